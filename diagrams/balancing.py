@@ -36,6 +36,10 @@ class Balancing(LeggedLoop):
         recovery: Whether to add recovery steps; by default if there is an assessment to trigger
             them. Without one the diagram has an input port ``safety_probability``.
         ball: Whether the plant has a ball; by default if pushes are sampled.
+
+    Raises:
+        ValueError: A robot without feet or gains, an assessment of another diagram, or a ball
+            with an engine that does not support it.
     """
 
     Parameters = BalancingParameters

@@ -213,6 +213,10 @@ class Reaching(LeggedLoop):
 
         Returns:
             The first step after the initial push; 0 without one.
+
+        Raises:
+            ValueError: The goal is not three finite numbers.
+            RuntimeError: No sampled posture is in the safe set.
         """
         parameters = self.scenario.parameters
         q = parameters.start.sample(self.safe_set, rng, self.mirror)
@@ -257,7 +261,11 @@ class Reaching(LeggedLoop):
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
-        """Starts in the standing posture with a plan to a target; without initial noise."""
+        """Starts in the standing posture with a plan to a target; without initial noise.
+
+        Raises:
+            ValueError: The goal is not three finite numbers.
+        """
         self._set(context, self.kinematics.standing_positions(), goal)
         self._observers.reseed(context, rng)
         self._observers.silence(context)

@@ -228,7 +228,11 @@ class Walking(LeggedLoop):
         return episode.desired_output[0]
 
     def command_plan(self, command: np.ndarray) -> PiecewisePolynomial:
-        """The plan of a constant command (3,) [m/s, rad/s]."""
+        """The plan of a constant command (3,) [m/s, rad/s].
+
+        Raises:
+            ValueError: The command is not three finite numbers.
+        """
         command = np.asarray(command, dtype=float)
         if command.shape != (3,) or not np.isfinite(command).all():
             raise ValueError(
@@ -276,7 +280,11 @@ class Walking(LeggedLoop):
         self.set_plan(context, PiecewisePolynomial(np.asarray(command, dtype=float)[:, None]))
 
     def set_guarded(self, context: Context, is_guarded: bool) -> None:
-        """Sets whether the guard acts."""
+        """Sets whether the guard acts.
+
+        Raises:
+            ValueError: The diagram was built without a guard.
+        """
         if self._guard is None:
             raise ValueError("walking: the diagram was built without a guard: pass guard=True")
         self._guard.set_acting(self._guard.GetMyMutableContextFromRoot(context), is_guarded)

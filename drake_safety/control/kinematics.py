@@ -49,6 +49,10 @@ class RobotKinematics:
     Positions are Drake's ``q = [q_WB (w, x, y, z), p_WB, joints]`` and velocities
     ``v = [w_WB, v_WB, joint rates]``. The object keeps one scratch Context a thread, which every
     method overwrites. Of a plant variation only the masses are used.
+
+    Raises:
+        ValueError: The robot has no feet, its base is not the only floating body, or a foot's body
+            or joint does not exist.
     """
 
     def __init__(self, robot: RobotModel, variation: PlantVariation | None = None):

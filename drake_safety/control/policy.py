@@ -346,7 +346,11 @@ def read_policy_file(path: Path) -> PolicyParameters:
 
 
 def load_policy(path: Path, kinematics: RobotKinematics) -> Policy:
-    """Loads a policy for a robot."""
+    """Loads a policy for a robot.
+
+    Raises:
+        ValueError: The file does not fit the schema, the robot or the network.
+    """
     return Policy(
         read_policy_file(path),
         kinematics.joint_names,

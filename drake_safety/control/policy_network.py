@@ -93,7 +93,12 @@ class PolicyNetwork:
 
 
 def load_network(path: Path) -> PolicyNetwork:
-    """Loads a network from an ONNX (``.onnx``) or TorchScript (``.pt``, ``.jit``) file."""
+    """Loads a network from an ONNX (``.onnx``) or TorchScript (``.pt``, ``.jit``) file.
+
+    Raises:
+        MissingExtraError: The package that evaluates it is not installed.
+        ValueError: The file does not exist, is of another kind, or cannot be read.
+    """
     loaders = {".onnx": _load_onnx, ".pt": _load_torchscript, ".jit": _load_torchscript}
     if path.suffix not in loaders:
         raise ValueError(

@@ -91,7 +91,11 @@ class StandingFoot:
 
 
 class WholeBodyModel:
-    """Frames, gains and limits of a robot's whole-body program; no reaching without a hand."""
+    """Frames, gains and limits of a robot's whole-body program; no reaching without a hand.
+
+    Raises:
+        ValueError: The hand does not exist.
+    """
 
     def __init__(self, kinematics: RobotKinematics, hand: str | None = None):
         robot, plant = kinematics.robot, kinematics.plant

@@ -85,7 +85,11 @@ _MEDIAN_BOOTSTRAP = Bootstrap(num_resamples=2000)
 
 
 def proportion(count: int, n: int, *, confidence: float = 0.95) -> Estimate:
-    """The share `count` of `n` independent samples, with its Clopper-Pearson interval."""
+    """The share `count` of `n` independent samples, with its Clopper-Pearson interval.
+
+    Raises:
+        ValueError: `count` is not in 0..n.
+    """
     if not 0 <= count <= n:
         raise ValueError(f"proportion: count is {count}, expected 0..{n}")
     from scipy.stats import binomtest
@@ -100,6 +104,9 @@ def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> E
     """The median of independent values (N,), with its bootstrap interval.
 
     Infinite values are allowed: a fall that never happens is later than any other.
+
+    Raises:
+        ValueError: A value is NaN.
     """
     values = np.sort(np.asarray(values, dtype=float))
     if np.isnan(values).any():

@@ -97,7 +97,11 @@ class StillCamera:
         self._world = scene_graph.world_frame_id()
 
     def render(self, positions: np.ndarray) -> np.ndarray:
-        """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8."""
+        """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8.
+
+        Raises:
+            ValueError: The positions have another size, or are not finite.
+        """
         self._pose(positions)
         base = self._base.EvalPoseInWorld(self._plant_context).translation()
         target = np.append(base[:2] + self._offset, self._look_at_height)
@@ -147,7 +151,11 @@ class StillCamera:
 
 
 def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.ndarray:
-    """All positions (N, n_q) of a plant from the logged states (N, n) of its model instances."""
+    """All positions (N, n_q) of a plant from the logged states (N, n) of its model instances.
+
+    Raises:
+        ValueError: A model instance with positions is missing, or has another number of them.
+    """
     plant = loop.plant
     instances = map(ModelInstanceIndex, range(plant.num_model_instances()))
     moving = {plant.GetModelInstanceName(i): i for i in instances if plant.num_positions(i)}

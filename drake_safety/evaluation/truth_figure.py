@@ -43,6 +43,10 @@ def truth_figure(
         episodes: Episodes that it has not used.
         x: Name of the state variable on the horizontal axis, of `episodes.info.state_names`.
         labels: Labels of the two axes, such as "tilt [rad]"; the names by default.
+
+    Raises:
+        ValueError: A state variable does not exist, the assessment has used the episodes' seed, or
+            no episode starts inside the safe set and has an outcome.
     """
     names = episodes.info.state_names
     for name in (x, y):

@@ -25,6 +25,9 @@ class AdaptiveThreshold:
 
     Attributes:
         threshold: Present lower bound of the probability for "safe"; above 1 if none is.
+
+    Raises:
+        ValueError: The step is not positive.
     """
 
     def __init__(self, calibration: Calibration, step: float = 1.0):

@@ -106,6 +106,10 @@ class SafetyAssessment:
         Args:
             progress: Called with a stage ("distances", "t-SNE", "training", "innovation",
                 "beliefs"), the percentage done and 100; True shows it.
+
+        Raises:
+            MissingExtraError: The extra "train" is not installed.
+            ValueError: A parameter is invalid, the horizons differ, or there are too few segments.
         """
         require_extra("train", "SafetyAssessment.fit")
         self.parameters.check()
@@ -190,6 +194,11 @@ class SafetyAssessment:
             method: "recalibration" corrects the base logit and with it the training scores;
                 "paper" is the paper's update by a discrepancy function and feedback beliefs.
                 Default: "recalibration" for maps with heads, else "paper".
+
+        Raises:
+            MissingExtraError: The extra "train" is not installed.
+            ValueError: Unknown method, maps without heads for "recalibration", no feedback, or
+                feedback of another scenario.
         """
         require_extra("train", "SafetyAssessment.adapt", "sklearn")
         self._check_fitted()
@@ -245,6 +254,9 @@ class SafetyAssessment:
         Args:
             purpose: "calibration" or "adaptation" if the sets replace those of an earlier one,
                 which are then ignored; the default is evaluation.
+
+        Raises:
+            ValueError: A seed was used; the message names its purpose and a free seed.
         """
         self._check_fitted()
         used = [one for one in self.used_ if one.purpose != purpose]
@@ -253,7 +265,11 @@ class SafetyAssessment:
     def adopt_calibrations(
         self, calibrations: Sequence[Calibration], info: EpisodesInfo, num_episodes: int
     ) -> None:
-        """Replaces the calibrations; ValueError if their episodes trained or adapted the maps."""
+        """Replaces the calibrations.
+
+        Raises:
+            ValueError: The episodes were used for training or adaptation.
+        """
         self.check_unused(info.seed, purpose="calibration")
         kept = [one for one in self.used_ if one.purpose != "calibration"]
         self.calibrations_ = {one.kind: one for one in calibrations}
@@ -322,6 +338,9 @@ class SafetyAssessment:
         Returns:
             The assessments. Novel inputs and those that are not finite get the empty belief, whose
             probability is 0. A row has the same bits whatever the others are.
+
+        Raises:
+            ValueError: A width or a shape is wrong, or the assessment is not fitted.
         """
         self._check_fitted()
         x = self.inputs_of(state, desired_preview, features)
@@ -402,6 +421,9 @@ class SafetyAssessment:
 
         Returns:
             x (N, n_x), the logit (N,) and its gradient (N, n_x).
+
+        Raises:
+            ValueError: The maps have no safety head, as in the paper's mode.
         """
         x = self.inputs_of(state, desired_preview, features)
         return x, *self.embedding_.logit_gradient(x)
@@ -417,6 +439,10 @@ class SafetyAssessment:
 
         It is that of the present beliefs, correction and novelty, and its metadata say what its
         inputs are, what its thresholds promise and for which plant.
+
+        Raises:
+            MissingExtraError: The extra "onnx" is not installed.
+            ValueError: The assessment is not fitted.
         """
         from drake_safety.learning import onnx_graph
 
@@ -425,7 +451,11 @@ class SafetyAssessment:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SafetyAssessment:
-        """Reads a file written by `save`."""
+        """Reads a file written by `save`.
+
+        Raises:
+            ValueError: The file is truncated, not an assessment, or of another schema version.
+        """
         parameters, learned = assessment_file.read(Path(path))
         assessment = cls(parameters)
         vars(assessment).update(learned)

@@ -43,6 +43,10 @@ def from_scores(
         score: Unsafety scores lambda in [0, 1], (N,).
         uncertainty: mu in [0, 1], scalar or (N,).
         cause: Column of the constraint that each unsafe mass is assigned to, -1 for none, (N,).
+
+    Raises:
+        ValueError: A score or an uncertainty lies outside [0, 1], `cause` is missing although
+            `num_causes` > 0, or an unsafe score has no cause.
     """
     score = np.asarray(score, dtype=float)
     uncertainty = np.broadcast_to(np.asarray(uncertainty, dtype=float), score.shape)
@@ -100,6 +104,9 @@ def fuse_cells(
         num_cells: Number of cells V.
         min_count: k_min, the number of beliefs below which a cell stays empty.
         multiplicity: Number of equal beliefs that each stands for, (N,); one by default.
+
+    Raises:
+        ValueError: `cells` and `beliefs` differ in length.
     """
     beliefs = np.asarray(beliefs, dtype=float)
     cells = np.asarray(cells)
@@ -150,6 +157,9 @@ def average_cells(beliefs: np.ndarray, cells: np.ndarray, uncertainty: np.ndarra
 
     Returns:
         Beliefs (V, 3 + n_c); cells without beliefs are empty.
+
+    Raises:
+        ValueError: `cells` and `beliefs` differ in length.
     """
     if cells.shape != beliefs.shape[:1]:
         raise ValueError(

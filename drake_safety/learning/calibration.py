@@ -186,6 +186,9 @@ def score_threshold(
     Returns:
         The midpoint between the k-th lowest unsafe score and the next lower score of either label;
         just below the former if there is none.
+
+    Raises:
+        ValueError: Too few samples have the label, no score is finite, or a rate is not in (0, 1).
     """
     score, label = _checked(unsafe_score, is_unsafe)
     if not np.isfinite(score).any():
@@ -207,7 +210,11 @@ def score_threshold(
 
 
 def allowed_misses(num_unsafe: int, miss_rate: float, *, confidence: float | None = None) -> int:
-    """How many of n unsafe episodes may be missed, see `score_threshold`; -1 if n is too small."""
+    """How many of n unsafe episodes may be missed, see `score_threshold`; -1 if n is too small.
+
+    Raises:
+        ValueError: A rate is not in (0, 1).
+    """
     _check_share("miss_rate", miss_rate)
     if confidence is None:
         return math.floor(miss_rate * (num_unsafe + 1) + 1e-9) - 1
@@ -221,7 +228,11 @@ def allowed_misses(num_unsafe: int, miss_rate: float, *, confidence: float | Non
 
 
 def episodes_needed(miss_rate: float, *, confidence: float | None = None) -> int:
-    """Returns the least number of unsafe episodes for a promised miss rate."""
+    """Returns the least number of unsafe episodes for a promised miss rate.
+
+    Raises:
+        ValueError: A rate is not in (0, 1).
+    """
     _check_share("miss_rate", miss_rate)
     if confidence is None:
         return math.ceil(1.0 / miss_rate - 1e-9) - 1
@@ -248,6 +259,9 @@ def episode_scores(
 
     Returns:
         Score and label of each episode that has segments, (M,) each.
+
+    Raises:
+        ValueError: Unknown kind.
     """
     if kind not in KINDS:
         raise ValueError(f"calibration: unknown kind '{kind}'; the kinds are {list(KINDS)}")

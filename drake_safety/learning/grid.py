@@ -62,6 +62,9 @@ class Grid:
 
         Departure: the extent of a t-SNE embedding grows with the number of points, so a cell length
         in its units is not comparable across data sets.
+
+        Raises:
+            ValueError: The points are not finite or all coincide.
         """
         centred = points - points.mean(axis=0)
         extent = float(np.abs(centred).max())

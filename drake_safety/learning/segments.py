@@ -161,7 +161,12 @@ class Episodes(Sequence[Episode]):
     """A set of episodes that share one `EpisodesInfo`; a slice is a set."""
 
     def __init__(self, info: EpisodesInfo, episodes: Iterable[Episode]):
-        """Checks every episode against `info`."""
+        """Checks every episode against `info`.
+
+        Raises:
+            ValueError: An array's shape does not fit `info` and `time_s`, or the cause is unknown
+                or contradicts `is_safe`.
+        """
         self.info = info
         self._episodes = list(episodes)
         for episode in self._episodes:
@@ -328,6 +333,10 @@ def split(
         stride: Rows between two starts; `stride=H` is the paper's split.
         discount: gamma of the unsafety score.
         shortest: Least number of samples left of a complete episode; H by default.
+
+    Raises:
+        ValueError: The stride is below 1, `shortest` is not in 1..H, or no episode gives a
+            segment.
     """
     if stride < 1:
         raise ValueError(f"split: stride is {stride}, expected >= 1")

@@ -44,6 +44,9 @@ def segments_for(
 
     Returns:
         The segments, and whether each is embedded by t-SNE, (N,).
+
+    Raises:
+        ValueError: The episodes give too few segments for t-SNE.
     """
     is_sharpened, horizon = parameters.is_sharpened, parameters.horizon
     segments = split(

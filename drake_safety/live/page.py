@@ -24,7 +24,11 @@ _KEYS = {"Escape": "Esc", "ArrowUp": "↑", "ArrowDown": "↓", "ArrowLeft": "�
 
 @contextlib.contextmanager
 def serve_page(panel: LivePanel, *, host: str, port: int, scene_port: int) -> Iterator[None]:
-    """Serves the page in a thread; one page in a process."""
+    """Serves the page in a thread; one page in a process.
+
+    Raises:
+        ValueError: The server does not start.
+    """
     options: dict[str, Any] = {
         "root": lambda: build_page(panel, scene_port),
         "title": panel.title,

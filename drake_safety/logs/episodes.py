@@ -59,6 +59,10 @@ def cut_log(
     Returns:
         The episodes and their starts: ``run_episode(nominal_loop, start=starts[i])`` is the twin
         of ``episodes[i]``.
+
+    Raises:
+        ValueError: A log is of another robot, has no z*, begins outside the safe set, or is
+            too short for one segment.
     """
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")

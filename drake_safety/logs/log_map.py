@@ -161,7 +161,11 @@ class LogMap:
 
 
 def load_log_map(path: str | Path) -> LogMap:
-    """Reads a ``columns.yaml``."""
+    """Reads a ``columns.yaml``.
+
+    Raises:
+        ValueError: The file does not exist or does not fit the schema.
+    """
     who = f"map '{path}'"
     log_map = load_typed_file(LogMap, Path(path), who)
     try:

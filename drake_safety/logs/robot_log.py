@@ -101,6 +101,9 @@ def read_pieces(
 
     The first piece is checked as a log is, since these checks are about the map: a later one may
     begin in mid-motion, or after a fall.
+
+    Raises:
+        ValueError: See :func:`read_log`; or nothing is left.
     """
     path, log_map, kinematics, channels = _opened(path, log_map, robot, step_s)
     found, cuts = cut_channels(channels, log_map.max_gap_s)
@@ -151,6 +154,9 @@ def read_log(
         log_map: The map of its columns, or the path of a ``columns.yaml``.
         step_s: Time between two rows of the result [s]; by default the times are those of the
             base's positions.
+
+    Raises:
+        ValueError: A value is missing or implausible; the message names file, row and column.
     """
     path, log_map, kinematics, channels = _opened(path, log_map, robot, step_s)
     for channel in channels.values():

@@ -75,6 +75,9 @@ def choose_plan(
         context: Its Context, in the state to plan from; the chosen plan is set in it.
         threshold: Lowest probability of an accepted plan. If no candidate reaches it, the best
             one is set, and ``is_accepted`` is False.
+
+    Raises:
+        ValueError: The task's plans cannot be chosen.
     """
     offering = require(loop, OffersPlans)
     plans = offering.candidate_plans(context, rng, num_plans)

@@ -236,7 +236,11 @@ class RobotModel:
         return [*self.feet.values(), *self.reaching_frames.values()]
 
     def reaching_frame(self, hand: str) -> ReachingFrame:
-        """Returns the reaching frame of a hand."""
+        """Returns the reaching frame of a hand.
+
+        Raises:
+            ValueError: The hand does not exist.
+        """
         if hand not in self.reaching_frames:
             raise ValueError(
                 f"robot '{self.name}' has no reaching frame '{hand}'; "
@@ -248,6 +252,9 @@ class RobotModel:
         """Returns each joint's mirrored joint; joints without a pattern map to themselves.
 
         Patterns hold in both directions, so one side's names suffice.
+
+        Raises:
+            ValueError: A pattern matches no joint, or maps a joint to a missing one or to two.
         """
         names = list(joint_names)
         partners: dict[str, str] = {}
@@ -378,7 +385,11 @@ def _validate(value: Any) -> None:
 
 
 def load_robot_file(path: str | Path) -> RobotModel:
-    """Reads a ``robot.yaml``; its folder is the robot's ``source_dir``."""
+    """Reads a ``robot.yaml``; its folder is the robot's ``source_dir``.
+
+    Raises:
+        ValueError: The file does not exist or does not fit the schema.
+    """
     path = Path(path)
     robot = load_typed_file(RobotModel, path, f"robot file '{path}'")
     robot.source_dir = str(path.resolve().parent)

@@ -85,6 +85,9 @@ def write_robot(
         feet: Links that touch the ground; found by their height by default.
         moved: Joints that a policy moves: they are not fixed, though they may move neither a foot
             nor a hand; None for all.
+
+    Raises:
+        ValueError: Invalid name, unknown task, existing folder, or a URDF without a legged robot.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise ValueError(f"new: a robot's name is letters, digits and _; got '{name}'")

@@ -26,6 +26,9 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     Visual meshes that Drake does not render are converted, see
     :func:`~drake_safety.robots.mesh_cache.shown_mesh`, or left out if that fails. Collision meshes
     that Drake does not read are left out.
+
+    Raises:
+        ValueError: The file does not exist or is not a URDF.
     """
     copy = read_urdf(path)
     for element in copy.root.findall("gazebo"):

@@ -110,7 +110,11 @@ class HasBall(Protocol):
         """Samples a ball with a given time of impact [s]."""
 
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
-        """Sets a ball in flight that hits a robot at rest after ``lead_s`` [s]; returns when."""
+        """Sets a ball in flight that hits a robot at rest after ``lead_s`` [s]; returns when.
+
+        Raises:
+            ValueError: The loop was built without its ball.
+        """
 
 
 @runtime_checkable
@@ -134,7 +138,11 @@ class FollowsCommands(Protocol):
         """Sets a constant command (3,) from now on."""
 
     def set_guarded(self, context: Context, is_guarded: bool) -> None:
-        """Sets whether a guard replaces commands that are not accepted."""
+        """Sets whether a guard replaces commands that are not accepted.
+
+        Raises:
+            ValueError: The loop was built without a guard.
+        """
 
 
 @runtime_checkable
@@ -165,7 +173,11 @@ class CanStartAnywhere(Protocol):
     def reset_to(
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
     ) -> None:
-        """Sets plant state and plan; without ``rng`` the initial state is without noise."""
+        """Sets plant state and plan; without ``rng`` the initial state is without noise.
+
+        Raises:
+            ValueError: The start does not fit the plant.
+        """
 
     def start_of(self, context: Context) -> EpisodeStart:
         """State and plan of a Context, as a start for :meth:`reset_to`."""

@@ -188,6 +188,9 @@ class ClosedLoop(Diagram):
         The names of the ports' entries must have been set. The scenario says what an alarm of the
         monitor does. The arguments are those of
         :func:`~drake_safety.systems.safety_assessor.AddSafetyAssessor`.
+
+        Raises:
+            ValueError: The assessment is that of another diagram.
         """
         if self.assessment is None:
             return None
@@ -209,7 +212,11 @@ class ClosedLoop(Diagram):
         return assessor
 
     def finish(self, builder: DiagramBuilder) -> None:
-        """Builds the diagram and checks its ports."""
+        """Builds the diagram and checks its ports.
+
+        Raises:
+            ValueError: A required port is missing, or its size is not the number of its names.
+        """
         builder.BuildInto(self)
         check_ports(self)
 

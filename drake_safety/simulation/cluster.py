@@ -10,7 +10,12 @@ from drake_safety.extras import require_extra
 
 @contextlib.contextmanager
 def connected(address: str, *, timeout_s: float = 20.0) -> Iterator[None]:
-    """Simulates on a dask cluster, in place of processes of this machine, while the block runs."""
+    """Simulates on a dask cluster, in place of processes of this machine, while the block runs.
+
+    Raises:
+        MissingExtraError: dask is not installed.
+        ValueError: No scheduler answers, or it has no workers.
+    """
     require_extra("cluster", f"cluster '{address}'")
     import joblib
     from distributed import Client

@@ -155,7 +155,11 @@ def open_folder(
 
 
 def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any]]:
-    """Reads the metadata of a folder's episodes, and the extra stored with it."""
+    """Reads the metadata of a folder's episodes, and the extra stored with it.
+
+    Raises:
+        ValueError: There is no ``info.json``, or it has another schema.
+    """
     file = Path(path) / _INFO_NAME
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
@@ -180,7 +184,11 @@ def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any
 
 
 def completed(path: str | os.PathLike[str]) -> set[int]:
-    """Indices of the episodes on disk; empty if nothing was written yet."""
+    """Indices of the episodes on disk; empty if nothing was written yet.
+
+    Raises:
+        ValueError: A shard is truncated or damaged, or there are shards but no ``info.json``.
+    """
     shards = shards_in(Path(path))
     if shards and not (Path(path) / _INFO_NAME).exists():
         raise ValueError(

@@ -69,6 +69,9 @@ def run_pairs(
             holds are not simulated again.
         **loop_options: Options of the task; they replace those of
             ``pairing_options`` of the task.
+
+    Raises:
+        ValueError: No such variation, or the folder holds other sets.
     """
     loop_options = scenario.task_class().pairing_options(scenario, variation) | loop_options
     sets = {}
@@ -142,7 +145,11 @@ def run_twins(
     num_workers: int | None = None,
     progress: Progress | bool | None = None,
 ) -> Episodes:
-    """Simulates the nominal twins of recorded windows."""
+    """Simulates the nominal twins of recorded windows.
+
+    Raises:
+        ValueError: The task cannot begin with a given start.
+    """
     # pydrake never frees a system in Python: one loop serves every call.
     info = episodes_info(worker_loop(scenario, _TWINS, {}), seed)
     twins = run_batches(

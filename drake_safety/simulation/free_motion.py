@@ -54,6 +54,9 @@ def run_free(
         index: Number of the episode; it and the seed determine start and plan.
         duration_s: End time [s]; a fall, or half a second outside the safe set, ends it sooner.
         ports: More output ports to log, into ``extra``.
+
+    Raises:
+        ValueError: The loop has no such port, or the simulation fails before the first row.
     """
     require_ports(loop, ("margins", *ports))
     simulator = Simulator(loop)

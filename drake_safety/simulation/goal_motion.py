@@ -90,6 +90,9 @@ def run_to_goal(
         ports: More output ports to log, into ``extra``.
         until_unsafe: Whether the motion ends when it leaves the safe set, not only at a fall.
         after_fall_s: Time for which a motion continues after a fall [s].
+
+    Raises:
+        ValueError: The task's plans have no goal, its robot cannot be pushed, or has no such body.
     """
     simulator = Simulator(loop)
     simulator.set_target_realtime_rate(realtime_rate)

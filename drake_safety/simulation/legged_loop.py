@@ -227,7 +227,11 @@ class LeggedLoop(PlannedLoop):
         builder.Connect(self._push_source.get_output_port(), self._physics.applied_spatial_force)
 
     def set_push(self, context: Context, push: Push) -> None:
-        """Sets a push, in place of an earlier one; ValueError without such a body or source."""
+        """Sets a push, in place of an earlier one.
+
+        Raises:
+            ValueError: The robot has no such body, or the task adds no source of pushes.
+        """
         if self._push_source is None:
             raise ValueError(f"task '{type(self).__name__}' has no pushes on its robot")
         self._push_source.set_push(

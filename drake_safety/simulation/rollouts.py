@@ -139,6 +139,9 @@ def inputs_at(loop: ClosedLoop, start: EpisodeStart) -> tuple[np.ndarray, np.nda
 
     Returns:
         State (n_s,) without noise, desired preview (H*n_z,) and features (n_f,).
+
+    Raises:
+        ValueError: The task takes no start, or the start does not fit the plant.
     """
     context = loop.CreateDefaultContext()
     require(loop, CanStartAnywhere).reset_to(context, None, start)

@@ -97,7 +97,11 @@ class Scenario:
         return round(self.episode_duration_s / self.step_s)
 
     def variation(self, name: str) -> PlantVariation:
-        """A plant variation by name."""
+        """A plant variation by name.
+
+        Raises:
+            ValueError: No such variation.
+        """
         if name not in self.variations:
             raise ValueError(
                 f"scenario '{self.name}' has no variation '{name}'"
@@ -106,7 +110,11 @@ class Scenario:
         return self.variations[name]
 
     def task_class(self) -> type[ClosedLoop]:
-        """The task, imported."""
+        """The task, imported.
+
+        Raises:
+            ValueError: The import path is malformed or is not that of a ClosedLoop.
+        """
         return _import_task(self.task, self.name, self.folder)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -127,6 +135,9 @@ class Scenario:
             assessment: Adds an assessor and, for example, recovery.
             meshcat: Adds a visualiser; a task whose constructor does not take it draws nothing.
             **options: Options of the task, such as ``recovery=False``.
+
+        Raises:
+            ValueError: Unknown variation or option, or an assessment of another diagram.
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
         _check_options(task, options)
@@ -151,6 +162,9 @@ class Scenario:
         Args:
             variation: The simulated plant. The nominal one is always included, because it is the
                 controllers' model.
+
+        Raises:
+            ValueError: No such variation.
         """
         if variation != "nominal":
             self.variation(variation)
@@ -308,6 +322,9 @@ def read_scenario(name: str | Path) -> tuple[Scenario, Any]:
 
     Returns:
         The scenario without parameters, and the task's parameters as they stand in the file.
+
+    Raises:
+        ValueError: See :func:`load_scenario`.
     """
     path = _scenario_file(name)
     with reading(path):
@@ -333,6 +350,9 @@ def parse_scenario(text: str, *, name: str, folder: Path, task_folder: str = "")
 
     Args:
         task_folder: Folder in which the task's module may stand; "" for none.
+
+    Raises:
+        ValueError: See :func:`load_scenario`.
     """
     scenario, parameters = _parsed(text, name, folder)
     scenario.folder = task_folder

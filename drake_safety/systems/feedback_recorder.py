@@ -71,6 +71,9 @@ class FeedbackRecorder(LeafSystem):
         num_steps: Steps of a safe window.
         watch_period_s: Sampling period of ``safe`` [s].
         capacity: Largest number of finished windows kept; the oldest are dropped.
+
+    Raises:
+        ValueError: A window is shorter than the horizon.
     """
 
     def __init__(

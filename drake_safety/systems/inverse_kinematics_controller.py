@@ -39,6 +39,9 @@ class InverseKinematicsController(LeafSystem):
         stiffness: Servo stiffness of every joint, (n_j,) [N·m/rad].
         period_s: Control period [s].
         offset_s: Time of the first update, after those of its inputs [s].
+
+    Raises:
+        ValueError: A stiffness is not positive.
     """
 
     def __init__(

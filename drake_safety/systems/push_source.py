@@ -47,7 +47,11 @@ class PushSource(LeafSystem):
     def set_push(
         self, context: Context, body: str, force_n: np.ndarray, *, start_s: float, duration_s: float
     ) -> None:
-        """Sets the push; it replaces an earlier one."""
+        """Sets the push; it replaces an earlier one.
+
+        Raises:
+            ValueError: The robot has no such body.
+        """
         if body not in self._bodies:
             raise ValueError(
                 f"push: robot '{self._robot_name}' has no body '{body}'; its bodies are "

@@ -92,6 +92,9 @@ class SafetyAssessor(Diagram):
         """Takes over what an assessment adapted from this system's own has learned.
 
         The monitor begins anew: its alarm was about the robot before the adaptation.
+
+        Raises:
+            ValueError: The adapted assessment has other maps.
         """
         self.evaluator.adopt(self.GetMutableSubsystemContext(self.evaluator, context), adapted)
         if self.monitor is not None:

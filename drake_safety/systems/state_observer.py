@@ -42,6 +42,9 @@ class StateObserver(LeafSystem):
         mirror: If given, the state s_k is that of the robot's mirror image.
         is_walking: Whether s_k is :func:`~drake_safety.control.observation.walking_state`, and z_k
             the velocity (v_x, v_y, ω_z) in the heading frame [m/s, rad/s].
+
+    Raises:
+        ValueError: The robot has no such reaching frame.
     """
 
     def __init__(

@@ -104,6 +104,10 @@ class TrajectoryPlanner(LeafSystem):
         num_outputs: n_z, a multiple of three.
         outlook_s: Duration of the outlook [s]; that of the preview by default.
         num_outlook: M, samples of the outlook.
+
+    Raises:
+        ValueError: ``num_outputs`` is not a multiple of three, or horizon, step or number of
+            samples of the outlook is too small.
     """
 
     def __init__(
@@ -155,6 +159,9 @@ class TrajectoryPlanner(LeafSystem):
         Args:
             plan: Positions in the stance frame over simulation time, (n_z, 1) [m].
             stance_pose: [x, y, yaw] (3,) [m, rad]; unchanged by default.
+
+        Raises:
+            ValueError: The plan's size is not n_z.
         """
         if (plan.rows(), plan.cols()) != (self._num_outputs, 1):
             raise ValueError(

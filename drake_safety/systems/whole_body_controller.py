@@ -48,6 +48,9 @@ class WholeBodyController(LeafSystem):
             default.
         period_s: Control period [s].
         offset_s: Time of the first update, after those of its inputs [s].
+
+    Raises:
+        ValueError: The robot has no such hand, or the matrix is of another size.
     """
 
     def __init__(
@@ -89,7 +92,11 @@ class WholeBodyController(LeafSystem):
         self.DeclareStateOutputPort("num_failures", self._num_failures)
 
     def set_reference(self, context: Context, reference: WholeBodyReference) -> None:
-        """Sets stance, centre of mass, orientations and posture, such as ``model.reference(q)``."""
+        """Sets stance, centre of mass, orientations and posture, such as ``model.reference(q)``.
+
+        Raises:
+            ValueError: A part of the reference does not fit the robot.
+        """
         self.model.check_reference(reference)
         parameter = context.get_mutable_abstract_parameter(self._reference_index)
         parameter.set_value(copy.deepcopy(reference))
