@@ -112,7 +112,7 @@ def _bins(p: np.ndarray, num_bins: int) -> list[np.ndarray]:
 def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
     """Plots the observed share of unsafe ends over the predicted probability."""
     with drawing_style():
-        fig = new_figure(5.4, 6.0)
+        fig = new_figure(5.4, 6.6)
         axes = fig.subplots()
         axes.plot([0, 1], [0, 1], color=FAINT_INK, linewidth=0.8)
         for i, (name, one) in enumerate(curves.items()):
