@@ -7,8 +7,6 @@ import sys
 import time
 
 import numpy as np
-import pandas as pd
-import pyarrow.parquet as pq
 import pytest
 
 from cart_episodes import assert_identical, make_episode, make_info
@@ -16,6 +14,8 @@ from drake_safety.learning.segments import Episode
 from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes, read_info
 
 pytestmark = pytest.mark.train
+pd = pytest.importorskip("pandas")
+pq = pytest.importorskip("pyarrow.parquet")
 
 
 def write(path, episodes, info=None, **options):

@@ -42,6 +42,7 @@ def test_every_stored_evaluation_is_shown():
     assert shown == {path.stem for path in STORED}
 
 
+@pytest.mark.train
 def test_what_is_stored_is_read_again_but_for_folders_of_ones_own(tmp_path):
     info = make_info(scenario="lip")
     extra = {"command": "drake-safety train lip --resume --out=/somebodys/own/lip"}
