@@ -104,9 +104,11 @@ def test_the_newest_feedback_is_kept_so_that_a_long_simulation_needs_no_more_mem
 
 
 def test_a_monitor_that_ends_the_simulation_ends_it_here_too():
+    system = ConstantVectorSource([0.0])
+
     def monitor(context):
         if context.get_time() > 0.85:
-            return EventStatus.ReachedTermination(None, "enough")
+            return EventStatus.ReachedTermination(system, "enough")
         return EventStatus.DidNothing()
 
     adaptation, _ = run(2.05, monitor=monitor, update_interval=1)
