@@ -22,8 +22,8 @@ from drake_safety.models import load_robot
 from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import GoalWords
-from drake_safety.simulation.contract import Finding, failed, passed
 from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.finding import Finding, failed, passed
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.command_guard import CommandGuard

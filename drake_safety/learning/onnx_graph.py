@@ -31,7 +31,6 @@ from drake_safety.learning.trained_maps import INPUT_LIMIT, Embedding
 if TYPE_CHECKING:
     import onnx
 
-    from drake_safety.learning.assessment import SafetyAssessment
 
 SCHEMA_VERSION = 1
 """Version of the graph's ports and of its metadata."""
@@ -55,7 +54,7 @@ _UNITS = (
 )
 
 
-def write(path: Path, assessment: SafetyAssessment) -> None:
+def write(path: Path, assessment: Any) -> None:
     """Writes `SafetyAssessment.predict` as one ONNX file, atomically.
 
     The same assessment gives the same bytes.
@@ -139,7 +138,7 @@ def write(path: Path, assessment: SafetyAssessment) -> None:
         temporary.write_bytes(model.SerializeToString(deterministic=True))
 
 
-def _contract(assessment: SafetyAssessment, ports: Iterable[str]) -> dict[str, Any]:
+def _contract(assessment: Any, ports: Iterable[str]) -> dict[str, Any]:
     """What the file is, by the name of the entry of its metadata."""
     info, parameters = assessment.info_, assessment.parameters
     adaptation, calibrations = assessment.adaptation_, assessment.calibrations_.values()

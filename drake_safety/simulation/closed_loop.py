@@ -16,9 +16,8 @@ from drake_safety.systems.safety_assessor import AddSafetyAssessor, SafetyAssess
 
 if TYPE_CHECKING:
     from drake_safety.control.kinematics import RobotKinematics
-    from drake_safety.simulation.contract import Finding
     from drake_safety.simulation.episode_start import StatePlane
-    from drake_safety.simulation.scenario import Scenario
+    from drake_safety.simulation.finding import Finding
 
 RECORDED_PORTS = RECORDED
 """Output ports recorded in episodes."""
@@ -93,7 +92,8 @@ class ClosedLoop(Diagram):
     feature_names: list[str]
     constraint_names: list[str]
 
-    def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
+    # `scenario` is a Scenario, whose module imports this one.
+    def __init__(self, scenario: Any, variation: str, assessment: SafetyAssessment | None):
         super().__init__()
         self.scenario = scenario
         self.variation_name = variation
@@ -108,19 +108,19 @@ class ClosedLoop(Diagram):
         return stated
 
     @classmethod
-    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, Any]:
+    def pairing_options(cls, scenario: Any, variation: str) -> dict[str, Any]:
         """Options with which an actual variation and its nominal twin can start alike."""
         del scenario, variation
         return {}
 
     @classmethod
-    def model_files(cls, scenario: Scenario) -> list[Path]:
+    def model_files(cls, scenario: Any) -> list[Path]:
         """Files besides the scenario that determine the plant; part of the hash."""
         del scenario
         return []
 
     @classmethod
-    def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterable[Finding]:
+    def check_files(cls, scenario: Any, kinematics: RobotKinematics) -> Iterable[Finding]:
         """Findings about the task's own files, which ``check`` checks before the diagram."""
         del scenario, kinematics
         return ()

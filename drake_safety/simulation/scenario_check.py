@@ -22,7 +22,8 @@ from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.robots.urdf_copy import read_urdf
 from drake_safety.simulation.capabilities import HasBall
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.contract import Finding, check_contract, failed, passed, warned
+from drake_safety.simulation.contract import check_contract
+from drake_safety.simulation.finding import Finding, failed, passed, warned
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
