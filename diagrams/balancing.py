@@ -19,7 +19,7 @@ from drake_safety.plants.physics import ENGINES_WITH_BALLS, Scene
 from drake_safety.robots.robot_model import by_pattern
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
-from drake_safety.simulation.sampling import calm_start
+from drake_safety.simulation.sampling import calm_start, undisturbed_start
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
 from drake_safety.systems.recovery_switch import RecoverySwitch
@@ -132,6 +132,9 @@ class Balancing(LeggedLoop):
             outlook=desired["desired_outlook"],
             servo_command=controller.GetOutputPort("desired_joint_state"),
         )
+        self.monitored_features = [
+            name for name in self.feature_names if name.startswith("servo_load_")
+        ]
         assessor = self._export_robot(
             builder,
             period_s=parameters.recovery.assessment_period_s,
@@ -178,6 +181,14 @@ class Balancing(LeggedLoop):
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
         """Samples an undisturbed motion near the stance, for throws."""
         self._start_calm(context, rng, elapsed_s=0.0)
+
+    def reset_undisturbed(
+        self, context: Context, rng: np.random.Generator, duration_s: float
+    ) -> None:
+        """Samples base motions about the stance, one after another, with rests between them."""
+        parameters = self.scenario.parameters
+        start = undisturbed_start(self.kinematics, rng, parameters.start, duration_s)
+        self._begin(context, rng, start)
 
     def _start_calm(self, context: Context, rng: np.random.Generator, elapsed_s: float) -> None:
         """Starts ``elapsed_s`` [s] into an undisturbed motion, without tracking error."""

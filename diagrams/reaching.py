@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.kinematics import fit_stance
+from drake_safety.control.kinematics import fit_stance, planar_pose
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.reaching_safe_set import ReachingSafeSet
 from drake_safety.diagrams.reaching_parameters import ReachingParameters
@@ -29,6 +29,7 @@ from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.trajectory_planner import interpolate, plan_shape, points_of_plan
 from drake_safety.systems.whole_body_controller import WholeBodyController
 
+_USUAL_SHARES = (0.1, 0.5)  # Of the way to a target, in undisturbed motion.
 _NUM_OUTLOOK = 31  # Samples of the whole plan: dense enough for thin obstacles.
 
 
@@ -129,6 +130,7 @@ class Reaching(LeggedLoop):
         )
         self.angular_constraints = self.safe_set.angular_names
         self._watch(builder, self.safe_set)
+        self.monitored_features = []  # Its controller follows the preview.
         self._export_robot(
             builder,
             period_s=parameters.assessment_period_s,
@@ -258,6 +260,32 @@ class Reaching(LeggedLoop):
             plans.append(interpolate(*ends, end - start, start, detour=detour))
         return plans
 
+    def reset_undisturbed(
+        self, context: Context, rng: np.random.Generator, duration_s: float
+    ) -> None:
+        """Samples straight motions of the hand towards targets and back, one after another.
+
+        They end before half of the way, so that most of them are safe.
+        """
+        parameters = self.scenario.parameters
+        q = parameters.start.sample(self.safe_set, rng, self.mirror)
+        box = np.sort(self._reflected(parameters.target.box), axis=0)
+        self._set(context, q, self._output_of(q))
+        first = self._plan_of(context)
+        home, piece_s = first.value(0.0).ravel(), parameters.plan_duration_s
+        plan, stance = None, self._stance_in_world(q)
+        for i in range(math.ceil(duration_s / (2.0 * piece_s))):
+            target = stance.inverse() @ rng.uniform(*box)
+            goal = home + rng.uniform(*_USUAL_SHARES) * (target - home)
+            for k, ends in enumerate(((home, goal), (goal, home))):
+                piece = interpolate(*ends, piece_s, (2 * i + k) * piece_s)
+                if plan is None:
+                    plan = piece
+                else:
+                    plan.ConcatenateInTime(piece)
+        self.set_plan(context, plan)
+        self._observers.reseed(context, rng)
+
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
@@ -281,11 +309,7 @@ class Reaching(LeggedLoop):
             raise ValueError(f"reaching: a target is three finite numbers [m]; got {goal}")
         q = q.copy()
         q[6] -= self.scenario.parameters.start.sink_m
-        stance_pose = fit_stance(
-            self.kinematics.contact_positions(q), self.kinematics.nominal_contacts
-        )
-        x, y, yaw = stance_pose
-        X_SW = RigidTransform(RotationMatrix.MakeZRotation(yaw), [x, y, 0.0]).inverse()
+        X_SW = self._stance_in_world(q).inverse()
         plan = interpolate(
             X_SW @ self._output_of(q),
             X_SW @ goal,
@@ -294,6 +318,11 @@ class Reaching(LeggedLoop):
         )
         v = np.zeros(self.kinematics.num_velocities)
         self._enter(context, EpisodeStart(q=q, v=v, plan=plan))
+
+    def _stance_in_world(self, q: np.ndarray) -> RigidTransform:
+        """The frame of plans."""
+        contacts = self.kinematics.contact_positions(q)
+        return planar_pose(fit_stance(contacts, self.kinematics.nominal_contacts))
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:
         super()._set_state(context, start)

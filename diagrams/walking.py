@@ -32,6 +32,10 @@ from drake_safety.systems.recovery_trigger import RecoveryTrigger
 
 _NUM_OUTLOOK = 9  # Samples of the commands from now to the end, for the features.
 _SETTLING_S = 1.0
+_HELD_S = (2.0, 6.0)  # Shortest and longest time for which undisturbed motion holds a command.
+_STANDING_SHARE = 0.1  # Of its commands.
+_POSITION = "base_height"  # No sensor of a robot measures it.
+_UNCOMMANDED = "action_change"
 
 
 class Walking(LeggedLoop):
@@ -160,6 +164,11 @@ class Walking(LeggedLoop):
         elif trigger is not None:
             builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
         builder.ExportOutput(controller.GetOutputPort("status"), "controller_status")
+        self.monitored_states = [name for name in self.state_names if name != _POSITION]
+        # What the policy sees: its last actions, its phase and the command.
+        self.monitored_features = [
+            name for name in controller.action_names if name != _UNCOMMANDED
+        ]
         self._rehearsal: Walking | None = None
         self._settled: EpisodeStart | None = None
         self.finish(builder)
@@ -274,6 +283,22 @@ class Walking(LeggedLoop):
         self._enter(context, replace(self.settled_start(), plan=self.command_plan(goal)))
         self._observers.reseed(context, rng)
         self._observers.silence(context)
+
+    def reset_undisturbed(
+        self, context: Context, rng: np.random.Generator, duration_s: float
+    ) -> None:
+        """Starts from standing with random commands inside the policy's ranges, 2 to 6 s each."""
+        commands, changes = [self._usual_command(rng)], [rng.uniform(*_HELD_S)]
+        while changes[-1] < duration_s:
+            commands.append(self._usual_command(rng))
+            changes.append(changes[-1] + rng.uniform(*_HELD_S))
+        plan = profile(commands, changes[:-1], duration_s)
+        self.reset_to(context, rng, replace(self.settled_start(), plan=plan))
+
+    def _usual_command(self, rng: np.random.Generator) -> np.ndarray:
+        limits = self.policy.parameters.command
+        drawn = rng.uniform(limits.lowest, limits.highest)
+        return np.zeros(3) if rng.random() < _STANDING_SHARE else drawn
 
     def set_command(self, context: Context, command: np.ndarray) -> None:
         """Sets a constant command (v_x, v_y, ω_z) (3,) [m/s, rad/s] from now on."""

@@ -11,15 +11,21 @@ if TYPE_CHECKING:
     from drake_safety.assessments import load_assessment
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.assessment_parameters import AssessmentParameters
+    from drake_safety.learning.change_detector import ChangeDetector
     from drake_safety.learning.segments import Episode, Episodes
     from drake_safety.robots.shift import Fault
     from drake_safety.simulation.closed_loop import ClosedLoop
     from drake_safety.simulation.contract import check_contract
     from drake_safety.simulation.episode_start import EpisodeStart
     from drake_safety.simulation.recording import record_episodes
-    from drake_safety.simulation.rollouts import inputs_at, run_episode, run_episodes
+    from drake_safety.simulation.rollouts import (
+        inputs_at,
+        run_episode,
+        run_episodes,
+        run_motions,
+    )
     from drake_safety.simulation.scenario import Scenario, load_scenario
-    from drake_safety.systems.novelty_monitor import NoveltyMonitor
+    from drake_safety.systems.change_monitor import ChangeMonitor
     from drake_safety.systems.recovery_switch import RecoverySwitch
     from drake_safety.systems.safety_assessor import AddSafetyAssessor, SafetyAssessor
     from drake_safety.systems.sensor_faults import SensorFaults
@@ -27,12 +33,13 @@ if TYPE_CHECKING:
 __all__ = [
     "AddSafetyAssessor",
     "AssessmentParameters",
+    "ChangeDetector",
+    "ChangeMonitor",
     "ClosedLoop",
     "Episode",
     "EpisodeStart",
     "Episodes",
     "Fault",
-    "NoveltyMonitor",
     "RecoverySwitch",
     "SafetyAssessment",
     "SafetyAssessor",
@@ -46,6 +53,7 @@ __all__ = [
     "record_episodes",
     "run_episode",
     "run_episodes",
+    "run_motions",
 ]
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -78,12 +86,13 @@ if not (_PACKAGE / "models").is_dir():
 _HOMES = {
     "AddSafetyAssessor": "drake_safety.systems.safety_assessor",
     "AssessmentParameters": "drake_safety.learning.assessment_parameters",
+    "ChangeDetector": "drake_safety.learning.change_detector",
+    "ChangeMonitor": "drake_safety.systems.change_monitor",
     "ClosedLoop": "drake_safety.simulation.closed_loop",
     "Episode": "drake_safety.learning.segments",
     "EpisodeStart": "drake_safety.simulation.episode_start",
     "Episodes": "drake_safety.learning.segments",
     "Fault": "drake_safety.robots.shift",
-    "NoveltyMonitor": "drake_safety.systems.novelty_monitor",
     "RecoverySwitch": "drake_safety.systems.recovery_switch",
     "SafetyAssessment": "drake_safety.learning.assessment",
     "SafetyAssessor": "drake_safety.systems.safety_assessor",
@@ -96,6 +105,7 @@ _HOMES = {
     "record_episodes": "drake_safety.simulation.recording",
     "run_episode": "drake_safety.simulation.rollouts",
     "run_episodes": "drake_safety.simulation.rollouts",
+    "run_motions": "drake_safety.simulation.rollouts",
 }
 
 

@@ -37,18 +37,19 @@ from drake_safety.evaluation.metrics import Estimate, segment_estimates
 from drake_safety.evaluation.results import Results
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.seeds import ADAPTATION
+from drake_safety.learning.seeds import ADAPTATION, MOTION
 from drake_safety.learning.segments import Episodes, split
-from drake_safety.logs.episodes import cut_log
+from drake_safety.logs.episodes import cut_log, motions_from_log
 from drake_safety.logs.robot_log import LogPieces, RobotLog, read_log, read_pieces
 from drake_safety.models import load_robot
 from drake_safety.simulation.feedback import EpisodePairs, pair_starts, run_pairs
-from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
 _JUDGED = {"before": "before feedback", "after": "after feedback"}
 _COLUMNS = ("brier", "auc", "unsafe_recall", "safe_recall")
 _MOST_CUTS = 3  # Printed of a log.
+_MOTION_S = 240.0  # Undisturbed motion of a simulated actual plant, for the monitor.
 _THRESHOLD = 0.5  # Safety probability below which a segment is classified unsafe.
 
 
@@ -115,11 +116,25 @@ def adapt(
     check_writable(folder)
     with open_stages() as stages:
         if log_map is not None:
-            pairs = _logged_pairs(loaded, logs, log_map, seed, is_strict=strict)
+            pieces = _log_pieces(loaded, logs, log_map, is_strict=strict)
+            actual, starts = cut_log(pieces, loaded)
+            pairs = pair_starts(loaded, actual, starts, seed=seed)
+            motions = motions_from_log(pieces, loaded)
         else:
             pairs = paired_episodes(loaded, feedback, variation, seed, learned.out, workers, stages)
         sets = pairs.feedback()
-        adapted = {mode: prior.adapt(sets) for mode, prior in priors.items()}
+        if not logs:
+            motions = run_motions(
+                loaded,
+                _MOTION_S,
+                variation=variation,
+                seed=MOTION.seeds()["motion of the actual robot"],
+                num_workers=workers,
+                path=feedback_folder(learned.out, loaded.simulation_hash(variation), seed) / "motion",
+                progress=partial(stages, "undisturbed actual motion"),
+                **loaded.task_class().pairing_options(loaded, variation),
+            )
+        adapted = {mode: prior.adapt(sets, motions=motions) for mode, prior in priors.items()}
         folder.mkdir(parents=True, exist_ok=True)
         for mode, one in adapted.items():
             one.save(assessment_file(folder, mode))
@@ -232,10 +247,10 @@ def fresh_actual_episodes(
     )
 
 
-def _logged_pairs(
-    scenario: Scenario, logs: list[Path], log_map: Path, seed: int, *, is_strict: bool
-) -> EpisodePairs:
-
+def _log_pieces(
+    scenario: Scenario, logs: list[Path], log_map: Path, *, is_strict: bool
+) -> list[RobotLog]:
+    """The pieces of logs without gaps; where they are cut is printed."""
     robot = load_robot(scenario.robot)
     pieces: list[RobotLog] = []
     for log in logs:
@@ -246,8 +261,7 @@ def _logged_pairs(
         pieces += found.pieces
         if found.cuts:
             _print_cuts(log, found)
-    actual, starts = cut_log(pieces, scenario)
-    return pair_starts(scenario, actual, starts, seed=seed)
+    return pieces
 
 
 def _print_unchanged(

@@ -33,7 +33,7 @@ from drake_safety.cli.training_folder import (
     load_assessment,
     run_fresh_episodes,
 )
-from drake_safety.evaluation import shift_study
+from drake_safety.evaluation import monitor_study, shift_study
 from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.episode_study import evaluate_episodes, evaluate_plans
 from drake_safety.evaluation.figure_style import save
@@ -50,16 +50,16 @@ from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import PLAN, episode_scores
-from drake_safety.learning.seeds import EVALUATION, SHIFTS, SeedBlock
+from drake_safety.learning.seeds import EVALUATION, MOTION, SHIFTS, SeedBlock
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.capabilities import HasBall, HasGoals, require
-from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 from drake_safety.simulation.throws import ThrowLog
 
 SHIFTS_FILE = "shifts.json"
 _DEFAULT_THROWS = 600
-_MOST_JUDGED = 1000  # Nominal motions under `--shifts`; all of them count for false alarms.
+_MOST_JUDGED = 1000  # Nominal motions under `--shifts`.
 
 
 @dataclass(kw_only=True)
@@ -279,6 +279,7 @@ def add_shifts(
         judges = {name: shift_study.assessment_judge(one) for name, one in modes.items()}
     scenario, seed, stages = evaluation.scenario, evaluation.seeds["shifts"], evaluation.stages
     nominal = shift_study.motions_of(evaluation.fresh("nominal motions", num_nominal, "shifts"))
+    found: dict[str, Estimate] = {}
     sets: dict[str, MotionSet] = {"nominal": ("nominal", nominal[:_MOST_JUDGED])}
     shifts = plant_shifts(scenario, scenario.make_loop())
     for i, (name, shift) in enumerate(shifts.items()):
@@ -296,10 +297,31 @@ def add_shifts(
             **options,
         )
         sets[name] = (shift.kind, shift_study.motions_of(episodes))
+        monitored = monitor_study.run_monitored(
+            shifted,
+            name,
+            num_motions,
+            seed,
+            gamma.detector_,
+            options=options,
+            num_workers=evaluation.workers,
+        )
+        judge = judges["gamma"]
+        sequences = monitor_study.sequences(monitored, gamma, judge)
+        of_monitor = monitor_study.monitor_estimates(sequences, gamma.info_.step_s)
+        found |= {f"shifts.{name}.{key}": estimate for key, estimate in of_monitor.items()}
     stages("shifted motions", len(shifts), len(shifts))
     sets |= others(nominal[:num_motions])
-    found = shift_study.evaluate_shifts(sets, judges, gamma, stages, more)
-    alarms = shift_study.false_alarms(nominal, gamma)
+    found |= shift_study.evaluate_shifts(sets, judges, gamma, stages, more)
+    usual = run_motions(
+        scenario,
+        num_nominal * scenario.episode_duration_s,
+        seed=MOTION.seeds()["other motion"],
+        num_workers=evaluation.workers,
+        path=evaluation.run_folder / "fresh" / "motion",
+        progress=partial(stages, "undisturbed nominal motion"),
+    )
+    alarms = monitor_study.false_alarms(usual, gamma.detector_)
     found["shifts.nominal.monitor.false_alarms_per_hour"] = alarms
     evaluation.add(found, shifts=shift_study.shifts_figure(found))
     return {"kinds": {name: kind for name, (kind, _) in sets.items()}}

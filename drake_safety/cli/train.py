@@ -34,12 +34,16 @@ from drake_safety.cli.training_folder import (
 )
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.seeds import TRAINING
 from drake_safety.learning.training import segments_for
 from drake_safety.simulation.dataset import completed, load_episodes
-from drake_safety.simulation.rollouts import run_episodes
+from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 from drake_safety.simulation.worker_processes import end_with_parent
+
+DEFAULT_MOTION_MIN = 24.0
+"""Minutes of undisturbed motion, half of them for the limits."""
 
 
 def train(
@@ -47,6 +51,10 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder for episodes and assessments.")],
     episodes: Annotated[int, typer.Option(help="Nominal training episodes.", min=1)] = 2048,
     seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = TRAINING.first,
+    motion: Annotated[
+        float,
+        typer.Option(help="Minutes of undisturbed motion from which the monitor learns.", min=0.0),
+    ] = DEFAULT_MOTION_MIN,
     mode: Annotated[
         str, typer.Option(help="'sharpened', 'paper' (the method as published), or 'both'.")
     ] = "both",
@@ -88,10 +96,22 @@ def train(
                 extra={"command": command_line(), "scenario_yaml": loaded.to_yaml()},
                 **options,
             )
+        detector = None
+        if motion:
+            motions = run_motions(
+                loaded,
+                60.0 * motion,
+                num_workers=workers,
+                path=out / "motion",
+                progress=partial(stages, "undisturbed motion"),
+            )
+            detector = ChangeDetector.fit(
+                motions, lambda done: stages("monitor", round(100 * done), 100)
+            )
         # The modes are independent: the first is trained here, the others in worker processes.
         with _worker_processes(len(modes) - 1) as submit:
-            beside = {name: submit(_learn, loaded, name, out) for name in modes[1:]}
-            learned = [_learn(loaded, modes[0], out, stages)]
+            beside = {name: submit(_learn, loaded, name, out, detector) for name in modes[1:]}
+            learned = [_learn(loaded, modes[0], out, detector, stages)]
             for name, result in beside.items():
                 stages(name, 0, 1)
                 learned.append(result.result())
@@ -100,6 +120,8 @@ def train(
     for name, (num_segments, unsafe, cpu_s) in zip(modes, learned, strict=True):
         table.add_row(name, f"{num_segments}", unsafe, f"{cpu_s:.0f} s")
     console.print(table)
+    if detector is not None:
+        console.print(detector.describe(), highlight=False, soft_wrap=True)
     for folder in sets:
         print_path("episodes  ", folder)
     for name in modes:
@@ -126,7 +148,11 @@ def _worker_processes(num_workers: int) -> Iterator[Callable[..., Any]]:
 
 
 def _learn(
-    scenario: Scenario, mode: str, out: Path, stages: StageProgress | None = None
+    scenario: Scenario,
+    mode: str,
+    out: Path,
+    detector: ChangeDetector | None,
+    stages: StageProgress | None = None,
 ) -> tuple[int, str, float]:
     """Trains and saves one mode.
 
@@ -134,6 +160,7 @@ def _learn(
         scenario: The scenario.
         mode: The mode.
         out: Folder of the training.
+        detector: That of undisturbed motion; by default it is learned from the episodes.
         stages: Progress bars.
 
     Returns:
@@ -149,7 +176,7 @@ def _learn(
     data = load_episodes(episodes_folder(out, mode))
     # Γ is that of the scenario's diagram, whatever the options of its training episodes.
     data.info = replace(data.info, scenario_hash=scenario.simulation_hash())
-    assessment = SafetyAssessment(scenario.assessment).fit(data, report)
+    assessment = SafetyAssessment(scenario.assessment).fit(data, report, detector=detector)
     assessment.save(assessment_file(out, mode))
     unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
     num_segments = len(segments_for(data, scenario.assessment)[0])

@@ -17,7 +17,7 @@ import numpy as np
 
 from drake_safety.evaluation.figure_style import spoken
 from drake_safety.evaluation.interval_figure import interval_figure
-from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, proportion, rate_per_hour
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.tables import Column, Table, rows_of
 from drake_safety.files.progress import StageProgress
@@ -32,12 +32,7 @@ SEEN = ("state", "desired_preview", "features")
 """Output ports that are inputs of assessor and monitor."""
 CONFIDENT = 0.9
 """Least safety probability of a confident verdict."""
-SPANS_S = (10.0, 60.0)
-"""Times since a shift over which confident errors with the monitor are counted [s]."""
-LASTING = ("plant", "sensor")
-"""Kinds whose motions follow each other."""
 BOOTSTRAP = Bootstrap(num_resamples=200)
-_MOST_STARTS = 100  # Sequences of motions per shift.
 _COLUMNS = (
     Column("unsafe", "unsafe", "=%", digits=1),
     Column("gamma.unknown", "don't know", "=%", digits=1),
@@ -178,28 +173,6 @@ class JudgedShift:
         is_sure = (one.probability >= CONFIDENT) & ~one.is_unknown
         return is_sure & self.is_unsafe[self.motion]
 
-    @cached_property
-    def sequences(self) -> list[tuple[np.ndarray, int]]:
-        """Motions one after another until a minute has passed, begun at up to 100 of them.
-
-        Each is the order of the motions, and the row of the monitor's alarm, or the number of rows.
-        """
-        innovation = self.assessment.innovation_
-        x = [
-            self.assessment.inputs_of(m.state, m.desired_preview, m.features) for m in self.motions
-        ]
-        distances = [self.assessment.novelty_.of(one) for one in x]
-        num, found = len(x), []
-        for start in np.linspace(0, num, min(_MOST_STARTS, num), endpoint=False).astype(int):
-            order = (start + np.arange(num)) % num
-            is_enough = np.cumsum(self.sizes[order]) * innovation.step_s > max(SPANS_S)
-            if is_enough.any():
-                order = order[: int(np.argmax(is_enough)) + 1]
-            levels = innovation.levels([x[i] for i in order], [distances[i] for i in order])
-            is_alarm = levels.max(axis=1) > 1.0
-            found.append((order, int(np.argmax(is_alarm)) if is_alarm.any() else len(is_alarm)))
-        return found
-
 
 def shift_estimates(judged: JudgedShift) -> dict[str, Estimate]:
     """Shares of rows sure and wrong and "don't know", and the AUC of all rows, of each method.
@@ -209,78 +182,19 @@ def shift_estimates(judged: JudgedShift) -> dict[str, Estimate]:
     is_unsafe, motion = judged.is_unsafe, judged.motion
     found = {"unsafe": proportion(int(is_unsafe.sum()), len(is_unsafe))}
     for name, verdicts in judged.verdicts.items():
-        found[f"{name}.confident_error"] = _mean(judged.is_wrong(name), motion)
-        found[f"{name}.unknown"] = _mean(verdicts.is_unknown, motion)
+        found[f"{name}.confident_error"] = mean_over(judged.is_wrong(name), motion)
+        found[f"{name}.unknown"] = mean_over(verdicts.is_unknown, motion)
         if 0 < is_unsafe.sum() < len(is_unsafe):
             score = 1.0 - np.nan_to_num(verdicts.probability)
             found[f"{name}.auc"] = auc(score, is_unsafe[motion], motion)
     return found
 
 
-def monitor_estimates(judged: JudgedShift) -> dict[str, Estimate]:
-    """The monitor on motions one after another: its delay, and Γ's confident errors until then."""
-    step_s = judged.assessment.innovation_.step_s
-    is_wrong = judged.is_wrong("gamma")
-    delay = []
-    errors: dict[float, list[float]] = {span: [] for span in SPANS_S}
-    for order, alarm in judged.sequences:
-        rows = np.concatenate([judged.first[i] + np.arange(judged.sizes[i]) for i in order])
-        delay.append((alarm + 1) * step_s if alarm < len(rows) else np.inf)
-        until = is_wrong[rows] & (np.arange(len(rows)) < alarm)
-        for span in SPANS_S:
-            errors[span].append(float(until[: round(span / step_s)].mean()))
-    found = {
-        f"monitor.confident_error_{span:g}s": _mean(np.array(values), np.arange(len(values)))
-        for span, values in errors.items()
-    }
-    found["monitor.delay_s"] = _quantile(np.array(delay), 0.5)
-    found["monitor.delay_95_s"] = _quantile(np.array(delay), 0.95)
-    found["monitor.alarmed"] = proportion(int(np.isfinite(delay).sum()), len(delay))
-    return found
-
-
-def _mean(values: np.ndarray, motion: np.ndarray) -> Estimate:
+def mean_over(values: np.ndarray, motion: np.ndarray) -> Estimate:
     def mean(weight: np.ndarray) -> float:
         return float(np.average(values, weights=weight)) if weight.any() else np.nan
 
     return BOOTSTRAP.over_episodes(mean, motion)
-
-
-def _quantile(values: np.ndarray, quantile: float) -> Estimate:
-    def of(drawn: np.ndarray) -> float:
-        return float(np.sort(drawn)[min(int(quantile * len(drawn)), len(drawn) - 1)])
-
-    rng = np.random.default_rng(0)
-    drawn = [
-        of(values[rng.integers(len(values), size=len(values))])
-        for _ in range(BOOTSTRAP.num_resamples)
-    ]
-    low, high = np.quantile(drawn, BOOTSTRAP.quantiles, method="nearest")
-    return Estimate(of(values), float(low), float(high), len(values))
-
-
-def false_alarms(motions: Sequence[Motion], assessment: SafetyAssessment) -> Estimate:
-    """False alarms of the monitor per hour, on nominal motions one after another.
-
-    Motions that end unsafely are left out; the charts begin anew after an alarm.
-    """
-    innovation = assessment.innovation_
-    x = [
-        assessment.inputs_of(one.state, one.desired_preview, one.features)
-        for one in motions
-        if not one.is_unsafe
-    ]
-    distances = [assessment.novelty_.of(one) for one in x]
-    ends = np.cumsum([len(one) for one in x])
-    begin, count = 0, 0
-    while begin < len(x):
-        is_alarm = innovation.levels(x[begin:], distances[begin:]).max(axis=1) > 1.0
-        if not is_alarm.any():
-            break
-        count += 1
-        row = int(np.argmax(is_alarm)) + (ends[begin - 1] if begin else 0)
-        begin = int(np.searchsorted(ends, row, side="right")) + 1
-    return rate_per_hour(count, sum(map(len, x)) * innovation.step_s, len(x))
 
 
 def evaluate_shifts(
@@ -290,7 +204,7 @@ def evaluate_shifts(
     progress: StageProgress,
     more: Callable[[JudgedShift, str], Mapping[str, Estimate]] = lambda judged, kind: {},
 ) -> dict[str, Estimate]:
-    """Estimates of every shift by dotted key; of the monitor on changed plants and sensors.
+    """Estimates of every shift by dotted key.
 
     Judges are methods by name; "gamma" is Γ.
     """
@@ -299,8 +213,6 @@ def evaluate_shifts(
         progress("shifts", i, len(sets))
         judged = JudgedShift.judged_by(judges, motions, assessment)
         of = {**shift_estimates(judged), **more(judged, kind)}
-        if kind in LASTING:
-            of |= monitor_estimates(judged)
         found |= {f"shifts.{name}.{key}": estimate for key, estimate in of.items()}
     progress("shifts", len(sets), len(sets))
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +21,7 @@ from drake_safety.learning.assessment_parameters import (
 )
 from drake_safety.learning.blas_threads import one_blas_thread
 from drake_safety.learning.calibration import Calibration
+from drake_safety.learning.change_detector import ChangeDetector, usual_rows
 from drake_safety.learning.feedback import (
     FeedbackSegments,
     FeedbackSet,
@@ -28,7 +30,6 @@ from drake_safety.learning.feedback import (
     used_episodes,
 )
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.innovation import Innovation
 from drake_safety.learning.inputs import input_names, inputs, plan_columns, used_states
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
@@ -54,7 +55,7 @@ class SafetyAssessment:
     - `info_`: the `EpisodesInfo` of the training episodes.
     - `grid_`: the `Grid` of the embedding space.
     - `embedding_`: the maps Psi, an immutable `Embedding`.
-    - `innovation_`: the `Innovation`, the error of predicting the next state, for a monitor.
+    - `detector_`: the `ChangeDetector`, which sees a changed plant or sensor, for a monitor.
     - `beliefs_`: the beliefs of every map's cells, (K, R*R, 3 + n_c). They may be replaced, and
       predictions take other beliefs as an argument.
     - `training_`: the `TrainingScores`, the embedded training segments, from which adaptation
@@ -99,13 +100,19 @@ class SafetyAssessment:
         return len(self.info_.constraint_names)
 
     def fit(
-        self, episodes: Episodes, progress: StageProgress | bool | None = None
+        self,
+        episodes: Episodes,
+        progress: StageProgress | bool | None = None,
+        *,
+        detector: ChangeDetector | None = None,
     ) -> SafetyAssessment:
         """Learns embedding and beliefs from nominal episodes.
 
         Args:
-            progress: Called with a stage ("distances", "t-SNE", "training", "innovation",
+            progress: Called with a stage ("distances", "t-SNE", "training", "monitor",
                 "beliefs"), the percentage done and 100; True shows it.
+            detector: That of undisturbed motion. By default it is learned from the episodes, whose
+                motion rarely suffices for its limits.
 
         Raises:
             MissingExtraError: The extra "train" is not installed.
@@ -120,10 +127,15 @@ class SafetyAssessment:
             threadpool_limits(1, user_api="blas"),
             shown(progress, lambda stages: stages) as report,
         ):
-            self._learn(episodes, report)
+            self._learn(episodes, report, detector)
         return self
 
-    def _learn(self, episodes: Episodes, progress: StageProgress | None) -> None:
+    def _learn(
+        self,
+        episodes: Episodes,
+        progress: StageProgress | None,
+        detector: ChangeDetector | None,
+    ) -> None:
         parameters = self.parameters
         info = episodes.info
         check_preview(info, parameters)
@@ -149,15 +161,9 @@ class SafetyAssessment:
             parameters.novelty_rate,
             plan=plan_columns(info, parameters),
         )
-        self.innovation_ = Innovation.fit(
-            [self._rows(one)[one.first_step :] for one in episodes if one.is_safe]
-            or [self._rows(one) for one in episodes],
-            num_states=int(used_states(info, parameters).sum()),
-            step_s=info.step_s,
-            novelty=self.novelty_,
-        )
+        self.detector_ = ChangeDetector.fit(episodes) if detector is None else detector
         if progress is not None:
-            progress("innovation", 100, 100)
+            progress("monitor", 100, 100)
         output = self.embedding_.evaluate(x)
         self.base_logit_: BaseLogit | None = base_logit
         self.training_ = TrainingScores.of(segments, output, base_logit).thinned(
@@ -181,7 +187,11 @@ class SafetyAssessment:
         )
 
     def adapt(
-        self, feedback: Sequence[FeedbackSet], *, method: str | None = None
+        self,
+        feedback: Sequence[FeedbackSet],
+        *,
+        method: str | None = None,
+        motions: Episodes | Sequence[np.ndarray] | None = None,
     ) -> SafetyAssessment:
         """Returns a copy adapted to feedback from the actual robot.
 
@@ -194,6 +204,8 @@ class SafetyAssessment:
             method: "recalibration" corrects the base logit and with it the training scores;
                 "paper" is the paper's update by a discrepancy function and feedback beliefs.
                 Default: "recalibration" for maps with heads, else "paper".
+            motions: Motion of the actual robot that the monitor is to know as well, or its rows
+                (state, desired preview, features), (K, n) each, as far apart as in its training.
 
         Raises:
             MissingExtraError: The extra "train" is not installed.
@@ -216,7 +228,8 @@ class SafetyAssessment:
         adapted.novelty_ = self.novelty_.with_feedback(
             np.concatenate(rows), self.parameters.novelty_rate
         )
-        adapted.innovation_ = self.innovation_.with_feedback(rows, adapted.novelty_)
+        if motions is not None:
+            adapted.detector_ = self._detector_with(motions)
         adapted.parameters = copy.deepcopy(self.parameters)
         # The thresholds' promises hold for the old beliefs only.
         adapted.calibrations_ = {}
@@ -247,6 +260,17 @@ class SafetyAssessment:
             num_differing=sum(one.differs for one in feedback),
         )
         return adapted
+
+    def _detector_with(self, motions: Episodes | Sequence[np.ndarray]) -> ChangeDetector:
+        if not isinstance(motions, Episodes):
+            return self.detector_.with_motions(motions)
+        found, wanted = motions.info.step_s, self.detector_.step_s
+        if not math.isclose(found, wanted):
+            raise ValueError(
+                f"SafetyAssessment of '{self.info_.scenario}': rows of the motions are {found} s "
+                f"apart, expected {wanted} s"
+            )
+        return self.detector_.with_motions(usual_rows(motions))
 
     def check_unused(self, *seeds: int, purpose: str = "") -> None:
         """Checks that seeds were not used for training, calibration or adaptation.

@@ -19,8 +19,8 @@ from drake_safety.learning.assessment_parameters import (
     PaperReading,
 )
 from drake_safety.learning.calibration import Calibration
+from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.innovation import Innovation
 from drake_safety.learning.inputs import plan_columns, used_states
 from drake_safety.learning.novelty import Moments, Novelty
 from drake_safety.learning.prediction import BaseLogit, Correction
@@ -29,11 +29,11 @@ from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
 
 SCHEMA = "drake_safety.assessment"
-SCHEMA_VERSION = 9
+SCHEMA_VERSION = 10
 
 _MAPS, _CORRECTION = "embedding.", "correction."
 _INPUT_RANGE = "input_range"
-_INNOVATION = "innovation."
+_DETECTOR = "detector."
 _NOVELTY, _FEEDBACK_NOVELTY = "novelty.", "feedback_novelty."
 _TRAINING: dict[str, tuple[type, type]] = {
     "points": (np.float32, np.float32),
@@ -69,10 +69,7 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
     for prefix, one in moments.items():
         if one is not None:
             tensors[f"{prefix}mean"], tensors[f"{prefix}covariance"] = one.mean, one.covariance
-    # The network in single precision, all else as it is.
-    for name, value in learned["innovation_"].arrays().items():
-        is_layer = name.startswith("layer.")
-        tensors[f"{_INNOVATION}{name}"] = value.astype(np.float32) if is_layer else value
+    tensors |= {f"{_DETECTOR}{k}": v for k, v in learned["detector_"].arrays().items()}
     for name, (stored, _) in _TRAINING.items():
         if (values := getattr(learned["training_"], name)) is not None:
             tensors[f"training_{name}"] = values.astype(stored)
@@ -187,14 +184,8 @@ def _learned(
         "beliefs_": tensors["beliefs"],
         "correction_": Correction(**correction),
         "novelty_": _novelty(numbers, tensors, plan_columns(info, parameters)),
-        "innovation_": Innovation.from_arrays(
-            {
-                k.removeprefix(_INNOVATION): v.astype(float)
-                for k, v in tensors.items()
-                if k.startswith(_INNOVATION)
-            },
-            num_inputs=embedding.num_inputs,
-            num_states=int(used_states(info, parameters).sum()),
+        "detector_": ChangeDetector.from_arrays(
+            {k.removeprefix(_DETECTOR): v for k, v in tensors.items() if k.startswith(_DETECTOR)}
         ),
         "calibrations_": {one.kind: one for one in calibrations},
         "used_": [_made(UsedEpisodes, one) for one in numbers["used"]],

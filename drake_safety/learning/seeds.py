@@ -47,7 +47,9 @@ DEMONSTRATION = SeedBlock(7_000_000, ("demonstration",))
 """For `run`, `play` and `check`."""
 SHIFTS = SeedBlock(8_000_000, ("shifts",))
 """Conditions that training does not have."""
-BLOCKS = (TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION, DEMONSTRATION, SHIFTS)
+MOTION = SeedBlock(9_000_000, ("motion", "motion of the actual robot", "other motion"))
+"""Undisturbed motion, of which a monitor learns what is usual, and other motion to judge it."""
+BLOCKS = (TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION, DEMONSTRATION, SHIFTS, MOTION)
 
 
 @dataclass(frozen=True, kw_only=True)

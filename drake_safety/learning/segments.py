@@ -63,6 +63,8 @@ class EpisodesInfo:
         feature_names: Names of the n_f columns of `features`.
         num_steps: T, rows after the first one of a complete episode; 0 if unknown.
         preview_stride: Rows between two of the H samples of a preview or a segment.
+        monitored_states: States that a `ChangeDetector` predicts; None for all of them.
+        monitored_features: Features by which it predicts them; None for all of them.
     """
 
     scenario: str
@@ -78,6 +80,8 @@ class EpisodesInfo:
     versions: dict[str, str]
     num_steps: int = 0
     preview_stride: int = 1
+    monitored_states: list[str] | None = None
+    monitored_features: list[str] | None = None
 
     def __post_init__(self) -> None:
         for name, is_valid, expected in (

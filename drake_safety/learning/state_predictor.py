@@ -1,104 +1,170 @@
-"""Prediction of the next measured state from the inputs."""
+"""Prediction of the next measured state from the last two inputs."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-HIDDEN_SIZES = (128, 128)
+HIDDEN_SIZES = (256, 256)
 """Units of the hidden layers."""
-_SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column].
-_RIDGE = 1.0
-_LEAST_EARLY_STOPPING = 100  # Rows, of which a tenth is held out.
-_MOST_ROWS = 40_000  # For the network.
+_SMALLEST_SPREAD = 1e-4  # Of a column [unit of the column]; constant ones would be divided by zero.
+_LARGEST_INPUT = 10.0  # In standard deviations; beyond, the network extrapolates.
+_EPOCHS, _MOST_STEPS, _BATCH, _RATE, _DECAY = 25, 6000, 512, 2e-3, 1e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Predictor:
-    """Predicts the change of the measured state in one step from x.
+class StatePredictor:
+    """Predicts the change of the measured state in one step.
 
-    A linear regression with a network of two hidden layers on its residual.
+    A network of two hidden layers beside a linear map, both of the last two inputs.
 
     Attributes:
-        mean, scale: Standardisation of x, (n_x,).
-        linear, bias: The regression, (n_x, n_s), (n_s,).
-        layers: Weights and biases of the network.
+        mean, scale: Standardisation of an input, (n_u,).
+        unit: Standard deviations of the change, (n_w,).
+        weights: The linear map's and the layers' weights and biases, by name.
     """
 
     mean: np.ndarray
     scale: np.ndarray
-    linear: np.ndarray
-    bias: np.ndarray
-    layers: tuple[tuple[np.ndarray, np.ndarray], ...]
+    unit: np.ndarray
+    weights: Mapping[str, np.ndarray]
 
     @classmethod
-    def fit(cls, x: np.ndarray, change: np.ndarray) -> Predictor:
-        """Fits the change (N, n_s) to inputs (N, n_x)."""
-        from sklearn.linear_model import Ridge
-        from sklearn.neural_network import MLPRegressor
-        from threadpoolctl import threadpool_limits
+    def fit(
+        cls,
+        inputs: Sequence[np.ndarray],
+        states: Sequence[np.ndarray],
+        progress: Callable[[float], None] | None = None,
+    ) -> StatePredictor:
+        """Learns from inputs (K, n_u) and states (K, n_w) of motions of at least three rows."""
+        import torch
 
-        mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), _SMALLEST_SPREAD)
-        z = (x - mean) / scale
-        with threadpool_limits(1):
-            ridge = Ridge(alpha=_RIDGE).fit(z, change)
-            residual = change - ridge.predict(z)
-            unit = np.maximum(residual.std(axis=0), 1e-12)
-            rows = np.random.default_rng(0).permutation(len(x))[:_MOST_ROWS]
-            network = MLPRegressor(
-                hidden_layer_sizes=HIDDEN_SIZES,
-                alpha=1e-3,
-                batch_size=min(256, len(rows)),
-                early_stopping=len(rows) >= _LEAST_EARLY_STOPPING,
-                n_iter_no_change=4,
-                max_iter=40,
-                tol=1e-3,
-                random_state=0,
+        every = np.concatenate(inputs)
+        mean, scale = every.mean(axis=0), np.maximum(every.std(axis=0), _SMALLEST_SPREAD)
+        change = np.concatenate([np.diff(one, axis=0)[1:] for one in states])
+        unit = np.maximum(change.std(axis=0), 1e-9)
+        start = cls(mean=mean, scale=scale, unit=unit, weights={})
+        x = torch.tensor(np.concatenate([start._pairs(one) for one in inputs]))
+        y = torch.tensor((change / unit).astype(np.float32))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            network = _network(x.shape[1], y.shape[1])
+            per_epoch = max(1, len(x) // _BATCH)
+            num_steps = min(_EPOCHS * per_epoch, _MOST_STEPS)
+            optimiser = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_DECAY)
+            schedule = torch.optim.lr_scheduler.OneCycleLR(
+                optimiser, _RATE, total_steps=num_steps + 1
             )
-            _fit_quietly(network, z[rows], residual[rows] / unit)
-        layers = [*zip(network.coefs_, network.intercepts_, strict=True)]
-        layers[-1] = (layers[-1][0] * unit, layers[-1][1] * unit)
-        # Files store the network in single precision.
-        layers = [tuple(np.float32(part).astype(float) for part in layer) for layer in layers]
-        return cls(
-            mean=mean,
-            scale=scale,
-            linear=ridge.coef_.T,
-            bias=ridge.intercept_,
-            layers=tuple(layers),
-        )
+            order = torch.randperm(len(x))
+            for step in range(num_steps):
+                if (batch := step % per_epoch) == 0:
+                    order = torch.randperm(len(x))
+                rows = order[batch * _BATCH : (batch + 1) * _BATCH]
+                loss = torch.nn.functional.smooth_l1_loss(network(x[rows]), y[rows])
+                optimiser.zero_grad()
+                loss.backward()
+                optimiser.step()
+                schedule.step()
+                if progress is not None and step % 50 == 0:
+                    progress(step / num_steps)
+        weights = {k: v.detach().numpy().T.copy() for k, v in network.state_dict().items()}
+        return replace(start, weights=weights)
 
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Returns the predicted changes (N, n_s) at inputs (N, n_x)."""
-        z = (x - self.mean) / self.scale
-        hidden = z
-        for weight, bias in self.layers[:-1]:
-            hidden = np.maximum(hidden @ weight + bias, 0.0)
-        weight, bias = self.layers[-1]
-        return z @ self.linear + self.bias + (hidden @ weight + bias)
+    def _pairs(self, inputs: np.ndarray) -> np.ndarray:
+        """Standardised inputs (K, n_u) beside the ones before them, (K - 2, 2 n_u)."""
+        z = np.clip((inputs - self.mean) / self.scale, -_LARGEST_INPUT, _LARGEST_INPUT)
+        return np.concatenate([z[1:-1], z[:-2]], axis=1).astype(np.float32)
 
-    def corrected(self, x: np.ndarray, change: np.ndarray) -> Predictor:
-        """Returns the predictor with the regression fitted to another plant's changes."""
+    def _evaluated(self, z: np.ndarray) -> np.ndarray:
+        """Predicted changes in their units of standardised pairs, (..., n_w)."""
+        w, hidden = self.weights, z
+        for i in range(len(HIDDEN_SIZES)):
+            hidden = hidden @ w[f"hidden.{i}.weight"] + w[f"hidden.{i}.bias"]
+            hidden = hidden / (1.0 + np.exp(-np.maximum(hidden, -80.0)))
+        found: np.ndarray = hidden @ w["output.weight"] + (z @ w["linear.weight"] + w["linear.bias"])
+        return found
+
+    def errors(self, inputs: np.ndarray, states: np.ndarray) -> np.ndarray:
+        """Errors of the predicted states of a motion from the third row on, (K - 2, n_w)."""
+        predicted = self.unit * self._evaluated(self._pairs(inputs))
+        errors: np.ndarray = np.diff(states, axis=0)[1:] - predicted
+        return errors
+
+    def error(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """The error (n_w,) of a change (n_w,) after an input and the one before, (n_u,) each."""
+        z = np.stack([x, previous])
+        z -= self.mean
+        z /= self.scale
+        np.clip(z, -_LARGEST_INPUT, _LARGEST_INPUT, out=z)
+        error: np.ndarray = change - self.unit * self._evaluated(z.ravel().astype(np.float32))
+        return error
+
+    def corrected(
+        self, inputs: Sequence[np.ndarray], states: Sequence[np.ndarray]
+    ) -> StatePredictor:
+        """Returns the predictor with its linear map fitted to another plant's motions."""
         from sklearn.linear_model import Ridge
 
-        z = (x - self.mean) / self.scale
-        # Few rows: what they do not determine stays as it was.
-        ridge = Ridge(alpha=len(x) / 10.0).fit(z, change - self(x))
-        return Predictor(
-            mean=self.mean,
-            scale=self.scale,
-            linear=self.linear + ridge.coef_.T,
-            bias=self.bias + ridge.intercept_,
-            layers=self.layers,
+        z = np.concatenate([self._pairs(one) for one in inputs])
+        errors = np.concatenate(
+            [self.errors(*one) for one in zip(inputs, states, strict=True)]
         )
+        # Few rows: what they do not determine stays as it was.
+        ridge = Ridge(alpha=len(z) / 10.0).fit(z, errors / self.unit)
+        weights = dict(self.weights)
+        weights["linear.weight"] = (weights["linear.weight"] + ridge.coef_.T).astype(np.float32)
+        weights["linear.bias"] = (weights["linear.bias"] + ridge.intercept_).astype(np.float32)
+        return replace(self, weights=weights)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns all that `from_arrays` needs, by name."""
+        return {"mean": self.mean, "scale": self.scale, "unit": self.unit, **self.weights}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> StatePredictor:
+        """Makes the predictor of arrays written by `arrays`."""
+        own = {name: arrays[name].astype(float) for name in ("mean", "scale", "unit")}
+        weights = {k: v.astype(np.float32) for k, v in arrays.items() if k not in own}
+        return cls(**own, weights=weights)
+
+    @staticmethod
+    def shapes(num_inputs: int, num_states: int) -> dict[str, tuple[int, ...]]:
+        """Shapes of the arrays."""
+        widths = (2 * num_inputs, *HIDDEN_SIZES)
+        shapes: dict[str, tuple[int, ...]] = {
+            "mean": (num_inputs,),
+            "scale": (num_inputs,),
+            "unit": (num_states,),
+            "linear.weight": (widths[0], num_states),
+            "linear.bias": (num_states,),
+            "output.weight": (widths[-1], num_states),
+        }
+        for i, pair in enumerate(itertools.pairwise(widths)):
+            shapes |= {f"hidden.{i}.weight": pair, f"hidden.{i}.bias": pair[1:]}
+        return shapes
 
 
-def _fit_quietly(network: Any, z: np.ndarray, target: np.ndarray) -> None:
-    import warnings
+def _network(num_inputs: int, num_outputs: int):  # type: ignore[no-untyped-def]
+    import torch
 
-    with warnings.catch_warnings():
-        # The number of epochs is limited on purpose.
-        warnings.simplefilter("ignore")
-        network.fit(z, target)
+    class Network(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            widths = (num_inputs, *HIDDEN_SIZES)
+            self.linear = torch.nn.Linear(num_inputs, num_outputs)
+            self.hidden = torch.nn.ModuleList(
+                torch.nn.Linear(*pair) for pair in itertools.pairwise(widths)
+            )
+            self.output = torch.nn.Linear(widths[-1], num_outputs, bias=False)
+
+        def forward(self, x: torch.Tensor) -> torch.Tensor:
+            hidden = x
+            for layer in self.hidden:
+                hidden = torch.nn.functional.silu(layer(hidden))
+            found: torch.Tensor = self.output(hidden) + self.linear(x)
+            return found
+
+    return Network()

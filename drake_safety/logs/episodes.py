@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -20,7 +20,7 @@ from drake_safety.simulation.closed_loop import RECORDED_PORTS
 from drake_safety.simulation.episode_recorder import Recorder
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
-from drake_safety.simulation.rollouts import episodes_info
+from drake_safety.simulation.rollouts import MOTION_PIECE_S, episodes_info
 from drake_safety.simulation.scenario import Scenario
 
 _ROUNDING_S = 1e-9
@@ -71,7 +71,8 @@ def cut_log(
     for pieces in _by_log([log] if isinstance(log, RobotLog) else log):
         num_before = len(episodes)
         for one in pieces:
-            found, has_left = _cut(one, loop, _desired_output(one, loop, desired_output))
+            desired = _desired_output(one, loop, desired_output)
+            found, has_left = _cut(one, loop, desired, _Rows.of(loop.scenario))
             for episode, start in found:
                 episodes.append(replace(episode, index=len(episodes)))
                 starts.append(start)
@@ -86,6 +87,42 @@ def cut_log(
                 f"'{scenario.name}'"
             )
     return Episodes(episodes_info(loop, seed=NOT_DRAWN), episodes), starts
+
+
+def motions_from_log(
+    log: RobotLog | Sequence[RobotLog],
+    loop: LeggedLoop | Scenario,
+    *,
+    desired_output: np.ndarray | None = None,
+) -> Episodes:
+    """Converts logs to motions for a `ChangeDetector`, with rows `monitor_step_s` apart.
+
+    Each lasts up to a minute, in the stance frame of its first row. The arguments and errors are
+    those of :func:`cut_log`.
+    """
+    if isinstance(loop, Scenario):
+        loop = loop.make_loop("actual")
+    rows = _Rows(loop.scenario.monitor_step_s, MOTION_PIECE_S, shortest=2)
+    motions: list[Episode] = []
+    for pieces in _by_log([log] if isinstance(log, RobotLog) else log):
+        for one in pieces:
+            found, has_left = _cut(one, loop, _desired_output(one, loop, desired_output), rows)
+            motions += [replace(motion, index=len(motions) + i) for i, (motion, _) in enumerate(found)]
+            if has_left:
+                break
+    return Episodes(replace(episodes_info(loop, seed=NOT_DRAWN), step_s=rows.step_s), motions)
+
+
+class _Rows(NamedTuple):
+    """Rows of the episodes of a log: their distance, duration, and least number of steps."""
+
+    step_s: float
+    duration_s: float
+    shortest: int
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> _Rows:
+        return cls(scenario.step_s, scenario.episode_duration_s, shortest_steps(scenario.assessment))
 
 
 def shortest_steps(assessment: AssessmentParameters) -> int:
@@ -104,18 +141,17 @@ def _by_log(logs: Sequence[RobotLog]) -> list[list[RobotLog]]:
 
 
 def _cut(
-    log: RobotLog, loop: LeggedLoop, desired: np.ndarray
+    log: RobotLog, loop: LeggedLoop, desired: np.ndarray, rows: _Rows
 ) -> tuple[list[tuple[Episode, EpisodeStart]], bool]:
     """Episodes and starts of a piece with z* (N, n_z) [m], and whether it leaves the safe set."""
     scenario = loop.scenario
-    shortest = shortest_steps(scenario.assessment)
     context = loop.CreateDefaultContext()
     found: list[tuple[Episode, EpisodeStart]] = []
     begin_s = 0.0
-    while log.duration_s - begin_s > scenario.step_s:
-        start = _start(log, loop, desired, begin_s)
+    while log.duration_s - begin_s > rows.step_s:
+        start = _start(log, loop, desired, begin_s, rows.duration_s)
         loop.reset_to(context, None, start)
-        episode = _episode(log, loop, context, begin_s)
+        episode = _episode(log, loop, context, begin_s, rows)
         if not episode.is_safe and episode.num_steps == 0 and not found:
             if log.piece:
                 return [], True
@@ -123,7 +159,7 @@ def _cut(
                 f"log '{log.path}' begins outside the safe set of scenario '{scenario.name}': "
                 f"the margin '{episode.cause}' is {episode.margins[0].min():.3g}"
             )
-        if not episode.is_safe or episode.num_steps >= shortest:
+        if not episode.is_safe or episode.num_steps >= rows.shortest:
             found.append((episode, start))
         if not episode.is_safe:
             return found, True
@@ -156,7 +192,9 @@ def _desired_output(
     return np.tile(value, (len(log.time_s), 1))
 
 
-def _start(log: RobotLog, loop: LeggedLoop, desired: np.ndarray, begin_s: float) -> EpisodeStart:
+def _start(
+    log: RobotLog, loop: LeggedLoop, desired: np.ndarray, begin_s: float, duration_s: float
+) -> EpisodeStart:
     """The logged state at a time, with the later z* as a plan."""
     kinematics = loop.kinematics
     begin = np.array([begin_s])
@@ -167,7 +205,7 @@ def _start(log: RobotLog, loop: LeggedLoop, desired: np.ndarray, begin_s: float)
     scenario = loop.scenario
     # Previews and outlooks of the longest episode end before.
     reach_s = (
-        2 * scenario.episode_duration_s + scenario.assessment.horizon * scenario.preview_step_s
+        duration_s + scenario.episode_duration_s + scenario.assessment.horizon * scenario.preview_step_s
     )
     later = log.time_s[(log.time_s > begin_s + _ROUNDING_S) & (log.time_s <= begin_s + reach_s)]
     hold = PiecewisePolynomial(np.zeros((desired.shape[1], 1)))
@@ -185,14 +223,15 @@ def _start(log: RobotLog, loop: LeggedLoop, desired: np.ndarray, begin_s: float)
     return start
 
 
-def _episode(log: RobotLog, loop: LeggedLoop, context: Context, begin_s: float) -> Episode:
-    scenario = loop.scenario
-    length_s = min(scenario.episode_duration_s, log.duration_s - begin_s)
+def _episode(
+    log: RobotLog, loop: LeggedLoop, context: Context, begin_s: float, rows: _Rows
+) -> Episode:
+    length_s = min(rows.duration_s, log.duration_s - begin_s)
     period_s = loop.monitor_period_s
     ticks = period_s * np.arange(int(length_s / period_s + 1e-6) + 1)
     margins = _margins(log, loop, context, begin_s, ticks)
     is_out = (margins < 0).any(axis=1)
-    times = scenario.step_s * np.arange(int(length_s / scenario.step_s + 1e-6) + 1)
+    times = rows.step_s * np.arange(int(length_s / rows.step_s + 1e-6) + 1)
     if is_out.any():
         end_s = ticks[int(np.argmax(is_out))]
         times = np.append(times[times < end_s - _ROUNDING_S], end_s)

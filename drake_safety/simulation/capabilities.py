@@ -100,6 +100,16 @@ class CanFall(Protocol):
 
 
 @runtime_checkable
+class MovesUndisturbed(Protocol):
+    """The robot can move for as long as one likes, by plans that follow each other."""
+
+    def reset_undisturbed(
+        self, context: Context, rng: np.random.Generator, duration_s: float
+    ) -> None:
+        """Samples motion without offset, push or ball of a given duration [s]."""
+
+
+@runtime_checkable
 class HasBall(Protocol):
     """A ball can be thrown at the robot, and recovery can be triggered."""
 
@@ -186,6 +196,7 @@ class CanStartAnywhere(Protocol):
 _DESCRIPTIONS: dict[type, str] = {
     HasGoals: "plans with a goal",
     HasBall: "a ball to throw",
+    MovesUndisturbed: "long undisturbed motion",
     CanFall: "a fall",
     CanBePushed: "pushes on its robot",
     FollowsCommands: "commands that change while it moves",

@@ -87,6 +87,14 @@ class ClosedLoop(Diagram):
     """Options of the diagram for training episodes of the paper's mode, which has no disturbances
     but the offsets of the initial state."""
 
+    monitored_states: list[str] | None = None
+    """States that the change monitor predicts, such as those that a real robot measures; None for
+    all of them."""
+
+    monitored_features: list[str] | None = None
+    """Features by which it predicts them beside the desired preview, such as what the controller
+    commands; None for all of them."""
+
     state_names: list[str]
     output_names: list[str]
     feature_names: list[str]

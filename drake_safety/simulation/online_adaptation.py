@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
@@ -61,6 +62,7 @@ class OnlineAdaptation:
         self._scenario, self._prior, self._method = scenario, prior, method
         self._recorder, self._assessor, self._run = recorder, assessor, run
         self._capacity, self._num_new = capacity, 0
+        self._motion: list[list[np.ndarray]] = [[]]  # Rows of the monitor.
         self.feedback: list[FeedbackSet] = []
         self.adapted: list[SafetyAssessment] = []
         self.num_updates = 0
@@ -74,12 +76,30 @@ class OnlineAdaptation:
         context, step_s = simulator.get_mutable_context(), self._recorder.info.step_s
         while True:
             next_row_s = step_s * (math.floor(context.get_time() / step_s + 1e-6) + 1)
-            status = simulator.AdvanceTo(min(next_row_s, until_s))
+            status = self._advanced(simulator, min(next_row_s, until_s))
             is_ended = status.reason() != SimulatorStatus.ReturnReason.kReachedBoundaryTime
             if is_ended or context.get_time() >= until_s:
                 return status
             simulator.AdvancePendingEvents()  # The row is recorded.
             self._update(context)
+
+    def _advanced(self, simulator: Simulator, until_s: float) -> SimulatorStatus:
+        """Advances and keeps the rows that the monitor sees."""
+        context, monitor = simulator.get_mutable_context(), self._assessor.monitor
+        step_s = self._prior.detector_.step_s
+        while monitor is not None:
+            row_s = step_s * (math.floor(context.get_time() / step_s + 1e-6) + 1)
+            if row_s > until_s + 1e-9:
+                break
+            status = simulator.AdvanceTo(row_s)
+            if status.reason() != SimulatorStatus.ReturnReason.kReachedBoundaryTime:
+                return status
+            own_context = monitor.GetMyContextFromRoot(context)
+            if not monitor.is_held(own_context):
+                self._motion[-1].append(monitor.row(own_context))
+            elif self._motion[-1]:
+                self._motion.append([])
+        return simulator.AdvanceTo(until_s)
 
     def _update(self, root_context: Context) -> None:
         """Takes finished windows and, after every k_u of them, updates the assessor."""
@@ -96,7 +116,8 @@ class OnlineAdaptation:
         if self._num_new < self._prior.parameters.adaptation.update_interval:
             return
         self._num_new = 0
-        adapted = self._prior.adapt(self.feedback, method=self._method)
+        motions = [np.array(rows) for rows in self._motion if rows]
+        adapted = self._prior.adapt(self.feedback, method=self._method, motions=motions)
         self.adapted = [*self.adapted, adapted][-_KEPT_UPDATES:]
         self.num_updates += 1
         self._assessor.adopt(self._assessor.GetMyMutableContextFromRoot(root_context), adapted)

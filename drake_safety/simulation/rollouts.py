@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 from collections.abc import Callable
 from contextlib import closing, nullcontext
+from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -15,6 +17,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
+from drake_safety.learning.seeds import MOTION
 from drake_safety.learning.segments import (
     DIVERGED,
     Episode,
@@ -22,7 +25,13 @@ from drake_safety.learning.segments import (
     EpisodesInfo,
     installed_versions,
 )
-from drake_safety.simulation.capabilities import CanStartAnywhere, HasGoals, OffersPlans, require
+from drake_safety.simulation.capabilities import (
+    CanStartAnywhere,
+    HasGoals,
+    MovesUndisturbed,
+    OffersPlans,
+    require,
+)
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, is_same, load_episodes
 from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
@@ -30,6 +39,8 @@ from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import Progress, run_batches
 
+MOTION_PIECE_S = 60.0
+"""Duration of one undisturbed motion [s]."""
 _LOGGER = logging.getLogger("drake_safety")
 
 
@@ -61,6 +72,8 @@ def episodes_info(
         versions=installed_versions("drake", "numpy", loop.variation.engine),
         num_steps=scenario.num_steps,
         preview_stride=scenario.assessment.preview_stride,
+        monitored_states=loop.monitored_states,
+        monitored_features=loop.monitored_features,
     )
 
 
@@ -150,6 +163,96 @@ def inputs_at(loop: ClosedLoop, start: EpisodeStart) -> tuple[np.ndarray, np.nda
         for name in ("state", "desired_preview", "features")
     )
     return state, preview, features
+
+
+def run_motions(
+    scenario: Scenario,
+    duration_s: float,
+    *,
+    variation: str = "nominal",
+    seed: int = MOTION.first,
+    num_workers: int | None = None,
+    path: str | PathLike[str] | None = None,
+    progress: Progress | bool | None = None,
+    extra: dict[str, Any] | None = None,
+    **loop_options: Any,
+) -> Episodes:
+    """Simulates undisturbed motion, in worker processes, for a `ChangeDetector`.
+
+    A task that :class:`~drake_safety.simulation.capabilities.MovesUndisturbed` moves for a minute
+    at a time; of others these are ordinary episodes. Rows are `scenario.monitor_step_s` apart. A
+    motion ends when it leaves the safe set.
+
+    Args:
+        duration_s: Duration of all motions together, if none leaves the safe set [s].
+        path, **loop_options: As for `run_episodes`.
+
+    Raises:
+        ValueError: The folder holds another set or one that is not the same any more.
+        EpisodeError: A system of the loop raised an error, which is its cause.
+    """
+    loop = worker_loop(scenario, variation, loop_options)
+    piece_s = _piece_s(loop)
+    info = episodes_info(loop, seed, {**loop_options, "undisturbed_s": piece_s})
+    step_s = scenario.monitor_step_s
+    return collect_episodes(
+        replace(info, step_s=step_s, num_steps=round(piece_s / step_s)),
+        math.ceil(duration_s / piece_s - 1e-6),
+        partial(motion_batch, scenario, variation, loop_options, seed),
+        num_workers=num_workers,
+        path=path,
+        progress=progress,
+        extra=extra,
+    )
+
+
+def _piece_s(loop: ClosedLoop) -> float:
+    is_long = isinstance(loop, MovesUndisturbed)
+    return MOTION_PIECE_S if is_long else loop.scenario.episode_duration_s
+
+
+def run_motion(
+    loop: ClosedLoop,
+    index: int = 0,
+    *,
+    seed: int = MOTION.first,
+    until_s: float = math.inf,
+    with_features: bool = False,
+) -> Episode:
+    """Simulates one undisturbed motion; see `run_motions`.
+
+    Args:
+        until_s: Time at which it ends, if not sooner [s].
+        with_features: Whether to record features that the monitor does not read, too.
+    """
+    scenario, piece_s, step_s = loop.scenario, _piece_s(loop), loop.scenario.monitor_step_s
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.remove_visuals(context)
+    rng = episode_rng(seed, index)
+    first_step = 0
+    if isinstance(loop, MovesUndisturbed):
+        loop.reset_undisturbed(context, rng, piece_s)
+    else:
+        first_step = math.ceil(loop.reset(context, rng) * scenario.step_s / step_s)
+    # Features may cost more than the simulation.
+    left_out = "features" if loop.monitored_features == [] and not with_features else ""
+    motion = record_episode(
+        simulator,
+        {name: name for name in REQUIRED_PORTS if name != left_out},
+        EpisodeTiming(
+            step_s=step_s,
+            num_steps=round(min(piece_s, until_s) / step_s),
+            monitor_period_s=loop.monitor_period_s,
+        ),
+        constraint_names=loop.constraint_names,
+        who=f"motion {index} of '{scenario.name}' (seed {seed})",
+        index=index,
+        first_step=first_step,
+    )
+    if left_out:
+        motion.features = np.zeros((len(motion.time_s), len(loop.feature_names)))
+    return motion
 
 
 def run_episodes(
@@ -301,6 +404,19 @@ def worker_loop(scenario: Scenario, variation: str, options: dict[str, Any]) -> 
         _LOOPS.clear()
         _LOOPS[key] = scenario.make_loop(variation, **options)
     return _LOOPS[key]
+
+
+def motion_batch(
+    scenario: Scenario,
+    variation: str,
+    options: dict[str, Any],
+    seed: int,
+    indices: list[int],
+    **limits: Any,
+) -> list[Episode]:
+    """Simulates undisturbed motions in this process; for `limits` see `run_motion`."""
+    loop = worker_loop(scenario, variation, options)
+    return [run_motion(loop, index, seed=seed, **limits) for index in indices]
 
 
 def _episode_batch(

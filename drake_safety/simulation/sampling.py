@@ -149,6 +149,51 @@ def calm_start(
     return _start(kinematics, X_WB, joints, v, p_WC, plan)
 
 
+_RESTS_S = (0.2, 1.0)  # Shortest and longest rest between two motions.
+_USUAL_SHARE = 0.5  # Of the range of training's plans.
+
+
+def undisturbed_start(
+    kinematics: RobotKinematics,
+    rng: np.random.Generator,
+    sampling: StartSampling,
+    duration_s: float,
+) -> EpisodeStart:
+    """Samples a start at rest with base motions one after another.
+
+    Their ends are within half of the range of training's plans, most of which are then safe.
+
+    Args:
+        duration_s: Duration of all motions together [s].
+    """
+    xy = rng.uniform(-1, 1, (kinematics.num_contacts, 2)) * sampling.foot_offset_m
+    p_WC = np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])
+    low, high = sampling.target_height_m
+    middle = np.array([*kinematics.nominal_base_offset, 0.5 * (low + high)])
+    half = _USUAL_SHARE * np.array([*sampling.target_offset_m, 0.5 * (high - low)])
+    point = np.array([*kinematics.nominal_base_offset, kinematics.standing_height])
+    time_s = rng.uniform(*_RESTS_S)
+    pieces = [_rest(point, 0.0, time_s)]
+    X_WB = planar_pose(fit_stance(p_WC, kinematics.nominal_contacts)) @ RigidTransform(point)
+    while time_s < duration_s:
+        goal = middle + rng.uniform(-half, half)
+        pieces.append(interpolate(point, goal, _between(rng, sampling.plan_duration_s), time_s))
+        time_s = pieces[-1].end_time()
+        rest_s = rng.uniform(*_RESTS_S)
+        pieces.append(_rest(goal, time_s, time_s + rest_s))
+        point, time_s = goal, time_s + rest_s
+    plan = pieces[0]
+    for piece in pieces[1:]:
+        plan.ConcatenateInTime(piece)
+    joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
+    v = np.zeros(kinematics.num_velocities)
+    return _start(kinematics, X_WB, joints, v, p_WC, plan)
+
+
+def _rest(point: np.ndarray, start_s: float, end_s: float) -> PiecewisePolynomial:
+    return PiecewisePolynomial.ZeroOrderHold([start_s, end_s], np.stack([point, point], axis=1))
+
+
 def resting_feet(
     kinematics: RobotKinematics, X_WB: RigidTransform, joints: np.ndarray, V_WB: np.ndarray
 ) -> np.ndarray:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
 
+_LEAST_MONITOR_STEP_S = 0.02
 _MOST_STEPS = 10_000_000  # Of an episode, of any kind.
 
 
@@ -90,6 +91,12 @@ class Scenario:
     def preview_step_s(self) -> float:
         """Time between two samples of the preview [s]."""
         return self.assessment.preview_stride * self.step_s
+
+    @property
+    def monitor_step_s(self) -> float:
+        """Time between two updates of the change monitor [s]: of control periods, at least .02."""
+        periods = math.ceil(_LEAST_MONITOR_STEP_S / self.control_period_s - 1e-6)
+        return periods * self.control_period_s
 
     @property
     def num_steps(self) -> int:

@@ -41,7 +41,7 @@ class BeliefEvaluator(LeafSystem):
     is 0 where the belief is "don't know". ``novelty`` is the distance of the inputs from those of
     training, novel above 1. The belief of inputs that are novel or not finite is (0, 0, 1), and so
     is the belief before the first evaluation, and every belief while ``alarm`` is above 0.5, as
-    that of a :class:`~drake_safety.systems.novelty_monitor.NoveltyMonitor`. While one of
+    that of a :class:`~drake_safety.systems.change_monitor.ChangeMonitor`. While one of
     ``margins``, those of the measured state, is negative, no belief is safe: its mass for "safe"
     counts as unsafe by the most violated constraint. The beliefs of the grid, the correction and
     the novelty are parameters of the Context: :meth:`adopt` replaces them by those of an adapted

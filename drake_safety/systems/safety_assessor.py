@@ -6,14 +6,14 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
-from drake_safety.systems.novelty_monitor import NoveltyMonitor
+from drake_safety.systems.change_monitor import ChangeMonitor
 
 ON_ALARM = ("unknown", "report")
 """What an alarm does: every belief is unknown, or only the port ``alarm`` says so."""
 
 
 class SafetyAssessor(Diagram):
-    """Γ in a diagram: a :class:`BeliefEvaluator` and a :class:`NoveltyMonitor`, connected.
+    """Γ in a diagram: a :class:`BeliefEvaluator` and a :class:`ChangeMonitor`, connected.
 
     .. pydrake_system::
 
@@ -69,12 +69,12 @@ class SafetyAssessor(Diagram):
                 heeds_alarm=on_alarm == "unknown",
             ),
         )
-        self.monitor: NoveltyMonitor | None = None
+        self.monitor: ChangeMonitor | None = None
         inputs = ["state", "desired_preview", "features"]
         for name in [*inputs, "margins"] if checks_margins else inputs:
             builder.ExportInput(self.evaluator.GetInputPort(name), name)
         if on_alarm is not None:
-            self.monitor = builder.AddNamedSystem("novelty_monitor", NoveltyMonitor(assessment))
+            self.monitor = builder.AddNamedSystem("change_monitor", ChangeMonitor(assessment))
             for name in inputs:
                 builder.ConnectInput(name, self.monitor.GetInputPort(name))
             builder.ExportInput(self.monitor.GetInputPort("hold"), "hold")

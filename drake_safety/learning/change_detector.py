@@ -1,0 +1,357 @@
+"""Detection of a changed plant or sensor: how the measured state follows from the last ones."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from drake_safety.extras import require_extra
+from drake_safety.learning.segments import Episode, Episodes
+from drake_safety.learning.state_predictor import HIDDEN_SIZES, StatePredictor
+
+TIME_CONSTANTS_S = (0.1, 0.5, 2.0)
+"""Memories of the charts."""
+FALSE_ALARMS_PER_HOUR = 0.1
+"""For which the limits are made: at most one in ten hours of nominal motion."""
+LEAST_MOTION_S = 360.0
+"""Motion for the limits, below which there is no alarm."""
+NUM_PREVIEWED = 2
+"""Samples of the desired preview that the predictor sees: the one of now and the next."""
+_CLIP = 6.0  # Of an innovation, in standard deviations, so that one impact is no lasting change.
+_BEFORE_LEAVING_S = 0.5  # Left out of a motion that leaves the safe set.
+_BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
+_TAIL_SHARE = 0.1  # Of the blocks.
+_LEAST_LIMIT = 0.3  # Of a chart, in standard deviations of its value for white innovations.
+_FREE_REPEATS = 3  # Beyond the longest run of repeated inputs in training.
+_ARRAYS = ("deviation", "limits")
+_SETTINGS = ("alarm_level", "longest_repeat", "step_s", "motion_s")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ChangeDetector:
+    """Charts of the innovation, the error of predicting the next measured state.
+
+    A plant or a sensor that changed cannot be seen in one input: it lies among those of training.
+    It is seen in how the state follows from the last two inputs. Each state's innovation, in its
+    standard deviations and clipped, has exponentially weighted means of itself and of its square,
+    with three memories. The largest of the six, in units of what undisturbed motion of the nominal
+    plant reached, is the state's level; an alarm is a level above 1. The limits are those of motion
+    that the predictor did not see, extrapolated to a rate of false alarms by the exponential tail
+    of the maxima of blocks (peaks over threshold; Coles 2001, section 4). Nothing is learned from
+    failures.
+
+    Attributes:
+        predictor: The prediction.
+        columns: Which entries of (state, desired preview, features) it sees, (n_u,).
+        watched: Which states it predicts, (n_w,).
+        deviation: Standard deviations of the innovations, (n_w,).
+        limits: Of the charts, (6, n_w): of the means, then of the squares.
+        alarm_level: 1, or infinite where there was too little motion for limits.
+        longest_repeat: Longest known run of repeated inputs.
+        step_s: Time between two inputs [s].
+        motion_s: Duration of the motion for the limits [s].
+    """
+
+    predictor: StatePredictor
+    columns: np.ndarray
+    watched: np.ndarray
+    deviation: np.ndarray
+    limits: np.ndarray
+    alarm_level: float
+    longest_repeat: int
+    step_s: float
+    motion_s: float
+
+    def __deepcopy__(self, memo: object) -> ChangeDetector:
+        return self
+
+    @property
+    def has_limits(self) -> bool:
+        """Whether there was enough motion for limits; otherwise it never alarms."""
+        return math.isfinite(self.alarm_level)
+
+    @property
+    def rates(self) -> np.ndarray:
+        """Weight of the newest innovation in the charts of each memory, (3,)."""
+        return np.minimum(1.0, self.step_s / np.array(TIME_CONSTANTS_S))
+
+    def describe(self) -> str:
+        """What the limits were learned from, and what they promise."""
+        motion = f"monitor: {self.motion_s / 60.0:.0f} min of motion for its limits"
+        if self.has_limits:
+            return f"{motion}, for at most one false alarm in {1 / FALSE_ALARMS_PER_HOUR:.0f} h"
+        return f"{motion}, {LEAST_MOTION_S / 60.0:.0f} are needed: it reports levels and never alarms"
+
+    @classmethod
+    def fit(
+        cls, motions: Episodes, progress: Callable[[float], None] | None = None
+    ) -> ChangeDetector:
+        """Learns the prediction from one half of the motions, and the limits from the other.
+
+        Args:
+            motions: Undisturbed motions, such as those of `run_motions`; those that leave the safe
+                set count until shortly before.
+            progress: Called with the fraction done.
+
+        Raises:
+            MissingExtraError: The extra "train" is not installed.
+            ValueError: Fewer than two motions have three rows, or a name is unknown.
+        """
+        require_extra("train", "ChangeDetector.fit", "torch")
+        info = motions.info
+        watched = _chosen(info.monitored_states, info.state_names, "monitored_states")
+        features = _chosen(info.monitored_features, info.feature_names, "monitored_features")
+        num_states, num_outputs = len(info.state_names), len(info.output_names)
+        plan = num_states + np.arange(min(NUM_PREVIEWED, info.horizon) * num_outputs)
+        features += num_states + info.horizon * num_outputs
+        columns = np.concatenate([watched, plan, features])
+        rows = [one for one in usual_rows(motions) if len(one) > 2]
+        seen, states = [one[:, columns] for one in rows], [one[:, watched] for one in rows]
+        if len(seen) < 2:
+            raise ValueError(
+                f"ChangeDetector: {len(seen)} motions have three rows; two are needed, one for the "
+                "prediction and one for the limits"
+            )
+        with threadpool_limits(1, user_api="blas"):
+            # Motions alternate, so that both halves are alike.
+            predictor = StatePredictor.fit(seen[::2], states[::2], progress)
+            unlimited = cls(
+                predictor=predictor,
+                columns=columns,
+                watched=watched,
+                deviation=np.ones(len(watched)),
+                limits=np.ones((2 * len(TIME_CONSTANTS_S), len(watched))),
+                alarm_level=math.inf,
+                longest_repeat=max(map(_longest_repeat, seen)) + _FREE_REPEATS,
+                step_s=float(info.step_s),
+                motion_s=0.0,
+            )
+            return unlimited._limited(seen[1::2], states[1::2])
+
+    def _limited(
+        self, seen: Sequence[np.ndarray], states: Sequence[np.ndarray]
+    ) -> ChangeDetector:
+        """Chooses deviations and limits from inputs (K, n_u) and states (K, n_w) of motions."""
+        errors = [self.predictor.errors(*one) for one in zip(seen, states, strict=True)]
+        if len(errors) == 1:
+            errors = np.array_split(errors[0], 2)
+        deviation = np.maximum(np.concatenate(errors).std(axis=0), 1e-9)
+        charts = [self._charts(np.clip(one / deviation, -_CLIP, _CLIP)) for one in errors]
+        motion_s = self.step_s * sum(map(len, errors))
+        halves = [_block_maxima(charts[i::2], self.step_s) for i in range(2)]
+        least = _LEAST_LIMIT * np.sqrt(self.rates / (2.0 - self.rates))
+        least = np.concatenate([least, math.sqrt(2.0) * least])[:, None]
+
+        def scales(blocks: np.ndarray) -> np.ndarray:
+            return np.maximum(blocks.mean(axis=0) + 4.0 * blocks.std(axis=0), least)
+
+        # Each half in units of the other's: the limits must hold for motion that they do not know.
+        levels = [
+            (own / scales(other)).max(axis=(1, 2))
+            for own, other in zip(halves, reversed(halves), strict=True)
+        ]
+        per_hour = 3600.0 / _BLOCK_S
+        limit = _tail_limit(np.concatenate(levels), FALSE_ALARMS_PER_HOUR / per_hour)
+        return replace(
+            self,
+            deviation=deviation,
+            limits=limit * scales(np.concatenate(halves)),
+            alarm_level=1.0 if motion_s >= LEAST_MOTION_S else math.inf,
+            motion_s=motion_s,
+        )
+
+    def _charts(self, innovations: np.ndarray) -> np.ndarray:
+        """Values of the charts after each of consecutive innovations (K, n_w), (K, 6, n_w)."""
+        from scipy.signal import lfilter
+
+        found = [
+            lfilter([rate], [1.0, rate - 1.0], values, axis=0)
+            for values in (innovations, np.square(innovations) - 1.0)
+            for rate in self.rates
+        ]
+        means = len(self.rates)
+        charts: np.ndarray = np.stack(found, axis=1)
+        charts[:, :means] = np.abs(charts[:, :means])
+        return charts
+
+    def innovation(self, x: np.ndarray, previous: np.ndarray, state: np.ndarray) -> np.ndarray:
+        """The innovation (n_w,) of a state (n_w,) after two inputs (n_u,), clipped."""
+        error = self.predictor.error(x, previous, state)
+        clipped: np.ndarray = np.clip(error / self.deviation, -_CLIP, _CLIP)
+        return clipped
+
+    def updated(self, charts: np.ndarray, innovation: np.ndarray) -> np.ndarray:
+        """The charts (6, n_w), signed, after one more innovation (n_w,)."""
+        values = np.stack([innovation, innovation * innovation - 1.0])
+        old = charts.reshape(2, len(TIME_CONSTANTS_S), -1)
+        found = old + self.rates[:, None] * (values[:, None] - old)
+        return found.reshape(charts.shape)
+
+    def levels(self, charts: np.ndarray, repeats: float = 0.0) -> np.ndarray:
+        """Largest chart of each state, in units of its limit, (n_w,).
+
+        Args:
+            charts: Their values, (6, n_w).
+            repeats: Length of the run of repeated inputs, which concerns all states.
+        """
+        found = charts / self.limits
+        means = found[: len(TIME_CONSTANTS_S)]
+        np.abs(means, out=means)
+        levels: np.ndarray = np.maximum.reduce(found, axis=0)
+        return np.maximum(levels, repeats / self.longest_repeat)
+
+    def levels_of(self, motions: Sequence[np.ndarray]) -> np.ndarray:
+        """Levels at each row of consecutive motions (K, n), (sum of K, n_w).
+
+        Between motions the charts keep their values, which the first two rows of a motion show.
+        """
+        is_charted = np.concatenate([np.arange(len(one)) > 1 for one in motions])
+        found = np.zeros((len(is_charted), len(self.watched)))
+        if not is_charted.any():
+            return found
+        parts = [(one[:, self.columns], one[:, self.watched]) for one in motions if len(one) > 2]
+        errors = np.concatenate([self.predictor.errors(*one) for one in parts])
+        charts = self._charts(np.clip(errors / self.deviation, -_CLIP, _CLIP))
+        repeats = np.concatenate([_repeats(x)[1:] for x, _ in parts]) / self.longest_repeat
+        found[is_charted] = np.maximum((charts / self.limits).max(axis=1), repeats[:, None])
+        last = np.maximum.accumulate(np.where(is_charted, np.arange(len(found)), 0))
+        return found[last]
+
+    def with_motions(self, motions: Sequence[np.ndarray]) -> ChangeDetector:
+        """Returns the detector for which an actual robot's motions (K, n) are known as well.
+
+        The prediction gets a linear correction, and no limit becomes lower.
+        """
+        rows = [one for one in motions if len(one) > 2]
+        if not rows:
+            return self
+        seen = [one[:, self.columns] for one in rows]
+        states = [one[:, self.watched] for one in rows]
+        corrected = replace(self, predictor=self.predictor.corrected(seen, states))
+        limited = corrected._limited(seen, states)
+        return replace(
+            corrected,
+            deviation=np.maximum(limited.deviation, self.deviation),
+            limits=np.maximum(limited.limits, self.limits),
+            longest_repeat=max(self.longest_repeat, *map(_longest_repeat, seen)),
+        )
+
+    def cause(self, charts: np.ndarray, repeats: float, state_names: Sequence[str]) -> str:
+        """Says what an alarm saw: which state, for how long, and of what kind.
+
+        Args:
+            charts: Their values at the alarm, (6, n_w).
+            state_names: Names of the watched states.
+        """
+        if repeats > self.longest_repeat:
+            return "inputs frozen"
+        ratio = charts / self.limits
+        ratio[: len(TIME_CONSTANTS_S)] = np.abs(ratio[: len(TIME_CONSTANTS_S)])
+        chart, state = np.unravel_index(np.argmax(ratio), ratio.shape)
+        memory_s = 2.0 * TIME_CONSTANTS_S[chart % len(TIME_CONSTANTS_S)]
+        name, value = state_names[state], float(charts[chart, state])
+        is_mean = chart < len(TIME_CONSTANTS_S)
+        joint = name.removesuffix("_rate")
+        if joint in state_names and f"{joint}_rate" in state_names:
+            seen = f"joint {joint} answers unlike in training"
+        elif is_mean and name.startswith(("velocity_", "base_")) and name[-1] in _SIDES:
+            seen = f"pushed steadily {_SIDES[name[-1]][int(value < 0.0)]}"
+        else:
+            seen = f"{name} changes unlike in training"
+        if is_mean:
+            return f"{seen} ({name} {value:+.1f} standard deviations over {memory_s:g} s)"
+        return f"{seen} ({name} {math.sqrt(value + 1.0):.1f} times as irregular over {memory_s:g} s)"
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns all that `from_arrays` needs, by name."""
+        found = {name: getattr(self, name) for name in _ARRAYS}
+        found |= {name: getattr(self, name).astype(np.int32) for name in ("columns", "watched")}
+        found["settings"] = np.array([getattr(self, name) for name in _SETTINGS], dtype=float)
+        return found | {f"predictor.{k}": v for k, v in self.predictor.arrays().items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ChangeDetector:
+        """Makes the detector of arrays written by `arrays`.
+
+        Raises:
+            ValueError: Their shapes do not fit each other.
+        """
+        n_u, n_w = len(arrays["columns"]), len(arrays["watched"])
+        shapes: dict[str, tuple[int, ...]] = {
+            "deviation": (n_w,),
+            "limits": (2 * len(TIME_CONSTANTS_S), n_w),
+            "settings": (len(_SETTINGS),),
+            **{f"predictor.{k}": v for k, v in StatePredictor.shapes(n_u, n_w).items()},
+        }
+        for name, shape in shapes.items():
+            if arrays[name].shape != shape:
+                raise ValueError(
+                    f"the shape of its detector.{name} is {arrays[name].shape}, expected {shape}"
+                )
+        settings = dict(zip(_SETTINGS, arrays["settings"].tolist(), strict=True))
+        settings["longest_repeat"] = int(settings["longest_repeat"])
+        prefix = "predictor."
+        of_predictor = {k.removeprefix(prefix): v for k, v in arrays.items() if prefix in k}
+        return cls(
+            predictor=StatePredictor.from_arrays(of_predictor),
+            columns=arrays["columns"].astype(int),
+            watched=arrays["watched"].astype(int),
+            **{name: arrays[name].astype(float) for name in _ARRAYS},
+            **settings,
+        )
+
+
+_SIDES = {"x": ("forward", "backward"), "y": ("to the left", "to the right"), "z": ("up", "down")}
+
+
+def _chosen(names: Sequence[str] | None, every: Sequence[str], what: str) -> np.ndarray:
+    """Places of names among all of them; all places for None."""
+    names = every if names is None else names
+    if unknown := [name for name in names if name not in every]:
+        raise ValueError(f"ChangeDetector: {what} has {unknown}, which are none of {list(every)}")
+    return np.array([every.index(name) for name in names], dtype=int)
+
+
+def rows_of(motion: Episode) -> np.ndarray:
+    """(state, desired preview, features) of a motion, (K, n)."""
+    return np.concatenate([motion.state, motion.desired_preview, motion.features], axis=1)
+
+
+def usual_rows(motions: Episodes) -> list[np.ndarray]:
+    """(state, desired preview, features) of motions (K, n), until shortly before they leave."""
+    lost = math.ceil(_BEFORE_LEAVING_S / motions.info.step_s)
+    return [rows_of(one)[one.first_step : None if one.is_safe else -lost] for one in motions]
+
+
+def _block_maxima(charts: Sequence[np.ndarray], step_s: float) -> np.ndarray:
+    """Maxima of blocks of two seconds of charts (K, 6, n_w), (B, 6, n_w); blocks end with motions."""
+    size = max(1, round(_BLOCK_S / step_s))
+    blocks = [
+        one[i : i + size].max(axis=0) for one in charts for i in range(0, max(len(one) - size // 2, 1), size)
+    ]
+    return np.stack(blocks)
+
+
+def _tail_limit(maxima: np.ndarray, probability: float) -> float:
+    """The level that a block exceeds with a small probability, by an exponential tail."""
+    threshold = float(np.quantile(maxima, 1.0 - _TAIL_SHARE))
+    excess = maxima[maxima > threshold] - threshold
+    mean = float(excess.mean()) if len(excess) else 0.1 * threshold
+    extrapolated = threshold + mean * math.log(_TAIL_SHARE / probability)
+    return max(extrapolated, float(maxima.max()))
+
+
+def _repeats(x: np.ndarray) -> np.ndarray:
+    """Length of the run of inputs that repeat the one before, from the second input on, (K - 1,)."""
+    is_same = np.all(x[1:] == x[:-1], axis=1)
+    runs = itertools.accumulate(is_same.tolist(), lambda run, same: run + 1 if same else 0, initial=0)
+    return np.array([*runs][1:], dtype=float)
+
+
+def _longest_repeat(x: np.ndarray) -> int:
+    return int(_repeats(x).max(initial=0.0))

@@ -1,0 +1,161 @@
+"""ChangeMonitor: an alarm when plant or sensors no longer behave as in training."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.blas_threads import one_blas_thread
+from drake_safety.learning.change_detector import TIME_CONSTANTS_S, ChangeDetector
+
+RECOVERY_S = 5.0
+"""Time for which every level must be below its limit before an alarm ends [s]."""
+
+
+class ChangeMonitor(LeafSystem):
+    """Watches how each measured state follows from the last two inputs.
+
+    .. pydrake_system::
+
+        name: ChangeMonitor
+        input_ports:
+        - state
+        - desired_preview
+        - features (only if the prediction reads some)
+        - hold (optional)
+        output_ports:
+        - alarm
+        - levels
+        - alarm_cause
+
+    Every step of its training it predicts the state and updates the charts of a
+    :class:`~drake_safety.learning.change_detector.ChangeDetector`. ``levels`` has the level of each
+    watched state in units of its limit. When one exceeds 1, ``alarm`` becomes 1 and
+    ``alarm_cause`` says what was seen; it ends when all were below 1 for five seconds, or with a
+    reset. Without enough motion for limits there is no alarm. While ``hold`` is above 0.5, as
+    during a recovery step that training does not have, the charts wait. The detector is a
+    parameter of the Context, see :meth:`adopt`.
+    """
+
+    def __init__(self, assessment: SafetyAssessment):
+        super().__init__()
+        info, detector = assessment.info_, assessment.detector_
+        self.level_names = [info.state_names[i] for i in detector.watched]
+        self._detector = self.DeclareAbstractParameter(Value(detector))
+        sizes = {
+            "state": len(info.state_names),
+            "desired_preview": info.horizon * len(info.output_names),
+            "features": len(info.feature_names),
+        }
+        self._inputs = {
+            name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()
+        }
+        num_without = sizes["state"] + sizes["desired_preview"]
+        self.reads_features = bool((detector.columns >= num_without).any())
+        self._hold_port = self.DeclareVectorInputPort("hold", 1)
+        n_w, n_u = len(detector.watched), len(detector.columns)
+        n_charts = 2 * len(TIME_CONSTANTS_S) * n_w
+        # `seen` are charts and repeats at the alarm.
+        parts = {"state": n_w, "x": n_u, "previous": n_u, "charts": n_charts, "repeats": 1}
+        parts |= {"levels": n_w, "alarm": 1, "calm_s": 1, "seen": n_charts + 1}
+        starts = np.cumsum([0, *parts.values()]).tolist()
+        self._places = {
+            name: slice(start, start + size)
+            for (name, size), start in zip(parts.items(), starts, strict=False)
+        }
+        self._initial = np.zeros(starts[-1])
+        for name in ("x", "previous"):
+            self._initial[self._places[name]] = np.nan
+        state = self.DeclareDiscreteState(self._initial)
+        self.DeclarePeriodicDiscreteUpdateEvent(detector.step_s, 0.0, self._update)
+        ticket = {self.discrete_state_ticket(state)}
+        self.DeclareVectorOutputPort("alarm", BasicVector(1), self._calc_alarm, ticket)
+        self.DeclareVectorOutputPort("levels", BasicVector(n_w), self._calc_levels, ticket)
+        self.DeclareAbstractOutputPort(
+            "alarm_cause", lambda: Value(""), self._calc_alarm_cause, ticket
+        )
+
+    def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
+        """Takes over the detector of an assessment adapted from this system's own."""
+        context.get_mutable_abstract_parameter(self._detector).set_value(adapted.detector_)
+
+    def reset(self, context: Context) -> None:
+        """Ends the alarm and empties the charts."""
+        context.get_mutable_discrete_state_vector().SetFromVector(self._initial)
+
+    def row(self, context: Context) -> np.ndarray:
+        """(state, desired preview, features) at the ports, (n,); features that are not read are 0."""
+        features = self._inputs["features"]
+        return np.concatenate(
+            [
+                self._inputs["state"].Eval(context),
+                self._inputs["desired_preview"].Eval(context),
+                features.Eval(context) if self.reads_features else np.zeros(features.size()),
+            ]
+        )
+
+    def is_held(self, context: Context) -> bool:
+        """Whether the port ``hold`` makes it wait."""
+        return self._hold_port.HasValue(context) and bool(self._hold_port.Eval(context)[0] > 0.5)
+
+    @one_blas_thread
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        detector = self._detector_of(context)
+        values = context.get_discrete_state_vector().get_value().copy()
+        part = {name: values[place] for name, place in self._places.items()}  # Views.
+        row = self.row(context)
+        x, state = row[detector.columns], row[detector.watched]
+        if self.is_held(context) or not x @ x < math.inf:  # As for NaN.
+            part["x"][:] = part["previous"][:] = np.nan
+        else:
+            if not math.isnan(part["previous"][0]):
+                self._chart(part, detector, x, state)
+            part["previous"][:] = part["x"]
+            part["x"][:], part["state"][:] = x, state
+        discrete_state.set_value(values)
+
+    def _chart(
+        self, part: dict[str, np.ndarray], detector: ChangeDetector, x: np.ndarray, state: np.ndarray
+    ) -> None:
+        """Updates charts, levels and alarm in a copy of the discrete state."""
+        change = state - part["state"]
+        innovation = detector.innovation(part["x"], part["previous"], change)
+        charts = detector.updated(part["charts"].reshape(-1, len(state)), innovation)
+        is_repeated = np.array_equal(x, part["x"])
+        repeats = part["repeats"][0] + 1.0 if is_repeated else 0.0
+        levels = detector.levels(charts, repeats)
+        part["charts"][:], part["repeats"][0], part["levels"][:] = charts.ravel(), repeats, levels
+        if levels.max() > detector.alarm_level:
+            if part["alarm"][0] == 0.0:
+                part["seen"][:-1], part["seen"][-1] = part["charts"], repeats
+            part["alarm"][0], part["calm_s"][0] = 1.0, 0.0
+        elif part["alarm"][0] > 0.0:
+            part["calm_s"][0] += detector.step_s
+            if part["calm_s"][0] >= RECOVERY_S:
+                part["alarm"][0] = 0.0
+
+    def _detector_of(self, context: Context) -> ChangeDetector:
+        detector: ChangeDetector = context.get_abstract_parameter(self._detector).get_value()
+        return detector
+
+    def _of(self, context: Context, name: str) -> np.ndarray:
+        values: np.ndarray = context.get_discrete_state_vector().get_value()[self._places[name]]
+        return values
+
+    def _calc_alarm(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._of(context, "alarm")[0])
+
+    def _calc_levels(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._of(context, "levels"))
+
+    def _calc_alarm_cause(self, context: Context, output: Value) -> None:
+        cause = ""
+        if self._of(context, "alarm")[0] > 0.0:
+            seen = self._of(context, "seen")
+            charts = seen[:-1].reshape(-1, len(self.level_names))
+            cause = self._detector_of(context).cause(charts, seen[-1], self.level_names)
+        output.set_value(cause)
