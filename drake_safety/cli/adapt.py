@@ -116,7 +116,7 @@ def adapt(
     check_writable(folder)
     with open_stages() as stages:
         if log_map is not None:
-            pieces = _log_pieces(loaded, logs, log_map, is_strict=strict)
+            pieces = log_pieces(loaded, logs, log_map, is_strict=strict)
             actual, starts = cut_log(pieces, loaded)
             pairs = pair_starts(loaded, actual, starts, seed=seed)
             motions = motions_from_log(pieces, loaded)
@@ -130,7 +130,8 @@ def adapt(
                 variation=variation,
                 seed=MOTION.seeds()["motion of the actual robot"],
                 num_workers=workers,
-                path=feedback_folder(learned.out, loaded.simulation_hash(variation), seed) / "motion",
+                path=feedback_folder(learned.out, loaded.simulation_hash(variation), seed)
+                / "motion",
                 progress=partial(stages, "undisturbed actual motion"),
                 **loaded.task_class().pairing_options(loaded, variation),
             )
@@ -247,8 +248,8 @@ def fresh_actual_episodes(
     )
 
 
-def _log_pieces(
-    scenario: Scenario, logs: list[Path], log_map: Path, *, is_strict: bool
+def log_pieces(
+    scenario: Scenario, logs: list[Path], log_map: Path, *, is_strict: bool = False
 ) -> list[RobotLog]:
     """The pieces of logs without gaps; where they are cut is printed."""
     robot = load_robot(scenario.robot)

@@ -352,6 +352,7 @@ def write(
     results.write(evaluation.folder / name)
     for table in tables(results):
         console.print(table.to_rich())
+    console.print(sharpened.detector_.describe(), highlight=False, soft_wrap=True)
     print_path("figures", evaluation.folder / name)
     for picture in evaluation.pictures:
         print_path("picture", picture)
