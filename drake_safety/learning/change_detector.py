@@ -212,15 +212,15 @@ class ChangeDetector:
 
     def levels_of(self, motions: Sequence[np.ndarray]) -> np.ndarray:
         """Levels at each row of consecutive motions; see `watch`."""
-        return self.watch(motions, [""] * len(self.watched))[0]
+        return self.watch(motions)[0]
 
     def watch(
-        self, motions: Sequence[np.ndarray], state_names: Sequence[str]
+        self, motions: Sequence[np.ndarray], state_names: Sequence[str] | None = None
     ) -> tuple[np.ndarray, list[Alarm]]:
         """Levels at each row of consecutive motions (K, n), (sum of K, n_w), and the alarms.
 
         Between motions the charts keep their values, which the first two rows of a motion show.
-        The names are those of the watched states.
+        Causes need the names of the watched states.
         """
         is_charted = np.concatenate([np.arange(len(one)) > 1 for one in motions])
         levels = np.zeros((len(is_charted), len(self.watched)))
@@ -238,6 +238,7 @@ class ChangeDetector:
         for level in levels[rows[:-1]].max(axis=1):
             states.append(self.next_alarm(*states[-1], level))
         changes = np.flatnonzero(np.diff([alarm for alarm, _ in states], append=0.0)).tolist()
+        state_names = state_names or [""] * len(self.watched)
         return levels, [
             Alarm(rows[i], rows[k], self.cause(charts[i], repeats[i], state_names))
             for i, k in zip(changes[::2], changes[1::2], strict=True)
