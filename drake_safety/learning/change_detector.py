@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -31,7 +31,6 @@ _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
 _TAIL_SHARE = 0.1  # Of the blocks.
 _LEAST_LIMIT = 0.3  # Of a chart, in standard deviations of its value for white innovations.
 _FREE_REPEATS = 3  # Beyond the longest run of repeated inputs in training.
-_ARRAYS = ("deviation", "limits")
 _SETTINGS = ("alarm_level", "longest_repeat", "step_s", "motion_s")
 
 
@@ -96,9 +95,8 @@ class ChangeDetector:
         motion = f"monitor: {self.motion_s / 60.0:.0f} min of motion for its limits"
         if self.has_limits:
             return f"{motion}, for at most one false alarm in {1 / FALSE_ALARMS_PER_HOUR:.0f} h"
-        return (
-            f"{motion}, {LEAST_MOTION_S / 60.0:.0f} are needed: it reports levels and never alarms"
-        )
+        needed = f"{LEAST_MOTION_S / 60.0:.0f} are needed"
+        return f"{motion}, {needed}: it reports levels and never alarms"
 
     @classmethod
     def fit(
@@ -282,7 +280,7 @@ class ChangeDetector:
         if repeats > self.longest_repeat:
             return "inputs frozen"
         ratio = _sizes(charts) / self.limits
-        chart, state = divmod(int(np.argmax(ratio)), ratio.shape[1])
+        chart, state = map(int, np.unravel_index(np.argmax(ratio), ratio.shape))
         memory_s = 2.0 * TIME_CONSTANTS_S[chart % len(TIME_CONSTANTS_S)]
         name, value = state_names[state], float(charts[chart, state])
         is_mean = chart < len(TIME_CONSTANTS_S)
@@ -295,13 +293,12 @@ class ChangeDetector:
             seen = f"{name} changes unlike in training"
         if is_mean:
             return f"{seen} ({name} {value:+.1f} standard deviations over {memory_s:g} s)"
-        return (
-            f"{seen} ({name} {math.sqrt(value + 1.0):.1f} times as irregular over {memory_s:g} s)"
-        )
+        times = math.sqrt(value + 1.0)
+        return f"{seen} ({name} {times:.1f} times as irregular over {memory_s:g} s)"
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns all that `from_arrays` needs, by name."""
-        found = {name: getattr(self, name) for name in _ARRAYS}
+        found = {"deviation": self.deviation, "limits": self.limits}
         found |= {name: getattr(self, name).astype(np.int32) for name in ("columns", "watched")}
         found["settings"] = np.array([getattr(self, name) for name in _SETTINGS], dtype=float)
         return found | {f"predictor.{k}": v for k, v in self.predictor.arrays().items()}
@@ -325,16 +322,19 @@ class ChangeDetector:
                 raise ValueError(
                     f"the shape of its detector.{name} is {arrays[name].shape}, expected {shape}"
                 )
-        settings: dict[str, Any] = dict(zip(_SETTINGS, arrays["settings"].tolist(), strict=True))
-        settings["longest_repeat"] = int(settings["longest_repeat"])
-        settings |= {name: arrays[name].astype(float) for name in _ARRAYS}
+        alarm_level, longest_repeat, step_s, motion_s = arrays["settings"].tolist()
         prefix = "predictor."
         of_predictor = {k.removeprefix(prefix): v for k, v in arrays.items() if prefix in k}
         return cls(
             predictor=StatePredictor.from_arrays(of_predictor),
             columns=arrays["columns"].astype(int),
             watched=arrays["watched"].astype(int),
-            **settings,
+            deviation=arrays["deviation"].astype(float),
+            limits=arrays["limits"].astype(float),
+            alarm_level=alarm_level,
+            longest_repeat=int(longest_repeat),
+            step_s=step_s,
+            motion_s=motion_s,
         )
 
 
@@ -367,7 +367,7 @@ def _sizes(charts: np.ndarray) -> np.ndarray:
 
 
 def _block_maxima(charts: Sequence[np.ndarray], step_s: float) -> np.ndarray:
-    """Maxima of blocks of two seconds of charts (K, 6, n_w), (B, 6, n_w), each of one motion."""
+    """Maxima of blocks of 2 s of charts (K, 6, n_w), (B, 6, n_w); blocks end with motions."""
     size = max(1, round(_BLOCK_S / step_s))
     blocks = [
         one[i : i + size].max(axis=0)
@@ -394,7 +394,7 @@ def _tail_limit(maxima: np.ndarray, probability: float) -> float:
 
 
 def _repeats(x: np.ndarray) -> np.ndarray:
-    """Length of the run of inputs that repeat the one before, from the second on, (K - 1,)."""
+    """Length of the run of repeated inputs, from the second input on, (K - 1,)."""
     is_same = np.all(x[1:] == x[:-1], axis=1)
     runs = itertools.accumulate(
         is_same.tolist(), lambda run, same: run + 1 if same else 0, initial=0

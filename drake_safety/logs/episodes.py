@@ -133,9 +133,8 @@ class _Rows(NamedTuple):
 
     @classmethod
     def of(cls, scenario: Scenario) -> _Rows:
-        return cls(
-            scenario.step_s, scenario.episode_duration_s, shortest_steps(scenario.assessment)
-        )
+        shortest = shortest_steps(scenario.assessment)
+        return cls(scenario.step_s, scenario.episode_duration_s, shortest)
 
 
 def shortest_steps(assessment: AssessmentParameters) -> int:
@@ -217,11 +216,8 @@ def _start(
         feet = values_at(log.time_s, log.foot_positions, begin).reshape(-1, 3)
     scenario = loop.scenario
     # Previews and outlooks of the longest episode end before.
-    reach_s = (
-        duration_s
-        + scenario.episode_duration_s
-        + scenario.assessment.horizon * scenario.preview_step_s
-    )
+    reach_s = duration_s + scenario.episode_duration_s
+    reach_s += scenario.assessment.horizon * scenario.preview_step_s
     later = log.time_s[(log.time_s > begin_s + _ROUNDING_S) & (log.time_s <= begin_s + reach_s)]
     hold = PiecewisePolynomial(np.zeros((desired.shape[1], 1)))
     start = EpisodeStart(q=q, v=v, plan=hold, foot_positions=feet)
