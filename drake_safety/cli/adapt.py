@@ -122,18 +122,18 @@ def adapt(
             motions = motions_from_log(pieces, loaded)
         else:
             pairs = paired_episodes(loaded, feedback, variation, seed, learned.out, workers, stages)
-        sets = pairs.feedback()
-        if not logs:
+            hash_ = loaded.simulation_hash(variation)
             motions = run_motions(
                 loaded,
                 _MOTION_S,
                 variation=variation,
                 seed=MOTION.seeds()["motion of the actual robot"],
                 num_workers=workers,
-                path=feedback_folder(learned.out, loaded.simulation_hash(variation), seed) / "motion",
+                path=feedback_folder(learned.out, hash_, seed) / "motion",
                 progress=partial(stages, "undisturbed actual motion"),
                 **loaded.task_class().pairing_options(loaded, variation),
             )
+        sets = pairs.feedback()
         adapted = {mode: prior.adapt(sets, motions=motions) for mode, prior in priors.items()}
         folder.mkdir(parents=True, exist_ok=True)
         for mode, one in adapted.items():

@@ -17,8 +17,8 @@ import numpy as np
 from drake_safety.evaluation.metrics import Estimate, proportion, rate_per_hour
 from drake_safety.evaluation.shift_study import BOOTSTRAP, CONFIDENT, Judge, mean_over
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.change_detector import ChangeDetector, rows_of
-from drake_safety.learning.segments import DIVERGED, Episode
+from drake_safety.learning.change_detector import ChangeDetector, rows_of, usual_rows
+from drake_safety.learning.segments import DIVERGED, Episode, Episodes
 from drake_safety.simulation.rollouts import motion_batch
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import run_batches
@@ -70,7 +70,9 @@ def run_monitored(
 
     motions = simulated([*range(num_motions)], _FIRST_S)
     quiet = [
-        i for i, one in motions.items() if one.is_safe and not _alarms([rows_of(one)], detector).any()
+        i
+        for i, one in motions.items()
+        if one.is_safe and not _alarms([rows_of(one)], detector).any()
     ]
     motions |= simulated(quiet, max(SPANS_S))
     return [motions[i] for i in sorted(motions) if motions[i].cause != DIVERGED]
@@ -114,9 +116,7 @@ def sequences(
         alarm_s = float(np.argmax(alarms)) * detector.step_s if alarms.any() else np.inf
         begin = detector.step_s * np.cumsum([0, *(len(rows[i]) for i in order)])
         errors = np.concatenate([begin[k] + wrong[i] for k, i in enumerate(order)])
-        leaves = [
-            begin[k + 1] for k, i in enumerate(order) if not motions[i].is_safe
-        ]
+        leaves = [begin[k + 1] for k, i in enumerate(order) if not motions[i].is_safe]
         result.append(
             Sequence60(
                 alarm_s=alarm_s,
@@ -127,9 +127,7 @@ def sequences(
     return result
 
 
-def monitor_estimates(
-    found: Sequence[Sequence60], step_s: float
-) -> dict[str, Estimate]:
+def monitor_estimates(found: Sequence[Sequence60], step_s: float) -> dict[str, Estimate]:
     """Alarms, their delay, motions that leave the safe set, and Γ's confident errors until then.
 
     Args:
@@ -139,9 +137,7 @@ def monitor_estimates(
     delay = np.array([one.alarm_s for one in found])
     estimates = {
         "monitor.alarmed": proportion(int(np.isfinite(delay).sum()), len(delay)),
-        "monitor.leaves": proportion(
-            sum(one.leave_s <= max(SPANS_S) for one in found), len(found)
-        ),
+        "monitor.leaves": proportion(sum(one.leave_s <= max(SPANS_S) for one in found), len(found)),
         "monitor.delay_s": quantile(delay, 0.5),
         "monitor.delay_95_s": quantile(delay, 0.95),
     }
@@ -166,19 +162,11 @@ def quantile(values: np.ndarray, share: float) -> Estimate:
     return Estimate(of(values), float(low), float(high), len(values))
 
 
-def false_alarms(motions: Sequence[Episode], detector: ChangeDetector) -> Estimate:
+def false_alarms(motions: Episodes, detector: ChangeDetector) -> Estimate:
     """False alarms per hour on motions of the nominal plant, each judged anew.
 
-    Rows within an episode of leaving the safe set do not count.
+    An alarm that goes on is one. Rows shortly before leaving the safe set do not count.
     """
-    count, duration_s = 0, 0.0
-    for one in motions:
-        lost = 0 if one.is_safe else round(_BEFORE_LEAVING_S / detector.step_s)
-        alarms = _alarms([rows_of(one)], detector)[: max(len(one.time_s) - lost, 0)]
-        # An alarm that goes on is one.
-        count += int(alarms.any())
-        duration_s += len(alarms) * detector.step_s
-    return rate_per_hour(count, duration_s, len(motions))
-
-
-_BEFORE_LEAVING_S = 0.5
+    found = [_alarms([rows], detector) for rows in usual_rows(motions)]
+    duration_s = detector.step_s * sum(map(len, found))
+    return rate_per_hour(sum(bool(one.any()) for one in found), duration_s, len(motions))

@@ -191,6 +191,8 @@ def shift_estimates(judged: JudgedShift) -> dict[str, Estimate]:
 
 
 def mean_over(values: np.ndarray, motion: np.ndarray) -> Estimate:
+    """Mean of the values (N,) of rows, with its interval over their motions (N,)."""
+
     def mean(weight: np.ndarray) -> float:
         return float(np.average(values, weights=weight)) if weight.any() else np.nan
 

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from drake_safety.extras import require_extra
 from drake_safety.learning.segments import Episode, Episodes
-from drake_safety.learning.state_predictor import HIDDEN_SIZES, StatePredictor
+from drake_safety.learning.state_predictor import StatePredictor
 
 TIME_CONSTANTS_S = (0.1, 0.5, 2.0)
 """Memories of the charts."""
@@ -28,7 +28,6 @@ _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
 _TAIL_SHARE = 0.1  # Of the blocks.
 _LEAST_LIMIT = 0.3  # Of a chart, in standard deviations of its value for white innovations.
 _FREE_REPEATS = 3  # Beyond the longest run of repeated inputs in training.
-_ARRAYS = ("deviation", "limits")
 _SETTINGS = ("alarm_level", "longest_repeat", "step_s", "motion_s")
 
 
@@ -85,7 +84,8 @@ class ChangeDetector:
         motion = f"monitor: {self.motion_s / 60.0:.0f} min of motion for its limits"
         if self.has_limits:
             return f"{motion}, for at most one false alarm in {1 / FALSE_ALARMS_PER_HOUR:.0f} h"
-        return f"{motion}, {LEAST_MOTION_S / 60.0:.0f} are needed: it reports levels and never alarms"
+        needed = f"{LEAST_MOTION_S / 60.0:.0f} are needed"
+        return f"{motion}, {needed}: it reports levels and never alarms"
 
     @classmethod
     def fit(
@@ -124,7 +124,7 @@ class ChangeDetector:
                 predictor=predictor,
                 columns=columns,
                 watched=watched,
-                deviation=np.ones(len(watched)),
+                deviation=np.full(len(watched), 1e-9),
                 limits=np.ones((2 * len(TIME_CONSTANTS_S), len(watched))),
                 alarm_level=math.inf,
                 longest_repeat=max(map(_longest_repeat, seen)) + _FREE_REPEATS,
@@ -133,17 +133,15 @@ class ChangeDetector:
             )
             return unlimited._limited(seen[1::2], states[1::2])
 
-    def _limited(
-        self, seen: Sequence[np.ndarray], states: Sequence[np.ndarray]
-    ) -> ChangeDetector:
+    def _limited(self, seen: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> ChangeDetector:
         """Chooses deviations and limits from inputs (K, n_u) and states (K, n_w) of motions."""
         errors = [self.predictor.errors(*one) for one in zip(seen, states, strict=True)]
-        if len(errors) == 1:
+        if len(errors) == 1 and len(errors[0]) > 1:
             errors = np.array_split(errors[0], 2)
-        deviation = np.maximum(np.concatenate(errors).std(axis=0), 1e-9)
+        deviation = np.maximum(np.concatenate(errors).std(axis=0), self.deviation)
         charts = [self._charts(np.clip(one / deviation, -_CLIP, _CLIP)) for one in errors]
         motion_s = self.step_s * sum(map(len, errors))
-        halves = [_block_maxima(charts[i::2], self.step_s) for i in range(2)]
+        halves = [_block_maxima(charts[i::2] or charts, self.step_s) for i in range(2)]
         least = _LEAST_LIMIT * np.sqrt(self.rates / (2.0 - self.rates))
         least = np.concatenate([least, math.sqrt(2.0) * least])[:, None]
 
@@ -179,9 +177,9 @@ class ChangeDetector:
         charts[:, :means] = np.abs(charts[:, :means])
         return charts
 
-    def innovation(self, x: np.ndarray, previous: np.ndarray, state: np.ndarray) -> np.ndarray:
-        """The innovation (n_w,) of a state (n_w,) after two inputs (n_u,), clipped."""
-        error = self.predictor.error(x, previous, state)
+    def innovation(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """The innovation (n_w,) of a change of the state after two inputs (n_u,), clipped."""
+        error = self.predictor.error(x, previous, change)
         clipped: np.ndarray = np.clip(error / self.deviation, -_CLIP, _CLIP)
         return clipped
 
@@ -236,7 +234,7 @@ class ChangeDetector:
         limited = corrected._limited(seen, states)
         return replace(
             corrected,
-            deviation=np.maximum(limited.deviation, self.deviation),
+            deviation=limited.deviation,
             limits=np.maximum(limited.limits, self.limits),
             longest_repeat=max(self.longest_repeat, *map(_longest_repeat, seen)),
         )
@@ -252,7 +250,7 @@ class ChangeDetector:
             return "inputs frozen"
         ratio = charts / self.limits
         ratio[: len(TIME_CONSTANTS_S)] = np.abs(ratio[: len(TIME_CONSTANTS_S)])
-        chart, state = np.unravel_index(np.argmax(ratio), ratio.shape)
+        chart, state = map(int, np.unravel_index(np.argmax(ratio), ratio.shape))
         memory_s = 2.0 * TIME_CONSTANTS_S[chart % len(TIME_CONSTANTS_S)]
         name, value = state_names[state], float(charts[chart, state])
         is_mean = chart < len(TIME_CONSTANTS_S)
@@ -265,11 +263,12 @@ class ChangeDetector:
             seen = f"{name} changes unlike in training"
         if is_mean:
             return f"{seen} ({name} {value:+.1f} standard deviations over {memory_s:g} s)"
-        return f"{seen} ({name} {math.sqrt(value + 1.0):.1f} times as irregular over {memory_s:g} s)"
+        times = math.sqrt(value + 1.0)
+        return f"{seen} ({name} {times:.1f} times as irregular over {memory_s:g} s)"
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns all that `from_arrays` needs, by name."""
-        found = {name: getattr(self, name) for name in _ARRAYS}
+        found = {"deviation": self.deviation, "limits": self.limits}
         found |= {name: getattr(self, name).astype(np.int32) for name in ("columns", "watched")}
         found["settings"] = np.array([getattr(self, name) for name in _SETTINGS], dtype=float)
         return found | {f"predictor.{k}": v for k, v in self.predictor.arrays().items()}
@@ -293,16 +292,19 @@ class ChangeDetector:
                 raise ValueError(
                     f"the shape of its detector.{name} is {arrays[name].shape}, expected {shape}"
                 )
-        settings = dict(zip(_SETTINGS, arrays["settings"].tolist(), strict=True))
-        settings["longest_repeat"] = int(settings["longest_repeat"])
+        alarm_level, longest_repeat, step_s, motion_s = arrays["settings"].tolist()
         prefix = "predictor."
         of_predictor = {k.removeprefix(prefix): v for k, v in arrays.items() if prefix in k}
         return cls(
             predictor=StatePredictor.from_arrays(of_predictor),
             columns=arrays["columns"].astype(int),
             watched=arrays["watched"].astype(int),
-            **{name: arrays[name].astype(float) for name in _ARRAYS},
-            **settings,
+            deviation=arrays["deviation"].astype(float),
+            limits=arrays["limits"].astype(float),
+            alarm_level=alarm_level,
+            longest_repeat=int(longest_repeat),
+            step_s=step_s,
+            motion_s=motion_s,
         )
 
 
@@ -329,10 +331,12 @@ def usual_rows(motions: Episodes) -> list[np.ndarray]:
 
 
 def _block_maxima(charts: Sequence[np.ndarray], step_s: float) -> np.ndarray:
-    """Maxima of blocks of two seconds of charts (K, 6, n_w), (B, 6, n_w); blocks end with motions."""
+    """Maxima of blocks of 2 s of charts (K, 6, n_w), (B, 6, n_w); blocks end with motions."""
     size = max(1, round(_BLOCK_S / step_s))
     blocks = [
-        one[i : i + size].max(axis=0) for one in charts for i in range(0, max(len(one) - size // 2, 1), size)
+        one[i : i + size].max(axis=0)
+        for one in charts
+        for i in range(0, max(len(one) - size // 2, 1), size)
     ]
     return np.stack(blocks)
 
@@ -347,9 +351,11 @@ def _tail_limit(maxima: np.ndarray, probability: float) -> float:
 
 
 def _repeats(x: np.ndarray) -> np.ndarray:
-    """Length of the run of inputs that repeat the one before, from the second input on, (K - 1,)."""
+    """Length of the run of repeated inputs, from the second input on, (K - 1,)."""
     is_same = np.all(x[1:] == x[:-1], axis=1)
-    runs = itertools.accumulate(is_same.tolist(), lambda run, same: run + 1 if same else 0, initial=0)
+    runs = itertools.accumulate(
+        is_same.tolist(), lambda run, same: run + 1 if same else 0, initial=0
+    )
     return np.array([*runs][1:], dtype=float)
 
 

@@ -84,7 +84,8 @@ class StatePredictor:
         for i in range(len(HIDDEN_SIZES)):
             hidden = hidden @ w[f"hidden.{i}.weight"] + w[f"hidden.{i}.bias"]
             hidden = hidden / (1.0 + np.exp(-np.maximum(hidden, -80.0)))
-        found: np.ndarray = hidden @ w["output.weight"] + (z @ w["linear.weight"] + w["linear.bias"])
+        linear = z @ w["linear.weight"] + w["linear.bias"]
+        found: np.ndarray = hidden @ w["output.weight"] + linear
         return found
 
     def errors(self, inputs: np.ndarray, states: np.ndarray) -> np.ndarray:
@@ -109,9 +110,7 @@ class StatePredictor:
         from sklearn.linear_model import Ridge
 
         z = np.concatenate([self._pairs(one) for one in inputs])
-        errors = np.concatenate(
-            [self.errors(*one) for one in zip(inputs, states, strict=True)]
-        )
+        errors = np.concatenate([self.errors(*one) for one in zip(inputs, states, strict=True)])
         # Few rows: what they do not determine stays as it was.
         ridge = Ridge(alpha=len(z) / 10.0).fit(z, errors / self.unit)
         weights = dict(self.weights)

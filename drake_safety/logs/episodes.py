@@ -107,9 +107,10 @@ def motions_from_log(
     for pieces in _by_log([log] if isinstance(log, RobotLog) else log):
         for one in pieces:
             found, has_left = _cut(one, loop, _desired_output(one, loop, desired_output), rows)
-            motions += [replace(motion, index=len(motions) + i) for i, (motion, _) in enumerate(found)]
+            motions += [motion for motion, _ in found]
             if has_left:
                 break
+    motions = [replace(motion, index=i) for i, motion in enumerate(motions)]
     return Episodes(replace(episodes_info(loop, seed=NOT_DRAWN), step_s=rows.step_s), motions)
 
 
@@ -122,7 +123,8 @@ class _Rows(NamedTuple):
 
     @classmethod
     def of(cls, scenario: Scenario) -> _Rows:
-        return cls(scenario.step_s, scenario.episode_duration_s, shortest_steps(scenario.assessment))
+        shortest = shortest_steps(scenario.assessment)
+        return cls(scenario.step_s, scenario.episode_duration_s, shortest)
 
 
 def shortest_steps(assessment: AssessmentParameters) -> int:
@@ -204,9 +206,8 @@ def _start(
         feet = values_at(log.time_s, log.foot_positions, begin).reshape(-1, 3)
     scenario = loop.scenario
     # Previews and outlooks of the longest episode end before.
-    reach_s = (
-        duration_s + scenario.episode_duration_s + scenario.assessment.horizon * scenario.preview_step_s
-    )
+    reach_s = duration_s + scenario.episode_duration_s
+    reach_s += scenario.assessment.horizon * scenario.preview_step_s
     later = log.time_s[(log.time_s > begin_s + _ROUNDING_S) & (log.time_s <= begin_s + reach_s)]
     hold = PiecewisePolynomial(np.zeros((desired.shape[1], 1)))
     start = EpisodeStart(q=q, v=v, plan=hold, foot_positions=feet)
