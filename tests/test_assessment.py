@@ -273,9 +273,9 @@ def test_learning_gives_the_same_bits_for_any_number_of_threads():
         pair = (getattr(each.training_, name) for each in found)
         np.testing.assert_array_equal(*pair)
     np.testing.assert_array_equal(one.novelty_.limits, other.novelty_.limits)
-    for name, array in one.innovation_.arrays().items():
-        np.testing.assert_array_equal(array, other.innovation_.arrays()[name], err_msg=name)
-    stages = ["distances", "t-SNE", "training", "innovation", "beliefs"]
+    for name, array in one.detector_.arrays().items():
+        np.testing.assert_array_equal(array, other.detector_.arrays()[name], err_msg=name)
+    stages = ["distances", "t-SNE", "training", "monitor", "beliefs"]
     assert list(dict.fromkeys(stage for stage, *_ in seen)) == stages
     assert all(0 <= done <= total == 100 for _, done, total in seen)
 
@@ -339,7 +339,7 @@ def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_
     save_file(load_file(path), tmp_path / "old", metadata)
     with pytest.raises(ValueError, match=f"schema version 8, this version reads {SCHEMA_VERSION}"):
         SafetyAssessment.load(tmp_path / "old")
-    save_file(load_file(path), tmp_path / "hollow", {SCHEMA: '{"schema_version": 9}'})
+    save_file(load_file(path), tmp_path / "hollow", {SCHEMA: '{"schema_version": 10}'})
     with pytest.raises(ValueError, match="damaged safety assessment: it has no 'sha256'"):
         SafetyAssessment.load(tmp_path / "hollow")
     for text in ("", "[]", "{}", "[" * 100_000):

@@ -11,6 +11,7 @@ import numpy as np
 
 from drake_safety.extras import require_extra
 from drake_safety.learning.assessment_parameters import AssessmentParameters
+from drake_safety.learning.blas_threads import one_torch_thread
 from drake_safety.learning.distance import NeighbourGraph
 from drake_safety.learning.trained_maps import Embedding
 
@@ -149,13 +150,8 @@ def train_map(
     require_extra("train", "train_map", "torch")
     import torch
 
-    num_threads = torch.get_num_threads()
-    # One thread is fastest for layers of this size.
-    torch.set_num_threads(1)
-    try:
+    with one_torch_thread():
         return _train(torch, data, parameters, seed, held_out, progress)
-    finally:
-        torch.set_num_threads(num_threads)
 
 
 def _train(

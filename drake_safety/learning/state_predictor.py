@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drake_safety.learning.blas_threads import one_torch_thread
+
 HIDDEN_SIZES = (256, 256)
 """Units of the hidden layers."""
 _SMALLEST_SPREAD = 1e-4  # Of a column [unit of the column]; constant ones would be divided by zero.
@@ -49,7 +51,7 @@ class StatePredictor:
         start = cls(mean=mean, scale=scale, unit=unit, weights={})
         x = torch.tensor(np.concatenate([start._pairs(one) for one in inputs]))
         y = torch.tensor((change / unit).astype(np.float32))
-        with torch.random.fork_rng(devices=[]):
+        with one_torch_thread(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             network = _network(x.shape[1], y.shape[1])
             per_epoch = max(1, len(x) // _BATCH)
