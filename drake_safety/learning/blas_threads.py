@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from threading import Lock
 from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
@@ -62,19 +61,6 @@ class OneBlasThread:
 
 ONE_BLAS_THREAD = OneBlasThread()
 """The one of this process."""
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Training in one thread: fastest for small layers, and the same bits on any machine."""
-    import torch
-
-    number = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(number)
 
 
 def one_blas_thread(function: Callable[_P, _R]) -> Callable[_P, _R]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,6 @@ import numpy as np
 
 from drake_safety.extras import require_extra
 from drake_safety.learning.assessment_parameters import AssessmentParameters
-from drake_safety.learning.blas_threads import one_torch_thread
 from drake_safety.learning.distance import NeighbourGraph
 from drake_safety.learning.trained_maps import Embedding
 
@@ -152,6 +152,19 @@ def train_map(
 
     with one_torch_thread():
         return _train(torch, data, parameters, seed, held_out, progress)
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Training in one thread: fastest for small layers, and the same bits on any machine."""
+    import torch
+
+    number = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(number)
 
 
 def _train(

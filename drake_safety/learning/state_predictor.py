@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drake_safety.learning.blas_threads import one_torch_thread
-
 HIDDEN_SIZES = (256, 256)
 """Units of the hidden layers."""
 _SMALLEST_SPREAD = 1e-4  # Of a column [unit of the column]; constant ones would be divided by zero.
@@ -43,6 +41,8 @@ class StatePredictor:
     ) -> StatePredictor:
         """Learns from inputs (K, n_u) and states (K, n_w) of motions of at least three rows."""
         import torch
+
+        from drake_safety.learning.embedding import one_torch_thread
 
         every = np.concatenate(inputs)
         mean, scale = every.mean(axis=0), np.maximum(every.std(axis=0), _SMALLEST_SPREAD)
