@@ -65,7 +65,11 @@ def test_sequences_count_what_is_sure_and_wrong_until_the_alarm():
     np.testing.assert_allclose(third.error_s, [15.0, 16.0, 17.0, 18.0, 19.0])
     # A sequence lasts a minute.
     quiet = [motion(i, 100) for i in range(2)] + [motion(2, 100, alarm=[50])]
-    assert [one.alarm_s for one in sequences(quiet, assessment, judge)] == [math.inf, math.inf, 25.0]
+    assert [one.alarm_s for one in sequences(quiet, assessment, judge)] == [
+        math.inf,
+        math.inf,
+        25.0,
+    ]
 
 
 def test_estimates_are_of_all_sequences():
