@@ -54,7 +54,7 @@ class Prior:
 class Watching:
     """A change monitor that waits, and sees NaN, for a while."""
 
-    def GetMyContextFromRoot(self, root):  # noqa: N802
+    def GetMyContextFromRoot(self, root):
         return root
 
     def is_held(self, context):
