@@ -166,7 +166,8 @@ class Walking(LeggedLoop):
         builder.ExportOutput(controller.GetOutputPort("status"), "controller_status")
         self.monitored_states = [name for name in self.state_names if name != _POSITION]
         # What the policy sees: its last actions, its phase and the command.
-        self.monitored_features = [name for name in controller.action_names if name != _UNCOMMANDED]
+        self.memory_features = tuple(controller.action_names)
+        self.monitored_features = [name for name in self.memory_features if name != _UNCOMMANDED]
         self._rehearsal: Walking | None = None
         self._settled: EpisodeStart | None = None
         self.finish(builder)

@@ -14,6 +14,7 @@ from studies.bench import bench
 from studies.compare import compare
 from studies.converged import converged
 from studies.evaluate import evaluate
+from studies.monitor import monitor
 from studies.planning import plan_study
 from studies.promises import promises
 from studies.publish import readme, ship, store
@@ -31,7 +32,7 @@ app = typer.Typer(
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
     *(evaluate, compare, promises),
-    *(ablate, plan_study, adaptation, readings, converged, scale, truth, walking),
+    *(ablate, plan_study, monitor, adaptation, readings, converged, scale, truth, walking),
     *(animation, bench, store, readme, ship),
 )
 for _command in _COMMANDS:

@@ -116,10 +116,11 @@ def adapt(
     check_writable(folder)
     with open_stages() as stages:
         if log_map is not None:
-            pieces = _log_pieces(loaded, logs, log_map, is_strict=strict)
+            pieces = log_pieces(loaded, logs, log_map, is_strict=strict)
             actual, starts = cut_log(pieces, loaded)
             pairs = pair_starts(loaded, actual, starts, seed=seed)
-            motions = motions_from_log(pieces, loaded)
+            step_s = priors[MODES[0]].detector_.step_s
+            motions = motions_from_log(pieces, loaded, step_s=step_s)
         else:
             pairs = paired_episodes(loaded, feedback, variation, seed, learned.out, workers, stages)
             hash_ = loaded.simulation_hash(variation)
@@ -247,8 +248,8 @@ def fresh_actual_episodes(
     )
 
 
-def _log_pieces(
-    scenario: Scenario, logs: list[Path], log_map: Path, *, is_strict: bool
+def log_pieces(
+    scenario: Scenario, logs: list[Path], log_map: Path, *, is_strict: bool = False
 ) -> list[RobotLog]:
     """The pieces of logs without gaps; where they are cut is printed."""
     robot = load_robot(scenario.robot)

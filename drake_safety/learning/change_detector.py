@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -20,6 +21,8 @@ FALSE_ALARMS_PER_HOUR = 0.1
 """For which the limits are made: at most one in ten hours of nominal motion."""
 LEAST_MOTION_S = 360.0
 """Motion for the limits, below which there is no alarm."""
+RECOVERY_S = 5.0
+"""Time for which every level must be below its limit before an alarm ends [s]."""
 NUM_PREVIEWED = 2
 """Samples of the desired preview that the predictor sees: the one of now and the next."""
 _CLIP = 6.0  # Of an innovation, in standard deviations, so that one impact is no lasting change.
@@ -29,6 +32,14 @@ _TAIL_SHARE = 0.1  # Of the blocks.
 _LEAST_LIMIT = 0.3  # Of a chart, in standard deviations of its value for white innovations.
 _FREE_REPEATS = 3  # Beyond the longest run of repeated inputs in training.
 _SETTINGS = ("alarm_level", "longest_repeat", "step_s", "motion_s")
+
+
+class Alarm(NamedTuple):
+    """First row of an alarm, the row after its last one, and what was seen at its begin."""
+
+    begin: int
+    end: int
+    cause: str
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,7 +150,7 @@ class ChangeDetector:
         if len(errors) == 1 and len(errors[0]) > 1:
             errors = np.array_split(errors[0], 2)
         deviation = np.maximum(np.concatenate(errors).std(axis=0), self.deviation)
-        charts = [self._charts(np.clip(one / deviation, -_CLIP, _CLIP)) for one in errors]
+        charts = [_sizes(self._charts(np.clip(one / deviation, -_CLIP, _CLIP))) for one in errors]
         motion_s = self.step_s * sum(map(len, errors))
         halves = [_block_maxima(charts[i::2] or charts, self.step_s) for i in range(2)]
         least = _LEAST_LIMIT * np.sqrt(self.rates / (2.0 - self.rates))
@@ -164,7 +175,7 @@ class ChangeDetector:
         )
 
     def _charts(self, innovations: np.ndarray) -> np.ndarray:
-        """Values of the charts after each of consecutive innovations (K, n_w), (K, 6, n_w)."""
+        """The charts, signed, after each of consecutive innovations (K, n_w), (K, 6, n_w)."""
         from scipy.signal import lfilter
 
         found = [
@@ -172,10 +183,7 @@ class ChangeDetector:
             for values in (innovations, np.square(innovations) - 1.0)
             for rate in self.rates
         ]
-        means = len(self.rates)
-        charts: np.ndarray = np.stack(found, axis=1)
-        charts[:, :means] = np.abs(charts[:, :means])
-        return charts
+        return np.stack(found, axis=1)
 
     def innovation(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
         """The innovation (n_w,) of a change of the state after two inputs (n_u,), clipped."""
@@ -190,35 +198,58 @@ class ChangeDetector:
         found = old + self.rates[:, None] * (values[:, None] - old)
         return found.reshape(charts.shape)
 
-    def levels(self, charts: np.ndarray, repeats: float = 0.0) -> np.ndarray:
-        """Largest chart of each state, in units of its limit, (n_w,).
+    def levels(self, charts: np.ndarray, repeats: float | np.ndarray = 0.0) -> np.ndarray:
+        """Largest chart of each state, in units of its limit, (..., n_w).
 
         Args:
-            charts: Their values, (6, n_w).
-            repeats: Length of the run of repeated inputs, which concerns all states.
+            charts: Their values, (..., 6, n_w).
+            repeats: Length of the run of repeated inputs, which concerns all states, (..., 1).
         """
-        found = charts / self.limits
-        means = found[: len(TIME_CONSTANTS_S)]
-        np.abs(means, out=means)
-        levels: np.ndarray = np.maximum.reduce(found, axis=0)
+        levels: np.ndarray = (_sizes(charts) / self.limits).max(axis=-2)
         return np.maximum(levels, repeats / self.longest_repeat)
 
     def levels_of(self, motions: Sequence[np.ndarray]) -> np.ndarray:
-        """Levels at each row of consecutive motions (K, n), (sum of K, n_w).
+        """Levels at each row of consecutive motions; see `watch`."""
+        return self.watch(motions)[0]
+
+    def watch(
+        self, motions: Sequence[np.ndarray], state_names: Sequence[str] | None = None
+    ) -> tuple[np.ndarray, list[Alarm]]:
+        """Levels at each row of consecutive motions (K, n), (sum of K, n_w), and the alarms.
 
         Between motions the charts keep their values, which the first two rows of a motion show.
+        Causes need the names of the watched states.
         """
         is_charted = np.concatenate([np.arange(len(one)) > 1 for one in motions])
-        found = np.zeros((len(is_charted), len(self.watched)))
+        levels = np.zeros((len(is_charted), len(self.watched)))
         if not is_charted.any():
-            return found
+            return levels, []
         parts = [(one[:, self.columns], one[:, self.watched]) for one in motions if len(one) > 2]
         errors = np.concatenate([self.predictor.errors(*one) for one in parts])
         charts = self._charts(np.clip(errors / self.deviation, -_CLIP, _CLIP))
-        repeats = np.concatenate([_repeats(x)[1:] for x, _ in parts]) / self.longest_repeat
-        found[is_charted] = np.maximum((charts / self.limits).max(axis=1), repeats[:, None])
-        last = np.maximum.accumulate(np.where(is_charted, np.arange(len(found)), 0))
-        return found[last]
+        repeats = np.concatenate([_repeats(x)[1:] for x, _ in parts])
+        levels[is_charted] = self.levels(charts, repeats[:, None])
+        last = np.maximum.accumulate(np.where(is_charted, np.arange(len(levels)), 0))
+        levels = levels[last]
+        rows = [*np.flatnonzero(is_charted).tolist(), len(levels)]
+        states = [(0.0, 0.0)]
+        for level in levels[rows[:-1]].max(axis=1):
+            states.append(self.next_alarm(*states[-1], level))
+        changes = np.flatnonzero(np.diff([alarm for alarm, _ in states], append=0.0)).tolist()
+        state_names = state_names or [""] * len(self.watched)
+        return levels, [
+            Alarm(rows[i], rows[k], self.cause(charts[i], repeats[i], state_names))
+            for i, k in zip(changes[::2], changes[1::2], strict=True)
+        ]
+
+    def next_alarm(self, alarm: float, calm_s: float, level: float) -> tuple[float, float]:
+        """Alarm (0 or 1), and time since a level was above its limit [s], after one more level."""
+        if level > self.alarm_level:
+            return 1.0, 0.0
+        calm_s += self.step_s
+        if alarm == 0.0 or calm_s > RECOVERY_S - 0.5 * self.step_s:
+            return 0.0, 0.0
+        return 1.0, calm_s
 
     def with_motions(self, motions: Sequence[np.ndarray]) -> ChangeDetector:
         """Returns the detector for which an actual robot's motions (K, n) are known as well.
@@ -248,8 +279,7 @@ class ChangeDetector:
         """
         if repeats > self.longest_repeat:
             return "inputs frozen"
-        ratio = charts / self.limits
-        ratio[: len(TIME_CONSTANTS_S)] = np.abs(ratio[: len(TIME_CONSTANTS_S)])
+        ratio = _sizes(charts) / self.limits
         chart, state = map(int, np.unravel_index(np.argmax(ratio), ratio.shape))
         memory_s = 2.0 * TIME_CONSTANTS_S[chart % len(TIME_CONSTANTS_S)]
         name, value = state_names[state], float(charts[chart, state])
@@ -328,6 +358,12 @@ def usual_rows(motions: Episodes) -> list[np.ndarray]:
     """(state, desired preview, features) of motions (K, n), until shortly before they leave."""
     lost = math.ceil(_BEFORE_LEAVING_S / motions.info.step_s)
     return [rows_of(one)[one.first_step : None if one.is_safe else -lost] for one in motions]
+
+
+def _sizes(charts: np.ndarray) -> np.ndarray:
+    """Charts (..., 6, n_w) with the absolute values of the means."""
+    means, squares = np.split(charts, 2, axis=-2)
+    return np.concatenate([np.abs(means), squares], axis=-2)
 
 
 def _block_maxima(charts: Sequence[np.ndarray], step_s: float) -> np.ndarray:

@@ -94,23 +94,33 @@ def motions_from_log(
     loop: LeggedLoop | Scenario,
     *,
     desired_output: np.ndarray | None = None,
+    step_s: float | None = None,
 ) -> Episodes:
-    """Converts logs to motions for a `ChangeDetector`, with rows `monitor_step_s` apart.
+    """Converts logs to motions for a `ChangeDetector`, with their times in the log.
 
     Each lasts up to a minute, in the stance frame of its first row. The arguments and errors are
-    those of :func:`cut_log`.
+    those of :func:`cut_log`; a log is also refused if the monitor reads the controller's memory.
+    Rows are `step_s` apart, by default the scenario's `monitor_step_s`.
     """
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")
-    rows = _Rows(loop.scenario.monitor_step_s, MOTION_PIECE_S, shortest=2)
+    if unlogged := set(loop.memory_features).intersection(loop.monitored_features or ()):
+        raise ValueError(
+            f"the monitor reads {sorted(unlogged)}, which a log of positions and velocities does "
+            "not have: write what the policy observes and commands as sequences of an .npz file"
+        )
+    rows = _Rows(step_s or loop.scenario.monitor_step_s, MOTION_PIECE_S, shortest=2)
     motions: list[Episode] = []
     for pieces in _by_log([log] if isinstance(log, RobotLog) else log):
         for one in pieces:
             found, has_left = _cut(one, loop, _desired_output(one, loop, desired_output), rows)
-            motions += [motion for motion, _ in found]
+            begin_s = one.begin_s
+            for motion, _ in found:
+                time_s = begin_s + motion.time_s
+                motions.append(replace(motion, index=len(motions), time_s=time_s))
+                begin_s = float(time_s[-1])
             if has_left:
                 break
-    motions = [replace(motion, index=i) for i, motion in enumerate(motions)]
     return Episodes(replace(episodes_info(loop, seed=NOT_DRAWN), step_s=rows.step_s), motions)
 
 

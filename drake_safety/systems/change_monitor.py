@@ -12,9 +12,6 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.blas_threads import one_blas_thread
 from drake_safety.learning.change_detector import TIME_CONSTANTS_S, ChangeDetector
 
-RECOVERY_S = 5.0
-"""Time for which every level must be below its limit before an alarm ends [s]."""
-
 
 class ChangeMonitor(LeafSystem):
     """Watches how each measured state follows from the last two inputs.
@@ -130,14 +127,12 @@ class ChangeMonitor(LeafSystem):
         charts = detector.updated(part["charts"].reshape(-1, len(state)), innovation)
         levels = detector.levels(charts, part["repeats"][0])
         part["charts"][:], part["levels"][:] = charts.ravel(), levels
-        if levels.max() > detector.alarm_level:
-            if part["alarm"][0] == 0.0:
-                part["seen"][:-1], part["seen"][-1] = part["charts"], part["repeats"][0]
-            part["alarm"][0], part["calm_s"][0] = 1.0, 0.0
-        elif part["alarm"][0] > 0.0:
-            part["calm_s"][0] += detector.step_s
-            if part["calm_s"][0] >= RECOVERY_S:
-                part["alarm"][0] = 0.0
+        before = part["alarm"][0]
+        part["alarm"][0], part["calm_s"][0] = detector.next_alarm(
+            before, part["calm_s"][0], float(levels.max())
+        )
+        if part["alarm"][0] > before:
+            part["seen"][:-1], part["seen"][-1] = part["charts"], part["repeats"][0]
 
     def _detector_of(self, context: Context) -> ChangeDetector:
         detector: ChangeDetector = context.get_abstract_parameter(self._detector).get_value()
