@@ -135,7 +135,7 @@ class ChangeDetector:
                 predictor=predictor,
                 columns=columns,
                 watched=watched,
-                deviation=np.ones(len(watched)),
+                deviation=np.full(len(watched), 1e-9),
                 limits=np.ones((2 * len(TIME_CONSTANTS_S), len(watched))),
                 alarm_level=math.inf,
                 longest_repeat=max(map(_longest_repeat, seen)) + _FREE_REPEATS,
@@ -147,12 +147,12 @@ class ChangeDetector:
     def _limited(self, seen: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> ChangeDetector:
         """Chooses deviations and limits from inputs (K, n_u) and states (K, n_w) of motions."""
         errors = [self.predictor.errors(*one) for one in zip(seen, states, strict=True)]
-        if len(errors) == 1:
+        if len(errors) == 1 and len(errors[0]) > 1:
             errors = np.array_split(errors[0], 2)
-        deviation = np.maximum(np.concatenate(errors).std(axis=0), 1e-9)
+        deviation = np.maximum(np.concatenate(errors).std(axis=0), self.deviation)
         charts = [_sizes(self._charts(np.clip(one / deviation, -_CLIP, _CLIP))) for one in errors]
         motion_s = self.step_s * sum(map(len, errors))
-        halves = [_block_maxima(charts[i::2], self.step_s) for i in range(2)]
+        halves = [_block_maxima(charts[i::2] or charts, self.step_s) for i in range(2)]
         least = _LEAST_LIMIT * np.sqrt(self.rates / (2.0 - self.rates))
         least = np.concatenate([least, math.sqrt(2.0) * least])[:, None]
 
@@ -185,9 +185,9 @@ class ChangeDetector:
         ]
         return np.stack(found, axis=1)
 
-    def innovation(self, x: np.ndarray, previous: np.ndarray, state: np.ndarray) -> np.ndarray:
-        """The innovation (n_w,) of a state (n_w,) after two inputs (n_u,), clipped."""
-        error = self.predictor.error(x, previous, state)
+    def innovation(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """The innovation (n_w,) of a change of the state after two inputs (n_u,), clipped."""
+        error = self.predictor.error(x, previous, change)
         clipped: np.ndarray = np.clip(error / self.deviation, -_CLIP, _CLIP)
         return clipped
 
@@ -265,7 +265,7 @@ class ChangeDetector:
         limited = corrected._limited(seen, states)
         return replace(
             corrected,
-            deviation=np.maximum(limited.deviation, self.deviation),
+            deviation=limited.deviation,
             limits=np.maximum(limited.limits, self.limits),
             longest_repeat=max(self.longest_repeat, *map(_longest_repeat, seen)),
         )

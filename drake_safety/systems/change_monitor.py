@@ -108,34 +108,31 @@ class ChangeMonitor(LeafSystem):
         x, state = row[detector.columns], row[detector.watched]
         if self.is_held(context) or not x @ x < math.inf:  # As for NaN.
             part["x"][:] = part["previous"][:] = np.nan
+            part["repeats"][0] = 0.0
         else:
+            is_repeated = np.array_equal(x, part["x"])
+            part["repeats"][0] = part["repeats"][0] + 1.0 if is_repeated else 0.0
             if not math.isnan(part["previous"][0]):
-                self._chart(part, detector, x, state)
+                self._chart(part, detector, state)
             part["previous"][:] = part["x"]
             part["x"][:], part["state"][:] = x, state
         discrete_state.set_value(values)
 
     def _chart(
-        self,
-        part: dict[str, np.ndarray],
-        detector: ChangeDetector,
-        x: np.ndarray,
-        state: np.ndarray,
+        self, part: dict[str, np.ndarray], detector: ChangeDetector, state: np.ndarray
     ) -> None:
         """Updates charts, levels and alarm in a copy of the discrete state."""
         change = state - part["state"]
         innovation = detector.innovation(part["x"], part["previous"], change)
         charts = detector.updated(part["charts"].reshape(-1, len(state)), innovation)
-        is_repeated = np.array_equal(x, part["x"])
-        repeats = part["repeats"][0] + 1.0 if is_repeated else 0.0
-        levels = detector.levels(charts, repeats)
-        part["charts"][:], part["repeats"][0], part["levels"][:] = charts.ravel(), repeats, levels
+        levels = detector.levels(charts, part["repeats"][0])
+        part["charts"][:], part["levels"][:] = charts.ravel(), levels
         before = part["alarm"][0]
         part["alarm"][0], part["calm_s"][0] = detector.next_alarm(
             before, part["calm_s"][0], float(levels.max())
         )
         if part["alarm"][0] > before:
-            part["seen"][:-1], part["seen"][-1] = part["charts"], repeats
+            part["seen"][:-1], part["seen"][-1] = part["charts"], part["repeats"][0]
 
     def _detector_of(self, context: Context) -> ChangeDetector:
         detector: ChangeDetector = context.get_abstract_parameter(self._detector).get_value()
