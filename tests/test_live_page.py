@@ -159,7 +159,8 @@ def test_a_page_is_served_without_other_hosts_until_a_signal(playing, number):
     process.send_signal(number)
     told, _ = process.communicate(timeout=WITHIN_S)
     assert process.returncode == 0
-    assert "real-time factor" in told
+    # A signal may arrive before the first step.
+    assert "real-time factor" in told or "nothing was simulated" in told
 
 
 @pytest.mark.slow
