@@ -15,6 +15,7 @@ from studies.bench import bench
 from studies.compare import compare
 from studies.converged import converged
 from studies.evaluate import evaluate
+from studies.monitor import monitor
 from studies.planning import plan_study
 from studies.promises import promises
 from studies.publish import readme, ship, store
@@ -32,7 +33,8 @@ app = typer.Typer(
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
     *(evaluate, compare, promises),
-    *(ablate, plan_study, adaptation, readings, converged, scale, truth, walking, anomalies),
+    *(ablate, plan_study, monitor, anomalies, adaptation, readings, converged, scale),
+    *(truth, walking),
     *(animation, bench, store, readme, ship),
 )
 for _command in _COMMANDS:

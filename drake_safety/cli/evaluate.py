@@ -297,7 +297,7 @@ def add_shifts(
             **options,
         )
         sets[name] = (shift.kind, shift_study.motions_of(episodes))
-        monitored = monitor_study.run_monitored(
+        motions = monitor_study.run_monitored(
             shifted,
             name,
             num_motions,
@@ -306,9 +306,8 @@ def add_shifts(
             options=options,
             num_workers=evaluation.workers,
         )
-        judge = judges["gamma"]
-        sequences = monitor_study.sequences(monitored, gamma, judge)
-        of_monitor = monitor_study.monitor_estimates(sequences, gamma.info_.step_s)
+        watched = monitor_study.monitored(motions, gamma, judges["gamma"])
+        of_monitor = monitor_study.monitor_estimates(watched)
         found |= {f"shifts.{name}.{key}": estimate for key, estimate in of_monitor.items()}
     stages("shifted motions", len(shifts), len(shifts))
     sets |= others(nominal[:num_motions])

@@ -1,14 +1,14 @@
 """The change monitor on undisturbed motion: its alarms, and what Γ says until then.
 
 A row is sure and wrong where Γ is confident in a motion that leaves the safe set within an
-episode's duration. Rows since an alarm are "don't know". Motions follow each other: when one leaves
-the safe set, the robot begins anew and the charts go on, as on a robot that is put on its feet.
+episode's duration, and there is no alarm: rows during one are "don't know", as with ``on_alarm:
+unknown``. Motions follow each other: when one leaves the safe set, the robot begins anew and the
+charts go on, as on a robot that is put on its feet.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -17,8 +17,8 @@ import numpy as np
 from drake_safety.evaluation.metrics import Estimate, proportion, rate_per_hour
 from drake_safety.evaluation.shift_study import BOOTSTRAP, CONFIDENT, Judge, mean_over
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.change_detector import ChangeDetector, rows_of
-from drake_safety.learning.segments import DIVERGED, Episode
+from drake_safety.learning.change_detector import ChangeDetector, rows_of, usual_rows
+from drake_safety.learning.segments import DIVERGED, Episode, Episodes
 from drake_safety.simulation.rollouts import motion_batch
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import run_batches
@@ -26,21 +26,6 @@ from drake_safety.simulation.worker_processes import run_batches
 SPANS_S = (10.0, 60.0)
 """Times since a change over which confident errors are counted [s]."""
 _FIRST_S = 12.0  # Simulated of each motion; only those without an alarm go on.
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sequence60:
-    """One minute since a change.
-
-    Attributes:
-        alarm_s: Time of the first alarm [s]; infinite without one.
-        leave_s: Time at which it first left the safe set [s]; infinite if it did not.
-        error_s: Times of rows that are sure and wrong, before the alarm [s].
-    """
-
-    alarm_s: float
-    leave_s: float
-    error_s: np.ndarray
 
 
 def run_monitored(
@@ -70,84 +55,96 @@ def run_monitored(
 
     motions = simulated([*range(num_motions)], _FIRST_S)
     quiet = [
-        i for i, one in motions.items() if one.is_safe and not _alarms([rows_of(one)], detector).any()
+        i for i, one in motions.items() if one.is_safe and not detector.watch([rows_of(one)])[1]
     ]
     motions |= simulated(quiet, max(SPANS_S))
     return [motions[i] for i in sorted(motions) if motions[i].cause != DIVERGED]
 
 
-def _alarms(rows: Sequence[np.ndarray], detector: ChangeDetector) -> np.ndarray:
-    levels = detector.levels_of(rows).max(axis=1)
-    return levels > detector.alarm_level
-
-
-def sequences(
+def monitored(
     motions: Sequence[Episode], assessment: SafetyAssessment, judge: Judge
-) -> list[Sequence60]:
-    """A sequence begins with each of the motions and goes on with those after it."""
-    detector = assessment.detector_
-    every = max(1, round(assessment.info_.step_s / detector.step_s))
-    horizon = round(assessment.info_.num_steps * assessment.info_.step_s / detector.step_s)
+) -> dict[str, np.ndarray]:
+    """What happens in the minute that begins with each of M motions and goes on with those after.
+
+    Returns:
+        "alarm_s", the time of the first alarm, "leave_s", that of first leaving the safe set, both
+        infinite without one, (M,) [s]; the durations of confident errors in the first 10 s and
+        60 s, "error_s" outside alarms and "silent_error_s" without a monitor, (M, 2) [s].
+    """
+    detector, info = assessment.detector_, assessment.info_
+    every = max(1, round(info.step_s / detector.step_s))
+    horizon = round(info.num_steps * info.step_s / detector.step_s)
     rows = [rows_of(one) for one in motions]
-    wrong = []
-    for one in motions:
-        kept = np.arange(0, len(one.time_s), every)
-        found = judge(
-            one.state[kept],
-            one.desired_preview[kept],
-            one.features[kept],
-            np.any(one.margins[kept] < 0.0, axis=1),
-        )
-        is_sure = (found.probability >= CONFIDENT) & ~found.is_unknown
-        ends = len(one.time_s) - 1 - kept <= horizon
-        wrong.append(one.time_s[kept[is_sure & ends & (not one.is_safe)]])
-    result = []
+    wrong = [_sure_and_wrong(one, judge, every, horizon) for one in motions]
     most = round(max(SPANS_S) / detector.step_s)
+    found: dict[str, list[Any]] = {
+        "alarm_s": [],
+        "leave_s": [],
+        "error_s": [],
+        "silent_error_s": [],
+    }
     for start in range(len(motions)):
-        order, length = [], 0
+        order, begin = [], [0]
         for i in (start + np.arange(len(motions))) % len(motions):
             order.append(int(i))
-            length += len(rows[i])
-            if length >= most:
+            begin.append(begin[-1] + len(rows[i]))
+            if begin[-1] >= most:
                 break
-        alarms = _alarms([rows[i] for i in order], detector)[:most]
-        alarm_s = float(np.argmax(alarms)) * detector.step_s if alarms.any() else np.inf
-        begin = detector.step_s * np.cumsum([0, *(len(rows[i]) for i in order)])
+        _, alarms = detector.watch([rows[i] for i in order])
+        is_alarm = np.zeros(begin[-1], dtype=bool)
+        for alarm in alarms:
+            is_alarm[alarm.begin : alarm.end] = True
         errors = np.concatenate([begin[k] + wrong[i] for k, i in enumerate(order)])
-        leaves = [
-            begin[k + 1] for k, i in enumerate(order) if not motions[i].is_safe
-        ]
-        result.append(
-            Sequence60(
-                alarm_s=alarm_s,
-                leave_s=min(leaves, default=np.inf),
-                error_s=errors[errors < alarm_s],
-            )
-        )
-    return result
+        leaves = [begin[k + 1] for k, i in enumerate(order) if not motions[i].is_safe]
+        first = {
+            "alarm_s": min((one.begin for one in alarms), default=np.inf),
+            "leave_s": min(leaves, default=np.inf),
+        }
+        for name, row in first.items():
+            found[name].append(row * detector.step_s if row < most else np.inf)
+        for name, counted in (
+            ("error_s", errors[~is_alarm[errors]]),
+            ("silent_error_s", errors),
+        ):
+            times = detector.step_s * counted
+            found[name].append([every * detector.step_s * (times < span).sum() for span in SPANS_S])
+    return {name: np.array(values) for name, values in found.items()}
 
 
-def monitor_estimates(
-    found: Sequence[Sequence60], step_s: float
-) -> dict[str, Estimate]:
-    """Alarms, their delay, motions that leave the safe set, and Γ's confident errors until then.
+def _sure_and_wrong(motion: Episode, judge: Judge, every: int, horizon: int) -> np.ndarray:
+    """Rows that are sure and wrong, of those that are judged: all ``every`` rows."""
+    rows = np.arange(0, len(motion.time_s), every)
+    if motion.is_safe:
+        return rows[:0]
+    found = judge(
+        motion.state[rows],
+        motion.desired_preview[rows],
+        motion.features[rows],
+        np.any(motion.margins[rows] < 0.0, axis=1),
+    )
+    is_sure = (found.probability >= CONFIDENT) & ~found.is_unknown
+    is_last = len(motion.time_s) - 1 - rows <= horizon
+    wrong: np.ndarray = rows[is_sure & is_last]
+    return wrong
+
+
+def monitor_estimates(found: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
+    """Alarms, their delay, motions that leave the safe set, and Γ's confident errors.
 
     Args:
-        step_s: Time between two judged rows [s].
+        found: What `monitored` returns.
     """
-    each = np.arange(len(found))
-    delay = np.array([one.alarm_s for one in found])
+    each, delay = np.arange(len(found["alarm_s"])), found["alarm_s"]
     estimates = {
         "monitor.alarmed": proportion(int(np.isfinite(delay).sum()), len(delay)),
-        "monitor.leaves": proportion(
-            sum(one.leave_s <= max(SPANS_S) for one in found), len(found)
-        ),
+        "monitor.leaves": proportion(int(np.isfinite(found["leave_s"]).sum()), len(delay)),
         "monitor.delay_s": quantile(delay, 0.5),
         "monitor.delay_95_s": quantile(delay, 0.95),
     }
-    for span in SPANS_S:
-        share = np.array([(one.error_s < span).sum() * step_s / span for one in found])
-        estimates[f"monitor.confident_error_{span:g}s"] = mean_over(share, each)
+    for i, span in enumerate(SPANS_S):
+        for name in ("", "silent_"):
+            share = found[f"{name}error_s"][:, i] / span
+            estimates[f"monitor.{name}confident_error_{span:g}s"] = mean_over(share, each)
     return estimates
 
 
@@ -166,19 +163,11 @@ def quantile(values: np.ndarray, share: float) -> Estimate:
     return Estimate(of(values), float(low), float(high), len(values))
 
 
-def false_alarms(motions: Sequence[Episode], detector: ChangeDetector) -> Estimate:
+def false_alarms(motions: Episodes, detector: ChangeDetector) -> Estimate:
     """False alarms per hour on motions of the nominal plant, each judged anew.
 
-    Rows within an episode of leaving the safe set do not count.
+    Rows shortly before leaving the safe set do not count.
     """
-    count, duration_s = 0, 0.0
-    for one in motions:
-        lost = 0 if one.is_safe else round(_BEFORE_LEAVING_S / detector.step_s)
-        alarms = _alarms([rows_of(one)], detector)[: max(len(one.time_s) - lost, 0)]
-        # An alarm that goes on is one.
-        count += int(alarms.any())
-        duration_s += len(alarms) * detector.step_s
-    return rate_per_hour(count, duration_s, len(motions))
-
-
-_BEFORE_LEAVING_S = 0.5
+    rows = [one for one in usual_rows(motions) if len(one)]
+    count = sum(len(detector.watch([one])[1]) for one in rows)
+    return rate_per_hour(count, sum(map(len, rows)) * detector.step_s, len(rows))

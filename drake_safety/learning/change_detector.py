@@ -338,10 +338,17 @@ def _block_maxima(charts: Sequence[np.ndarray], step_s: float) -> np.ndarray:
 
 
 def _tail_limit(maxima: np.ndarray, probability: float) -> float:
-    """The level that a block exceeds with a small probability, by an exponential tail."""
+    """The level that a block exceeds with a small probability, by an exponential tail.
+
+    The mean excess is its upper bound of 95 %: the less motion, the wider the limit.
+    """
+    from scipy.stats import chi2
+
     threshold = float(np.quantile(maxima, 1.0 - _TAIL_SHARE))
     excess = maxima[maxima > threshold] - threshold
-    mean = float(excess.mean()) if len(excess) else 0.1 * threshold
+    if not len(excess):
+        return 2.0 * float(maxima.max())
+    mean = 2.0 * excess.sum() / chi2.ppf(0.05, 2 * len(excess))
     extrapolated = threshold + mean * math.log(_TAIL_SHARE / probability)
     return max(extrapolated, float(maxima.max()))
 
