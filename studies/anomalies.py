@@ -33,7 +33,7 @@ from drake_safety.evaluation.metrics import Estimate, auc, median, share
 from drake_safety.learning.change_detector import ChangeDetector, rows_of, usual_rows
 from drake_safety.learning.seeds import ANOMALIES
 from drake_safety.learning.segments import Episodes
-from drake_safety.simulation.capabilities import MovesUndisturbed, require
+from drake_safety.simulation.capabilities import FollowsCommands, require
 from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.worker_processes import Progress
@@ -78,8 +78,8 @@ def anomalies(
 ) -> None:
     """Judge the change monitor on RAPT's 14 kinds of anomaly, beside a GRU and simpler monitors.
 
-    For walking and balancing robots. Motion is kept in OUT/anomalies: a stopped study continues.
-    Writes OUT/anomalies.json.
+    For walking robots. Motion is kept in OUT/anomalies: a stopped study continues. Writes
+    OUT/anomalies.json.
     """
     learned = assessment_folder(load_scenario(scenario), assessment)
     print_shipped(learned)
@@ -89,9 +89,7 @@ def anomalies(
     ) as study:
         detector = study.load(MODES[0], seeds.values()).detector_
         loop: Any = study.scenario.make_loop()
-        require(loop, MovesUndisturbed, "anomalies")
-        if not loop.robot.joint_gains:
-            raise ValueError(f"anomalies: robot '{loop.robot.name}' has no position servos")
+        require(loop, FollowsCommands, "anomalies")  # Its controller's memory can be handed over.
         drawn = partial(_motion, study, out / "anomalies", seeds)
         num = math.ceil(episodes / len(SENSORS | PLANTS))
         calm = drawn("unperturbed", episodes * EPISODE_S, EPISODE_S)
@@ -130,6 +128,11 @@ def anomalies(
             "detector": detector.describe(),
             "thresholds": len(calibration),
             "left_out": sum(not one.is_safe for one in [*calm, *other]),
+            "perturbed": sum(one.kind != UNPERTURBED for one in seen),
+            "kinds": [POOLED, *SENSORS, *PLANTS, UNPERTURBED],
+            "false_positives": FALSE_POSITIVES,
+            "episode_s": EPISODE_S,
+            "onset_s": ONSET_S,
         }
 
 
