@@ -394,13 +394,18 @@ def _block_maxima(charts: np.ndarray, step_s: float) -> np.ndarray:
 
 
 def _tail_limit(maxima: np.ndarray, probability: float) -> float:
-    """The level that a block exceeds with a small probability, by an exponential tail."""
+    """The level that a block exceeds with a small probability, by an exponential tail.
+
+    The mean excess is its upper bound of 95 %: the less motion, the wider the limit.
+    """
+    from scipy.stats import chi2
+
     threshold = float(np.quantile(maxima, 1.0 - _TAIL_SHARE))
     excess = maxima[maxima > threshold] - threshold
     if not len(excess):
         return 2.0 * float(maxima.max())
-    extrapolated = threshold + excess.mean() * math.log(_TAIL_SHARE / probability)
-    return float(max(extrapolated, maxima.max()))
+    mean = 2.0 * excess.sum() / chi2.ppf(0.05, 2 * len(excess))
+    return float(max(threshold + mean * math.log(_TAIL_SHARE / probability), maxima.max()))
 
 
 def _repeats(x: np.ndarray) -> np.ndarray:
