@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.geometry import Meshcat
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
 from pydrake.trajectories import PiecewisePolynomial

@@ -166,9 +166,8 @@ class Walking(LeggedLoop):
         builder.ExportOutput(controller.GetOutputPort("status"), "controller_status")
         self.monitored_states = [name for name in self.state_names if name != _POSITION]
         # What the policy sees: its last actions, its phase and the command.
-        self.monitored_features = [
-            name for name in controller.action_names if name != _UNCOMMANDED
-        ]
+        self.memory_features = tuple(controller.action_names)
+        self.monitored_features = [name for name in self.memory_features if name != _UNCOMMANDED]
         self._rehearsal: Walking | None = None
         self._settled: EpisodeStart | None = None
         self.finish(builder)
@@ -288,14 +287,15 @@ class Walking(LeggedLoop):
         self, context: Context, rng: np.random.Generator, duration_s: float
     ) -> None:
         """Starts from standing with random commands inside the policy's ranges, 2 to 6 s each."""
-        commands, changes = [self._usual_command(rng)], [rng.uniform(*_HELD_S)]
+        commands, changes = [self.usual_command(rng)], [rng.uniform(*_HELD_S)]
         while changes[-1] < duration_s:
-            commands.append(self._usual_command(rng))
+            commands.append(self.usual_command(rng))
             changes.append(changes[-1] + rng.uniform(*_HELD_S))
         plan = profile(commands, changes[:-1], duration_s)
         self.reset_to(context, rng, replace(self.settled_start(), plan=plan))
 
-    def _usual_command(self, rng: np.random.Generator) -> np.ndarray:
+    def usual_command(self, rng: np.random.Generator) -> np.ndarray:
+        """Samples a command inside the policy's ranges, some of them zero, (3,) [m/s, rad/s]."""
         limits = self.policy.parameters.command
         drawn = rng.uniform(limits.lowest, limits.highest)
         return np.zeros(3) if rng.random() < _STANDING_SHARE else drawn

@@ -1,4 +1,4 @@
-"""``python -m studies monitor``: the change monitor on changed plants and sensors, and for hours."""
+"""``python -m studies monitor``: the monitor on changed plants and sensors, and for hours."""
 
 from __future__ import annotations
 

@@ -20,8 +20,6 @@ from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.evaluation.metrics import Estimate, auc, proportion
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shift_study import (
-    BOOTSTRAP,
-    LASTING,
     SEEN,
     Judge,
     JudgedShift,
@@ -312,12 +310,11 @@ def junk(motions: Sequence[Motion], seed: int) -> dict[str, MotionSet]:
     return found
 
 
-def baseline_estimates(judged: JudgedShift, kind: str) -> dict[str, Estimate]:
+def baseline_estimates(judged: JudgedShift) -> dict[str, Estimate]:
     """What the documentation compares beside `shift_estimates`.
 
     Args:
         judged: The verdicts; "gamma" is Γ.
-        kind: That of the shift.
 
     Returns:
         Of each method the confident error at k = 0 and the AUC of the rows that Γ knows; what a
@@ -336,31 +333,7 @@ def baseline_estimates(judged: JudgedShift, kind: str) -> dict[str, Estimate]:
     if promise is None or not is_unsafe.any():
         return found
     probability = judged.verdicts["gamma"].probability[judged.first]
-    found |= promised(promise, probability, is_unsafe)
-    if kind in LASTING:
-        accepted = _first_probability(judged) >= promise.threshold
-        counts = []  # Missed and unsafe motions of each sequence.
-        for order, alarm in judged.sequences:
-            begins = np.concatenate([[0], np.cumsum(judged.sizes[order])[:-1]])
-            is_missed = is_unsafe[order] & accepted[order] & (begins < alarm)
-            counts.append((is_missed.sum(), is_unsafe[order].sum()))
-        of_sequences = np.array(counts)
-
-        def missed_share(weight: np.ndarray) -> float:
-            num_missed, num_unsafe = weight @ of_sequences
-            return float(num_missed / num_unsafe) if num_unsafe else np.nan
-
-        found["monitor.missed"] = BOOTSTRAP.over_episodes(missed_share, np.arange(len(counts)))
-    return found
-
-
-def _first_probability(judged: JudgedShift) -> np.ndarray:
-    """Calibrated Γ of first rows as before the motion, without measured margins, (M,)."""
-    state, preview, features = (
-        np.stack([getattr(one, name)[0] for one in judged.motions]) for name in SEEN
-    )
-    is_inside = np.zeros(len(judged.motions), dtype=bool)
-    return assessment_judge(judged.assessment)(state, preview, features, is_inside).probability
+    return found | promised(promise, probability, is_unsafe)
 
 
 def promised(

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from drake_safety.diagrams.walking_parameters import profile
 from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.episode_recorder import Recorder, advance_to
@@ -23,8 +22,6 @@ from studies.harness import Arrays, kept
 
 ROW_S = 0.02
 """Time between two rows of a motion [s]."""
-_HELD_S = (2.0, 6.0)  # Shortest and longest time for which a tour holds a command.
-_STANDING_SHARE = 0.1
 _AFTER_FALL_S = 0.6  # Until the robot lies.
 
 
@@ -45,12 +42,9 @@ class WalkedMotion(WatchedMotion):
     impact_m_s: float
 
 
-def random_command(loop: Any, rng: np.random.Generator, *, is_inside: bool) -> np.ndarray:
-    """A command inside the policy's ranges, or past them but within those of training, (3,)."""
+def unusual_command(loop: Any, rng: np.random.Generator) -> np.ndarray:
+    """A command past the policy's ranges, but within those of training, (3,)."""
     limits = loop.policy.parameters.command
-    if is_inside:
-        drawn = rng.uniform(limits.lowest, limits.highest)
-        return np.zeros(3) if rng.random() < _STANDING_SHARE else drawn
     while True:
         command = rng.uniform(*loop.target_box)
         if np.any(command < limits.lowest) or np.any(command > limits.highest):
@@ -66,16 +60,10 @@ def run_tour(loop: Any, index: int, *, seed: int, duration_s: float) -> WalkedMo
         seed: Seed of the set.
         duration_s: Duration [s]; a fall ends it.
     """
-    rng = episode_rng(seed, index)
-    commands, changes = [random_command(loop, rng, is_inside=True)], [rng.uniform(*_HELD_S)]
-    while changes[-1] < duration_s:
-        commands.append(random_command(loop, rng, is_inside=True))
-        changes.append(changes[-1] + rng.uniform(*_HELD_S))
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
     loop.remove_visuals(context)
-    plan = profile(commands, changes[:-1], duration_s)
-    loop.reset_to(context, rng, replace(loop.settled_start(), plan=plan))
+    loop.reset_undisturbed(context, episode_rng(seed, index), duration_s)
     simulator.Initialize()
     ports = (*SEEN, "margins", "output", "desired_output")
     guarded = loop.HasOutputPort("guard_active")
@@ -119,7 +107,7 @@ def run_push(
     """
     rng = episode_rng(seed, index)
     push = loop.sample_push(rng) if is_pushed else None
-    command = random_command(loop, rng, is_inside=True)
+    command = loop.usual_command(rng)
     return _walked(loop, index, command, rng, duration_s, push=push)
 
 
@@ -133,7 +121,7 @@ def run_command(loop: Any, index: int, *, seed: int, duration_s: float) -> Walke
         duration_s: Duration [s]; it ends a little after a fall.
     """
     rng = episode_rng(seed, index)
-    return _walked(loop, index, random_command(loop, rng, is_inside=False), rng, duration_s)
+    return _walked(loop, index, unusual_command(loop, rng), rng, duration_s)
 
 
 def _walked(

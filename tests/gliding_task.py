@@ -114,6 +114,15 @@ class Gliding(ClosedLoop):
         return int(rng.integers(2))
 
 
+class Drifting(Gliding):
+    """One that can glide for as long as one likes."""
+
+    def reset_undisturbed(self, context, rng, duration_s):
+        self.mass.GetMyMutableContextFromRoot(context).SetDiscreteState(
+            [rng.uniform(-0.3, 0.3), rng.uniform(-0.6, 0.6) / duration_s]
+        )
+
+
 SCENARIO = """
 task: gliding_task:Gliding
 robot: none
@@ -123,6 +132,6 @@ variations: {nominal: {}, actual: {mass_scale: 1.2}}
 """
 
 
-def gliding(**parameters):
-    text = f"{SCENARIO}parameters: {parameters}\n"
+def gliding(task="Gliding", **parameters):
+    text = SCENARIO.replace("Gliding", task) + f"parameters: {parameters}\n"
     return parse_scenario(text, name="gliding", folder=Path())

@@ -19,6 +19,7 @@ from drake_safety.learning.beliefs import (
     fuse,
     safe_share,
 )
+from drake_safety.learning.change_detector import usual_rows
 from drake_safety.learning.discrepancy import DiscrepancyFunction, updated_uncertainty
 from drake_safety.learning.feedback import feedback_sets, segments_of
 from drake_safety.learning.grid import Grid
@@ -162,6 +163,26 @@ def test_a_gap_of_any_size_gives_a_probability_online_and_offline(sharpened, off
     single = sharpened.predict_one(*(part[0] for part in x), correction=extreme).probability
     assert many[0] == pytest.approx(expected, abs=1e-9)
     assert single == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.train
+def test_the_monitor_knows_the_motions_that_an_adaptation_is_given(sharpened):
+    def learned(motions):
+        weights = sharpened.adapt(worse(), motions=motions).detector_.predictor.weights
+        return weights["linear.weight"]
+
+    motions, prior = make_episodes(20, seed=9, noise=0.01), sharpened.detector_
+    expected = prior.with_motions(usual_rows(motions)).predictor.weights["linear.weight"]
+    np.testing.assert_array_equal(learned(motions), expected)
+    np.testing.assert_array_equal(learned(usual_rows(motions)), expected)
+    assert not np.array_equal(prior.predictor.weights["linear.weight"], expected)
+    assert sharpened.adapt(worse()).detector_ is prior
+    # Of motion with more rows it takes those that are as far apart as in its training.
+    finer = Episodes(replace(motions.info, step_s=0.5 * prior.step_s), list(motions))
+    np.testing.assert_array_equal(learned(finer), learned([x[::2] for x in usual_rows(finer)]))
+    other = Episodes(replace(motions.info, step_s=0.75 * prior.step_s), list(motions))
+    with pytest.raises(ValueError, match=r"rows of the motions are 0.03 s apart, which does not"):
+        learned(other)
 
 
 @pytest.mark.train

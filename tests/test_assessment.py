@@ -261,6 +261,11 @@ def test_what_cannot_be_learned_is_refused_and_nothing_is_known(name, value, num
         learner.predict(np.zeros((1, 6)), np.zeros((1, 30)))
 
 
+def assert_same_detector(one, other):
+    for name, array in one.detector_.arrays().items():
+        np.testing.assert_array_equal(array, other.detector_.arrays()[name], err_msg=name)
+
+
 def test_learning_gives_the_same_bits_for_any_number_of_threads():
     episodes, found, seen = make_episodes(120, noise=0.002), [], []
     for number in (1, 2):
@@ -273,9 +278,8 @@ def test_learning_gives_the_same_bits_for_any_number_of_threads():
         pair = (getattr(each.training_, name) for each in found)
         np.testing.assert_array_equal(*pair)
     np.testing.assert_array_equal(one.novelty_.limits, other.novelty_.limits)
-    for name, array in one.innovation_.arrays().items():
-        np.testing.assert_array_equal(array, other.innovation_.arrays()[name], err_msg=name)
-    stages = ["distances", "t-SNE", "training", "innovation", "beliefs"]
+    assert_same_detector(one, other)
+    stages = ["distances", "t-SNE", "training", "monitor", "beliefs"]
     assert list(dict.fromkeys(stage for stage, *_ in seen)) == stages
     assert all(0 <= done <= total == 100 for _, done, total in seen)
 
@@ -291,6 +295,7 @@ def test_what_is_saved_is_loaded_to_the_bit(assessment, held_out, tmp_path):
         np.testing.assert_array_equal(getattr(before, field.name), getattr(after, field.name))
     np.testing.assert_array_equal(loaded.training_.points, assessment.training_.points)
     assert loaded.embedding_.is_same(assessment.embedding_)
+    assert_same_detector(loaded, assessment)
     assert np.isfinite(loaded.embedding_.input_range).all() == assessment.parameters.is_sharpened
     assert list(tmp_path.iterdir()) == [path]
 
@@ -339,7 +344,7 @@ def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_
     save_file(load_file(path), tmp_path / "old", metadata)
     with pytest.raises(ValueError, match=f"schema version 8, this version reads {SCHEMA_VERSION}"):
         SafetyAssessment.load(tmp_path / "old")
-    save_file(load_file(path), tmp_path / "hollow", {SCHEMA: '{"schema_version": 9}'})
+    save_file(load_file(path), tmp_path / "hollow", {SCHEMA: '{"schema_version": 10}'})
     with pytest.raises(ValueError, match="damaged safety assessment: it has no 'sha256'"):
         SafetyAssessment.load(tmp_path / "hollow")
     for text in ("", "[]", "{}", "[" * 100_000):

@@ -10,6 +10,7 @@ from drake_safety.simulation.capabilities import (
     FollowsCommands,
     HasBall,
     HasGoals,
+    MovesUndisturbed,
     OffersPlans,
     require,
 )
@@ -18,11 +19,12 @@ from drake_safety.simulation.rollouts import run_episode
 from gliding_task import Gliding, gliding
 from shuttle_task import Shuttling, shuttling
 
-ASKED = (HasGoals, HasBall, CanFall, CanBePushed, FollowsCommands, OffersPlans, CanStartAnywhere)
+OF_LEGS = {CanFall, CanStartAnywhere, MovesUndisturbed}
+ASKED = (HasGoals, HasBall, CanBePushed, FollowsCommands, OffersPlans, *OF_LEGS)
 HAS = {
-    "laikago_balancing": {HasBall, CanFall, OffersPlans, CanStartAnywhere},
-    "atlas_reaching": {HasGoals, CanFall, CanBePushed, OffersPlans, CanStartAnywhere},
-    "go2_walking": {HasGoals, CanFall, CanBePushed, FollowsCommands, CanStartAnywhere},
+    "laikago_balancing": {HasBall, OffersPlans, *OF_LEGS},
+    "atlas_reaching": {HasGoals, CanBePushed, OffersPlans, *OF_LEGS},
+    "go2_walking": {HasGoals, CanBePushed, FollowsCommands, *OF_LEGS},
     "pendulum": {CanStartAnywhere},
 }
 

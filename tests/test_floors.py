@@ -60,7 +60,11 @@ EXTRAS = {
 }
 ONLY_IN = {
     "cloudpickle": ("drake_safety/simulation/worker_processes.py",),
-    "torch": ("drake_safety/learning/embedding.py", "drake_safety/control/policy_network.py"),
+    "torch": (
+        "drake_safety/learning/embedding.py",
+        "drake_safety/learning/state_predictor.py",
+        "drake_safety/control/policy_network.py",
+    ),
     "tslearn": ("drake_safety/learning/distance.py",),
     "dtaidistance": ("drake_safety/learning/distance.py",),
     "mujoco": ("drake_safety/plants/mujoco_model.py",),

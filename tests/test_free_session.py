@@ -1,6 +1,8 @@
 import contextlib
+import dataclasses
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -100,6 +102,19 @@ def test_a_state_unlike_training_is_not_called_unsafe_but_unknown(session):
     assert session.tick()
     assert session.panel.belief == (0.0, 0.0, 1.0)
     assert (session.panel.status.state, session.panel.status.cause) == ("don't know", "")
+
+
+def test_an_alarm_of_the_monitor_is_told_with_its_cause(session):
+    ticks(session, 0.4)
+    assert "monitor" not in session.panel.status.note
+    monitor = session.loop.GetSubsystemByName("safety_assessor").monitor
+    always = dataclasses.replace(session.assessment.detector_, alarm_level=-1.0)
+    own = monitor.GetMyMutableContextFromRoot(session.context)
+    monitor.adopt(own, SimpleNamespace(detector_=always))
+    ticks(session, 0.4)
+    cause = session.loop.GetOutputPort("alarm_cause").Eval(session.context)
+    assert cause
+    assert session.panel.status.note == f"R starts anew; monitor: {cause}"
 
 
 def test_starts_are_those_of_the_seed_and_a_click_begins_the_next(cart_loop, meshcat):

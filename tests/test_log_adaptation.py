@@ -6,7 +6,7 @@ from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episo
 from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_file
 from drake_safety.learning.assessment_parameters import PaperReading
 from drake_safety.learning.segments import Episodes
-from drake_safety.logs.episodes import cut_log
+from drake_safety.logs.episodes import cut_log, motions_from_log
 from drake_safety.simulation.feedback import EpisodePairs, pair_starts
 from drake_safety.simulation.rollouts import episodes_info
 from log_files import (
@@ -63,9 +63,11 @@ def directly(folder):
 def unwritten(folder):
     """What logs adapt to that never were in a file."""
     scenario = load_scenario(folder / "short.yaml")
-    actual, starts = cut_log([recorded(index) for index in INDICES], scenario)
+    logs = [recorded(index) for index in INDICES]
+    actual, starts = cut_log(logs, scenario)
     sets = pair_starts(scenario, actual, starts).feedback()
-    return {mode: load(folder, mode).adapt(sets) for mode in MODES}
+    motions = motions_from_log(logs, scenario)
+    return {mode: load(folder, mode).adapt(sets, motions=motions) for mode in MODES}
 
 
 def load(folder, mode):
@@ -92,6 +94,12 @@ def test_logs_of_every_format_adapt_as_the_runs_that_they_are_of(
         np.testing.assert_allclose(adapted.beliefs_, unwritten[mode].beliefs_, atol=1e-6)
         change = adapted.correction_.change
         np.testing.assert_allclose(change, unwritten[mode].correction_.change, atol=1e-6)
+        maps = [
+            one.detector_.predictor.weights["linear.weight"]
+            for one in (adapted, unwritten[mode], load(folder, mode))
+        ]
+        np.testing.assert_allclose(maps[0], maps[1], atol=1e-4)
+        assert np.abs(maps[0] - maps[2]).max() > 0.01
         # A twin of a log draws noise of its own, and its plan is another polynomial between rows.
         np.testing.assert_allclose(
             adapted.beliefs_, directly[mode].beliefs_, atol=min(0.1 * changed, 0.02)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drake_safety import run_episode
-from drake_safety.logs.episodes import cut_log, episodes_from_log
+from drake_safety.logs.episodes import cut_log, episodes_from_log, motions_from_log
 from log_files import (
     SAFE,
     UNSAFE,
@@ -72,6 +72,22 @@ def test_a_longer_log_gives_an_episode_after_the_other_and_drops_a_short_rest():
     # Of the previews the first stays in the second's frame, whose feet have not moved.
     first, second = (episode.desired_preview for episode in episodes)
     np.testing.assert_allclose(first[-1], second[0], atol=1e-9)
+
+
+def test_motions_of_a_log_go_on_through_its_episodes_at_the_monitors_rows():
+    loop = copy.deepcopy(balancing_scenario())
+    loop.episode_duration_s = 0.2
+    loop = loop.make_loop("actual")
+    safe, unsafe = motions_from_log([recorded(SAFE), recorded(UNSAFE)], loop)
+    np.testing.assert_allclose(safe.time_s, 0.02 * np.arange(31), atol=1e-9)
+    assert (safe.index, safe.is_safe, unsafe.index, unsafe.is_safe) == (0, True, 1, False)
+    (episode,) = episodes_from_log(recorded(SAFE), balancing_loop())
+    for name in ("state", "desired_preview"):
+        rows = getattr(safe, name)[::2]
+        np.testing.assert_allclose(rows, getattr(episode, name), atol=1e-9, err_msg=name)
+    # What is shorter than three rows is no motion.
+    motions = motions_from_log(part(recorded(SAFE), 0, 15), loop)
+    assert (len(motions), motions.info.step_s) == (0, 0.02)
 
 
 def test_after_the_last_row_the_desired_output_stays_as_it_is():

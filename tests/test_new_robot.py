@@ -54,6 +54,13 @@ def test_what_a_urdf_does_not_tell_is_asked_for_with_its_unit(spider):
     assert all(what in readme for what in spider.asked)
 
 
+def test_what_an_alarm_does_is_in_the_scenario(spider):
+    file = spider.folder / "balancing.yaml"
+    (line,) = (one for one in file.read_text().splitlines() if one.startswith("on_alarm:"))
+    assert "report:" in line.partition("#")[2]
+    assert load_scenario(file).on_alarm == "unknown"
+
+
 def test_numbers_scale_with_the_robot(spider):
     parameters = load_scenario(spider.folder / "balancing.yaml").parameters
     low, high = parameters.safe_set.height_m

@@ -37,17 +37,35 @@ PORTS = {"state": 1, "output": 1, "desired_output": 1, "desired_preview": 2, "pl
 class Prior:
     """An assessment whose adaptations say how many feedback sets they are of."""
 
+    detector_ = SimpleNamespace(step_s=0.05)
+
     def __init__(self, **settings):
         self.parameters = SimpleNamespace(adaptation=AdaptationParameters(**settings))
+        self.motions = []
 
-    def adapt(self, feedback, *, method=None):
+    def adapt(self, feedback, *, method=None, motions=None):
+        self.motions.append(motions)
         return (method, len(feedback))
 
     def feedback_segments(self, feedback):
         return [row for one in feedback for row in range(NUM_STEPS)]
 
 
-def run(duration_s, capacity=400, monitor=None, **settings):
+class Watching:
+    """A change monitor that waits, and sees NaN, for a while."""
+
+    def GetMyContextFromRoot(self, root):
+        return root
+
+    def is_held(self, context):
+        return 0.58 < context.get_time() < 0.72
+
+    def row(self, context):
+        time_s = context.get_time()
+        return np.array([np.nan if 1.08 < time_s < 1.12 else time_s])
+
+
+def run(duration_s, capacity=400, monitor=None, prior=None, watching=None, **settings):
     builder = DiagramBuilder()
     recorder = builder.AddSystem(
         FeedbackRecorder(INFO, num_steps=NUM_STEPS, plant_state_size=2, watch_period_s=STEP_S)
@@ -58,6 +76,7 @@ def run(duration_s, capacity=400, monitor=None, **settings):
     diagram = builder.Build()
     adopted = []
     assessor = SimpleNamespace(
+        monitor=watching,
         GetMyMutableContextFromRoot=lambda root: root,
         adopt=lambda context, adapted: adopted.append((context.get_time(), adapted)),
     )
@@ -66,8 +85,9 @@ def run(duration_s, capacity=400, monitor=None, **settings):
         info = replace(INFO, variation="nominal")
         return Episodes(info, [window.episode for window in windows])
 
+    prior = prior or Prior(**settings)
     adaptation = OnlineAdaptation(
-        None, Prior(**settings), recorder, assessor, method="paper", run=twins, capacity=capacity
+        None, prior, recorder, assessor, method="paper", run=twins, capacity=capacity
     )
     simulator = Simulator(diagram)
     if monitor is not None:
@@ -94,6 +114,15 @@ def test_every_k_u_sets_the_assessor_adopts_what_all_feedback_has_shown(
     assert [time_s for time_s, _ in adopted] == pytest.approx(times)
 
 
+def test_the_monitor_learns_of_the_motion_that_it_saw():
+    prior = Prior(update_interval=4)
+    run(1.65, prior=prior, watching=Watching())
+    (motions,) = prior.motions
+    expected = [np.arange(1, 12), np.arange(15, 22), np.arange(23, 33)]
+    for found, steps in zip(motions, expected, strict=True):
+        np.testing.assert_allclose(found[:, 0], 0.05 * steps, atol=1e-9)
+
+
 def test_the_newest_feedback_is_kept_so_that_a_long_simulation_needs_no_more_memory():
     adaptation, adopted = run(4.05, capacity=3, update_interval=1)
     # Ten windows, the last three of which are kept.
@@ -115,7 +144,7 @@ def test_a_monitor_that_ends_the_simulation_ends_it_here_too():
     assert adaptation.num_updates == 2
 
 
-def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterwards():
+def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterwards(monkeypatch):
     scenario = load_scenario("laikago_balancing")
     prior = load_assessment("laikago_balancing", "paper")
     prior.parameters.adaptation.update_interval = 2
@@ -126,6 +155,13 @@ def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterw
     recorder = AddFeedbackRecorder(builder, loop)
     simulator = Simulator(builder.Build())
     assessor = loop.GetSubsystemByName("safety_assessor")
+    adapt, motions = prior.adapt, []
+
+    def adapted(feedback, **options):
+        motions.append(options["motions"])
+        return adapt(feedback, **options)
+
+    monkeypatch.setattr(prior, "adapt", adapted)
     online = OnlineAdaptation(scenario, prior, recorder, assessor)
     root = simulator.get_mutable_context()
     for index in range(3):
@@ -142,8 +178,14 @@ def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterw
         rows = len(same.true_state)
         np.testing.assert_allclose(same.true_state, episode.true_state[:rows], atol=1e-9)
         assert same.is_unsafe != episode.is_safe
+        if index < len(motions[-1]):
+            # Some of the monitor's rows are those of an episode, which may end between two.
+            every = round(scenario.step_s / prior.detector_.step_s)
+            seen = motions[-1][index][every - 1 :: every, : episode.state.shape[1]]
+            rows = min(len(seen), len(episode.state) - 2)
+            np.testing.assert_allclose(seen[:rows], episode.state[1 : rows + 1], atol=1e-9)
     assert len(online.adapted) == len(online.feedback) // 2 > 0
-    expected = prior.adapt(online.feedback[: 2 * len(online.adapted)])
+    expected = adapt(online.feedback[: 2 * len(online.adapted)])
     np.testing.assert_array_equal(online.adapted[-1].beliefs_, expected.beliefs_)
     context = assessor.evaluator.GetMyContextFromRoot(root)
     np.testing.assert_array_equal(assessor.evaluator.get_beliefs(context), expected.beliefs_)

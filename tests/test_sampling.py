@@ -4,7 +4,13 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES
-from drake_safety.simulation.sampling import PushSampling, StartSampling, calm_start, resting_feet
+from drake_safety.simulation.sampling import (
+    PushSampling,
+    StartSampling,
+    calm_start,
+    resting_feet,
+    undisturbed_start,
+)
 from legged_robots import ROBOT_NAMES, robot_kinematics
 
 
@@ -61,6 +67,25 @@ def test_a_calm_start_is_a_point_of_its_motion_with_the_motions_velocity():
         np.testing.assert_allclose(contact_velocities(kinematics, start), 0.0, atol=1e-6)
         is_moving = np.linalg.norm(start.v[3:6]) > 1e-3
         assert is_moving == (0.0 < elapsed_s < 1.0)
+
+
+def test_undisturbed_motions_follow_each_other_with_rests_in_half_of_the_ranges():
+    kinematics = robot_kinematics(ROBOT_NAMES[0])
+    sampling = sampling_for(kinematics)
+    start = undisturbed_start(kinematics, np.random.default_rng(1), sampling, 30.0)
+    assert not start.v.any() and start.plan.start_time() == 0.0 and start.plan.end_time() >= 30.0
+    values = start.plan.vector_values(np.arange(0.0, 30.0, 0.02)).T
+    half = 0.5 * np.array(sampling.target_offset_m)
+    assert np.all(np.abs(values[:, :2] - kinematics.nominal_base_offset) <= half + 1e-9)
+    rest = np.all(np.diff(values, axis=0) == 0.0, axis=1)
+    # It moves most of the time, without jumps, and rests between two motions.
+    assert 0.1 < rest.mean() < 0.7
+    assert np.count_nonzero(np.diff(rest.astype(int)) == 1) >= 5
+    assert np.abs(np.diff(values, axis=0)).max() < 0.02
+    np.testing.assert_allclose(values[0, 2], kinematics.standing_height)
+    low, high = np.quantile(sampling.target_height_m, [0.25, 0.75])
+    later = values[300:, 2]  # After the motion from standing.
+    assert low - 1e-9 <= later.min() < later.max() <= high + 1e-9
 
 
 def test_feet_at_rest_need_no_joint_rates_when_the_base_is_at_rest():

@@ -51,6 +51,18 @@ def test_a_file_holds_only_what_differs_from_the_defaults():
     assert scenario.variation("actual").mass_scale == 1.2
 
 
+@pytest.mark.parametrize(
+    ("control_period_s", "monitor_step_s"),
+    [(0.01, 0.02), (0.02, 0.02), (0.004, 0.02), (0.006, 0.024), (0.05, 0.05)],
+)
+def test_the_monitor_steps_whole_control_periods_of_at_least_20_ms(
+    control_period_s, monitor_step_s
+):
+    scenario = laikago()
+    scenario.control_period_s = control_period_s
+    assert scenario.monitor_step_s == pytest.approx(monitor_step_s)
+
+
 def test_an_own_task_in_an_own_folder_needs_no_line_in_the_package(tmp_path):
     path = tmp_path / "sliding.yaml"
     path.write_text(SCENARIO)

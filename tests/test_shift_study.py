@@ -1,4 +1,3 @@
-import dataclasses
 import math
 
 import numpy as np
@@ -11,8 +10,6 @@ from drake_safety.evaluation.shift_study import (
     Motion,
     Verdicts,
     assessment_judge,
-    false_alarms,
-    monitor_estimates,
     motions_of,
     shift_estimates,
 )
@@ -83,11 +80,10 @@ def test_a_confident_error_is_a_row_called_safe_in_a_motion_that_ends_unsafely(a
     assert found["gamma.unknown"].value == pytest.approx(0.4)
     assert found["unsafe"].value == 0.75
     assert found["gamma.confident_error"].n == 4
-    beside = baseline_estimates(shift, "plan")
+    beside = baseline_estimates(shift)
     assert beside["gamma.first.confident_error"].value == 0.25
     # Of three unsafe plans, two have at least the promise's threshold.
     assert beside["missed"].value == pytest.approx(2 / 3)
-    assert "monitor.missed" not in beside
 
 
 @pytest.mark.train
@@ -104,7 +100,7 @@ def test_the_ranking_is_that_of_all_rows_and_of_those_that_gamma_knows(assessmen
         return Verdicts(probability=probability, is_unknown=np.zeros(len(state), dtype=bool))
 
     shift = judged(motions, assessment, other=other)
-    found = shift_estimates(shift) | baseline_estimates(shift, "plan")
+    found = shift_estimates(shift) | baseline_estimates(shift)
     assert found["gamma.known_auc"].value == 1.0
     assert found["gamma.auc"].value == pytest.approx(0.5)
     assert found["other.known_auc"].value == 0.0
@@ -118,7 +114,7 @@ def test_a_threshold_that_follows_outcomes_misses_less_and_accepts_less(assessme
     # Under this shift unsafe plans look as safe as the threshold, and a little more.
     probability = np.where(is_unsafe, rng.uniform(0.5, 0.9, 400), rng.uniform(0.7, 1.0, 400))
     motions = [motion(1, p, is_unsafe=bool(u)) for p, u in zip(probability, is_unsafe, strict=True)]
-    found = baseline_estimates(judged(motions, assessment), "plan")
+    found = baseline_estimates(judged(motions, assessment))
     assert found["fixed.missed"].value > 0.6
     assert found["fixed.accepted"].value == 1.0
     assert found["adaptive.missed"].value == pytest.approx(0.1, abs=0.05)
@@ -161,27 +157,6 @@ def test_junk_is_dont_know_and_keeps_what_it_says_it_keeps(assessment, nominal):
     result = shift_estimates(shift)
     assert result["gamma.unknown"].value > 0.9
     assert result["gamma.confident_error"].value < 0.05
-
-
-@pytest.mark.train
-def test_a_steady_push_is_noticed_and_the_same_plant_is_not(assessment, nominal):
-    assert false_alarms(nominal, assessment).value == 0.0
-    pushed = [
-        dataclasses.replace(one, state=one.state + 0.004 * np.arange(len(one.state))[:, None])
-        for one in nominal
-    ]
-    judges = {"gamma": assessment_judge(assessment)}
-    shift = JudgedShift.judged_by(judges, pushed, assessment)
-    found, of_rows = monitor_estimates(shift), shift_estimates(shift)
-    assert found["monitor.delay_s"].value < 5.0
-    assert found["monitor.delay_95_s"].value >= found["monitor.delay_s"].value
-    assert found["monitor.alarmed"].value == 1.0
-    # Rows after the alarm are not wrong any more.
-    error = found["monitor.confident_error_60s"].value
-    assert error <= of_rows["gamma.confident_error"].value
-    missed = baseline_estimates(shift, "plant")["monitor.missed"]
-    assert 0.0 <= missed.value <= 1.0
-    assert false_alarms(pushed, assessment).value > 100.0
 
 
 @pytest.mark.train

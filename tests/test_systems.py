@@ -10,10 +10,10 @@ from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.diagrams.pendulum import PendulumController, PendulumObserver, PendulumParameters
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
+from drake_safety.systems.change_monitor import ChangeMonitor
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
 from drake_safety.systems.gravity_features import GravityFeatures
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
-from drake_safety.systems.novelty_monitor import NoveltyMonitor
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
 from drake_safety.systems.recovery_switch import RecoverySwitch
@@ -36,7 +36,7 @@ N_S, N_F = len(LEARNED.info_.state_names), len(LEARNED.info_.feature_names)
 N_C, N_P = len(LEARNED.info_.constraint_names), 3 * LEARNED.info_.horizon
 SEEN = f"state {N_S}, desired_preview {N_P}, features {N_F}"
 PLAN = "desired_output 3, desired_preview 12, desired_outlook 9"
-ALARM = "alarm 1, levels 5, alarm_cause -"
+ALARM = f"alarm 1, levels {N_S}, alarm_cause -"
 BELIEF = "safety_probability 1, belief 3, embedding 2, novelty 1, "
 BELIEF += "cause_probability {0}, predicted_margins {0}"
 # Ports with their sizes; `?`: may be left open; `<`: of these inputs, or of all of them, at once.
@@ -55,7 +55,7 @@ CASES = {
         lambda: BeliefEvaluator(AssessmentDouble(), **PERIOD),
         f"state 2, desired_preview 6, features 3, margins 2, alarm 1 -> {BELIEF.format(2)}",
     ),
-    "NoveltyMonitor": (lambda: NoveltyMonitor(LEARNED), f"{SEEN}, hold? 1 -> {ALARM}"),
+    "ChangeMonitor": (lambda: ChangeMonitor(LEARNED), f"{SEEN}, hold? 1 -> {ALARM}"),
     "SafetyAssessor": (
         lambda: SafetyAssessor(LEARNED),
         f"{SEEN}, margins {N_C}, hold? 1 -> {BELIEF.format(N_C)}, {ALARM}",

@@ -14,7 +14,7 @@ from studies.walking import (
     speed_estimates,
     tour_estimates,
 )
-from studies.walking_motions import WalkedMotion, random_command, run_motions
+from studies.walking_motions import WalkedMotion, run_motions, unusual_command
 
 ALARM = Alarm(name="value", value=lambda motion: motion.features[:, 0])
 
@@ -90,9 +90,9 @@ def test_motions_are_kept_and_commands_are_inside_or_past_the_ranges(tmp_path: P
     loop = scenario.make_loop()
     limits, rng = loop.policy.parameters.command, np.random.default_rng(0)
     for _ in range(30):
-        inside = random_command(loop, rng, is_inside=True)
+        inside = loop.usual_command(rng)
         assert np.all(inside >= limits.lowest) and np.all(inside <= limits.highest)
-        past = random_command(loop, rng, is_inside=False)
+        past = unusual_command(loop, rng)
         assert np.any(past < limits.lowest) or np.any(past > limits.highest)
     options = {"seed": 3, "duration_s": 0.4, "folder": tmp_path}
     (first,) = run_motions(scenario, "tour", [0], **options)

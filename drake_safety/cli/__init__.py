@@ -76,6 +76,10 @@ COMMANDS = {
     "adapt": Entry(
         "adapt", "Adapt Γ to an actual robot, and evaluate it before and after.", "train", ""
     ),
+    "monitor": Entry(
+        "monitor",
+        "Run the change monitor over logs of a robot: its alarms, their causes, and its levels.",
+    ),
     "export": Entry(
         "export", "Write Γ as one ONNX file, which runs without this package and without Drake."
     ),

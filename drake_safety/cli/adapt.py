@@ -116,24 +116,25 @@ def adapt(
     check_writable(folder)
     with open_stages() as stages:
         if log_map is not None:
-            pieces = _log_pieces(loaded, logs, log_map, is_strict=strict)
+            pieces = log_pieces(loaded, logs, log_map, is_strict=strict)
             actual, starts = cut_log(pieces, loaded)
             pairs = pair_starts(loaded, actual, starts, seed=seed)
-            motions = motions_from_log(pieces, loaded)
+            step_s = priors[MODES[0]].detector_.step_s
+            motions = motions_from_log(pieces, loaded, step_s=step_s)
         else:
             pairs = paired_episodes(loaded, feedback, variation, seed, learned.out, workers, stages)
-        sets = pairs.feedback()
-        if not logs:
+            hash_ = loaded.simulation_hash(variation)
             motions = run_motions(
                 loaded,
                 _MOTION_S,
                 variation=variation,
                 seed=MOTION.seeds()["motion of the actual robot"],
                 num_workers=workers,
-                path=feedback_folder(learned.out, loaded.simulation_hash(variation), seed) / "motion",
+                path=feedback_folder(learned.out, hash_, seed) / "motion",
                 progress=partial(stages, "undisturbed actual motion"),
                 **loaded.task_class().pairing_options(loaded, variation),
             )
+        sets = pairs.feedback()
         adapted = {mode: prior.adapt(sets, motions=motions) for mode, prior in priors.items()}
         folder.mkdir(parents=True, exist_ok=True)
         for mode, one in adapted.items():
@@ -247,8 +248,8 @@ def fresh_actual_episodes(
     )
 
 
-def _log_pieces(
-    scenario: Scenario, logs: list[Path], log_map: Path, *, is_strict: bool
+def log_pieces(
+    scenario: Scenario, logs: list[Path], log_map: Path, *, is_strict: bool = False
 ) -> list[RobotLog]:
     """The pieces of logs without gaps; where they are cut is printed."""
     robot = load_robot(scenario.robot)

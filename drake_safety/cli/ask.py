@@ -62,7 +62,7 @@ def ask(
         }
         console.print(json.dumps(answer), soft_wrap=True, highlight=False)
     else:
-        print_shipped(folder)
+        print_shipped(folder, gamma)
         print_verdict(loop, verdict, nearest, origin)
     if not verdict.is_accepted:
         raise typer.Exit(1)

@@ -145,10 +145,12 @@ def print_path(what: str, path: Path) -> None:
     console.print(what, str(path), soft_wrap=True, highlight=False)
 
 
-def print_shipped(folder: AssessmentFolder) -> None:
-    """Prints which assessment is used by default."""
+def print_shipped(folder: AssessmentFolder, assessment: SafetyAssessment | None = None) -> None:
+    """Prints which assessment is used by default, and what its monitor promises."""
     if folder.is_shipped:
         print_path("assessment        comes with the package,", folder.path)
+    if assessment is not None:
+        console.print(assessment.detector_.describe(), highlight=False, soft_wrap=True)
 
 
 def command_line(program: str = "drake-safety", option: str = "") -> str:

@@ -258,7 +258,7 @@ def add_shifts(
     num_nominal: int,
     judges: Mapping[str, Judge] | None = None,
     others: Callable[[Sequence[Motion]], Mapping[str, MotionSet]] = lambda nominal: {},
-    more: Callable[[JudgedShift, str], Mapping[str, Estimate]] = lambda judged, kind: {},
+    more: Callable[[JudgedShift], Mapping[str, Estimate]] = lambda judged: {},
 ) -> dict[str, Any]:
     """Evaluates both modes, or other methods, on changed plants and faulty sensors.
 
@@ -268,7 +268,7 @@ def add_shifts(
         num_nominal: Nominal motions, for false alarms.
         judges: Methods; Γ, named "gamma", and the paper's mode by default.
         others: Further sets, made of the nominal motions.
-        more: Further estimates of a shift of a kind.
+        more: Further estimates of a shift.
 
     Returns:
         The kind of each shift.
@@ -351,6 +351,7 @@ def write(
     results.write(evaluation.folder / name)
     for table in tables(results):
         console.print(table.to_rich())
+    console.print(sharpened.detector_.describe(), highlight=False, soft_wrap=True)
     print_path("figures", evaluation.folder / name)
     for picture in evaluation.pictures:
         print_path("picture", picture)

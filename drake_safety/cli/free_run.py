@@ -11,14 +11,13 @@ from drake_safety.cli.run_settings import (
     RunSettings,
     events_table,
     first_below,
+    logged_ports,
 )
 from drake_safety.cli.training_folder import GoalThreshold
 from drake_safety.evaluation.timeline_figure import timeline_figure
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.free_motion import FreeMotion, run_free
-
-_PORTS = ("safety_probability", "belief", "cause_probability", "predicted_margins")
 
 
 def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
@@ -40,7 +39,7 @@ def run_episode_alone(settings: RunSettings, rule: GoalThreshold) -> None:
         seed=settings.seed,
         duration_s=settings.scenario.episode_duration_s if duration_s is None else duration_s,
         log_period_s=LOG_PERIOD_S,
-        ports=_PORTS,
+        ports=logged_ports(loop),
         realtime_rate=settings.realtime_rate,
     )
     probability = motion.extra["safety_probability"][:, 0]
@@ -82,4 +81,4 @@ def _table_of_events(
     end = motion.failure and f"the simulation failed: {motion.failure}"
     inside = "the end, inside the safe set throughout"
     events.append((float(motion.time_s[-1]), end or ("the end" if motion.cause else inside)))
-    return events_table(events, motion.time_s, motion.extra["safety_probability"][:, 0])
+    return events_table(events, motion.time_s, motion.extra, assessment)

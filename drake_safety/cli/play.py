@@ -68,7 +68,7 @@ def play(
         options["guard"] = True
     elif has_ball:
         options["ball"] = True
-    print_shipped(folder)
+    print_shipped(folder, gamma)
     page_port = _page_port(host, port)
     meshcat = open_viewer(host, page_port + 1, has_rate=False)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=meshcat, **options)

@@ -20,7 +20,13 @@ from drake_safety.cli.console import (
     print_shipped,
 )
 from drake_safety.cli.free_run import run_episode_alone
-from drake_safety.cli.run_settings import LOG_PERIOD_S, Recording, RunSettings, events_table
+from drake_safety.cli.run_settings import (
+    LOG_PERIOD_S,
+    Recording,
+    RunSettings,
+    events_table,
+    logged_ports,
+)
 from drake_safety.cli.target_run import run_to_target
 from drake_safety.cli.targets import HandOption, TargetOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
@@ -39,14 +45,6 @@ from drake_safety.simulation.throws import ThrowLog, run_throw
 _DURATION_S = 5.0  # Of a run with balls.
 _AROUND_IMPACT_S = (-0.02, 0.16)  # The ball in the air, and its effect.
 _AFTER_TRIGGER_S = 0.3  # Feet in the air.
-_PORTS = (
-    "safety_probability",
-    "belief",
-    "cause_probability",
-    "predicted_margins",
-    "embedding",
-    "ball_state",
-)
 # Keys of a ball on the command line, and fields of a throw.
 _THROW_FIELDS = {
     "time": "time_s",
@@ -124,7 +122,7 @@ def run(
         is_live=meshcat,
         host=host,
     )
-    print_shipped(learned)
+    print_shipped(learned, settings.assessment)
     if target is not None:
         rule = goal_threshold(learned.path, settings.assessment)
         if not run_to_target(settings, target, rule, is_forced=force or guard):
@@ -161,7 +159,7 @@ def _run_with_balls(settings: RunSettings) -> None:
         throws=throws,
         duration_s=_DURATION_S if settings.duration_s is None else settings.duration_s,
         log_period_s=LOG_PERIOD_S,
-        ports=_PORTS,
+        ports=(*logged_ports(loop), "embedding", "ball_state"),
         realtime_rate=settings.realtime_rate,
     )
     figures = {
@@ -274,4 +272,4 @@ def _table_of_events(
         events.append((log.fall_time_s, "the robot fell"))
     else:
         events.append((float(log.time_s[-1]), "standing"))
-    return events_table(events, log.time_s, log.extra["safety_probability"][:, 0])
+    return events_table(events, log.time_s, log.extra, assessment)

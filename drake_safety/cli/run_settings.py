@@ -119,6 +119,12 @@ class Recording:
             print_path("picture  ", path)
 
 
+def logged_ports(loop: ClosedLoop) -> tuple[str, ...]:
+    """The ports of Γ and, if the loop has them, of the monitor."""
+    of_gamma = ("safety_probability", "belief", "cause_probability", "predicted_margins")
+    return (*of_gamma, *filter(loop.HasOutputPort, ("alarm", "alarm_cause")))
+
+
 def first_below(probability: np.ndarray, threshold: float) -> int | None:
     """First row in which the probability is below a threshold or NaN; None for never."""
     is_below = ~(probability >= threshold)
@@ -126,17 +132,24 @@ def first_below(probability: np.ndarray, threshold: float) -> int | None:
 
 
 def events_table(
-    events: Sequence[tuple[float, str]], time_s: np.ndarray, probability: np.ndarray
+    events: Sequence[tuple[float, str]],
+    time_s: np.ndarray,
+    extra: Mapping[str, np.ndarray],
+    assessment: SafetyAssessment,
 ) -> Table:
-    """A table of events with the probability at their times.
+    """A table of events, times [s] and words, and the monitor's alarms, with the probability then.
 
-    Args:
-        events: Times [s] and descriptions.
-        time_s: Instants of the log [s], (N,).
-        probability: Probability, (N,).
+    The log has the `logged_ports` as `extra`, (N, size) each, at instants (N,) [s].
     """
     table = new_table("time [s]", "event", "probability")
-    for instant, event in sorted(events, key=lambda one: one[0]):
+    probability = extra["safety_probability"][:, 0]
+    is_on = extra.get("alarm", np.zeros((len(time_s), 1)))[:, 0] > 0.5
+    withdrawn = ". The promise is withdrawn" if assessment.calibrations_ else ""
+    alarms = []
+    for k in np.flatnonzero(np.diff(is_on, prepend=False)).tolist():
+        told = f"{extra['alarm_cause'][k]}{withdrawn}" if is_on[k] else "the alarm ends"
+        alarms.append((float(time_s[k]), f"monitor: {told}"))
+    for instant, event in sorted([*events, *alarms], key=lambda one: one[0]):
         row = abs(time_s - instant).argmin()
         table.add_row(f"{instant:.2f}", event, f"{probability[row]:.2f}")
     return table

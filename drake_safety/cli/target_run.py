@@ -15,6 +15,7 @@ from drake_safety.cli.run_settings import (
     RunSettings,
     events_table,
     first_below,
+    logged_ports,
 )
 from drake_safety.cli.targets import nearest_accepted, parse_target, print_verdict
 from drake_safety.cli.training_folder import GoalThreshold
@@ -28,14 +29,6 @@ from drake_safety.simulation.capabilities import CanBePushed, HasGoals, goal_wor
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.goal_motion import GoalMotion, run_to_goal
 
-_MOTION_PORTS = (
-    "safety_probability",
-    "belief",
-    "cause_probability",
-    "predicted_margins",
-    "alarm",
-    "alarm_cause",
-)
 _HAPPENING = {
     "guard_active": "the guard passes on another command",
     "recovery_active": "recovery triggered",
@@ -90,7 +83,7 @@ def run_to_target(
         duration_s=duration_s,
         seed=settings.seed,
         log_period_s=LOG_PERIOD_S,
-        ports=(*_MOTION_PORTS, *filter(loop.HasOutputPort, _HAPPENING)),
+        ports=(*logged_ports(loop), *filter(loop.HasOutputPort, _HAPPENING)),
         realtime_rate=settings.realtime_rate,
     )
     calibration = settings.assessment.calibrations_.get("motion")
@@ -180,7 +173,6 @@ def table_of_motion(
         threshold: Probability below which a row is an alarm.
     """
     words = goal_words(require(loop, HasGoals))
-    probability = motion.extra["safety_probability"][:, 0]
     events = [(0.0, f"{words.subject} starts")]
     for port, happens in _HAPPENING.items():
         if port in motion.extra and (motion.extra[port] > 0).any():
@@ -205,12 +197,6 @@ def table_of_motion(
                 f"probability below {threshold:.3f}; expected violation: {expected}",
             )
         )
-    is_changed = motion.extra["alarm"][:, 0] > 0.5
-    if is_changed.any():
-        row = int(np.argmax(is_changed))
-        seen = motion.extra["alarm_cause"][row]
-        withdrawn = " The promise is withdrawn" if assessment.calibrations_ else ""
-        events.append((float(motion.time_s[row]), f"monitor: {seen}.{withdrawn}"))
     if motion.has_left:
         events.append((motion.leave_time_s, f"left the safe set: {motion.cause}"))
     if motion.has_fallen:
@@ -223,4 +209,4 @@ def table_of_motion(
             reached = np.round(motion.output[len(motion.output) // 2 :].mean(axis=0), 2)
             missed = f"on its feet{place}; mean of the second half {words.value(reached)}"
         events.append((float(motion.time_s[-1]), missed))
-    return events_table(events, motion.time_s, probability)
+    return events_table(events, motion.time_s, motion.extra, assessment)

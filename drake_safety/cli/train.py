@@ -30,6 +30,7 @@ from drake_safety.cli.training_folder import (
     assessment_file,
     check_writable,
     episodes_folder,
+    load_assessment,
     training_options,
 )
 from drake_safety.files.progress import StageProgress
@@ -120,8 +121,8 @@ def train(
     for name, (num_segments, unsafe, cpu_s) in zip(modes, learned, strict=True):
         table.add_row(name, f"{num_segments}", unsafe, f"{cpu_s:.0f} s")
     console.print(table)
-    if detector is not None:
-        console.print(detector.describe(), highlight=False, soft_wrap=True)
+    described = load_assessment(out, modes[0]).detector_.describe()
+    console.print(described, highlight=False, soft_wrap=True)
     for folder in sets:
         print_path("episodes  ", folder)
     for name in modes:

@@ -191,6 +191,8 @@ def shift_estimates(judged: JudgedShift) -> dict[str, Estimate]:
 
 
 def mean_over(values: np.ndarray, motion: np.ndarray) -> Estimate:
+    """Mean of the values (N,) of rows, with its interval over their motions (N,)."""
+
     def mean(weight: np.ndarray) -> float:
         return float(np.average(values, weights=weight)) if weight.any() else np.nan
 
@@ -202,17 +204,17 @@ def evaluate_shifts(
     judges: Mapping[str, Judge],
     assessment: SafetyAssessment,
     progress: StageProgress,
-    more: Callable[[JudgedShift, str], Mapping[str, Estimate]] = lambda judged, kind: {},
+    more: Callable[[JudgedShift], Mapping[str, Estimate]] = lambda judged: {},
 ) -> dict[str, Estimate]:
     """Estimates of every shift by dotted key.
 
     Judges are methods by name; "gamma" is Γ.
     """
     found: dict[str, Estimate] = {}
-    for i, (name, (kind, motions)) in enumerate(sets.items()):
+    for i, (name, (_, motions)) in enumerate(sets.items()):
         progress("shifts", i, len(sets))
         judged = JudgedShift.judged_by(judges, motions, assessment)
-        of = {**shift_estimates(judged), **more(judged, kind)}
+        of = {**shift_estimates(judged), **more(judged)}
         found |= {f"shifts.{name}.{key}": estimate for key, estimate in of.items()}
     progress("shifts", len(sets), len(sets))
     return found
@@ -225,7 +227,7 @@ def shifts_tables(results: Results) -> list[Table]:
     meaning = _MEANING
     if false is not None:
         meaning += (
-            f" On {false.n} safe nominal motions the monitor gives {false.value:.2f} "
+            f" On {false.n} undisturbed nominal motions the monitor gives {false.value:.2f} "
             f"({false.low:.2f}–{false.high:.2f}) false alarms an hour."
         )
     labels = {name: spoken(name.removeprefix("shifts.")) for name in sets}

@@ -1,4 +1,4 @@
-"""Γ over the time of a run, with stills of the robot."""
+"""Γ over the time of a run, with stills of the robot; the monitor's levels over that of a log."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from drake_safety.evaluation.figure_style import (
     spoken,
 )
 from drake_safety.learning.beliefs import SAFE, UNCERTAINTY
+from drake_safety.learning.change_detector import Alarm
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.pushes import Push
 
@@ -39,6 +40,7 @@ _MAX_STILL_HEIGHT, _STILL_TITLE_HEIGHT = 2.6, 0.35
 _AXIS_LABEL_HEIGHT = 0.6
 _LABEL_ROW_HEIGHT, _LETTER_WIDTH, _LABEL_OFFSET = 0.2, 0.066, 0.11  # Of labels above the curve.
 _LOWEST, _HIGHEST = -0.02, 1.05  # Ends of the axis without labels.
+_NUM_LEVELS, _MOST_POINTS = 4, 4000  # Curves of levels, and points of one.
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 
@@ -119,7 +121,7 @@ def timeline_figure(
             curve_axes.axvspan(start, end, color=RECOVERY_COLOUR, alpha=0.14, linewidth=0, zorder=0)
         for instant in trigger_times_s:
             curve_axes.plot(instant, threshold, "v", color=UNSAFE_COLOUR, markersize=8, zorder=5)
-        top = _draw_labels(curve_axes, labels, rows)
+        top = _draw_labels(curve_axes, labels, rows, (_LOWEST, _HIGHEST))
         for axes, letter, (instant, image) in zip(pictures, _LETTERS, stills, strict=False):
             axes.imshow(image, interpolation="antialiased")
             axes.set(xticks=[], yticks=[])
@@ -132,6 +134,32 @@ def timeline_figure(
             panel.tick_params(labelbottom=False)
         panels[-1].set_xlabel("time [s]")
         fig.align_ylabels(panels)
+    return fig
+
+
+def levels_figure(
+    time_s: np.ndarray, levels: np.ndarray, names: list[str], alarms: list[Alarm], limit: float
+) -> Figure:
+    """Plots the largest levels (N, n_w) of the states that a monitor watches, and its alarms."""
+    # Of a long log the largest of some rows.
+    firsts = np.arange(0, len(time_s), max(1, len(time_s) // _MOST_POINTS))
+    peaks, levels = levels.max(axis=0), np.maximum.reduceat(levels, firsts)
+    labels = [_Label(float(time_s[one.begin]), one.cause, UNSAFE_COLOUR) for one in alarms]
+    rows = _label_rows(labels, time_s[0], time_s[-1])
+    with drawing_style():
+        heights = [_CURVE_HEIGHT + _LABEL_ROW_HEIGHT * (max(rows, default=-1) + 1)]
+        fig, _, (axes,) = _lay_out(heights, [])
+        axes.set(xlim=(time_s[0], time_s[-1]), xlabel="time [s]", ylabel="level")
+        for i, state in enumerate(np.argsort(peaks)[: -1 - _NUM_LEVELS : -1].tolist()):
+            style = {"color": SERIES_COLOURS[2 + i], "linestyle": SERIES_DASHES[i]}
+            axes.plot(time_s[firsts], levels[:, state], linewidth=1.5, label=names[state], **style)
+        if math.isfinite(limit):
+            axes.axhline(limit, color=UNSAFE_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2)
+        for one in alarms:
+            ends = time_s[one.begin], time_s[one.end - 1]
+            axes.axvspan(*ends, color=UNSAFE_COLOUR, alpha=0.14, linewidth=0, zorder=0)
+        _draw_labels(axes, labels, rows, (0.0, 1.05 * max(1.0, float(peaks.max()))))
+        _add_legend_on_the_right(axes, *axes.get_legend_handles_labels())
     return fig
 
 
@@ -282,13 +310,15 @@ def _label_rows(labels: Sequence[_Label], start_s: float, end_s: float) -> list[
     return found
 
 
-def _draw_labels(axes: Axes, labels: Sequence[_Label], rows: Sequence[int]) -> float:
-    """Writes labels in their rows above the curve; returns the upper end of the axis of Γ."""
+def _draw_labels(
+    axes: Axes, labels: Sequence[_Label], rows: Sequence[int], ends: tuple[float, float]
+) -> float:
+    """Writes labels in rows above an axis with these ends; returns the new upper end."""
     from matplotlib.patheffects import withStroke
 
-    row_height = (_HIGHEST - _LOWEST) * _LABEL_ROW_HEIGHT / _CURVE_HEIGHT
-    top = _HIGHEST + row_height * (max(rows, default=-1) + 1)
-    axes.set_ylim(_LOWEST, top)
+    row_height = (ends[1] - ends[0]) * _LABEL_ROW_HEIGHT / _CURVE_HEIGHT
+    top = ends[1] + row_height * (max(rows, default=-1) + 1)
+    axes.set_ylim(ends[0], top)
     start_s, end_s = axes.get_xlim()
     for label, row in zip(labels, rows, strict=True):
         place = (label.time_s, top - (row + 0.5) * row_height)

@@ -205,7 +205,8 @@ class SafetyAssessment:
                 "paper" is the paper's update by a discrepancy function and feedback beliefs.
                 Default: "recalibration" for maps with heads, else "paper".
             motions: Motion of the actual robot that the monitor is to know as well, or its rows
-                (state, desired preview, features), (K, n) each, as far apart as in its training.
+                (state, desired preview, features), (K, n) each, as far apart as in its training;
+                of motion with more rows those between are left out.
 
         Raises:
             MissingExtraError: The extra "train" is not installed.
@@ -265,12 +266,13 @@ class SafetyAssessment:
         if not isinstance(motions, Episodes):
             return self.detector_.with_motions(motions)
         found, wanted = motions.info.step_s, self.detector_.step_s
-        if not math.isclose(found, wanted):
+        every = round(wanted / found)
+        if not math.isclose(every * found, wanted):
             raise ValueError(
                 f"SafetyAssessment of '{self.info_.scenario}': rows of the motions are {found} s "
-                f"apart, expected {wanted} s"
+                f"apart, which does not divide the {wanted} s of the monitor's training"
             )
-        return self.detector_.with_motions(usual_rows(motions))
+        return self.detector_.with_motions([rows[::every] for rows in usual_rows(motions)])
 
     def check_unused(self, *seeds: int, purpose: str = "") -> None:
         """Checks that seeds were not used for training, calibration or adaptation.

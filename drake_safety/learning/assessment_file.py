@@ -21,7 +21,7 @@ from drake_safety.learning.assessment_parameters import (
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.inputs import plan_columns, used_states
+from drake_safety.learning.inputs import plan_columns
 from drake_safety.learning.novelty import Moments, Novelty
 from drake_safety.learning.prediction import BaseLogit, Correction
 from drake_safety.learning.seeds import UsedEpisodes

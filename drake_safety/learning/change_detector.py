@@ -6,13 +6,14 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from drake_safety.extras import require_extra
 from drake_safety.learning.segments import Episode, Episodes
-from drake_safety.learning.state_predictor import HIDDEN_SIZES, StatePredictor
+from drake_safety.learning.state_predictor import StatePredictor
 
 TIME_CONSTANTS_S = (0.1, 0.5, 2.0)
 """Memories of the charts."""
@@ -20,6 +21,8 @@ FALSE_ALARMS_PER_HOUR = 0.1
 """For which the limits are made: at most one in ten hours of nominal motion."""
 LEAST_MOTION_S = 360.0
 """Motion for the limits, below which there is no alarm."""
+RECOVERY_S = 5.0
+"""Time for which every level must be below its limit before an alarm ends [s]."""
 NUM_PREVIEWED = 2
 """Samples of the desired preview that the predictor sees: the one of now and the next."""
 _CLIP = 6.0  # Of an innovation, in standard deviations, so that one impact is no lasting change.
@@ -28,8 +31,15 @@ _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
 _TAIL_SHARE = 0.1  # Of the blocks.
 _LEAST_LIMIT = 0.3  # Of a chart, in standard deviations of its value for white innovations.
 _FREE_REPEATS = 3  # Beyond the longest run of repeated inputs in training.
-_ARRAYS = ("deviation", "limits")
 _SETTINGS = ("alarm_level", "longest_repeat", "step_s", "motion_s")
+
+
+class Alarm(NamedTuple):
+    """First row of an alarm, the row after its last one, and what was seen at its begin."""
+
+    begin: int
+    end: int
+    cause: str
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,7 +95,8 @@ class ChangeDetector:
         motion = f"monitor: {self.motion_s / 60.0:.0f} min of motion for its limits"
         if self.has_limits:
             return f"{motion}, for at most one false alarm in {1 / FALSE_ALARMS_PER_HOUR:.0f} h"
-        return f"{motion}, {LEAST_MOTION_S / 60.0:.0f} are needed: it reports levels and never alarms"
+        needed = f"{LEAST_MOTION_S / 60.0:.0f} are needed"
+        return f"{motion}, {needed}: it reports levels and never alarms"
 
     @classmethod
     def fit(
@@ -124,7 +135,7 @@ class ChangeDetector:
                 predictor=predictor,
                 columns=columns,
                 watched=watched,
-                deviation=np.ones(len(watched)),
+                deviation=np.full(len(watched), 1e-9),
                 limits=np.ones((2 * len(TIME_CONSTANTS_S), len(watched))),
                 alarm_level=math.inf,
                 longest_repeat=max(map(_longest_repeat, seen)) + _FREE_REPEATS,
@@ -133,17 +144,15 @@ class ChangeDetector:
             )
             return unlimited._limited(seen[1::2], states[1::2])
 
-    def _limited(
-        self, seen: Sequence[np.ndarray], states: Sequence[np.ndarray]
-    ) -> ChangeDetector:
+    def _limited(self, seen: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> ChangeDetector:
         """Chooses deviations and limits from inputs (K, n_u) and states (K, n_w) of motions."""
         errors = [self.predictor.errors(*one) for one in zip(seen, states, strict=True)]
-        if len(errors) == 1:
+        if len(errors) == 1 and len(errors[0]) > 1:
             errors = np.array_split(errors[0], 2)
-        deviation = np.maximum(np.concatenate(errors).std(axis=0), 1e-9)
-        charts = [self._charts(np.clip(one / deviation, -_CLIP, _CLIP)) for one in errors]
+        deviation = np.maximum(np.concatenate(errors).std(axis=0), self.deviation)
+        charts = [_sizes(self._charts(np.clip(one / deviation, -_CLIP, _CLIP))) for one in errors]
         motion_s = self.step_s * sum(map(len, errors))
-        halves = [_block_maxima(charts[i::2], self.step_s) for i in range(2)]
+        halves = [_block_maxima(charts[i::2] or charts, self.step_s) for i in range(2)]
         least = _LEAST_LIMIT * np.sqrt(self.rates / (2.0 - self.rates))
         least = np.concatenate([least, math.sqrt(2.0) * least])[:, None]
 
@@ -166,7 +175,7 @@ class ChangeDetector:
         )
 
     def _charts(self, innovations: np.ndarray) -> np.ndarray:
-        """Values of the charts after each of consecutive innovations (K, n_w), (K, 6, n_w)."""
+        """The charts, signed, after each of consecutive innovations (K, n_w), (K, 6, n_w)."""
         from scipy.signal import lfilter
 
         found = [
@@ -174,14 +183,11 @@ class ChangeDetector:
             for values in (innovations, np.square(innovations) - 1.0)
             for rate in self.rates
         ]
-        means = len(self.rates)
-        charts: np.ndarray = np.stack(found, axis=1)
-        charts[:, :means] = np.abs(charts[:, :means])
-        return charts
+        return np.stack(found, axis=1)
 
-    def innovation(self, x: np.ndarray, previous: np.ndarray, state: np.ndarray) -> np.ndarray:
-        """The innovation (n_w,) of a state (n_w,) after two inputs (n_u,), clipped."""
-        error = self.predictor.error(x, previous, state)
+    def innovation(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """The innovation (n_w,) of a change of the state after two inputs (n_u,), clipped."""
+        error = self.predictor.error(x, previous, change)
         clipped: np.ndarray = np.clip(error / self.deviation, -_CLIP, _CLIP)
         return clipped
 
@@ -192,35 +198,58 @@ class ChangeDetector:
         found = old + self.rates[:, None] * (values[:, None] - old)
         return found.reshape(charts.shape)
 
-    def levels(self, charts: np.ndarray, repeats: float = 0.0) -> np.ndarray:
-        """Largest chart of each state, in units of its limit, (n_w,).
+    def levels(self, charts: np.ndarray, repeats: float | np.ndarray = 0.0) -> np.ndarray:
+        """Largest chart of each state, in units of its limit, (..., n_w).
 
         Args:
-            charts: Their values, (6, n_w).
-            repeats: Length of the run of repeated inputs, which concerns all states.
+            charts: Their values, (..., 6, n_w).
+            repeats: Length of the run of repeated inputs, which concerns all states, (..., 1).
         """
-        found = charts / self.limits
-        means = found[: len(TIME_CONSTANTS_S)]
-        np.abs(means, out=means)
-        levels: np.ndarray = np.maximum.reduce(found, axis=0)
+        levels: np.ndarray = (_sizes(charts) / self.limits).max(axis=-2)
         return np.maximum(levels, repeats / self.longest_repeat)
 
     def levels_of(self, motions: Sequence[np.ndarray]) -> np.ndarray:
-        """Levels at each row of consecutive motions (K, n), (sum of K, n_w).
+        """Levels at each row of consecutive motions; see `watch`."""
+        return self.watch(motions)[0]
+
+    def watch(
+        self, motions: Sequence[np.ndarray], state_names: Sequence[str] | None = None
+    ) -> tuple[np.ndarray, list[Alarm]]:
+        """Levels at each row of consecutive motions (K, n), (sum of K, n_w), and the alarms.
 
         Between motions the charts keep their values, which the first two rows of a motion show.
+        Causes need the names of the watched states.
         """
         is_charted = np.concatenate([np.arange(len(one)) > 1 for one in motions])
-        found = np.zeros((len(is_charted), len(self.watched)))
+        levels = np.zeros((len(is_charted), len(self.watched)))
         if not is_charted.any():
-            return found
+            return levels, []
         parts = [(one[:, self.columns], one[:, self.watched]) for one in motions if len(one) > 2]
         errors = np.concatenate([self.predictor.errors(*one) for one in parts])
         charts = self._charts(np.clip(errors / self.deviation, -_CLIP, _CLIP))
-        repeats = np.concatenate([_repeats(x)[1:] for x, _ in parts]) / self.longest_repeat
-        found[is_charted] = np.maximum((charts / self.limits).max(axis=1), repeats[:, None])
-        last = np.maximum.accumulate(np.where(is_charted, np.arange(len(found)), 0))
-        return found[last]
+        repeats = np.concatenate([_repeats(x)[1:] for x, _ in parts])
+        levels[is_charted] = self.levels(charts, repeats[:, None])
+        last = np.maximum.accumulate(np.where(is_charted, np.arange(len(levels)), 0))
+        levels = levels[last]
+        rows = [*np.flatnonzero(is_charted).tolist(), len(levels)]
+        states = [(0.0, 0.0)]
+        for level in levels[rows[:-1]].max(axis=1):
+            states.append(self.next_alarm(*states[-1], level))
+        changes = np.flatnonzero(np.diff([alarm for alarm, _ in states], append=0.0)).tolist()
+        state_names = state_names or [""] * len(self.watched)
+        return levels, [
+            Alarm(rows[i], rows[k], self.cause(charts[i], repeats[i], state_names))
+            for i, k in zip(changes[::2], changes[1::2], strict=True)
+        ]
+
+    def next_alarm(self, alarm: float, calm_s: float, level: float) -> tuple[float, float]:
+        """Alarm (0 or 1), and time since a level was above its limit [s], after one more level."""
+        if level > self.alarm_level:
+            return 1.0, 0.0
+        calm_s += self.step_s
+        if alarm == 0.0 or calm_s > RECOVERY_S - 0.5 * self.step_s:
+            return 0.0, 0.0
+        return 1.0, calm_s
 
     def with_motions(self, motions: Sequence[np.ndarray]) -> ChangeDetector:
         """Returns the detector for which an actual robot's motions (K, n) are known as well.
@@ -236,7 +265,7 @@ class ChangeDetector:
         limited = corrected._limited(seen, states)
         return replace(
             corrected,
-            deviation=np.maximum(limited.deviation, self.deviation),
+            deviation=limited.deviation,
             limits=np.maximum(limited.limits, self.limits),
             longest_repeat=max(self.longest_repeat, *map(_longest_repeat, seen)),
         )
@@ -250,9 +279,8 @@ class ChangeDetector:
         """
         if repeats > self.longest_repeat:
             return "inputs frozen"
-        ratio = charts / self.limits
-        ratio[: len(TIME_CONSTANTS_S)] = np.abs(ratio[: len(TIME_CONSTANTS_S)])
-        chart, state = np.unravel_index(np.argmax(ratio), ratio.shape)
+        ratio = _sizes(charts) / self.limits
+        chart, state = map(int, np.unravel_index(np.argmax(ratio), ratio.shape))
         memory_s = 2.0 * TIME_CONSTANTS_S[chart % len(TIME_CONSTANTS_S)]
         name, value = state_names[state], float(charts[chart, state])
         is_mean = chart < len(TIME_CONSTANTS_S)
@@ -265,11 +293,12 @@ class ChangeDetector:
             seen = f"{name} changes unlike in training"
         if is_mean:
             return f"{seen} ({name} {value:+.1f} standard deviations over {memory_s:g} s)"
-        return f"{seen} ({name} {math.sqrt(value + 1.0):.1f} times as irregular over {memory_s:g} s)"
+        times = math.sqrt(value + 1.0)
+        return f"{seen} ({name} {times:.1f} times as irregular over {memory_s:g} s)"
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns all that `from_arrays` needs, by name."""
-        found = {name: getattr(self, name) for name in _ARRAYS}
+        found = {"deviation": self.deviation, "limits": self.limits}
         found |= {name: getattr(self, name).astype(np.int32) for name in ("columns", "watched")}
         found["settings"] = np.array([getattr(self, name) for name in _SETTINGS], dtype=float)
         return found | {f"predictor.{k}": v for k, v in self.predictor.arrays().items()}
@@ -293,16 +322,19 @@ class ChangeDetector:
                 raise ValueError(
                     f"the shape of its detector.{name} is {arrays[name].shape}, expected {shape}"
                 )
-        settings = dict(zip(_SETTINGS, arrays["settings"].tolist(), strict=True))
-        settings["longest_repeat"] = int(settings["longest_repeat"])
+        alarm_level, longest_repeat, step_s, motion_s = arrays["settings"].tolist()
         prefix = "predictor."
         of_predictor = {k.removeprefix(prefix): v for k, v in arrays.items() if prefix in k}
         return cls(
             predictor=StatePredictor.from_arrays(of_predictor),
             columns=arrays["columns"].astype(int),
             watched=arrays["watched"].astype(int),
-            **{name: arrays[name].astype(float) for name in _ARRAYS},
-            **settings,
+            deviation=arrays["deviation"].astype(float),
+            limits=arrays["limits"].astype(float),
+            alarm_level=alarm_level,
+            longest_repeat=int(longest_repeat),
+            step_s=step_s,
+            motion_s=motion_s,
         )
 
 
@@ -328,11 +360,19 @@ def usual_rows(motions: Episodes) -> list[np.ndarray]:
     return [rows_of(one)[one.first_step : None if one.is_safe else -lost] for one in motions]
 
 
+def _sizes(charts: np.ndarray) -> np.ndarray:
+    """Charts (..., 6, n_w) with the absolute values of the means."""
+    means, squares = np.split(charts, 2, axis=-2)
+    return np.concatenate([np.abs(means), squares], axis=-2)
+
+
 def _block_maxima(charts: Sequence[np.ndarray], step_s: float) -> np.ndarray:
-    """Maxima of blocks of two seconds of charts (K, 6, n_w), (B, 6, n_w); blocks end with motions."""
+    """Maxima of blocks of 2 s of charts (K, 6, n_w), (B, 6, n_w); blocks end with motions."""
     size = max(1, round(_BLOCK_S / step_s))
     blocks = [
-        one[i : i + size].max(axis=0) for one in charts for i in range(0, max(len(one) - size // 2, 1), size)
+        one[i : i + size].max(axis=0)
+        for one in charts
+        for i in range(0, max(len(one) - size // 2, 1), size)
     ]
     return np.stack(blocks)
 
@@ -354,9 +394,11 @@ def _tail_limit(maxima: np.ndarray, probability: float) -> float:
 
 
 def _repeats(x: np.ndarray) -> np.ndarray:
-    """Length of the run of inputs that repeat the one before, from the second input on, (K - 1,)."""
+    """Length of the run of repeated inputs, from the second input on, (K - 1,)."""
     is_same = np.all(x[1:] == x[:-1], axis=1)
-    runs = itertools.accumulate(is_same.tolist(), lambda run, same: run + 1 if same else 0, initial=0)
+    runs = itertools.accumulate(
+        is_same.tolist(), lambda run, same: run + 1 if same else 0, initial=0
+    )
     return np.array([*runs][1:], dtype=float)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -149,13 +150,21 @@ def train_map(
     require_extra("train", "train_map", "torch")
     import torch
 
-    num_threads = torch.get_num_threads()
-    # One thread is fastest for layers of this size.
+    with one_torch_thread():
+        return _train(torch, data, parameters, seed, held_out, progress)
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Training in one thread: fastest for small layers, and the same bits on any machine."""
+    import torch
+
+    number = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return _train(torch, data, parameters, seed, held_out, progress)
+        yield
     finally:
-        torch.set_num_threads(num_threads)
+        torch.set_num_threads(number)
 
 
 def _train(

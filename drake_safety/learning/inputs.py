@@ -99,11 +99,16 @@ def num_inputs(info: EpisodesInfo, parameters: AssessmentParameters) -> int:
     return width
 
 
+def preview_names(info: EpisodesInfo) -> list[str]:
+    """Returns the names of the preview's entries, (H*n_z,), counted from 0."""
+    return [f"desired {name} [{k}]" for k in range(info.horizon) for name in info.output_names]
+
+
 def input_names(info: EpisodesInfo, parameters: AssessmentParameters) -> list[str]:
-    """Returns the names of the columns of x, (n_x,); previews are counted from 0."""
+    """Returns the names of the columns of x, (n_x,)."""
     is_used = used_states(info, parameters)
     names = [name for name, used in zip(info.state_names, is_used, strict=True) if used]
-    names += [f"desired {name} [{k}]" for k in range(info.horizon) for name in info.output_names]
+    names += preview_names(info)
     if parameters.is_sharpened:
         names += info.feature_names
         names += [f"asinh {name}" for name in info.feature_names if parameters.feature_unit]

@@ -42,6 +42,8 @@ class StatePredictor:
         """Learns from inputs (K, n_u) and states (K, n_w) of motions of at least three rows."""
         import torch
 
+        from drake_safety.learning.embedding import one_torch_thread
+
         every = np.concatenate(inputs)
         mean, scale = every.mean(axis=0), np.maximum(every.std(axis=0), _SMALLEST_SPREAD)
         change = np.concatenate([np.diff(one, axis=0)[1:] for one in states])
@@ -49,7 +51,7 @@ class StatePredictor:
         start = cls(mean=mean, scale=scale, unit=unit, weights={})
         x = torch.tensor(np.concatenate([start._pairs(one) for one in inputs]))
         y = torch.tensor((change / unit).astype(np.float32))
-        with torch.random.fork_rng(devices=[]):
+        with one_torch_thread(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             network = _network(x.shape[1], y.shape[1])
             per_epoch = max(1, len(x) // _BATCH)
@@ -84,7 +86,8 @@ class StatePredictor:
         for i in range(len(HIDDEN_SIZES)):
             hidden = hidden @ w[f"hidden.{i}.weight"] + w[f"hidden.{i}.bias"]
             hidden = hidden / (1.0 + np.exp(-np.maximum(hidden, -80.0)))
-        found: np.ndarray = hidden @ w["output.weight"] + (z @ w["linear.weight"] + w["linear.bias"])
+        linear = z @ w["linear.weight"] + w["linear.bias"]
+        found: np.ndarray = hidden @ w["output.weight"] + linear
         return found
 
     def errors(self, inputs: np.ndarray, states: np.ndarray) -> np.ndarray:
@@ -109,9 +112,7 @@ class StatePredictor:
         from sklearn.linear_model import Ridge
 
         z = np.concatenate([self._pairs(one) for one in inputs])
-        errors = np.concatenate(
-            [self.errors(*one) for one in zip(inputs, states, strict=True)]
-        )
+        errors = np.concatenate([self.errors(*one) for one in zip(inputs, states, strict=True)])
         # Few rows: what they do not determine stays as it was.
         ridge = Ridge(alpha=len(z) / 10.0).fit(z, errors / self.unit)
         weights = dict(self.weights)

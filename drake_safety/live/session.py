@@ -116,6 +116,10 @@ class LiveSession(ABC):
         if self._camera is not None:
             self._camera.follow(self.context)
         self._show_status()
+        if self.loop.HasOutputPort("alarm") and self._eval("alarm")[0] > 0.5:
+            cause = self.loop.GetOutputPort("alarm_cause").Eval(self.context)
+            note = f"{self.panel.status.note}; monitor: {cause}".removeprefix("; ")
+            self.panel.status = replace(self.panel.status, note=note)
         return True
 
     def run(self, *, is_paced: bool = True) -> None:

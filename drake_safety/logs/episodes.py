@@ -94,20 +94,31 @@ def motions_from_log(
     loop: LeggedLoop | Scenario,
     *,
     desired_output: np.ndarray | None = None,
+    step_s: float | None = None,
 ) -> Episodes:
-    """Converts logs to motions for a `ChangeDetector`, with rows `monitor_step_s` apart.
+    """Converts logs to motions for a `ChangeDetector`, with their times in the log.
 
     Each lasts up to a minute, in the stance frame of its first row. The arguments and errors are
-    those of :func:`cut_log`.
+    those of :func:`cut_log`; a log is also refused if the monitor reads the controller's memory.
+    Rows are `step_s` apart, by default the scenario's `monitor_step_s`.
     """
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")
-    rows = _Rows(loop.scenario.monitor_step_s, MOTION_PIECE_S, shortest=2)
+    if unlogged := set(loop.memory_features).intersection(loop.monitored_features or ()):
+        raise ValueError(
+            f"the monitor reads {sorted(unlogged)}, which a log of positions and velocities does "
+            "not have: write what the policy observes and commands as sequences of an .npz file"
+        )
+    rows = _Rows(step_s or loop.scenario.monitor_step_s, MOTION_PIECE_S, shortest=2)
     motions: list[Episode] = []
     for pieces in _by_log([log] if isinstance(log, RobotLog) else log):
         for one in pieces:
             found, has_left = _cut(one, loop, _desired_output(one, loop, desired_output), rows)
-            motions += [replace(motion, index=len(motions) + i) for i, (motion, _) in enumerate(found)]
+            begin_s = one.begin_s
+            for motion, _ in found:
+                time_s = begin_s + motion.time_s
+                motions.append(replace(motion, index=len(motions), time_s=time_s))
+                begin_s = float(time_s[-1])
             if has_left:
                 break
     return Episodes(replace(episodes_info(loop, seed=NOT_DRAWN), step_s=rows.step_s), motions)
@@ -122,7 +133,8 @@ class _Rows(NamedTuple):
 
     @classmethod
     def of(cls, scenario: Scenario) -> _Rows:
-        return cls(scenario.step_s, scenario.episode_duration_s, shortest_steps(scenario.assessment))
+        shortest = shortest_steps(scenario.assessment)
+        return cls(scenario.step_s, scenario.episode_duration_s, shortest)
 
 
 def shortest_steps(assessment: AssessmentParameters) -> int:
@@ -204,9 +216,8 @@ def _start(
         feet = values_at(log.time_s, log.foot_positions, begin).reshape(-1, 3)
     scenario = loop.scenario
     # Previews and outlooks of the longest episode end before.
-    reach_s = (
-        duration_s + scenario.episode_duration_s + scenario.assessment.horizon * scenario.preview_step_s
-    )
+    reach_s = duration_s + scenario.episode_duration_s
+    reach_s += scenario.assessment.horizon * scenario.preview_step_s
     later = log.time_s[(log.time_s > begin_s + _ROUNDING_S) & (log.time_s <= begin_s + reach_s)]
     hold = PiecewisePolynomial(np.zeros((desired.shape[1], 1)))
     start = EpisodeStart(q=q, v=v, plan=hold, foot_positions=feet)

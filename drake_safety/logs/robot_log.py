@@ -47,6 +47,7 @@ class RobotLog:
         desired_output: z* in the world, (N, n_z) [m], or None.
         foot_positions: Desired foot positions, (N, 3 n_c) [m], or None.
         piece: Number of this piece of a log that was cut, from 0.
+        begin_s: Time of the first row since the log's first row of any topic [s].
     """
 
     path: Path
@@ -57,6 +58,7 @@ class RobotLog:
     desired_output: np.ndarray | None = None
     foot_positions: np.ndarray | None = None
     piece: int = 0
+    begin_s: float = 0.0
 
     @property
     def duration_s(self) -> float:
@@ -108,12 +110,15 @@ def read_pieces(
     path, log_map, kinematics, channels = _opened(path, log_map, robot, step_s)
     found, cuts = cut_channels(channels, log_map.max_gap_s)
     pieces: list[RobotLog] = []
+    origin = min(channel.time[0] for channel in channels.values())
     for part in found:
         if len(_times(log_map, part, step_s)) < 2:
             continue
         checks.check_norms(part[log_map.base_orientation.topic], log_map.base_orientation.columns)
         one = _converted(path, log_map, kinematics, part, step_s, is_checked=not pieces)
-        pieces.append(replace(one, piece=len(pieces)))
+        before_s = min(channel.seconds_since(origin)[0] for channel in part.values())
+        begin_s = float(before_s) + one.begin_s
+        pieces.append(replace(one, piece=len(pieces), begin_s=begin_s))
     if not pieces:
         raise ValueError(
             f"log '{path}' has no {checks.MIN_ROWS} rows without a missing value or a gap between "
@@ -291,9 +296,8 @@ def _converted(
     if is_checked and "desired_output" in extra:
         unit = log_map.desired_output.unit
         checks.check_desired_output(kinematics, extra["desired_output"][0], q[0, 4:7], where, unit)
-    return RobotLog(
-        path=path, robot=kinematics.robot.name, time_s=at_s - at_s[0], q=q, v=v, **extra
-    )
+    extra |= {"time_s": at_s - at_s[0], "begin_s": float(at_s[0])}
+    return RobotLog(path=path, robot=kinematics.robot.name, q=q, v=v, **extra)
 
 
 def _velocities(

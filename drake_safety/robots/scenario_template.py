@@ -28,7 +28,8 @@ class Sizes(RobotSize):
 
 def scenario_yaml(task: str, sizes: Sizes) -> str:
     """Writes the scenario of a task as commented YAML."""
-    return TASKS[task](sizes)
+    on_alarm = "on_alarm: unknown  # an alarm makes every belief unknown; report: only says so\n"
+    return TASKS[task](sizes) + on_alarm
 
 
 def _numbers(values: Sequence[float]) -> str:

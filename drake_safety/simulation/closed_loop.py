@@ -95,6 +95,9 @@ class ClosedLoop(Diagram):
     """Features by which it predicts them beside the desired preview, such as what the controller
     commands; None for all of them."""
 
+    memory_features: tuple[str, ...] = ()
+    """Features that depend on what the controller did before, which a log of the plant lacks."""
+
     state_names: list[str]
     output_names: list[str]
     feature_names: list[str]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
@@ -19,6 +21,7 @@ from drake_safety.systems.feedback_recorder import FeedbackRecorder
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
 _KEPT_UPDATES = 8
+_KEPT_MOTION_S = 600.0
 
 
 class OnlineAdaptation:
@@ -26,9 +29,9 @@ class OnlineAdaptation:
 
     "For computational efficiency, the online adaptation process is performed once every k_u sets of
     feedback data" (paper). Whenever the recorder has finished windows, their nominal twins are
-    simulated; after every k_u windows the prior assessment is adapted to the feedback so far, and
-    the assessor adopts the result. The simulation waits meanwhile. The object keeps feedback of one
-    simulation; use another one for another.
+    simulated; after every k_u windows the prior assessment is adapted to the feedback and the
+    motion so far, at most ten minutes, and the assessor adopts the result. The simulation waits
+    meanwhile. The object keeps feedback of one simulation; use another one for another.
 
     ```python
     online = OnlineAdaptation(scenario, prior, recorder, assessor)
@@ -62,7 +65,10 @@ class OnlineAdaptation:
         self._scenario, self._prior, self._method = scenario, prior, method
         self._recorder, self._assessor, self._run = recorder, assessor, run
         self._capacity, self._num_new = capacity, 0
-        self._motion: list[list[np.ndarray]] = [[]]  # Rows of the monitor.
+        # Rows that the monitor sees, and None between motions.
+        num_rows = round(_KEPT_MOTION_S / prior.detector_.step_s)
+        self._motion: deque[np.ndarray | None] = deque(maxlen=num_rows)
+        self._seen_s = -math.inf  # Time of the newest row.
         self.feedback: list[FeedbackSet] = []
         self.adapted: list[SafetyAssessment] = []
         self.num_updates = 0
@@ -91,14 +97,16 @@ class OnlineAdaptation:
             row_s = step_s * (math.floor(context.get_time() / step_s + 1e-6) + 1)
             if row_s > until_s + 1e-9:
                 break
-            status = simulator.AdvanceTo(row_s)
+            # A row is of the time before the updates that are due at it.
+            status = simulator.AdvanceTo(min(row_s - 4.0 * math.ulp(row_s), until_s))
             if status.reason() != SimulatorStatus.ReturnReason.kReachedBoundaryTime:
                 return status
-            own_context = monitor.GetMyContextFromRoot(context)
-            if not monitor.is_held(own_context):
-                self._motion[-1].append(monitor.row(own_context))
-            elif self._motion[-1]:
-                self._motion.append([])
+            if not math.isclose(row_s, self._seen_s + step_s, rel_tol=0.0, abs_tol=1e-6):
+                self._motion.append(None)  # The simulation began anew, or went on alone.
+            own_context, self._seen_s = monitor.GetMyContextFromRoot(context), row_s
+            row = monitor.row(own_context)
+            is_seen = not monitor.is_held(own_context) and np.isfinite(row).all()
+            self._motion.append(row if is_seen else None)
         return simulator.AdvanceTo(until_s)
 
     def _update(self, root_context: Context) -> None:
@@ -116,7 +124,11 @@ class OnlineAdaptation:
         if self._num_new < self._prior.parameters.adaptation.update_interval:
             return
         self._num_new = 0
-        motions = [np.array(rows) for rows in self._motion if rows]
+        motions = [
+            np.array([*rows])
+            for is_seen, rows in itertools.groupby(self._motion, lambda row: row is not None)
+            if is_seen
+        ]
         adapted = self._prior.adapt(self.feedback, method=self._method, motions=motions)
         self.adapted = [*self.adapted, adapted][-_KEPT_UPDATES:]
         self.num_updates += 1

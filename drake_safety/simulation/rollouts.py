@@ -37,7 +37,7 @@ from drake_safety.simulation.dataset import EpisodeWriter, is_same, load_episode
 from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.worker_processes import Progress, run_batches
+from drake_safety.simulation.worker_processes import BATCH_SIZE, Progress, run_batches
 
 MOTION_PIECE_S = 60.0
 """Duration of one undisturbed motion [s]."""
@@ -205,6 +205,7 @@ def run_motions(
         path=path,
         progress=progress,
         extra=extra,
+        batch_size=1 if isinstance(loop, MovesUndisturbed) else BATCH_SIZE,
     )
 
 
@@ -339,6 +340,7 @@ def collect_episodes(
     path: str | PathLike[str] | None = None,
     progress: Progress | bool | None = None,
     extra: dict[str, Any] | None = None,
+    batch_size: int = BATCH_SIZE,
 ) -> Episodes:
     """Simulates the episodes of a set that a folder does not hold yet, in worker processes.
 
@@ -361,6 +363,7 @@ def collect_episodes(
             progress=progress,
             num_done=len(kept),
             stage=f"episodes of '{info.scenario}'",
+            batch_size=batch_size,
         )
         with closing(results):
             for episode in results:

@@ -22,7 +22,8 @@ from pydrake.systems.framework import LeafSystem
 from drake_safety.files.progress import shown
 from drake_safety.learning.segments import installed_versions
 
-_BATCH = 4  # Episodes, or throws, per call of a worker.
+BATCH_SIZE = 4
+"""Episodes, or throws, per call of a worker."""
 _WATCH_PERIOD_S = 1.0
 _LOCAL_BACKENDS = ("LokyBackend", "SequentialBackend")
 _DASKS = "KilledWorker"
@@ -34,9 +35,9 @@ Progress = Callable[[int, int], None]
 """Called with the number done and in all."""
 
 
-def batches(items: list[_Item]) -> list[list[_Item]]:
+def batches(items: list[_Item], size: int = BATCH_SIZE) -> list[list[_Item]]:
     """Splits a list into batches, one for each call of a worker."""
-    return [items[i : i + _BATCH] for i in range(0, len(items), _BATCH)]
+    return [items[i : i + size] for i in range(0, len(items), size)]
 
 
 def run_batches(
@@ -47,6 +48,7 @@ def run_batches(
     progress: Progress | bool | None = None,
     num_done: int = 0,
     stage: str = "simulations",
+    batch_size: int = BATCH_SIZE,
 ) -> Generator[_Result, None, None]:
     """Calls a function for batches of items in worker processes; yields results as they finish.
 
@@ -56,7 +58,8 @@ def run_batches(
             shows it.
     """
     num_wanted = num_done + len(items)
-    results = parallel_map(function, [(batch,) for batch in batches(items)], num_workers)
+    calls = [(batch,) for batch in batches(items, batch_size)]
+    results = parallel_map(function, calls, num_workers)
     with shown(progress, lambda stages: partial(stages, stage)) as report, closing(results):
         if report is not None:
             report(num_done, num_wanted)

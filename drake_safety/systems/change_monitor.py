@@ -12,9 +12,6 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.blas_threads import one_blas_thread
 from drake_safety.learning.change_detector import TIME_CONSTANTS_S, ChangeDetector
 
-RECOVERY_S = 5.0
-"""Time for which every level must be below its limit before an alarm ends [s]."""
-
 
 class ChangeMonitor(LeafSystem):
     """Watches how each measured state follows from the last two inputs.
@@ -88,7 +85,7 @@ class ChangeMonitor(LeafSystem):
         context.get_mutable_discrete_state_vector().SetFromVector(self._initial)
 
     def row(self, context: Context) -> np.ndarray:
-        """(state, desired preview, features) at the ports, (n,); features that are not read are 0."""
+        """(state, desired preview, features) at the ports, (n,); features not read are 0."""
         features = self._inputs["features"]
         return np.concatenate(
             [
@@ -111,32 +108,31 @@ class ChangeMonitor(LeafSystem):
         x, state = row[detector.columns], row[detector.watched]
         if self.is_held(context) or not x @ x < math.inf:  # As for NaN.
             part["x"][:] = part["previous"][:] = np.nan
+            part["repeats"][0] = 0.0
         else:
+            is_repeated = np.array_equal(x, part["x"])
+            part["repeats"][0] = part["repeats"][0] + 1.0 if is_repeated else 0.0
             if not math.isnan(part["previous"][0]):
-                self._chart(part, detector, x, state)
+                self._chart(part, detector, state)
             part["previous"][:] = part["x"]
             part["x"][:], part["state"][:] = x, state
         discrete_state.set_value(values)
 
     def _chart(
-        self, part: dict[str, np.ndarray], detector: ChangeDetector, x: np.ndarray, state: np.ndarray
+        self, part: dict[str, np.ndarray], detector: ChangeDetector, state: np.ndarray
     ) -> None:
         """Updates charts, levels and alarm in a copy of the discrete state."""
         change = state - part["state"]
         innovation = detector.innovation(part["x"], part["previous"], change)
         charts = detector.updated(part["charts"].reshape(-1, len(state)), innovation)
-        is_repeated = np.array_equal(x, part["x"])
-        repeats = part["repeats"][0] + 1.0 if is_repeated else 0.0
-        levels = detector.levels(charts, repeats)
-        part["charts"][:], part["repeats"][0], part["levels"][:] = charts.ravel(), repeats, levels
-        if levels.max() > detector.alarm_level:
-            if part["alarm"][0] == 0.0:
-                part["seen"][:-1], part["seen"][-1] = part["charts"], repeats
-            part["alarm"][0], part["calm_s"][0] = 1.0, 0.0
-        elif part["alarm"][0] > 0.0:
-            part["calm_s"][0] += detector.step_s
-            if part["calm_s"][0] >= RECOVERY_S:
-                part["alarm"][0] = 0.0
+        levels = detector.levels(charts, part["repeats"][0])
+        part["charts"][:], part["levels"][:] = charts.ravel(), levels
+        before = part["alarm"][0]
+        part["alarm"][0], part["calm_s"][0] = detector.next_alarm(
+            before, part["calm_s"][0], float(levels.max())
+        )
+        if part["alarm"][0] > before:
+            part["seen"][:-1], part["seen"][-1] = part["charts"], part["repeats"][0]
 
     def _detector_of(self, context: Context) -> ChangeDetector:
         detector: ChangeDetector = context.get_abstract_parameter(self._detector).get_value()

@@ -139,7 +139,10 @@ def AddSafetyAssessor(
         "hold": hold,
     }
     ports = {name: port for name, port in given.items() if port is not None}
-    if assessor.evaluator.reads_features and features is None:
+    is_read = assessor.evaluator.reads_features or (
+        assessor.monitor is not None and assessor.monitor.reads_features
+    )
+    if is_read and features is None:
         raise ValueError(
             "AddSafetyAssessor: the assessment was fitted with features "
             f"{assessment.info_.feature_names}; give the port that carries them"

@@ -1,0 +1,157 @@
+"""``drake-safety monitor``: the change detector over logs of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from drake_safety.cli.adapt import log_pieces
+from drake_safety.cli.console import (
+    AssessmentOption,
+    ScenarioArgument,
+    command_line,
+    console,
+    new_table,
+    open_stages,
+    print_path,
+    print_shipped,
+    versions,
+)
+from drake_safety.cli.training_folder import (
+    MODES,
+    assessment_folder,
+    check_fresh,
+    check_writable,
+    load_assessment,
+)
+from drake_safety.evaluation.figure_style import save
+from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.timeline_figure import levels_figure
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.change_detector import rows_of
+from drake_safety.logs.episodes import motions_from_log
+from drake_safety.logs.robot_log import FORMATS
+from drake_safety.logs.sequences import Motion, SequenceMap, read_sequences
+from drake_safety.robots.robot_model import load_typed_file
+from drake_safety.simulation.rollouts import worker_loop
+from drake_safety.simulation.scenario import Scenario, load_scenario
+
+_SEQUENCES = ".npz"
+
+
+def monitor(
+    scenario: ScenarioArgument,
+    log: Annotated[
+        list[Path],
+        typer.Option(
+            help="Log of a robot, .npz file of sequences, or a folder of either; may be repeated."
+        ),
+    ],
+    log_map: Annotated[Path, typer.Option("--map", help="Map of their columns, a YAML file.")],
+    assessment: AssessmentOption = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write; ASSESSMENT/monitor by default.")
+    ] = None,
+) -> None:
+    """Run the change monitor over logs of a robot: its alarms, their causes, and its levels.
+
+    Writes monitor.json and a picture of each log, or sequence of an .npz file.
+    """
+    loaded = load_scenario(scenario)
+    learned = assessment_folder(loaded, assessment)
+    gamma = load_assessment(learned.path, MODES[0])
+    check_fresh(gamma, loaded)
+    folder = out or learned.out / "monitor"
+    check_writable(folder)
+    print_shipped(learned, gamma)
+    files = [file for given in log for file in _files(given)]
+    found: list[dict[str, Any]] = []
+    with open_stages() as stages:
+        for i, file in enumerate(files):
+            for what, motions in _motions(file, log_map, loaded, gamma):
+                picture = folder / f"{file.stem}-{len(found) + 1}"
+                found.append(what | _judged(motions, gamma, picture))
+            stages("logs", i + 1, len(files))
+    entries = {"command": command_line(), "scenario": loaded.name, "versions": versions()}
+    monitored = {"monitor": gamma.detector_.describe(), "logs": found}
+    Results({}, {**entries, **monitored}).write(folder / "monitor.json")
+    console.print(_table(found))
+    print_path("figures ", folder / "monitor.json")
+    print_path("pictures", folder)
+
+
+def _files(given: Path) -> list[Path]:
+    """A log, or those in a folder that is not itself a ROS 2 bag."""
+    bag, known = "metadata.yaml", [*FORMATS, _SEQUENCES]
+    if not given.exists():
+        raise ValueError(f"log '{given}' does not exist")
+    if not given.is_dir() or (given / bag).is_file():
+        return [given]
+    found = [p for p in given.iterdir() if p.suffix.lower() in known or (p / bag).is_file()]
+    if not found:
+        raise ValueError(f"folder '{given}' has no log; known are {known} and ROS 2 bags")
+    return sorted(found)
+
+
+def _motions(
+    file: Path, log_map: Path, scenario: Scenario, gamma: SafetyAssessment
+) -> Iterator[tuple[dict[str, Any], list[Motion]]]:
+    """A log, or each sequence of a file, by what identifies it; and its motions."""
+    what = {"log": str(file), "sequence": None, "left_safe_set": ""}
+    if file.suffix.lower() == _SEQUENCES:
+        read_by = load_typed_file(SequenceMap, log_map, f"map '{log_map}'")
+        read = read_sequences(file, read_by, gamma.detector_, gamma.info_)
+        yield from ((what | {"sequence": i}, motions) for i, motions in enumerate(read))
+    else:
+        pieces = log_pieces(scenario, [file], log_map)
+        loop = worker_loop(scenario, "actual", {})
+        found = motions_from_log(pieces, loop, step_s=gamma.detector_.step_s)
+        left = {"left_safe_set": next((one.cause for one in found if not one.is_safe), "")}
+        yield what | left, [(one.time_s, rows_of(one)) for one in found]
+
+
+def _judged(motions: Sequence[Motion], gamma: SafetyAssessment, picture: Path) -> dict[str, Any]:
+    """Duration, largest level and alarms of a log, which are drawn into a picture."""
+    detector = gamma.detector_
+    if not motions:
+        return {"end_s": 0.0, "level": 0.0, "state": "none", "alarms": []}
+    names = [gamma.info_.state_names[i] for i in detector.watched]
+    levels, alarms = detector.watch([rows for _, rows in motions], names)
+    time_s = np.concatenate([times for times, _ in motions]).round(6)
+    save(levels_figure(time_s, levels, names, alarms, detector.alarm_level), picture)
+    return {
+        "end_s": float(time_s[-1]),
+        "level": float(levels.max()),
+        "state": names[int(levels.max(axis=0).argmax())],
+        "alarms": [
+            {
+                "begin_s": float(time_s[one.begin]),
+                "end_s": float(time_s[one.end]) if one.end < len(time_s) else None,
+                "level": float(levels[one.begin : one.end].max()),
+                "cause": one.cause,
+            }
+            for one in alarms
+        ],
+    }
+
+
+def _table(found: Sequence[Mapping[str, Any]]) -> Table:
+    table = new_table("log", "until [s]", "alarm [s]", "ends [s]", "largest level", "cause")
+    for one in found:
+        number = "" if one["sequence"] is None else f" [{one['sequence']}]"
+        left = one["left_safe_set"] and f", left the safe set: {one['left_safe_set']}"
+        head = [f"{Path(*Path(one['log']).parts[-2:])}{number}", f"{one['end_s']:.2f}{left}"]
+        if not one["alarms"]:
+            told = f"no alarm; largest: {one['state']}"
+            table.add_row(*head, "-", "-", f"{one['level']:.2f}", told)
+        for alarm in one["alarms"]:
+            numbers = (alarm[key] for key in ("begin_s", "end_s", "level"))
+            cells = ["goes on" if value is None else f"{value:.2f}" for value in numbers]
+            table.add_row(*head, *cells, alarm["cause"])
+            head = ["", ""]
+    return table

@@ -1,0 +1,98 @@
+"""Sequences of observations in .npz files, such as a policy's, as rows of a ChangeDetector."""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from drake_safety.learning.change_detector import ChangeDetector
+from drake_safety.learning.inputs import preview_names
+from drake_safety.learning.segments import EpisodesInfo
+from drake_safety.logs.channel import listed
+from drake_safety.robots.reading import did_you_mean, reading
+
+Motion = tuple[np.ndarray, np.ndarray]  # Times (K,) [s] of consecutive rows (K, n).
+
+
+@dataclass(kw_only=True)
+class SequenceMap:
+    """The schema of the map of an ``.npz`` file."""
+
+    step_s: float = 0.0
+    """Time between two steps [s], required: the detector's, or an integer fraction of it."""
+    data: str = "observations"
+    """Array of sequences, (num_sequences, num_steps, n), or of one, (num_steps, n)."""
+    names: str = "observation_names"
+    """Array of the n names of observations."""
+    columns: dict[str, str] = field(default_factory=dict)
+    """Observation that is an input of the detector, where its name differs."""
+    scale: dict[str, float] = field(default_factory=dict)
+    """Factor of an input's observation; 1 by default."""
+    offset: dict[str, float] = field(default_factory=dict)
+    """What is added then, such as a joint's default position; 0 by default."""
+
+
+def read_sequences(
+    path: Path, sequence_map: SequenceMap, detector: ChangeDetector, info: EpisodesInfo
+) -> list[list[Motion]]:
+    """Reads the motions of each sequence in an ``.npz`` file; none reaches over a missing value.
+
+    The detector's inputs are read, which the info of its training names; the other columns are 0.
+
+    Raises:
+        ValueError: An array or an observation is missing, a shape or the step does not fit, or the
+            map names what the detector does not read.
+    """
+    every = [*info.state_names, *preview_names(info), *info.feature_names]
+    inputs = {every[i]: i for i in detector.columns.tolist()}
+    scale, offset = sequence_map.scale, sequence_map.offset
+    for name in (*sequence_map.columns, *scale, *offset):
+        if name not in inputs:
+            raise ValueError(
+                f"map: '{name}'{did_you_mean(name, inputs)} is none of the monitor's inputs "
+                f"{list(inputs)}"
+            )
+    given_s, step_s = sequence_map.step_s, detector.step_s
+    stride = max(1, round(step_s / max(given_s, 1e-6)))
+    if not math.isclose(stride * given_s, step_s, rel_tol=1e-6):
+        raise ValueError(
+            f"map: 'step_s' is {given_s}, expected {step_s}, the time between two rows of the "
+            "monitor, or an integer fraction of it [s]"
+        )
+    data, names = _arrays(path, sequence_map)
+    columns = {name: sequence_map.columns.get(name, name) for name in inputs}
+    if missing := [column for column in dict.fromkeys(columns.values()) if column not in names]:
+        raise ValueError(
+            f"sequences '{path}' have no observations {missing}, which the monitor reads; they "
+            f"have {listed(names)}: 'columns' of the map may name another one for an input"
+        )
+    rows = np.zeros((*data[:, ::stride].shape[:2], len(every)))
+    for name, column in columns.items():
+        values = data[:, ::stride, names.index(column)] * scale.get(name, 1.0)
+        rows[:, :, inputs[name]] = values + offset.get(name, 0.0)
+    return [_motions(sequence, step_s) for sequence in rows]
+
+
+def _arrays(path: Path, sequence_map: SequenceMap) -> tuple[np.ndarray, list[str]]:
+    """Observations (num_sequences, num_steps, n) and their names."""
+    with reading(path, "not an .npz file: sequences", Exception), np.load(path) as file:
+        for name in (sequence_map.data, sequence_map.names):
+            if name not in file.files:
+                raise ValueError(f"'{path}' has no array '{name}'; it has {file.files}")
+        data = file[sequence_map.data]
+        names = file[sequence_map.names].astype(str).ravel().tolist()
+    if data.ndim not in (2, 3) or data.shape[-1] != len(names) or data.dtype.kind not in "fiu":
+        raise ValueError(
+            f"sequences '{path}': '{sequence_map.data}' is {data.dtype} of shape {data.shape}, "
+            f"expected numbers (num_sequences, num_steps, {len(names)}): '{sequence_map.names}' "
+            f"has {len(names)} names"
+        )
+    return data.reshape(-1, *data.shape[-2:]), names
+
+
+def _motions(rows: np.ndarray, step_s: float) -> list[Motion]:
+    """The motions of a sequence (K, n) between missing values, of three rows or more."""
+    kept = np.flatnonzero(np.isfinite(rows).all(axis=1))
+    parts = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
+    return [(step_s * part, rows[part]) for part in parts if len(part) > 2]

@@ -1,0 +1,82 @@
+"""When an alarm begins and ends, and how it is told."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drake_safety.cli.run_settings import events_table
+from drake_safety.evaluation.timeline_figure import levels_figure
+from drake_safety.learning.change_detector import RECOVERY_S, Alarm
+from sprung_motions import INFO, STEP_S, learned, motion
+
+pytestmark = pytest.mark.train
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return learned()
+
+
+def test_an_alarm_ends_after_five_seconds_below_the_limit(detector):
+    rows = motion(30.0, 50, slice(100, 140))
+    levels, (one,) = detector.watch([rows], INFO.state_names)
+    largest = levels.max(axis=1)
+    last = int(np.flatnonzero(largest > 1.0)[-1])
+    assert one.begin == int(np.argmax(largest > 1.0))
+    assert one.end - last == round(RECOVERY_S / STEP_S)
+
+
+def test_rows_that_are_not_charted_are_no_time_without_an_alarm(detector):
+    rows = motion(30.0, 50, slice(100, 140))
+    ((begin, end, _),) = detector.watch([rows], INFO.state_names)[1]
+    cut = end - 20
+    (one,) = detector.watch([rows[:cut], rows[cut:]], INFO.state_names)[1]
+    assert (one.begin, one.end) == (begin, end + 2)
+
+
+def test_the_events_of_a_run_have_begin_and_end_of_every_alarm():
+    time_s = 0.02 * np.arange(50)
+    alarm = np.zeros((50, 1))
+    alarm[10:20] = alarm[40:] = 1.0
+    cause = np.full(50, "", dtype=object)
+    cause[10:20], cause[40:] = "inputs frozen", "pushed steadily down"
+    extra = {"safety_probability": np.ones((50, 1)), "alarm": alarm, "alarm_cause": cause}
+    told = [
+        [*zip(*(column.cells for column in table.columns), strict=True)]
+        for table in (
+            events_table([(0.5, "ball")], time_s, extra, SimpleNamespace(calibrations_={})),
+            events_table([], time_s, extra, SimpleNamespace(calibrations_={"plan": None})),
+            events_table(
+                [], time_s, {"safety_probability": alarm}, SimpleNamespace(calibrations_={})
+            ),
+        )
+    ]
+    assert told[0] == [
+        ("0.20", "monitor: inputs frozen", "1.00"),
+        ("0.40", "monitor: the alarm ends", "1.00"),
+        ("0.50", "ball", "1.00"),
+        ("0.80", "monitor: pushed steadily down", "1.00"),
+    ]
+    assert told[1][0][1] == "monitor: inputs frozen. The promise is withdrawn"
+    assert told[2] == []
+
+
+def test_the_figure_has_the_largest_levels_the_limit_and_the_alarms():
+    time_s = 0.02 * np.arange(20_000)
+    names = ["a", "b", "c", "d", "e"]
+    levels = np.full((20_000, 5), 0.5) * [1.0, 0.2, 1.1, 1.2, 1.3]
+    levels[10_001, 0] = 7.0
+    figure = levels_figure(time_s, levels, names, [Alarm(10_001, 10_500, "inputs frozen")], 1.0)
+    (axes,) = figure.axes
+    *curves, limit = axes.lines
+    assert [curve.get_label() for curve in curves] == ["a", "e", "d", "c"]
+    assert max(curves[0].get_ydata()) == 7.0
+    assert len(curves[0].get_ydata()) <= 4000
+    assert [*limit.get_ydata()] == [1.0, 1.0]
+    (span,) = axes.patches
+    assert (span.get_x(), span.get_width()) == pytest.approx((200.02, 9.96))
+    assert [text.get_text() for text in axes.texts] == ["inputs frozen"]
+    (axes,) = levels_figure(time_s, levels, names, [], math.inf).axes
+    assert len(axes.lines) == 4

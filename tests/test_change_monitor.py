@@ -1,0 +1,128 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_safety import ChangeMonitor, load_assessment, load_scenario
+from sprung_motions import HORIZON, INFO, STEP_S, learned, motion
+
+pytestmark = pytest.mark.train
+
+PUSHED = slice(100, 140)
+
+
+class Played:
+    """A diagram that plays rows of (state, desired preview, features), row k at step k."""
+
+    def __init__(self, rows, detector=None, hold=None):
+        builder = DiagramBuilder()
+        assessment = SimpleNamespace(info_=INFO, detector_=detector or learned())
+        self.monitor = builder.AddSystem(ChangeMonitor(assessment))
+        self.num_rows = len(rows)
+        times = STEP_S * (np.arange(len(rows) + 1) - 0.5)
+        parts = np.split(rows, [2, 2 + HORIZON], axis=1)
+        inputs = dict(zip(("state", "desired_preview", "features"), parts, strict=True))
+        for name, part in (inputs if hold is None else inputs | {"hold": hold}).items():
+            held = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([part, part[-1:]]).T)
+            source = builder.AddSystem(TrajectorySource(held))
+            builder.Connect(source.get_output_port(), self.monitor.GetInputPort(name))
+        self.simulator = Simulator(builder.Build())
+        root = self.simulator.get_mutable_context()
+        self.context = self.monitor.GetMyMutableContextFromRoot(root)
+
+    def told(self):
+        """Levels, alarm and its cause."""
+        ports = [self.monitor.GetOutputPort(name) for name in ("levels", "alarm", "alarm_cause")]
+        levels, alarm, cause = (np.copy(port.Eval(self.context)) for port in ports)
+        return levels, alarm[0], str(cause)
+
+    def history(self):
+        """The same after each row."""
+        found = []
+        for row in range(self.num_rows):
+            self.simulator.AdvanceTo((row + 0.25) * STEP_S)
+            found.append(self.told())
+        levels, alarm, cause = zip(*found, strict=True)
+        return np.array(levels), np.array(alarm), cause
+
+
+def test_a_diagram_and_rows_have_the_same_levels_and_alarms():
+    rows = np.concatenate([motion(30.0, 50, PUSHED), motion(2.0, 51, slice(0, None))])
+    levels, alarm, cause = Played(rows).history()
+    found, alarms = learned().watch([rows], INFO.state_names)
+    np.testing.assert_allclose(levels, found, atol=1e-5)  # Single precision in one of them.
+    assert not levels[:2].any() and len(alarms) >= 2
+    begin, end, said = alarms[-2]
+    assert 100 < begin < 140 < end < 600 and "joint knee answers unlike in training" in said
+    assert alarms[-1].end == len(rows)
+    expected = np.zeros(len(rows))
+    for one in alarms:
+        expected[one.begin : one.end] = 1.0
+        assert {*cause[one.begin : one.end]} == {one.cause} != {""}
+    np.testing.assert_array_equal(alarm, expected)
+    frozen = np.tile(rows[0], (6, 1))
+    levels, _, _ = Played(frozen).history()
+    np.testing.assert_allclose(levels, learned().levels_of([frozen]), atol=1e-5)
+
+
+def test_it_waits_while_it_is_held():
+    hold = np.zeros((300, 1))
+    hold[PUSHED] = 1.0
+    rows = motion(15.0, 50)
+    rows[PUSHED] = rows[100]  # Frozen.
+    levels, alarm, _ = Played(rows, hold=hold).history()
+    assert not alarm.any()
+    np.testing.assert_array_equal(levels[100:142], np.tile(levels[99], (42, 1)))
+    assert not np.array_equal(levels[142], levels[99])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_inputs_that_are_not_finite_are_left_out(value):
+    rows = motion(4.0, 50)
+    rows[40, 1] = value
+    levels, alarm, _ = Played(rows).history()
+    assert np.isfinite(levels).all() and not alarm.any()
+    np.testing.assert_array_equal(levels[40:43], np.tile(levels[39], (3, 1)))
+    assert not np.array_equal(levels[43], levels[39])
+
+
+def test_a_reset_ends_the_alarm_and_empties_the_charts():
+    played = Played(motion(4.0, 50, slice(10, None)))
+    played.simulator.AdvanceTo(2.0)
+    levels, alarm, cause = played.told()
+    assert levels.all() and alarm == 1.0 and cause
+    played.monitor.reset(played.context)
+    levels, alarm, cause = played.told()
+    assert not levels.any() and alarm == 0.0 and not cause
+
+
+def test_it_adopts_the_detector_of_an_adapted_assessment():
+    known = [motion(60.0, seed, slice(0, None)) for seed in range(2)]
+    adapted, rows = learned().with_motions(known), motion(3.0, 79, slice(0, None))
+    played = Played(rows)
+    played.monitor.adopt(played.context, SimpleNamespace(detector_=adapted))
+    levels, alarm, _ = played.history()
+    np.testing.assert_allclose(levels, adapted.levels_of([rows]), atol=1e-5)
+    assert not alarm.any() and Played(rows).history()[1].any()
+
+
+def test_without_limits_it_reports_levels_and_never_alarms():
+    unlimited = replace(learned(), alarm_level=np.inf)
+    levels, alarm, _ = Played(motion(3.0, 50, slice(10, None)), unlimited).history()
+    assert levels.max() > 1.0 and not alarm.any()
+
+
+@pytest.mark.parametrize("on_alarm", ["unknown", "report"])
+def test_a_scenario_says_what_an_alarm_does(on_alarm):
+    scenario = load_scenario("laikago_balancing")
+    scenario.on_alarm = on_alarm
+    loop = scenario.make_loop("nominal", assessment=load_assessment("laikago_balancing"))
+    assert loop.GetOutputPort("alarm").size() == 1
+    assert loop.GetOutputPort("levels").size() == len(loop.state_names)
+    evaluator = loop.GetSubsystemByName("safety_assessor").evaluator
+    assert evaluator.HasInputPort("alarm") == (on_alarm == "unknown")

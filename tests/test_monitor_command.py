@@ -1,0 +1,191 @@
+"""`drake-safety monitor`: logs and sequences of observations, judged by a detector."""
+
+import copy
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from command_line import call
+from drake_safety import load_assessment, load_scenario
+from drake_safety.learning.change_detector import rows_of
+from drake_safety.logs.episodes import motions_from_log
+from drake_safety.logs.robot_log import read_pieces
+from drake_safety.logs.sequences import SequenceMap, read_sequences
+from log_files import TABLE_MAP, frame_of, record
+from sprung_motions import HORIZON, INFO, STEP_S, learned, motion
+
+pytestmark = pytest.mark.train
+
+OBSERVED = ["load", "unread", "q", "dq", "now", "next"]
+COLUMNS = {
+    "knee": "q",
+    "knee_rate": "dq",
+    "desired goal [0]": "now",
+    "desired goal [1]": "next",
+}
+MAP = SequenceMap(step_s=STEP_S, columns=COLUMNS, scale={"knee_rate": 20.0}, offset={"knee": 0.5})
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return learned()
+
+
+def observed(rows):
+    """What a policy observes of rows (K, n): scaled rates, and positions about another zero."""
+    q, dq, now, later, load = rows[:, [0, 1, 2, 3, 2 + HORIZON]].T
+    return np.stack([load, np.full(len(rows), np.nan), q - 0.5, dq / 20.0, now, later], axis=1)
+
+
+def write(path, data, **arrays):
+    np.savez(path, **{"observations": data, "observation_names": np.array(OBSERVED)} | arrays)
+    return path
+
+
+def test_sequences_are_rows_of_the_detector(detector, tmp_path):
+    rows = [motion(4.0, seed) for seed in (60, 61)]
+    data = np.stack([observed(one) for one in rows])
+    file = write(tmp_path / "many.npz", data)
+    names = np.array(OBSERVED, dtype="S")
+    one_file = write(tmp_path / "one.npz", data[1], observation_names=names)
+    found = read_sequences(file, MAP, detector, INFO)
+    for sequence, expected in zip(found, rows, strict=True):
+        ((time_s, read),) = sequence
+        np.testing.assert_allclose(time_s, STEP_S * np.arange(len(expected)))
+        used = detector.columns
+        np.testing.assert_allclose(read[:, used], expected[:, used], atol=1e-12)
+        assert not read[:, np.setdiff1d(np.arange(read.shape[1]), used)].any()
+    (alone,) = read_sequences(one_file, MAP, detector, INFO)
+    np.testing.assert_array_equal(alone[0][1], found[1][0][1])
+
+
+def test_a_sequence_is_cut_at_missing_values_and_thinned_to_the_step_of_the_detector(
+    detector, tmp_path
+):
+    data = np.repeat(observed(motion(4.0, 60)), 2, axis=0)  # At twice the rate.
+    data[20:24, 2] = data[140:, 4] = np.nan
+    file = write(tmp_path / "fast.npz", data)
+    read_by = dataclasses.replace(MAP, step_s=0.5 * STEP_S)
+    (sequence,) = read_sequences(file, read_by, detector, INFO)
+    first, second = (time_s for time_s, _ in sequence)
+    np.testing.assert_allclose(first, STEP_S * np.arange(10))
+    np.testing.assert_allclose(second, STEP_S * np.arange(12, 70))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"columns": {}}, r"no observations \['knee', 'knee_rate', .*they have \['load'"),
+        ({"columns": {"kne": "q"}}, r"'kne' \(did you mean 'knee'\?\) is none of .*'load'\]"),
+        ({"scale": {"light": 2.0}}, "'light' is none of the monitor's inputs"),
+        ({"step_s": 0.0}, r"'step_s' is 0.0, expected 0.05"),
+        ({"step_s": 0.04}, r"'step_s' is 0.04, expected 0.05"),
+        ({"data": "obs"}, r"has no array 'obs'; it has \['observations', 'observation_names'\]"),
+        ({"data": "observation_names"}, r"of shape \(6,\), expected numbers .*, 6\)"),
+    ],
+)
+def test_a_map_that_does_not_fit_is_refused(detector, tmp_path, change, message):
+    file = write(tmp_path / "runs.npz", observed(motion(2.0, 60)))
+    with pytest.raises(ValueError, match=message):
+        read_sequences(file, dataclasses.replace(MAP, **change), detector, INFO)
+
+
+def test_what_is_no_file_of_arrays_is_refused(detector, tmp_path):
+    (tmp_path / "runs.npz").write_text("time,q\n")
+    with pytest.raises(ValueError, match=r"not an \.npz file: sequences '.*runs\.npz'"):
+        read_sequences(tmp_path / "runs.npz", MAP, detector, INFO)
+    file = write(tmp_path / "objects.npz", np.array([{}], dtype=object))
+    with pytest.raises(ValueError, match=r"not an \.npz file: sequences '.*objects\.npz'"):
+        read_sequences(file, MAP, detector, INFO)
+
+
+@pytest.fixture(scope="module")
+def folder(detector, tmp_path_factory):
+    """An assessment with the detector of the mass on a spring, and a folder of runs."""
+    folder = tmp_path_factory.mktemp("spring")
+    assessment = copy.copy(load_assessment("laikago_balancing"))
+    scenario = load_scenario("laikago_balancing")
+    assert assessment.info_.scenario_hash == scenario.simulation_hash()
+    names = ("state_names", "output_names", "feature_names", "horizon")
+    changed = {name: getattr(INFO, name) for name in names}
+    assessment.info_ = dataclasses.replace(assessment.info_, **changed)
+    assessment.detector_ = detector
+    runs = folder / "runs"
+    runs.mkdir()
+    usual, pushed = motion(30.0, 60), motion(30.0, 50, slice(100, 140))
+    write(runs / "a.npz", np.stack([observed(usual), observed(pushed)]))
+    write(runs / "b.npz", observed(usual))
+    (runs / "notes.txt").write_text("")
+    text = f"step_s: {STEP_S}\nscale: {{knee_rate: 20.0}}\noffset: {{knee: 0.5}}\ncolumns:\n"
+    text += "".join(f"  {name}: {column}\n" for name, column in COLUMNS.items())
+    (folder / "map.yaml").write_text(text)
+    return folder, assessment
+
+
+def test_one_command_judges_a_folder(folder, monkeypatch, capsys, detector):
+    folder, assessment = folder
+    monkeypatch.setattr("drake_safety.cli.monitor.load_assessment", lambda *_: assessment)
+    options = ("--map", folder / "map.yaml", "--assessment", folder, "--out", folder / "out")
+    assert not call(monkeypatch, "monitor", "laikago_balancing", "--log", folder / "runs", *options)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert detector.describe() in printed
+    for told in ("runs/a.npz [0]", "runs/a.npz [1]", "runs/b.npz [0]", "no alarm; largest: knee"):
+        assert told in printed
+    logs = json.loads((folder / "out" / "monitor.json").read_text())["entries"]["logs"]
+    assert [(one["sequence"], len(one["alarms"])) for one in logs] == [(0, 0), (1, 1), (0, 0)]
+    ((begin, end, cause),) = detector.watch([motion(30.0, 50, slice(100, 140))], INFO.state_names)[
+        1
+    ]
+    (alarm,) = logs[1]["alarms"]
+    assert (alarm["begin_s"], alarm["end_s"]) == pytest.approx((begin * STEP_S, end * STEP_S))
+    assert alarm["cause"] == cause
+    assert alarm["level"] == logs[1]["level"] > 1.0 > logs[0]["level"] > 0.0
+    assert f"{begin * STEP_S:.2f}" in printed
+    pictures = {path.name for path in (folder / "out").iterdir()} - {"monitor.json"}
+    assert pictures == {f"{n}.{kind}" for n in ("a-1", "a-2", "b-3") for kind in ("png", "svg")}
+
+
+def test_a_folder_without_logs_is_refused(folder, monkeypatch, capsys, tmp_path):
+    folder, assessment = folder
+    monkeypatch.setattr("drake_safety.cli.monitor.load_assessment", lambda *_: assessment)
+    options = ("--map", folder / "map.yaml", "--assessment", folder)
+    for log, told in ((tmp_path, "has no log; known are ['.csv'"), ("x.npz", "does not exist")):
+        assert call(monkeypatch, "monitor", "laikago_balancing", "--log", log, *options) == 2
+        assert told in capsys.readouterr().out
+
+
+def test_a_log_is_judged_as_its_motions_are_with_its_own_times(monkeypatch, capsys, tmp_path):
+    scenario = load_scenario("laikago_balancing")
+    scenario.episode_duration_s = 2.0
+    loop = scenario.make_loop("actual")
+    frame = frame_of(record(loop, 3), loop.kinematics.joint_names)
+    frame.loc[300:320, "gyro_x"] = np.nan
+    frame.to_csv(tmp_path / "stand.csv", index=False)
+    (tmp_path / "columns.yaml").write_text(TABLE_MAP)
+    options = ("--log", tmp_path / "stand.csv", "--map", tmp_path / "columns.yaml")
+    assert not call(
+        monkeypatch, "monitor", "laikago_balancing", *options, "--out", tmp_path / "out"
+    )
+    assert "stand.csv' is cut where values are missing" in capsys.readouterr().out
+    (one,) = json.loads((tmp_path / "out" / "monitor.json").read_text())["entries"]["logs"]
+    assessment = load_assessment("laikago_balancing")
+    pieces = read_pieces(tmp_path / "stand.csv", tmp_path / "columns.yaml", loop.robot).pieces
+    motions = motions_from_log(pieces, loop)
+    assert len(motions) == 2
+    for begin_s, motion_ in zip((0.0, 321 * scenario.time_step_s), motions, strict=True):
+        expected = begin_s + scenario.monitor_step_s * np.arange(len(motion_.time_s))
+        np.testing.assert_allclose(motion_.time_s, expected, atol=1e-6)
+    levels = assessment.detector_.levels_of([rows_of(motion_) for motion_ in motions])
+    assert one["level"] == pytest.approx(levels.max())
+    assert one["end_s"] == pytest.approx(motions[1].time_s[-1])
+    assert one["left_safe_set"] == ""
+    every_second = motions_from_log(pieces, loop, step_s=0.04)
+    np.testing.assert_allclose(every_second[0].state, motions[0].state[::2], atol=1e-9)
+
+
+def test_a_log_without_the_policy_s_actions_is_refused():
+    loop = load_scenario("go2_walking").make_loop("nominal")
+    with pytest.raises(ValueError, match=r"reads \['action_FL_calf_joint', .*npz file"):
+        motions_from_log([], loop)

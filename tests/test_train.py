@@ -1,0 +1,44 @@
+import numpy as np
+import pytest
+
+from command_line import call
+from drake_safety.cli.training_folder import MODES, adapted_folder, load_assessment
+from drake_safety.learning.change_detector import usual_rows
+from drake_safety.learning.seeds import MOTION
+from drake_safety.simulation.dataset import load_episodes
+from shuttle_task import SCENARIO
+
+
+def same_detector(one, other):
+    pairs = zip(one.arrays().items(), other.arrays().items(), strict=True)
+    return all(a[0] == b[0] and np.array_equal(a[1], b[1]) for a, b in pairs)
+
+
+@pytest.mark.slow
+def test_the_monitor_is_learned_from_undisturbed_motion_that_is_kept(monkeypatch, capsys, tmp_path):
+    file, out = tmp_path / "shuttling.yaml", tmp_path / "run"
+    file.write_text(SCENARIO)
+    train = ("train", file, "--episodes", 60, "--workers", 1, "--out")
+    assert call(monkeypatch, *train, out, "--motion", 0.4) == 0
+    assert "0 min of motion for its limits" in capsys.readouterr().out
+    motions = load_episodes(out / "motion")
+    assert (len(motions), motions.info.seed, motions.info.step_s) == (30, MOTION.first, 0.02)
+    learned = {mode: load_assessment(out, mode).detector_ for mode in MODES}
+    assert same_detector(*learned.values())
+    halves = [len(one) - 2 for one in usual_rows(motions) if len(one) > 2]
+    assert learned["paper"].motion_s == pytest.approx(0.02 * sum(halves[1::2]))
+    # Of an actual plant the monitor learns from its motion too, which no pair is.
+    adapt = ("adapt", file, "--assessment", out, "--feedback", 10, "--workers", 1)
+    assert call(monkeypatch, *adapt) == 0
+    (folder,) = out.glob("feedback/*/motion")
+    actual = load_episodes(folder)
+    assert (actual.info.variation, actual.info.seed) == ("actual", MOTION.first + 1)
+    for mode in MODES:
+        adapted = load_assessment(adapted_folder(out, "actual"), mode).detector_
+        assert same_detector(adapted, learned[mode].with_motions(usual_rows(actual)))
+        assert not same_detector(adapted, learned[mode])
+    # Without motion it is learned from the episodes, whose rows are a step apart.
+    alone = tmp_path / "alone"
+    assert call(monkeypatch, *train, alone, "--motion", 0, "--mode", "paper") == 0
+    assert not (alone / "motion").exists()
+    assert load_assessment(alone, "paper").detector_.step_s == 0.04
