@@ -293,7 +293,7 @@ def judged(
                 "delay_s": median(delay_s[of_kind & is_detected]),
             }
             known = of_kind & is_detected & has_truth
-            if known.any():
+            if known.any() and any(monitor.names):
                 estimates["named"] = share(is_named[known], group[known])
         if not math.isnan(monitor.limit):
             estimates["alarmed"] = share(level[of_kind] > monitor.limit, group[of_kind])

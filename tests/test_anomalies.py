@@ -133,8 +133,10 @@ def test_areas_shares_delays_and_names_of_episodes():
         }
     )
     assert found["pooled"]["auc"].n == 5
-    plain = judged(column_monitor(), calibration, unperturbed, STEP_S)
-    assert "alarmed" not in plain["unperturbed"]
+    nameless = Monitor("nameless", [""], lambda rows: rows[:, :1])
+    one = constant("drift", 9, [0, 9], [0, 0], truth=["hip"])
+    plain = judged(nameless, calibration, [*unperturbed, one], STEP_S)["drift"]
+    assert plain["detected"].value == 1.0 and not {"alarmed", "named"} & set(plain)
 
 
 def test_a_wrong_name_is_none_and_episodes_of_one_recording_are_one_sample():
