@@ -18,7 +18,11 @@ from gliding_task import gliding
 
 NUM_EPISODES, PATIENCE_S = 120, 60.0
 # Sockets of dask's client are closed by its own threads, after the test.
-pytestmark = pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning"),
+    # Of joblib before 1.6.
+    pytest.mark.filterwarnings("ignore:`apply_async` is deprecated:DeprecationWarning"),
+]
 
 
 def start(folder, *arguments):

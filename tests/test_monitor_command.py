@@ -150,9 +150,10 @@ def test_one_command_judges_a_folder(folder, monkeypatch, capsys, detector):
 def test_a_folder_without_logs_is_refused(folder, monkeypatch, capsys, tmp_path):
     folder, assessment = folder
     monkeypatch.setattr("drake_safety.cli.monitor.load_assessment", lambda *_: assessment)
-    options = ("--log", tmp_path, "--map", folder / "map.yaml", "--assessment", folder)
-    assert call(monkeypatch, "monitor", "laikago_balancing", *options) == 2
-    assert "has no log; known are ['.csv'" in capsys.readouterr().out
+    options = ("--map", folder / "map.yaml", "--assessment", folder)
+    for log, told in ((tmp_path, "has no log; known are ['.csv'"), ("x.npz", "does not exist")):
+        assert call(monkeypatch, "monitor", "laikago_balancing", "--log", log, *options) == 2
+        assert told in capsys.readouterr().out
 
 
 def test_a_log_is_judged_as_its_motions_are_with_its_own_times(monkeypatch, capsys, tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from packaging.version import Version
 
 from command_line import call
 from drake_safety.assessments import assessed_scenarios, load_assessment
@@ -30,6 +31,8 @@ FIELDS = {
 }
 """Output port and field of `Assessments`."""
 NUM_INPUTS = 1000
+TAKES_NO_ROWS = Version("1.32")
+"""The first onnxruntime that takes an empty batch through the graph's search of the grid."""
 SINGLE = 2e-5
 """Largest difference of probabilities by rounding of single precision."""
 
@@ -243,8 +246,9 @@ def test_any_number_of_rows_is_taken_none_too(tmp_path):
     for row in (0, 500):
         alone = runtime({name: values[row : row + 1] for name, values in ports.items()})
         np.testing.assert_allclose(alone["belief"][0], together["belief"][row], atol=SINGLE)
-    none = runtime({name: values[:0] for name, values in ports.items()})
-    assert (none["belief"].shape, none["safety_probability"].shape) == ((0, 3), (0,))
+    if Version(onnxruntime.__version__) >= TAKES_NO_ROWS:
+        none = runtime({name: values[:0] for name, values in ports.items()})
+        assert (none["belief"].shape, none["safety_probability"].shape) == ((0, 3), (0,))
     # The same assessment gives the same file.
     load_assessment("go2_walking").to_onnx(tmp_path / "again")
     assert (tmp_path / "gamma.onnx").read_bytes() == (tmp_path / "again").read_bytes()

@@ -61,7 +61,8 @@ def test_the_lines_of_the_documentation_draw_a_task_of_ones_own(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     names = {"assessment": assessment, "scenario": scenario, "run_episodes": run_episodes}
     exec(block, names)
-    assert matplotlib.image.imread(tmp_path / "truth.png").shape == (920, 1800, 4)
+    height, *others = matplotlib.image.imread(tmp_path / "truth.png").shape
+    assert (abs(height - 920) <= 1, others) == (True, [1800, 4])
     left, right = names["figure"].axes[:2]
     assert left.get_xlabel() == right.get_xlabel() == "tilt [rad]"
     assert left.get_ylabel() == "tilt rate [rad/s]"

@@ -49,8 +49,7 @@ def monitor(
     log: Annotated[
         list[Path],
         typer.Option(
-            help="Log of a robot, .npz file of sequences, or a folder of either; may be repeated.",
-            exists=True,
+            help="Log of a robot, .npz file of sequences, or a folder of either; may be repeated."
         ),
     ],
     log_map: Annotated[Path, typer.Option("--map", help="Map of their columns, a YAML file.")],
@@ -89,6 +88,8 @@ def monitor(
 def _files(given: Path) -> list[Path]:
     """A log, or those in a folder that is not itself a ROS 2 bag."""
     bag, known = "metadata.yaml", [*FORMATS, _SEQUENCES]
+    if not given.exists():
+        raise ValueError(f"log '{given}' does not exist")
     if not given.is_dir() or (given / bag).is_file():
         return [given]
     found = [p for p in given.iterdir() if p.suffix.lower() in known or (p / bag).is_file()]

@@ -50,6 +50,8 @@ def run_monitored(
             until_s=until_s,
             with_features=True,
         )
+        if num_workers == 1:  # A worker process has none of its own.
+            return {one.index: one for one in simulate(indices)}
         found = run_batches(simulate, indices, num_workers=num_workers, batch_size=1)
         return {one.index: one for one in found}
 
