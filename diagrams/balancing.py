@@ -122,7 +122,7 @@ class Balancing(LeggedLoop):
         if recovery:
             for name in ("desired_foot_positions", "desired_yaw"):
                 builder.Connect(switch.GetOutputPort(name), controller.GetInputPort(name))
-        command = self._delayed(builder, controller.GetOutputPort("desired_joint_state"))
+        command = self._servo_command(builder, controller.GetOutputPort("desired_joint_state"))
         physics.connect_servos(builder, kinematics.joint_names, command)
 
         safe_set = BalanceSafeSet(kinematics, parameters.safe_set)

@@ -120,7 +120,12 @@ class Reaching(LeggedLoop):
         )
         self._controller = controller
         self._connect_controller(builder, controller, measured)
-        torques = self._delayed(builder, controller.GetOutputPort("actuation"))
+        actuators = map(self.plant.get_joint_actuator, self.plant.GetJointActuatorIndices())
+        torques = self._as_received(
+            builder,
+            controller.GetOutputPort("actuation"),
+            [one.name() for one in actuators if one.model_instance() == self.robot_instance],
+        )
         physics.connect_torques(builder, torques)
         self._add_push_source(builder)
 

@@ -136,7 +136,7 @@ class Walking(LeggedLoop):
         )
         builder.Connect(measured, controller.GetInputPort("plant_state"))
         builder.Connect(command, controller.GetInputPort("command"))
-        joint_state = self._delayed(builder, controller.GetOutputPort("desired_joint_state"))
+        joint_state = self._servo_command(builder, controller.GetOutputPort("desired_joint_state"))
         physics.connect_servos(builder, self.kinematics.joint_names, joint_state)
         self._add_push_source(builder)
         self._watch(

@@ -10,6 +10,7 @@ from drake_safety.cli import run_app
 from studies.ablation import ablate
 from studies.adaptation import adaptation
 from studies.animation import animation
+from studies.anomalies import anomalies
 from studies.bench import bench
 from studies.compare import compare
 from studies.converged import converged
@@ -32,7 +33,8 @@ app = typer.Typer(
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
     *(evaluate, compare, promises),
-    *(ablate, plan_study, monitor, adaptation, readings, converged, scale, truth, walking),
+    *(ablate, plan_study, monitor, anomalies, adaptation, readings, converged, scale),
+    *(truth, walking),
     *(animation, bench, store, readme, ship),
 )
 for _command in _COMMANDS:

@@ -35,7 +35,7 @@ from studies.documents import CARD_FILE, EVALUATION_FILE, card_text, generate
 NUM_EPISODES = 6
 """Number of fresh episodes whose verdicts are stored."""
 # Stored beside the evaluation.
-_STUDIES = ("readings", "converged", "shifts", "monitor", "walking")
+_STUDIES = ("readings", "converged", "shifts", "monitor", "anomalies", "walking")
 DOCUMENTS = [
     Path("README.md"),
     *(Path("docs") / f"{name}.md" for name in ("results", "paper", "shifts", "walking")),

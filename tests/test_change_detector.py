@@ -123,7 +123,7 @@ def test_an_alarm_says_what_it_saw(names, value, is_square, said):
 
 
 def test_too_little_motion_gives_levels_and_no_alarm():
-    rows = [motion(0.2 * LEAST_MOTION_S, seed) for seed in range(6)]
+    rows = [motion(0.1 * LEAST_MOTION_S, seed) for seed in range(6)]
     detector = ChangeDetector.fit(recorded(rows))
     assert not detector.has_limits and learned().has_limits
     levels, alarms = detector.watch([motion(5.0, 12, ALWAYS)])

@@ -74,7 +74,9 @@ def test_the_steady_force_is_as_large_as_stated():
 
 
 def test_a_weak_joint_has_less_torque_and_a_soft_one_lower_gains():
-    weaker = Shift(joints={KNEE: JointShift(effort_scale=0.5, stiffness_scale=0.25)})
+    weaker = Shift(
+        joints={KNEE: JointShift(effort_scale=0.5, stiffness_scale=0.25, damping_scale=3.0)}
+    )
     plain, shifted = loop_with(None).plant, loop_with(weaker).plant
 
     def actuator(plant, joint):
@@ -84,7 +86,7 @@ def test_a_weak_joint_has_less_torque_and_a_soft_one_lower_gains():
     weak, strong = actuator(shifted, KNEE), actuator(plain, KNEE)
     assert weak.effort_limit() == 0.5 * strong.effort_limit()
     assert weak.get_controller_gains().p == 0.25 * strong.get_controller_gains().p
-    assert weak.get_controller_gains().d == 0.25 * strong.get_controller_gains().d
+    assert weak.get_controller_gains().d == 0.75 * strong.get_controller_gains().d
     other = "FL_calf_joint"
     assert actuator(shifted, other).effort_limit() == actuator(plain, other).effort_limit()
 
@@ -118,6 +120,26 @@ def test_a_late_command_is_late():
     knee = 12 + loop_with(None).kinematics.joint_names.index(KNEE)
     difference = np.abs(late.true_state[:, knee] - plain.true_state[:, knee])
     assert 1e-3 < difference.max() < 0.3
+
+
+def test_swapped_joints_get_each_other_s_command_from_the_start_of_the_fault():
+    knees = [KNEE, "FL_hip_joint"]
+    loop = loop_with(Shift(command_faults=[Fault(kind="swap", entries=knees, start_s=0.1)]))
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset_to(context, None, loop.standing_start())
+    simulator.Initialize()
+    system = loop.GetSubsystemByName("command_faults")
+    one, other = (loop.kinematics.joint_names.index(name) for name in knees)
+    for time_s in (0.05, 0.2):
+        simulator.AdvanceTo(time_s)
+        own = system.GetMyContextFromRoot(context)
+        sent, received = system.get_input_port().Eval(own), system.get_output_port().Eval(own)
+        expected = sent.copy()
+        if time_s > 0.1:
+            expected[[one, other]] = sent[[other, one]]
+        np.testing.assert_array_equal(received, expected)
+        assert sent[one] != sent[other]
 
 
 RATES = Fault(kind="zero", entries=[".*_w", "trunk_[wv]."])
@@ -190,6 +212,7 @@ def test_a_scenario_file_can_state_a_shift(tmp_path):
         (lambda: Shift(command_delay_s=-1.0), "command_delay_s must not be negative"),
         (lambda: Shift(holes_m={"FR": 0.0}), "holes_m of foot 'FR' must be positive"),
         (lambda: JointShift(effort_scale=0.0), "effort_scale must be positive"),
+        (lambda: JointShift(damping_scale=-1.0), "damping_scale must be positive"),
     ],
 )
 def test_a_shift_that_is_none_is_refused(make, message):
@@ -203,6 +226,7 @@ def test_a_shift_that_is_none_is_refused(make, message):
         (Shift(joints={"elbow": JointShift(is_locked=True)}), "no joint for shift 'elbow'; it has"),
         (Shift(holes_m={"tail": 0.1}), "no foot 'tail' for a hole; it has"),
         (Shift(sensor_faults=[Fault(kind="zero", entries=["elbow_q"])]), "no entry 'elbow_q'"),
+        (Shift(command_faults=[Fault(kind="zero", entries=["elbow"])]), "no entry 'elbow'"),
         (Shift(command_delay_s=0.004), "a delay must be a multiple of the period 0.0025 s"),
     ],
 )

@@ -44,7 +44,7 @@ from drake_safety.simulation.scenario import Scenario, load_scenario
 from drake_safety.simulation.worker_processes import end_with_parent
 
 DEFAULT_MOTION_MIN = 24.0
-"""Minutes of undisturbed motion, half of them for the limits."""
+"""Minutes of undisturbed motion."""
 
 
 def train(

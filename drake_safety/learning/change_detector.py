@@ -19,14 +19,15 @@ TIME_CONSTANTS_S = (0.1, 0.5, 2.0)
 """Memories of the charts."""
 FALSE_ALARMS_PER_HOUR = 0.1
 """For which the limits are made: at most one in ten hours of nominal motion."""
-LEAST_MOTION_S = 360.0
-"""Motion for the limits, below which there is no alarm."""
+LEAST_MOTION_S = 720.0
+"""Motion below which there is no alarm."""
 RECOVERY_S = 5.0
 """Time for which every level must be below its limit before an alarm ends [s]."""
 NUM_PREVIEWED = 2
 """Samples of the desired preview that the predictor sees: the one of now and the next."""
 _CLIP = 6.0  # Of an innovation, in standard deviations, so that one impact is no lasting change.
 _BEFORE_LEAVING_S = 0.5  # Left out of a motion that leaves the safe set.
+_NUM_FOLDS = 3
 _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
 _TAIL_SHARE = 0.1  # Of the blocks.
 _LEAST_LIMIT = 0.3  # Of a chart, in standard deviations of its value for white innovations.
@@ -64,7 +65,7 @@ class ChangeDetector:
         alarm_level: 1, or infinite where there was too little motion for limits.
         longest_repeat: Longest known run of repeated inputs.
         step_s: Time between two inputs [s].
-        motion_s: Duration of the motion for the limits [s].
+        motion_s: Duration of the motion of training [s].
     """
 
     predictor: StatePredictor
@@ -92,9 +93,10 @@ class ChangeDetector:
 
     def describe(self) -> str:
         """What the limits were learned from, and what they promise."""
-        motion = f"monitor: {self.motion_s / 60.0:.0f} min of motion for its limits"
+        motion = f"monitor: {self.motion_s / 60.0:.0f} min of motion"
         if self.has_limits:
-            return f"{motion}, for at most one false alarm in {1 / FALSE_ALARMS_PER_HOUR:.0f} h"
+            hours = f"{1 / FALSE_ALARMS_PER_HOUR:.0f} h"
+            return f"{motion}, limits for at most one false alarm in {hours}"
         needed = f"{LEAST_MOTION_S / 60.0:.0f} are needed"
         return f"{motion}, {needed}: it reports levels and never alarms"
 
@@ -102,7 +104,10 @@ class ChangeDetector:
     def fit(
         cls, motions: Episodes, progress: Callable[[float], None] | None = None
     ) -> ChangeDetector:
-        """Learns the prediction from one half of the motions, and the limits from the other.
+        """Learns the prediction, and the limits from motions that a prediction has not seen.
+
+        Three further predictions are each learned without a third of the motions, whose errors
+        they give.
 
         Args:
             motions: Undisturbed motions, such as those of `run_motions`; those that leave the safe
@@ -128,11 +133,24 @@ class ChangeDetector:
                 f"ChangeDetector: {len(seen)} motions have three rows; two are needed, one for the "
                 "prediction and one for the limits"
             )
+        folds = min(_NUM_FOLDS, len(seen))
+
+        def learned(left_out: int | None, stage: int) -> StatePredictor:
+            known = [i for i in range(len(seen)) if i % folds != left_out]
+            return StatePredictor.fit(
+                [seen[i] for i in known],
+                [states[i] for i in known],
+                lambda done: progress((stage + done) / (folds + 1)) if progress else None,
+            )
+
+        errors = [np.empty(0)] * len(seen)
         with threadpool_limits(1, user_api="blas"):
-            # Motions alternate, so that both halves are alike.
-            predictor = StatePredictor.fit(seen[::2], states[::2], progress)
+            for fold in range(folds):
+                others = learned(fold, fold)
+                for i in range(fold, len(seen), folds):
+                    errors[i] = others.errors(seen[i], states[i])
             unlimited = cls(
-                predictor=predictor,
+                predictor=learned(None, folds),
                 columns=columns,
                 watched=watched,
                 deviation=np.full(len(watched), 1e-9),
@@ -142,34 +160,34 @@ class ChangeDetector:
                 step_s=float(info.step_s),
                 motion_s=0.0,
             )
-            return unlimited._limited(seen[1::2], states[1::2])
+            return unlimited._limited(errors)
 
-    def _limited(self, seen: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> ChangeDetector:
-        """Chooses deviations and limits from inputs (K, n_u) and states (K, n_w) of motions."""
-        errors = [self.predictor.errors(*one) for one in zip(seen, states, strict=True)]
+    def _limited(self, errors: Sequence[np.ndarray]) -> ChangeDetector:
+        """Chooses deviations and limits from errors of the prediction (K, n_w) in motions."""
         if len(errors) == 1 and len(errors[0]) > 1:
             errors = np.array_split(errors[0], 2)
         deviation = np.maximum(np.concatenate(errors).std(axis=0), self.deviation)
         charts = [_sizes(self._charts(np.clip(one / deviation, -_CLIP, _CLIP))) for one in errors]
+        blocks = [_block_maxima(one, self.step_s) for one in charts]
         motion_s = self.step_s * sum(map(len, errors))
-        halves = [_block_maxima(charts[i::2] or charts, self.step_s) for i in range(2)]
         least = _LEAST_LIMIT * np.sqrt(self.rates / (2.0 - self.rates))
         least = np.concatenate([least, math.sqrt(2.0) * least])[:, None]
 
-        def scales(blocks: np.ndarray) -> np.ndarray:
-            return np.maximum(blocks.mean(axis=0) + 4.0 * blocks.std(axis=0), least)
+        def scales(known: Sequence[np.ndarray]) -> np.ndarray:
+            maxima = np.concatenate(known)
+            return np.maximum(maxima.mean(axis=0) + 4.0 * maxima.std(axis=0), least)
 
-        # Each half in units of the other's: the limits must hold for motion that they do not know.
+        # Each motion in units of the others: the limits must hold for motion that they do not know.
         levels = [
-            (own / scales(other)).max(axis=(1, 2))
-            for own, other in zip(halves, reversed(halves), strict=True)
+            (own / scales(blocks[:i] + blocks[i + 1 :] or [own])).max(axis=(1, 2))
+            for i, own in enumerate(blocks)
         ]
         per_hour = 3600.0 / _BLOCK_S
         limit = _tail_limit(np.concatenate(levels), FALSE_ALARMS_PER_HOUR / per_hour)
         return replace(
             self,
             deviation=deviation,
-            limits=limit * scales(np.concatenate(halves)),
+            limits=limit * scales(blocks),
             alarm_level=1.0 if motion_s >= LEAST_MOTION_S else math.inf,
             motion_s=motion_s,
         )
@@ -262,7 +280,9 @@ class ChangeDetector:
         seen = [one[:, self.columns] for one in rows]
         states = [one[:, self.watched] for one in rows]
         corrected = replace(self, predictor=self.predictor.corrected(seen, states))
-        limited = corrected._limited(seen, states)
+        limited = corrected._limited(
+            [corrected.predictor.errors(*one) for one in zip(seen, states, strict=True)]
+        )
         return replace(
             corrected,
             deviation=limited.deviation,
@@ -366,31 +386,21 @@ def _sizes(charts: np.ndarray) -> np.ndarray:
     return np.concatenate([np.abs(means), squares], axis=-2)
 
 
-def _block_maxima(charts: Sequence[np.ndarray], step_s: float) -> np.ndarray:
-    """Maxima of blocks of 2 s of charts (K, 6, n_w), (B, 6, n_w); blocks end with motions."""
+def _block_maxima(charts: np.ndarray, step_s: float) -> np.ndarray:
+    """Maxima of blocks of two seconds of charts (K, 6, n_w), (B, 6, n_w)."""
     size = max(1, round(_BLOCK_S / step_s))
-    blocks = [
-        one[i : i + size].max(axis=0)
-        for one in charts
-        for i in range(0, max(len(one) - size // 2, 1), size)
-    ]
-    return np.stack(blocks)
+    starts = range(0, max(len(charts) - size // 2, 1), size)
+    return np.stack([charts[i : i + size].max(axis=0) for i in starts])
 
 
 def _tail_limit(maxima: np.ndarray, probability: float) -> float:
-    """The level that a block exceeds with a small probability, by an exponential tail.
-
-    The mean excess is its upper bound of 95 %: the less motion, the wider the limit.
-    """
-    from scipy.stats import chi2
-
+    """The level that a block exceeds with a small probability, by an exponential tail."""
     threshold = float(np.quantile(maxima, 1.0 - _TAIL_SHARE))
     excess = maxima[maxima > threshold] - threshold
     if not len(excess):
         return 2.0 * float(maxima.max())
-    mean = 2.0 * excess.sum() / chi2.ppf(0.05, 2 * len(excess))
-    extrapolated = threshold + mean * math.log(_TAIL_SHARE / probability)
-    return max(extrapolated, float(maxima.max()))
+    extrapolated = threshold + excess.mean() * math.log(_TAIL_SHARE / probability)
+    return float(max(extrapolated, maxima.max()))
 
 
 def _repeats(x: np.ndarray) -> np.ndarray:

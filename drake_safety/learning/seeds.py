@@ -49,7 +49,12 @@ SHIFTS = SeedBlock(8_000_000, ("shifts",))
 """Conditions that training does not have."""
 MOTION = SeedBlock(9_000_000, ("motion", "motion of the actual robot", "other motion"))
 """Undisturbed motion, of which a monitor learns what is usual, and other motion to judge it."""
-BLOCKS = (TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION, DEMONSTRATION, SHIFTS, MOTION)
+ANOMALIES = SeedBlock(10_000_000, ("unperturbed", "perturbed", "thresholds", "training"))
+"""Motion with and without an anomaly, and that for thresholds and training of other monitors."""
+BLOCKS = (
+    *(TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION),
+    *(DEMONSTRATION, SHIFTS, MOTION, ANOMALIES),
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,11 +27,13 @@ class JointShift:
     """Factor on the motor's largest torque."""
     stiffness_scale: float = 1.0
     """Factor on the position servo's gains."""
+    damping_scale: float = 1.0
+    """Further factor on its damping."""
     is_locked: bool = False
     """Whether the joint keeps its initial position."""
 
     def __post_init__(self) -> None:
-        for name in ("effort_scale", "stiffness_scale"):
+        for name in ("effort_scale", "stiffness_scale", "damping_scale"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"joint shift: {name} must be positive; got {getattr(self, name)}")
 
@@ -92,6 +94,9 @@ class Shift:
     """Joints that answer differently, by name or pattern."""
     command_delay_s: float = 0.0
     """Age of the command that the joints get [s]."""
+    command_faults: list[Fault] = field(default_factory=list)
+    """Faults of the command that the joints get. Entries are joints, their velocities end in
+    ``_rate``; where the command is torques, they are actuators."""
     holes_m: dict[str, float] = field(default_factory=dict)
     """Depth of the ground under a foot [m]."""
     sensor_faults: list[Fault] = field(default_factory=list)

@@ -1,7 +1,7 @@
 """LeggedLoop: base of the tasks of legged robots."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -139,16 +139,24 @@ class LeggedLoop(PlannedLoop):
         self.output_names = self._assessor_observer.output_names
         return self._observer.GetOutputPort("measured_plant_state")
 
-    def _delayed(self, builder: DiagramBuilder, command: OutputPort) -> OutputPort:
-        """Adds the variation's delay of the command between controller and robot."""
-        delay_s = (self.variation.shift or Shift()).command_delay_s
-        if not delay_s:
+    def _as_received(
+        self, builder: DiagramBuilder, command: OutputPort, names: Sequence[str]
+    ) -> OutputPort:
+        """Adds the variation's delay and faults of the command between controller and robot."""
+        shift = self.variation.shift or Shift()
+        delay_s, faults = shift.command_delay_s, list(shift.command_faults)
+        if delay_s:
+            faults.append(Fault(kind="delay", value=delay_s))
+        if not faults:
             return command
-        names = [str(i) for i in range(command.size())]
-        faults = [Fault(kind="delay", value=delay_s)]
         period_s = self.scenario.time_step_s
-        late = add_faults(builder, "command_delay", command, faults, names, period_s=period_s)
-        return late.get_output_port()
+        system = add_faults(builder, "command_faults", command, faults, names, period_s=period_s)
+        return system.get_output_port()
+
+    def _servo_command(self, builder: DiagramBuilder, command: OutputPort) -> OutputPort:
+        """The joint positions and velocities (2 n_j,) that servos receive of those commanded."""
+        names = self.kinematics.joint_names
+        return self._as_received(builder, command, [*names, *(f"{name}_rate" for name in names)])
 
     def _watch(
         self,

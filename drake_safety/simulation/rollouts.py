@@ -171,6 +171,7 @@ def run_motions(
     *,
     variation: str = "nominal",
     seed: int = MOTION.first,
+    until_s: float = math.inf,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
     progress: Progress | bool | None = None,
@@ -185,6 +186,7 @@ def run_motions(
 
     Args:
         duration_s: Duration of all motions together, if none leaves the safe set [s].
+        until_s: Time at which each ends, if not sooner [s].
         path, **loop_options: As for `run_episodes`.
 
     Raises:
@@ -192,13 +194,13 @@ def run_motions(
         EpisodeError: A system of the loop raised an error, which is its cause.
     """
     loop = worker_loop(scenario, variation, loop_options)
-    piece_s = _piece_s(loop)
+    piece_s = min(_piece_s(loop), until_s)
     info = episodes_info(loop, seed, {**loop_options, "undisturbed_s": piece_s})
     step_s = scenario.monitor_step_s
     return collect_episodes(
         replace(info, step_s=step_s, num_steps=round(piece_s / step_s)),
         math.ceil(duration_s / piece_s - 1e-6),
-        partial(motion_batch, scenario, variation, loop_options, seed),
+        partial(motion_batch, scenario, variation, loop_options, seed, until_s=until_s),
         num_workers=num_workers,
         path=path,
         progress=progress,
@@ -226,7 +228,7 @@ def run_motion(
         until_s: Time at which it ends, if not sooner [s].
         with_features: Whether to record features that the monitor does not read, too.
     """
-    scenario, piece_s, step_s = loop.scenario, _piece_s(loop), loop.scenario.monitor_step_s
+    scenario, piece_s = loop.scenario, _piece_s(loop)
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
     loop.remove_visuals(context)
@@ -235,7 +237,29 @@ def run_motion(
     if isinstance(loop, MovesUndisturbed):
         loop.reset_undisturbed(context, rng, piece_s)
     else:
-        first_step = math.ceil(loop.reset(context, rng) * scenario.step_s / step_s)
+        first_step = math.ceil(loop.reset(context, rng) * scenario.step_s / scenario.monitor_step_s)
+    return record_motion(
+        simulator,
+        min(piece_s, until_s),
+        who=f"motion {index} of '{scenario.name}' (seed {seed})",
+        index=index,
+        first_step=first_step,
+        with_features=with_features,
+    )
+
+
+def record_motion(
+    simulator: Simulator,
+    duration_s: float,
+    *,
+    who: str,
+    index: int = 0,
+    first_step: int = 0,
+    with_features: bool = False,
+) -> Episode:
+    """Simulates a loop from its state at time 0, with the rows of `run_motion`."""
+    loop = simulator.get_system()
+    step_s = loop.scenario.monitor_step_s
     # Features may cost more than the simulation.
     left_out = "features" if loop.monitored_features == [] and not with_features else ""
     motion = record_episode(
@@ -243,11 +267,11 @@ def run_motion(
         {name: name for name in REQUIRED_PORTS if name != left_out},
         EpisodeTiming(
             step_s=step_s,
-            num_steps=round(min(piece_s, until_s) / step_s),
+            num_steps=round(duration_s / step_s),
             monitor_period_s=loop.monitor_period_s,
         ),
         constraint_names=loop.constraint_names,
-        who=f"motion {index} of '{scenario.name}' (seed {seed})",
+        who=who,
         index=index,
         first_step=first_step,
     )
