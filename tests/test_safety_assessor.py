@@ -6,7 +6,13 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_safety import AddSafetyAssessor, AssessmentParameters, SafetyAssessment, SafetyAssessor
+from drake_safety import (
+    AddSafetyAssessor,
+    AssessmentParameters,
+    SafetyAssessment,
+    SafetyAssessor,
+    load_assessment,
+)
 from gliding_task import evaluated
 from lip_assessments import QUICK, worse
 from lip_episodes import STEP_S, make_episodes
@@ -87,6 +93,13 @@ def test_the_margins_are_not_left_out_by_mistake(assessment, inputs):
         added(assessment, {name: inputs[name] for name in INPUTS if name != "features"})
     with pytest.raises(ValueError, match=r"port 'y0' for state has size 1; .* fitted with 6"):
         added(assessment, {**inputs, "state": np.zeros(1)})
+    # In the paper's mode Γ reads no features, but its monitor may.
+    paper = load_assessment("laikago_balancing", "paper")
+    sizes = len(paper.info_.state_names), 3 * paper.info_.horizon
+    given = {"state": np.zeros(sizes[0]), "desired_preview": np.zeros(sizes[1]), "margins": None}
+    with pytest.raises(ValueError, match="was fitted with features"):
+        added(paper, given)
+    assert added(paper, given, on_alarm=None)[0].monitor is None
 
 
 def test_it_adopts_what_an_adapted_assessment_has_learned_and_the_alarm_ends(assessment, inputs):
