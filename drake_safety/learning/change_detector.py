@@ -21,8 +21,8 @@ FALSE_ALARMS_PER_HOUR = 0.1
 """For which the limits are made: at most one in ten hours of nominal motion."""
 LEAST_MOTION_S = 720.0
 """Motion below which there is no alarm."""
-RECOVERY_S = 5.0
-"""Time for which every level must be below its limit before an alarm ends [s]."""
+RECOVERED_LEVEL, RECOVERY_S = 0.7, 5.0
+"""Every level must be below the first for a time before an alarm ends [s]."""
 NUM_PREVIEWED = 2
 """Samples of the desired preview that the predictor sees: the one of now and the next."""
 _CLIP = 6.0  # Of an innovation, in standard deviations, so that one impact is no lasting change.
@@ -261,10 +261,10 @@ class ChangeDetector:
         ]
 
     def next_alarm(self, alarm: float, calm_s: float, level: float) -> tuple[float, float]:
-        """Alarm (0 or 1), and time since a level was above its limit [s], after one more level."""
+        """Alarm (0 or 1), and time for which all levels have been low [s], after one more level."""
         if level > self.alarm_level:
             return 1.0, 0.0
-        calm_s += self.step_s
+        calm_s = calm_s + self.step_s if level < RECOVERED_LEVEL else 0.0
         if alarm == 0.0 or calm_s > RECOVERY_S - 0.5 * self.step_s:
             return 0.0, 0.0
         return 1.0, calm_s

@@ -32,7 +32,7 @@ class ChangeMonitor(LeafSystem):
     Every step of its training it predicts the state and updates the charts of a
     :class:`~drake_safety.learning.change_detector.ChangeDetector`. ``levels`` has the level of each
     watched state in units of its limit. When one exceeds 1, ``alarm`` becomes 1 and
-    ``alarm_cause`` says what was seen; it ends when all were below 1 for five seconds, or with a
+    ``alarm_cause`` says what was seen; it ends when all were below 0.7 for five seconds, or with a
     reset. Without enough motion for limits there is no alarm. While ``hold`` is above 0.5, as
     during a recovery step that training does not have, the charts wait. The detector is a
     parameter of the Context, see :meth:`adopt`.
