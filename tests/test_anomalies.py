@@ -224,6 +224,7 @@ def test_a_motion_that_goes_on_as_the_same_plant_is_the_same(loop, monkeypatch):
     assert np.abs(pushed.true_state[50] - joined.true_state[50]).max() > 0.01
 
 
+@pytest.mark.train
 def test_motions_that_end_early_are_another_set(tmp_path):
     scenario = load_scenario(SCENARIO)
     options = {"seed": 3, "num_workers": 1, "path": tmp_path}
