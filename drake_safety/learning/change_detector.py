@@ -206,12 +206,12 @@ class ChangeDetector:
     def innovation(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
         """The innovation (n_w,) of a change of the state after two inputs (n_u,), clipped."""
         error = self.predictor.error(x, previous, change)
-        clipped: np.ndarray = np.clip(error / self.deviation, -_CLIP, _CLIP)
+        clipped: np.ndarray = np.minimum(np.maximum(error / self.deviation, -_CLIP), _CLIP)
         return clipped
 
     def updated(self, charts: np.ndarray, innovation: np.ndarray) -> np.ndarray:
         """The charts (6, n_w), signed, after one more innovation (n_w,)."""
-        values = np.stack([innovation, innovation * innovation - 1.0])
+        values = np.array((innovation, innovation * innovation - 1.0))
         old = charts.reshape(2, len(TIME_CONSTANTS_S), -1)
         found = old + self.rates[:, None] * (values[:, None] - old)
         return found.reshape(charts.shape)

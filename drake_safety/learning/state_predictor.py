@@ -98,10 +98,11 @@ class StatePredictor:
 
     def error(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
         """The error (n_w,) of a change (n_w,) after an input and the one before, (n_u,) each."""
-        z = np.stack([x, previous])
+        z = np.array((x, previous))
         z -= self.mean
         z /= self.scale
-        np.clip(z, -_LARGEST_INPUT, _LARGEST_INPUT, out=z)
+        np.maximum(z, -_LARGEST_INPUT, out=z)  # Twice as fast as `np.clip`.
+        np.minimum(z, _LARGEST_INPUT, out=z)
         error: np.ndarray = change - self.unit * self._evaluated(z.ravel().astype(np.float32))
         return error
 
