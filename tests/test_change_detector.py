@@ -60,7 +60,7 @@ def test_levels_are_those_of_the_recursion_over_consecutive_motions(monitored):
 
 
 def test_hours_of_the_same_plant_raise_few_alarms():
-    hours = 3.0  # The promise is an extrapolation from 18 minutes: here 2 in place of 0.3.
+    hours = 3.0  # The promise is an extrapolation, and too low with other seeds.
     usual = (motion(MOTION_S, 1000 + seed) for seed in range(round(hours * 3600 / MOTION_S)))
     alarms = sum(len(learned().watch([rows])[1]) for rows in usual)
     assert alarms <= hours
