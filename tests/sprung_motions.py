@@ -60,5 +60,5 @@ def recorded(rows, info=INFO, **changes):
 @functools.cache
 def learned():
     """A detector, of more motion than its limits need."""
-    num = round(1.5 * LEAST_MOTION_S / MOTION_S)
+    num = round(4.0 * LEAST_MOTION_S / MOTION_S)
     return ChangeDetector.fit(recorded([motion(MOTION_S, seed) for seed in range(num)]))

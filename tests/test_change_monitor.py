@@ -54,7 +54,7 @@ def test_a_diagram_and_rows_have_the_same_levels_and_alarms():
     rows = np.concatenate([motion(30.0, 50, PUSHED), motion(2.0, 51, slice(0, None))])
     levels, alarm, cause = Played(rows).history()
     found, alarms = learned().watch([rows], INFO.state_names)
-    np.testing.assert_allclose(levels, found, atol=1e-4)  # Single precision in one of them.
+    np.testing.assert_allclose(levels, found, atol=1e-5)  # Single precision in one of them.
     assert not levels[:2].any() and len(alarms) >= 2
     begin, end, said = alarms[-2]
     assert 100 < begin < 140 < end < 600 and "joint knee answers unlike in training" in said

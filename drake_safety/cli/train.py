@@ -43,8 +43,8 @@ from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 from drake_safety.simulation.worker_processes import end_with_parent
 
-DEFAULT_MOTION_MIN = 24.0
-"""Minutes of undisturbed motion."""
+DEFAULT_MOTION_MIN = 48.0
+"""Minutes of undisturbed motion, half of them for the limits."""
 
 
 def train(

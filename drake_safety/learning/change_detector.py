@@ -19,15 +19,14 @@ TIME_CONSTANTS_S = (0.1, 0.5, 2.0)
 """Memories of the charts."""
 FALSE_ALARMS_PER_HOUR = 0.1
 """For which the limits are made: at most one in ten hours of nominal motion."""
-LEAST_MOTION_S = 720.0
-"""Motion below which there is no alarm."""
+LEAST_MOTION_S = 360.0
+"""Motion for the limits, below which there is no alarm."""
 RECOVERED_LEVEL, RECOVERY_S = 0.7, 5.0
 """Every level must be below the first for a time before an alarm ends [s]."""
 NUM_PREVIEWED = 2
 """Samples of the desired preview that the predictor sees: the one of now and the next."""
 _CLIP = 6.0  # Of an innovation, in standard deviations, so that one impact is no lasting change.
 _BEFORE_LEAVING_S = 0.5  # Left out of a motion that leaves the safe set.
-_NUM_FOLDS = 3
 _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
 _TAIL_SHARE = 0.1  # Of the blocks.
 _LEAST_LIMIT = 0.3  # Of a chart, in standard deviations of its value for white innovations.
@@ -65,7 +64,7 @@ class ChangeDetector:
         alarm_level: 1, or infinite where there was too little motion for limits.
         longest_repeat: Longest known run of repeated inputs.
         step_s: Time between two inputs [s].
-        motion_s: Duration of the motion of training [s].
+        motion_s: Duration of the motion for the limits [s].
     """
 
     predictor: StatePredictor
@@ -93,10 +92,10 @@ class ChangeDetector:
 
     def describe(self) -> str:
         """What the limits were learned from, and what they promise."""
-        motion = f"monitor: {self.motion_s / 60.0:.0f} min of motion"
+        motion = f"monitor: {self.motion_s / 60.0:.0f} min of motion for its limits"
         if self.has_limits:
             hours = f"{1 / FALSE_ALARMS_PER_HOUR:.0f} h"
-            return f"{motion}, limits for at most one false alarm in {hours}"
+            return f"{motion}, for at most one false alarm in {hours}"
         needed = f"{LEAST_MOTION_S / 60.0:.0f} are needed"
         return f"{motion}, {needed}: it reports levels and never alarms"
 
@@ -104,10 +103,10 @@ class ChangeDetector:
     def fit(
         cls, motions: Episodes, progress: Callable[[float], None] | None = None
     ) -> ChangeDetector:
-        """Learns the prediction, and the limits from motions that a prediction has not seen.
+        """Learns the prediction from one half of the motions, and the limits from the other.
 
-        Three further predictions are each learned without a third of the motions, whose errors
-        they give.
+        Limits from the errors of other predictions, as in cross-validation, do not see what this
+        one gets wrong: on a mass on a spring they gave 16 to 71 false alarms in four hours.
 
         Args:
             motions: Undisturbed motions, such as those of `run_motions`; those that leave the safe
@@ -133,24 +132,11 @@ class ChangeDetector:
                 f"ChangeDetector: {len(seen)} motions have three rows; two are needed, one for the "
                 "prediction and one for the limits"
             )
-        folds = min(_NUM_FOLDS, len(seen))
-
-        def learned(left_out: int | None, stage: int) -> StatePredictor:
-            known = [i for i in range(len(seen)) if i % folds != left_out]
-            return StatePredictor.fit(
-                [seen[i] for i in known],
-                [states[i] for i in known],
-                lambda done: progress((stage + done) / (folds + 1)) if progress else None,
-            )
-
-        errors = [np.empty(0)] * len(seen)
         with threadpool_limits(1, user_api="blas"):
-            for fold in range(folds):
-                others = learned(fold, fold)
-                for i in range(fold, len(seen), folds):
-                    errors[i] = others.errors(seen[i], states[i])
+            # Motions alternate, so that both halves are alike.
+            predictor = StatePredictor.fit(seen[::2], states[::2], progress)
             unlimited = cls(
-                predictor=learned(None, folds),
+                predictor=predictor,
                 columns=columns,
                 watched=watched,
                 deviation=np.full(len(watched), 1e-9),
@@ -160,10 +146,11 @@ class ChangeDetector:
                 step_s=float(info.step_s),
                 motion_s=0.0,
             )
-            return unlimited._limited(errors)
+            return unlimited._limited(seen[1::2], states[1::2])
 
-    def _limited(self, errors: Sequence[np.ndarray]) -> ChangeDetector:
-        """Chooses deviations and limits from errors of the prediction (K, n_w) in motions."""
+    def _limited(self, seen: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> ChangeDetector:
+        """Chooses deviations and limits from inputs (K, n_u) and states (K, n_w) of motions."""
+        errors = [self.predictor.errors(*one) for one in zip(seen, states, strict=True)]
         if len(errors) == 1 and len(errors[0]) > 1:
             errors = np.array_split(errors[0], 2)
         deviation = np.maximum(np.concatenate(errors).std(axis=0), self.deviation)
@@ -280,9 +267,7 @@ class ChangeDetector:
         seen = [one[:, self.columns] for one in rows]
         states = [one[:, self.watched] for one in rows]
         corrected = replace(self, predictor=self.predictor.corrected(seen, states))
-        limited = corrected._limited(
-            [corrected.predictor.errors(*one) for one in zip(seen, states, strict=True)]
-        )
+        limited = corrected._limited(seen, states)
         return replace(
             corrected,
             deviation=limited.deviation,
