@@ -17,6 +17,7 @@ from drake_safety.evaluation.monitor_study import (
 )
 from drake_safety.evaluation.shift_study import assessment_judge
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
+from drake_safety.learning import calibration
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import MOTION, SHIFTS
 from drake_safety.simulation.rollouts import run_motions
@@ -41,6 +42,7 @@ def monitor(
     with open_study("monitor", scenario, assessment, seed=seed, workers=workers) as study:
         gamma, loaded = study.load("sharpened", [seed]), study.scenario
         shifts = plant_shifts(loaded, loaded.make_loop())
+        promise = gamma.calibrations_.get(calibration.MOTION)
         work = {}
         for name, shift in shifts.items():
             options = {**loaded.task_class().judging_options, **shift.options}
@@ -57,7 +59,7 @@ def monitor(
             progress=partial(study.stages, "shifts"),
         )
         for name, arrays in found.items():
-            study.add(f"monitor.{name}", _plain(monitor_estimates(arrays)))
+            study.add(f"monitor.{name}", _plain(monitor_estimates(arrays, promise)))
         if hours:
             usual = run_motions(
                 loaded,

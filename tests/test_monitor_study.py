@@ -63,6 +63,7 @@ def test_a_minute_goes_on_with_the_next_motions_and_an_alarm_is_dont_know():
     found = monitored(motions, assessment, judge)
     np.testing.assert_array_equal(found["alarm_s"], [12.0, 2.0, 16.0, 6.0, 22.0])
     np.testing.assert_array_equal(found["leave_s"], [10.0, 20.0, 10.0, 10.0, 10.0])
+    np.testing.assert_allclose(found["least"], [0.95, math.nan, CONFIDENT - 0.01, 0.95, 1.01])
     # The first is wrong for 5 s, the fourth for 5 s with and 3 s without the alarm.
     np.testing.assert_array_equal(found["silent_error_s"][:, 0], [5.0, 0.0, 0.0, 5.0, 0.0])
     np.testing.assert_array_equal(found["error_s"][:, 0], [5.0, 0.0, 0.0, 3.0, 0.0])
@@ -81,6 +82,7 @@ def test_estimates_are_of_all_minutes():
             "leave_s": np.array([40.0, np.inf, np.inf, np.inf]),
             "error_s": np.array([[6.0, 20.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]]),
             "silent_error_s": np.array([[6.0, 20.0], [0.0, 4.0], [0.0, 0.0], [0.0, 0.0]]),
+            "least": np.array([np.nan, np.nan, np.nan, np.nan]),
         }
     )
     assert found["monitor.alarmed"].value == 0.75
@@ -92,6 +94,23 @@ def test_estimates_are_of_all_minutes():
     assert found["monitor.confident_error_60s"].value == pytest.approx(20 / 60 / 4)
     assert found["monitor.silent_confident_error_60s"].value == pytest.approx(24 / 60 / 4)
     assert {one.n for one in found.values()} == {4}
+
+
+def test_a_promise_is_missed_where_neither_threshold_nor_alarm_announces_the_end():
+    found = {
+        "alarm_s": np.array([30.0, 2.0, 1.0, np.inf, 9.0]),
+        "leave_s": np.array([20.0, 4.0, 5.0, 60.0, 9.5]),
+        "error_s": np.zeros((5, 2)),
+        "silent_error_s": np.zeros((5, 2)),
+        "least": np.array([0.8, 0.7, 0.3, 0.3, np.nan]),
+    }
+    assert "monitor.missed" not in monitor_estimates(found)
+    estimates = monitor_estimates(found, SimpleNamespace(threshold=0.7))
+    assert (estimates["monitor.silent_missed"].value, estimates["monitor.missed"].value) == (
+        0.5,
+        0.25,
+    )
+    assert estimates["monitor.missed"].n == 4
 
 
 def test_false_alarms_are_those_of_undisturbed_motion():

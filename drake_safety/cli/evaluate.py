@@ -47,6 +47,7 @@ from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws, trigger_rules
 from drake_safety.evaluation.verdict_tables import verdict_tables
 from drake_safety.files.progress import StageProgress
+from drake_safety.learning import calibration
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import PLAN, episode_scores
@@ -307,7 +308,9 @@ def add_shifts(
             num_workers=evaluation.workers,
         )
         watched = monitor_study.monitored(motions, gamma, judges["gamma"])
-        of_monitor = monitor_study.monitor_estimates(watched)
+        of_monitor = monitor_study.monitor_estimates(
+            watched, gamma.calibrations_.get(calibration.MOTION)
+        )
         found |= {f"shifts.{name}.{key}": estimate for key, estimate in of_monitor.items()}
     stages("shifted motions", len(shifts), len(shifts))
     sets |= others(nominal[:num_motions])

@@ -17,6 +17,7 @@ import numpy as np
 from drake_safety.evaluation.metrics import Estimate, proportion, rate_per_hour
 from drake_safety.evaluation.shift_study import BOOTSTRAP, CONFIDENT, Judge, mean_over
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector, rows_of, usual_rows
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes
 from drake_safety.simulation.rollouts import motion_batch
@@ -71,19 +72,23 @@ def monitored(
     Returns:
         "alarm_s", the time of the first alarm, "leave_s", that of first leaving the safe set, both
         infinite without one, (M,) [s]; the durations of confident errors in the first 10 s and
-        60 s, "error_s" outside alarms and "silent_error_s" without a monitor, (M, 2) [s].
+        60 s, "error_s" outside alarms and "silent_error_s" without a monitor, (M, 2) [s]; "least",
+        the least probability in the last episode's duration of a motion that leaves the safe set,
+        NaN for others, (M,).
     """
     detector, info = assessment.detector_, assessment.info_
     every = max(1, round(info.step_s / detector.step_s))
     horizon = round(info.num_steps * info.step_s / detector.step_s)
     rows = [rows_of(one) for one in motions]
-    wrong = [_sure_and_wrong(one, judge, every, horizon) for one in motions]
+    found_wrong = [_sure_and_wrong(one, judge, every, horizon) for one in motions]
+    wrong = [rows for rows, _ in found_wrong]
     most = round(max(SPANS_S) / detector.step_s)
     found: dict[str, list[Any]] = {
         "alarm_s": [],
         "leave_s": [],
         "error_s": [],
         "silent_error_s": [],
+        "least": [least for _, least in found_wrong],
     }
     for start in range(len(motions)):
         order, begin = [], [0]
@@ -113,28 +118,37 @@ def monitored(
     return {name: np.array(values) for name, values in found.items()}
 
 
-def _sure_and_wrong(motion: Episode, judge: Judge, every: int, horizon: int) -> np.ndarray:
-    """Rows that are sure and wrong, of those that are judged: all ``every`` rows."""
+def _sure_and_wrong(
+    motion: Episode, judge: Judge, every: int, horizon: int
+) -> tuple[np.ndarray, float]:
+    """Rows that are sure and wrong, of those that are judged, all ``every`` rows; see `monitored`.
+
+    Returns:
+        The rows, and the least probability of the judged rows that can be wrong.
+    """
     rows = np.arange(0, len(motion.time_s), every)
     if motion.is_safe:
-        return rows[:0]
+        return rows[:0], np.nan
+    rows = rows[len(motion.time_s) - 1 - rows <= horizon]
+    is_outside = np.any(motion.margins[rows] < 0.0, axis=1)
     found = judge(
-        motion.state[rows],
-        motion.desired_preview[rows],
-        motion.features[rows],
-        np.any(motion.margins[rows] < 0.0, axis=1),
+        motion.state[rows], motion.desired_preview[rows], motion.features[rows], is_outside
     )
     is_sure = (found.probability >= CONFIDENT) & ~found.is_unknown
-    is_last = len(motion.time_s) - 1 - rows <= horizon
-    wrong: np.ndarray = rows[is_sure & is_last]
-    return wrong
+    inside = found.probability[~is_outside]
+    return rows[is_sure], float(inside.min()) if len(inside) else 0.0
 
 
-def monitor_estimates(found: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
+def monitor_estimates(
+    found: Mapping[str, np.ndarray], promise: Calibration | None = None
+) -> dict[str, Estimate]:
     """Alarms, their delay, motions that leave the safe set, and Γ's confident errors.
 
     Args:
         found: What `monitored` returns.
+        promise: A promise for motions, if there is one. Of the motions that leave the safe set,
+            "silent_missed" are those whose probability is never below its threshold; "missed" are
+            those without an alarm until then.
     """
     each, delay = np.arange(len(found["alarm_s"])), found["alarm_s"]
     estimates = {
@@ -147,6 +161,12 @@ def monitor_estimates(found: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
         for name in ("", "silent_"):
             share = found[f"{name}error_s"][:, i] / span
             estimates[f"monitor.{name}confident_error_{span:g}s"] = mean_over(share, each)
+    unsafe = int(np.isfinite(found["least"]).sum())
+    if promise is not None and unsafe:
+        is_missed = found["least"] >= promise.threshold
+        missed = {"silent_missed": is_missed, "missed": is_missed & (delay > found["leave_s"])}
+        for name, of in missed.items():
+            estimates[f"monitor.{name}"] = proportion(int(of.sum()), unsafe)
     return estimates
 
 
