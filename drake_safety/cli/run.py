@@ -33,10 +33,10 @@ from drake_safety.cli.training_folder import assessment_folder, goal_threshold, 
 from drake_safety.evaluation.path_figure import path_figure
 from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
 from drake_safety.evaluation.timeline_figure import timeline_figure
+from drake_safety.files.reading import did_you_mean
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.plants.balls import Throw
-from drake_safety.robots.reading import did_you_mean
 from drake_safety.simulation.capabilities import HasBall, HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.scenario import Scenario, load_scenario
