@@ -9,9 +9,7 @@ import numpy as np
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits
-from drake_safety.files.schema import (
-    schema,
-)
+from drake_safety.files.schema import schema
 from drake_safety.plants.balls import Throw
 from drake_safety.robots.robot_model import by_pattern
 from drake_safety.robots.robot_size import (

@@ -11,11 +11,7 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer, SceneGraph
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.files.schema import (
-    Bounds,
-    Positive,
-    schema,
-)
+from drake_safety.files.schema import Bounds, Positive, schema
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 from drake_safety.simulation.episode_start import EpisodeStart, StatePlane

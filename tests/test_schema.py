@@ -12,11 +12,7 @@ from drake_safety.control.walking_safe_set import WalkingLimits
 from drake_safety.diagrams.balancing_parameters import BalancingParameters
 from drake_safety.diagrams.pendulum import PendulumParameters
 from drake_safety.diagrams.reaching_parameters import ReachingParameters
-from drake_safety.diagrams.walking_parameters import (
-    CommandSampling,
-    WalkingRecovery,
-    WalkingStart,
-)
+from drake_safety.diagrams.walking_parameters import CommandSampling, WalkingRecovery, WalkingStart
 from drake_safety.files.reading import parse_yaml
 from drake_safety.files.schema import load_typed, load_typed_file
 from drake_safety.learning.assessment_parameters import AssessmentParameters

@@ -15,14 +15,7 @@ from drake_safety.control.observation import quaternion_of
 from drake_safety.control.policy_network import PolicyNetwork, load_network
 from drake_safety.control.policy_terms import TERMS, PolicyInput, Term, registered_terms
 from drake_safety.control.policy_terms import observation_term as observation_term
-from drake_safety.files.schema import (
-    Count,
-    Pattern,
-    Positive,
-    Triple,
-    load_typed_file,
-    schema,
-)
+from drake_safety.files.schema import Count, Pattern, Positive, Triple, load_typed_file, schema
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern
 

@@ -19,10 +19,7 @@ from drake_safety.control.safe_sets import (
     support_margin,
 )
 from drake_safety.control.whole_body_model import WholeBodyModel
-from drake_safety.files.schema import (
-    NotNegative,
-    schema,
-)
+from drake_safety.files.schema import NotNegative, schema
 from drake_safety.learning.inputs import is_rate
 from drake_safety.plants.obstacles import Clearance
 from drake_safety.robots.robot_size import GRAVITY_M_S2

@@ -4,12 +4,7 @@ import math
 
 import numpy as np
 
-from drake_safety.files.schema import (
-    Count,
-    NotNegative,
-    Positive,
-    schema,
-)
+from drake_safety.files.schema import Count, NotNegative, Positive, schema
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 
 

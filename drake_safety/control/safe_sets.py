@@ -8,10 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.files.schema import (
-    Interval,
-    schema,
-)
+from drake_safety.files.schema import Interval, schema
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 
 _NUM_DIRECTIONS = 8

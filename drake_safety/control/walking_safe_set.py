@@ -11,9 +11,7 @@ from pydantic import Field
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.control.observation import heading_velocity
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
-from drake_safety.files.schema import (
-    schema,
-)
+from drake_safety.files.schema import schema
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 
 _AXES = ("forward", "left", "yaw")

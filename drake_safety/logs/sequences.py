@@ -7,10 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_safety.files.reading import did_you_mean, reading
-from drake_safety.files.schema import (
-    NotNegative,
-    schema,
-)
+from drake_safety.files.schema import NotNegative, schema
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.inputs import preview_names
 from drake_safety.learning.segments import EpisodesInfo

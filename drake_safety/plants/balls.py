@@ -10,10 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia
 from pydrake.systems.framework import Context
 
-from drake_safety.files.schema import (
-    Positive,
-    schema,
-)
+from drake_safety.files.schema import Positive, schema
 from drake_safety.plants.obstacles import collision_geometries
 from drake_safety.robots.model_files import package_parser
 from drake_safety.robots.robot_size import GRAVITY_M_S2

@@ -18,10 +18,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from drake_safety.files.schema import (
-    Triple,
-    schema,
-)
+from drake_safety.files.schema import Triple, schema
 from drake_safety.robots.model_files import model_file, package_parser
 from drake_safety.robots.robot import Scratch, add_robot
 from drake_safety.robots.robot_model import RobotModel

@@ -18,12 +18,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context
 
-from drake_safety.files.schema import (
-    NotNegative,
-    Positive,
-    Triple,
-    schema,
-)
+from drake_safety.files.schema import NotNegative, Positive, Triple, schema
 from drake_safety.robots.robot_description import (
     add_description,
     add_stated_shapes,

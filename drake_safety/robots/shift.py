@@ -4,14 +4,9 @@ import math
 from dataclasses import field
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, FiniteFloat
 
-from drake_safety.files.schema import (
-    NotNegative,
-    Positive,
-    Triple,
-    schema,
-)
+from drake_safety.files.schema import NotNegative, Positive, Triple, schema
 
 FAULTS = {
     "bias": True,
@@ -63,7 +58,7 @@ class Fault:
     kind: Literal[*FAULTS] = "zero"  # type: ignore[valid-type]
     entries: list[str] = field(default_factory=lambda: [".*"])
     """Names or patterns of the entries; all by default."""
-    value: float | None = None
+    value: FiniteFloat | None = None
     start_s: NotNegative = 0.0
     """Time from which the fault lasts [s]."""
 
@@ -71,8 +66,7 @@ class Fault:
         if (self.value is not None) != FAULTS[self.kind]:
             needs = "needs a value" if FAULTS[self.kind] else "has no value"
             raise ValueError(f"fault: '{self.kind}' {needs}; got {self.value}")
-        lowest = 0.0 if self.kind in ("noise", "delay") else -math.inf
-        if self.value is not None and not lowest <= self.value < math.inf:
+        if self.kind in ("noise", "delay") and (self.value or 0.0) < 0:
             raise ValueError(f"fault: value of '{self.kind}' is out of range; got {self.value}")
 
 

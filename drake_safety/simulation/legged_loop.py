@@ -13,10 +13,7 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource, MatrixGain, 
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
-from drake_safety.files.schema import (
-    Positive,
-    schema,
-)
+from drake_safety.files.schema import Positive, schema
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
 from drake_safety.plants.obstacles import remove_visuals

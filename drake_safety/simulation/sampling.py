@@ -15,13 +15,7 @@ from drake_safety.control.kinematics import (
     fit_stance,
     planar_pose,
 )
-from drake_safety.files.schema import (
-    Bounds,
-    Pair,
-    Share,
-    Triple,
-    schema,
-)
+from drake_safety.files.schema import Bounds, Pair, Share, Triple, schema
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.systems.trajectory_planner import interpolate
