@@ -138,10 +138,9 @@ def _message(schema: Any, error: Any) -> str:
 
 def _keys(schema: Any, place: tuple[str | int, ...]) -> list[str]:
     """Keys of the dataclass at a place in a document."""
-    for key in (*place, None):
-        options = [one for one in get_args(schema) if one is not NoneType]
-        if len(options) < len(get_args(schema)):
-            (schema,) = options
-        if key is not None:
-            schema = get_type_hints(schema)[key] if is_dataclass(schema) else get_args(schema)[-1]
-    return [one.name for one in fields(schema)]
+    if NoneType in get_args(schema):
+        schema = get_args(schema)[0]
+    if not place:
+        return [one.name for one in fields(schema)]
+    inner = get_type_hints(schema)[place[0]] if is_dataclass(schema) else get_args(schema)[-1]
+    return _keys(inner, place[1:])
