@@ -92,7 +92,7 @@ def _arrays(path: Path, sequence_map: SequenceMap) -> tuple[np.ndarray, list[str
     return data.reshape(-1, *data.shape[-2:]), names
 
 
-def _motions(rows: np.ndarray, step_s: NotNegative) -> list[Motion]:
+def _motions(rows: np.ndarray, step_s: float) -> list[Motion]:
     """The motions of a sequence (K, n) between missing values, of three rows or more."""
     kept = np.flatnonzero(np.isfinite(rows).all(axis=1))
     parts = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
