@@ -1,7 +1,7 @@
 """Parameters of the balancing task, with defaults that scale with the robot's size."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits
+from drake_safety.files.schema import schema
 from drake_safety.plants.balls import Throw
 from drake_safety.robots.robot_model import by_pattern
 from drake_safety.robots.robot_size import (
@@ -21,7 +22,7 @@ from drake_safety.robots.robot_size import (
 from drake_safety.simulation.sampling import PushSampling, StartSampling
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class RecoveryParameters:
     """Parameters of trigger and recovery steps."""
 
@@ -35,7 +36,7 @@ class RecoveryParameters:
     step: RecoveryStepParameters = field(default_factory=RecoveryStepParameters)
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class BalancingParameters:
     """The task's part of the scenario file."""
 

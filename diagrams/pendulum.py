@@ -1,15 +1,17 @@
 """Pendulum: an inverted pendulum with a limited torque, whose true safe set can be computed."""
 
 import math
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import field
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 from pydrake.examples import PendulumGeometry, PendulumPlant
 from pydrake.geometry import Meshcat, MeshcatVisualizer, SceneGraph
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
 
+from drake_safety.files.schema import Bounds, Positive, schema
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 from drake_safety.simulation.episode_start import EpisodeStart, StatePlane
@@ -20,36 +22,29 @@ from drake_safety.systems.trajectory_planner import interpolate
 _NUM_OUTLOOK = 41  # Samples of the plan from now to its end, for the features.
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class PendulumParameters:
     """The task's part of the scenario file. Angles are from upright, positive to the front."""
 
-    mass_kg: float = 1.0
-    length_m: float = 0.5
-    damping: float = 0.05  # Of the hinge [N·m·s/rad].
-    effort_share: float = 0.35  # The motor's torque; 1 holds the pendulum when it is horizontal.
-    stiffness: float = 20.0  # Gain of the angle's error [N·m/rad].
-    rate_gain: float = 3.0  # Gain of the rate's error [N·m·s/rad].
-    largest_angle_rad: float = 0.6  # Beyond this angle the pendulum has left the safe set.
-    start_angle_rad: float = 0.6  # Half-width of the angles at which episodes begin.
-    start_rate_rad_s: float = 2.0  # Half-width of the rates at which episodes begin.
-    plan_angle_rad: float = 0.3  # Half-width of the angles at which plans begin and end.
-    plan_duration_s: list[float] = field(default_factory=lambda: [0.5, 1.5])  # Of motions.
+    mass_kg: Positive = 1.0
+    length_m: Positive = 0.5
+    damping: Positive = 0.05  # Of the hinge [N·m·s/rad].
+    # The motor's torque; 1 holds the pendulum when it is horizontal, and every episode is safe.
+    effort_share: Annotated[float, Field(gt=0, lt=1)] = 0.35
+    stiffness: Positive = 20.0  # Gain of the angle's error [N·m/rad].
+    rate_gain: Positive = 3.0  # Gain of the rate's error [N·m·s/rad].
+    largest_angle_rad: Positive = 0.6  # Beyond this angle the pendulum has left the safe set.
+    start_angle_rad: Positive = 0.6  # Half-width of the angles at which episodes begin.
+    start_rate_rad_s: Positive = 2.0  # Half-width of the rates at which episodes begin.
+    plan_angle_rad: Positive = 0.3  # Half-width of the angles at which plans begin and end.
+    plan_duration_s: Bounds[Positive] = field(default_factory=lambda: [0.5, 1.5])  # Of motions.
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not np.all(np.isfinite(value)) or np.min(value) <= 0:
-                raise ValueError(f"pendulum: {name} must be finite and positive; got {value}")
-        if self.plan_duration_s != sorted(self.plan_duration_s)[:2]:
-            expected = "plan_duration_s must be [shortest, longest]"
-        elif self.start_angle_rad > self.largest_angle_rad:
-            limit = f"largest_angle_rad {self.largest_angle_rad}"
-            expected = f"start_angle_rad must not exceed {limit}, or episodes begin unsafe"
-        elif self.effort_share >= 1:
-            expected = "effort_share must be below 1, or every episode is safe"
-        else:
-            return
-        raise ValueError(f"pendulum: {expected}; got {self}")
+        if self.start_angle_rad > self.largest_angle_rad:
+            raise ValueError(
+                f"start_angle_rad must not exceed largest_angle_rad {self.largest_angle_rad}, or "
+                f"episodes begin unsafe; got {self.start_angle_rad}"
+            )
 
     @property
     def hold_angle_rad(self) -> float:

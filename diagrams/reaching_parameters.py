@@ -1,10 +1,9 @@
 """Parameters of the reaching task."""
 
-from dataclasses import dataclass, field
-
-import numpy as np
+from dataclasses import field
 
 from drake_safety.control.reaching_safe_set import ReachingLimits
+from drake_safety.files.schema import Positive, Triple, schema
 from drake_safety.plants.obstacles import Obstacle
 from drake_safety.plants.pushes import Push, RandomPushes
 from drake_safety.simulation.legged_loop import View
@@ -16,18 +15,18 @@ from drake_safety.simulation.reaching_sampling import (
 )
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class ReachingParameters:
     """The task's part of the scenario file."""
 
     hand: str = ""
     """The hand of the training episodes, a reaching frame of the robot; the first one by
     default."""
-    plan_duration_s: float = 3.0
+    plan_duration_s: Positive = 3.0
     """Duration of the planned motion [s]."""
-    monitor_period_s: float = 0.02
+    monitor_period_s: Positive = 0.02
     """Sampling period of the safe set [s]."""
-    clearance_range_m: float = 0.1
+    clearance_range_m: Positive = 0.1
     """Distances to obstacles are clipped to this [m]."""
     safe_set: ReachingLimits = field(default_factory=ReachingLimits)
     start: PostureSampling = field(default_factory=PostureSampling)
@@ -39,32 +38,19 @@ class ReachingParameters:
     obstacles: list[Obstacle] = field(default_factory=list)
     decorations: list[Obstacle] = field(default_factory=list)
     """Models without collision geometry, for visualisation."""
-    named_targets: dict[str, list[float]] = field(default_factory=dict)
+    named_targets: dict[str, Triple] = field(default_factory=dict)
     """Named targets in the world, (3,) [m] each."""
     pushes: dict[str, Push] = field(default_factory=dict)
     """Named pushes for single runs."""
-    assessment_period_s: float = 0.1
+    assessment_period_s: Positive = 0.1
     """Time between two evaluations of Γ [s]. The features of a plan cost some 4 ms, and episodes
     have a row every 0.1 s."""
     view: View = field(default_factory=View)
     """The camera's pose when the trained hand reaches."""
 
     def __post_init__(self) -> None:
-        for name in (
-            "plan_duration_s",
-            "monitor_period_s",
-            "clearance_range_m",
-            "assessment_period_s",
-        ):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"reaching: {name} must be positive; got {getattr(self, name)}")
         if not self.start.clearance_m <= self.clearance_range_m:
             raise ValueError(
-                f"reaching: start.clearance_m must not exceed clearance_range_m, "
+                f"start.clearance_m must not exceed clearance_range_m, "
                 f"{self.clearance_range_m}; got {self.start.clearance_m}"
             )
-        for name, target in self.named_targets.items():
-            if len(target) != 3 or not np.isfinite(target).all():
-                raise ValueError(
-                    f"reaching: named target '{name}' must be three numbers [m]; got {target}"
-                )

@@ -1,43 +1,33 @@
 """Parameters of the walking task: commands, starts, guard and recovery."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
+from typing import Literal
 
 import numpy as np
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.policy import CommandLimits
 from drake_safety.control.walking_safe_set import WalkingLimits
+from drake_safety.files.schema import Bounds, Count, NotNegative, Positive, Share, Triple, schema
 from drake_safety.plants.pushes import Push, RandomPushes
 from drake_safety.simulation.legged_loop import View
 
-BRANCHES = ("stop", "slower")
-"""What a robot does when it recovers."""
 _RAMP_S = 0.1  # From one command to the next.
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class CommandSampling:
     """Random velocity profiles."""
 
-    reach: float = 3.0
+    reach: Positive = 3.0
     """How far commands go beyond the policy's ranges, as a factor on them."""
-    inside_share: float = 0.3
+    inside_share: Share = 0.3
     """Share of profiles inside the policy's ranges."""
-    num_segments: list[int] = field(default_factory=lambda: [1, 3])
+    num_segments: Bounds[Count] = field(default_factory=lambda: [1, 3])
     """Least and largest number of constant commands in an episode."""
-    standing_share: float = 0.1
+    standing_share: Share = 0.1
     """Share of commands that are zero."""
-
-    def __post_init__(self) -> None:
-        if not self.reach > 0:
-            raise ValueError(f"commands: reach must be positive; got {self.reach}")
-        for name in ("inside_share", "standing_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"commands: {name} must be in [0, 1]; got {getattr(self, name)}")
-        low, high = self.num_segments
-        if not 1 <= low <= high:
-            raise ValueError(f"commands: num_segments must be [1 or more, ...]; got {[low, high]}")
 
     def sample_command(
         self, limits: CommandLimits, rng: np.random.Generator, reach: float = 1.0
@@ -72,15 +62,15 @@ def profile(
     return PiecewisePolynomial.FirstOrderHold(times, np.transpose(values))
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class WalkingStart:
     """Random initial states: standing or in mid-stride, some with an offset as after a push."""
 
-    standing_share: float = 0.25
+    standing_share: Share = 0.25
     """Share of episodes that begin at rest in the standing posture."""
-    walked_s: list[float] = field(default_factory=lambda: [0.2, 1.6])
+    walked_s: Bounds[NotNegative] = field(default_factory=lambda: [0.2, 1.6])
     """Shortest and longest time of the others since the robot stood [s]."""
-    push_share: float = 0.5
+    push_share: Share = 0.5
     """Share of episodes with an offset."""
     velocity_m_s: float = 2.0
     """Largest horizontal velocity offset of the base."""
@@ -90,14 +80,6 @@ class WalkingStart:
     """Half-width of roll and pitch offsets."""
     joint_rad: float = 0.05
     """Standard deviation of the joints' offsets."""
-
-    def __post_init__(self) -> None:
-        for name in ("standing_share", "push_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"start: {name} must be in [0, 1]; got {getattr(self, name)}")
-        low, high = self.walked_s
-        if not 0 <= low <= high:
-            raise ValueError(f"start: walked_s must be [least, largest]; got {[low, high]}")
 
     def offset_velocities(self, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Returns velocities, of the base in the world and angular first, with a sampled offset."""
@@ -126,7 +108,7 @@ class WalkingStart:
         return q
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class GuardParameters:
     """The command guard."""
 
@@ -136,11 +118,11 @@ class GuardParameters:
     """Time between two decisions [s]."""
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class WalkingRecovery:
     """What the robot does when the probability falls below a threshold."""
 
-    branch: str = "stop"
+    branch: Literal["stop", "slower"] = "stop"
     """``stop``: a command of zero; ``slower``: a share of the command."""
     threshold: float = 0.5
     """Γ_thre, of the probability; not tuned."""
@@ -150,14 +132,8 @@ class WalkingRecovery:
     slower_share: float = 0.3
     """Share of the command for ``slower``."""
 
-    def __post_init__(self) -> None:
-        if self.branch not in BRANCHES:
-            raise ValueError(
-                f"recovery: branch must be one of {list(BRANCHES)}; got '{self.branch}'"
-            )
 
-
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class WalkingParameters:
     """The task's part of the scenario file."""
 
@@ -166,7 +142,7 @@ class WalkingParameters:
     safe_set: WalkingLimits = field(default_factory=WalkingLimits)
     commands: CommandSampling = field(default_factory=CommandSampling)
     start: WalkingStart = field(default_factory=WalkingStart)
-    named_commands: dict[str, list[float]] = field(default_factory=dict)
+    named_commands: dict[str, Triple] = field(default_factory=dict)
     """Named commands (v_x, v_y, ω_z) [m/s, rad/s]."""
     pushes: dict[str, Push] = field(default_factory=dict)
     """Named pushes for single runs."""

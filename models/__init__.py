@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from drake_safety.files.reading import did_you_mean
 from drake_safety.robots.model_files import add_to_package_map, model_file
-from drake_safety.robots.reading import did_you_mean
 from drake_safety.robots.robot_model import RobotModel, load_robot_file
 
 __all__ = ["add_to_package_map", "load_robot", "robot_files", "robot_names"]

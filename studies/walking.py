@@ -14,7 +14,6 @@ import typer
 
 from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
-from drake_safety.diagrams.walking_parameters import BRANCHES
 from drake_safety.evaluation.metrics import Estimate, median, proportion, rate_per_hour
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
@@ -116,7 +115,7 @@ def walking(
             fallen = [m.index for m in pushed if m.fall_time_s >= m.push_time_s and m.has_fallen]
             fallen = fallen[:recovered]
             alone = [motion for motion in pushed if motion.index in set(fallen)]
-            for branch in BRANCHES:
+            for branch in ("stop", "slower"):
                 again = run("push", fallen, branch=branch)
                 study.rows |= recovery_estimates(branch, alone, again)
         if commands:

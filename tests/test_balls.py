@@ -148,10 +148,3 @@ def test_a_flight_that_would_begin_underground_is_refused_with_the_longest_possi
     longest_s = float(str(error.value).split("at most ")[1].split(" s;")[0])
     bench.ball.throw(bench.context, Throw(), longest_s - 0.001)
     assert bench.position()[2] >= bench.ball.radius_m
-
-
-@pytest.mark.parametrize("change", [{"mass_kg": 0.0}, {"speed_m_s": -1.0}, {"mass_kg": math.nan}])
-def test_a_ball_without_mass_or_speed_is_refused(change):
-    (name,) = change
-    with pytest.raises(ValueError, match=f"throw: {name} must be positive"):
-        Throw(**change)

@@ -183,7 +183,7 @@ def threshold_of(score, is_unsafe, **options):
         ),
         (lambda: allowed_misses(100, 0.0), r"miss_rate is 0\.0, expected a value in"),
         (lambda: episodes_needed(1.0), r"miss_rate is 1\.0, expected a value in"),
-        (lambda: made(kind="walk"), "unknown kind 'walk'"),
+        (lambda: made(miss_rate=2.0), "miss_rate\n .* less than or equal to 1 .*input_value=2.0"),
         (lambda: made(unsafe_below=0.9), r"unsafe_below is 0\.9, .* the threshold 0\.8"),
         (lambda: episode_scores(None, None, "walk"), "unknown kind 'walk'"),
     ],

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from drake_safety.control.foreign_policy import converted_policy
-from drake_safety.control.policy import load_policy, read_policy_file
+from drake_safety.control.policy import load_policy
 from drake_safety.control.policy_template import survey_policy
 from policy_networks import save_network
 
@@ -289,19 +289,3 @@ LAB = CONFIG["beast/lab"]
 def test_files_of_other_forms_are_told_apart(tmp_path, content, message):
     with pytest.raises(ValueError, match=message):
         converted_policy(dump(tmp_path / "odd.yaml", content))
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (None, "does not exist"),
-        ("a: 1", "unknown key 'a'"),
-        ("read: deploy.yaml", "unknown key 'read'"),
-        ("a: [", "is not YAML"),
-    ],
-)
-def test_a_policy_yaml_that_is_none_is_refused(tmp_path, content, message):
-    if content is not None:
-        (tmp_path / "policy.yaml").write_text(content)
-    with pytest.raises(ValueError, match=message):
-        read_policy_file(tmp_path / "policy.yaml")

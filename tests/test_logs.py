@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from drake_safety.logs.conversion import angular_velocities, rates
 from drake_safety.logs.episodes import episodes_from_log
-from drake_safety.logs.log_map import load_log_map
 from drake_safety.logs.messages import field_of
 from drake_safety.logs.robot_log import read_log
 from log_files import (
@@ -196,26 +195,6 @@ def test_what_is_no_log_or_no_table_with_topics_is_refused(few_rows, tmp_path):
     path = write(few_rows, JOINTS, "csv", tmp_path)
     with pytest.raises(ValueError, match="has no topics; the map names"):
         read_log(path, map_of("mcap", tmp_path), ROBOT)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("base_position: {columns: [a, b]}", "must be 3 names"),
-        ("base_position: {columns: [a, b, a]}", "names a column twice"),
-        ("base_position: {columns: [a, b, c], unit: cm}", r"one of \['m', 'mm'\]; got 'cm'"),
-        ("base_orientation: {order: zyxw}", "'order' must be one of"),
-        ("time: {column: t, unit: h}", "'time.unit' must be one of"),
-        ("joint_positions: {template: q_}", "template must contain"),
-        ("joints: {}", "unknown key 'joints'; keys there are"),
-        ("max_gap_s: 1.0", "'base_position.columns' is missing: .* estimator .* MUSE, Pronto or"),
-    ],
-)
-def test_a_map_that_says_nothing_or_nonsense_is_refused(text, message, tmp_path):
-    path = tmp_path / "columns.yaml"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=message):
-        load_log_map(path)
 
 
 @pytest.mark.train

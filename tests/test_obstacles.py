@@ -261,16 +261,3 @@ def test_a_file_with_two_models_is_refused(tmp_path):
 def test_a_model_that_is_not_there_is_refused_by_name(name, message):
     with pytest.raises(ValueError, match=message):
         add_obstacles(MultibodyPlant(0.001), [Obstacle(model=name)])
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"position": [0.0, 1.0]}, r"obstacle 'shelf': position must be three .* got \[0.0, 1.0\]"),
-        ({"position": [0.0, 1.0, np.nan]}, "position must be three finite numbers"),
-        ({"yaw_rad": np.inf}, "obstacle 'shelf': yaw_rad must be finite; got inf"),
-    ],
-)
-def test_a_place_that_is_none_is_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        Obstacle(model="shelf", **change)

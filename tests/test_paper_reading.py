@@ -131,42 +131,6 @@ def test_standardised_inputs_make_the_map_independent_of_units():
         assert np.allclose(one, other, atol=1e-3) == standardized
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: PaperReading(loss="l1"), r"loss is l1, expected one of \['squared', 'norm'\]"),
-        (lambda: PaperReading(stride=-1), "stride is -1, expected >= 0"),
-        (lambda: PaperReading(hidden_sizes=[]), "expected one width >= 1 per layer"),
-        (lambda: PaperReading(held_out=1.0), r"held_out is 1.0, expected a value in \[0, 1\)"),
-        (lambda: paper(warping_cost="fast"), r"warping_cost is fast, expected one of .*'rooted'"),
-        (lambda: paper(exaggeration=0.5), "exaggeration is 0.5, expected >= 1"),
-        (lambda: paper(initialization="pca"), "initialization is pca, expected one of"),
-        (lambda: AdaptationParameters(count="all"), "count is all, expected one of"),
-        (lambda: AdaptationParameters(gate=-1.0), "gate"),
-        (lambda: AdaptationParameters(least_uncertainty=1.1), "least_uncertainty"),
-        (lambda: AdaptationParameters(update_interval=0), "update_interval"),
-        (lambda: AdaptationParameters(offset_std=0.0), "offset_std"),
-        (lambda: AdaptationParameters(slope_std=0.0), "slope_std"),
-        (lambda: AssessmentParameters(mode="blunt"), "mode"),
-        (lambda: AssessmentParameters(discount=1.1), "discount"),
-        (lambda: AssessmentParameters(discount=float("nan")), "discount"),
-        (lambda: AssessmentParameters(initial_uncertainty=-0.1), "initial_uncertainty"),
-        (lambda: AssessmentParameters(min_count=0), "min_count"),
-        (lambda: AssessmentParameters(cell_length=0.0), "cell_length"),
-        (lambda: AssessmentParameters(dropout=1.0), "dropout"),
-        (lambda: AssessmentParameters(hidden_sizes=[]), "hidden_sizes"),
-        (lambda: AssessmentParameters(margin_range=[0.1, -0.1]), "margin_range"),
-        (lambda: AssessmentParameters(raw_input_scale=0.0), "raw_input_scale"),
-        (lambda: AssessmentParameters(feature_unit=-1.0), "feature_unit"),
-        (lambda: AssessmentParameters(shortest_segment=11), "shortest_segment"),
-        (lambda: AssessmentParameters(distance_backend="fast"), r"distance_backend .*tslearn"),
-    ],
-)
-def test_parameters_out_of_range_are_refused_by_name(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
 def test_the_defaults_are_the_papers_table():
     learned, adapted = AssessmentParameters(), AdaptationParameters()
     assert (learned.discount, learned.horizon, learned.score_weight) == (0.99, 10, 0.01)

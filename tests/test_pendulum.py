@@ -100,9 +100,6 @@ def test_what_a_plan_asks_of_the_motor_is_that_of_its_minimum_jerk(loop):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("parameters: {effort_share: 1.2}", "effort_share must be below 1"),
-        ("parameters: {mass_kg: 0}", "mass_kg must be finite and positive"),
-        ("parameters: {plan_duration_s: [2, 1]}", r"plan_duration_s must be \[shortest, longest\]"),
         ("parameters: {start_angle_rad: 0.9}", "must not exceed largest_angle_rad 0.6"),
         (
             "variations: {nominal: {foot_friction: 0.3}}",

@@ -122,15 +122,6 @@ def test_a_history_of_the_whole_observation_is_laid_out_as_stated(tmp_path, hist
     np.testing.assert_allclose(made.observe(seen, last), second)
 
 
-def test_histories_that_cannot_be_kept_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"newest 2 samples once, from 0; got \[0, 2\]"):
-        WholeHistory(ages=[0, 2])
-    with pytest.raises(ValueError, match="must be 'time' or 'term'; got 'joint'"):
-        WholeHistory(by="joint")
-    with pytest.raises(ValueError, match=r"got both, \['a'\]"):
-        PolicyParameters(history=WholeHistory(ages=[0, 1]), observation=terms("a", history=2))
-
-
 @pytest.mark.train
 def test_the_gait_clock_runs_once_a_period_and_rests_while_standing(tmp_path):
     made = policy(tmp_path, gait=GaitClock(period_s=1.0))

@@ -160,21 +160,6 @@ def test_a_robot_has_fallen_below_its_height_and_beyond_its_tilt(name):
             assert abs(fall) < 1e-12 if sign == 0 else np.sign(fall) == sign
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"joint_margin_rad": -0.1}, "joint_margin_rad must be finite and not negative; got -0.1"),
-        ({"joint_margin_rad": math.nan}, "joint_margin_rad must be finite"),
-        ({"support_clearance_m": -0.01}, "support_clearance_m must be finite and not negative"),
-        ({"fall_height_share": 1.0}, r"fall_height_share must be in \(0, 1\); got 1.0"),
-        ({"fall_tilt_rad": 0.0}, r"fall_tilt_rad must be in \(0, pi\); got 0.0"),
-    ],
-)
-def test_limits_that_are_none_are_refused(change, message):
-    with pytest.raises(ValueError, match=f"safe set: {message}"):
-        ReachingLimits(**change)
-
-
 @pytest.mark.parametrize("name", ROBOTS)
 def test_features_of_the_state_are_what_they_are_called(name):
     of = safe_set(name, obstacles=[SHELF])

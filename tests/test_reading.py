@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from drake_safety import load_scenario
-from drake_safety.robots.reading import parse_yaml, reading
+from drake_safety.files.reading import parse_yaml, reading
 
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "\n".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 9)

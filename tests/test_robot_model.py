@@ -4,10 +4,8 @@ import pytest
 
 from drake_safety.models import load_robot, robot_names
 from drake_safety.robots.robot_model import (
-    Foot,
     ReachingFrame,
     RobotModel,
-    TaskGains,
     WholeBody,
     by_pattern,
     load_robot_file,
@@ -46,45 +44,6 @@ def test_whole_body_gains_and_reaching_frames_are_read_by_name(tmp_path):
     # What the file leaves out is as by default.
     assert tasks["posture"].weight == WholeBody().posture.weight
     assert tasks["center_of_mass"] == WholeBody().center_of_mass
-
-
-POINT = {"body": "left_shin", "point": [0, 1]}
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"foot_frictoin": 0.5}, "unknown key 'foot_frictoin'.*foot_friction"),
-        ({"joint_gains": {".*": {"stiffnes": 3.0}}}, r"joint_gains\.\.\*\.stiffnes.*'stiffness'"),
-        ({"foot_friction": -1.0}, "foot_friction must be positive; got -1"),
-        ({"whole_body": {"com": {}}}, r"unknown key 'whole_body\.com'.*'center_of_mass'"),
-        ({"whole_body": {"reaching": {"wieght": 1}}}, r"'whole_body\.reaching\.wieght'.*'weight'"),
-        ({"whole_body": {"orientation": {"a": {"gain": 1}}}}, r"n\.a\.gain'.*'stiffness'"),
-        ({"whole_body": {"orientation": {"a": {"weight": -1}}}}, r"n\.a\.weight must .*; got -1"),
-        ({"whole_body": {"friction": 0.0}}, r"whole_body\.friction must be .* positive; got 0"),
-        ({"reaching_frames": {"left": {"bodie": "x"}}}, r"'reaching_frames\.left\.bodie'.*'body'"),
-        ({"reaching_frames": {"left": POINT}}, r"'left': point must be \[x, y, z\]; got \[0.0, 1"),
-        ({"mirror": {"(": "x"}}, r"mirror pattern '\(' is not a regular expression"),
-    ],
-)
-def test_keys_and_values_that_do_not_fit_are_answered_with_what_does(tmp_path, change, message):
-    with pytest.raises(ValueError, match=message):
-        load_robot_file(edited(write_biped(tmp_path), **change))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"foot_friction": -1.0}, "foot_friction must be positive"),
-        ({"feet": {"left": Foot(contact_points=[[0.0, 0.1]])}}, r"'left': contact_points must"),
-        ({"reaching_frames": {"left": ReachingFrame(radius_m=-1.0)}}, "'left': radius_m must be f"),
-    ],
-)
-def test_values_of_a_constructor_are_validated_like_those_of_a_file(change, message):
-    with pytest.raises(ValueError, match=message):
-        RobotModel(name="mine", **change)
-    with pytest.raises(ValueError, match=r"whole_body\.posture\.damping"):
-        WholeBody(posture=TaskGains(damping=float("nan")))
 
 
 def test_an_unknown_hand_is_answered_with_those_that_exist():

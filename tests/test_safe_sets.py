@@ -247,16 +247,3 @@ def test_features_of_what_is_not_finite_are_not_a_number(value, where):
     preview = np.zeros((3, 3))
     {"position": q, "velocity": v, "preview": preview[1]}[where][1] = value
     assert np.isnan(safe_set.features(q, v, preview)).all()
-
-
-@pytest.mark.parametrize(
-    ("limits", "message"),
-    [
-        ({"height_m": [0.5, 0.3]}, r"lowest < highest; got \[0.5, 0.3\]"),
-        ({"height_m": [0.5]}, "height_m must be"),
-        ({"fall_height_m": 0.4}, "fall_height_m must not exceed the lowest safe height 0.3"),
-    ],
-)
-def test_contradictory_limits_are_refused(limits, message):
-    with pytest.raises(ValueError, match=message):
-        BalanceLimits(**limits)

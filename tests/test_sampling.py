@@ -111,18 +111,3 @@ def test_random_throws_lie_in_their_ranges():
         assert low <= values.min() and values.max() <= high
         assert values.max() - values.min() > 0.9 * (high - low)
     assert {throw.time_s for throw in throws} == {0.7}
-
-
-@pytest.mark.parametrize(
-    ("sampling", "change", "message"),
-    [
-        (StartSampling, {"base_height_m": [0.4]}, r"start: base_height_m must be \[lowest, high"),
-        (StartSampling, {"plan_duration_s": [2, 1]}, r"plan_duration_s must be .*; got \[2, 1\]"),
-        (StartSampling, {"velocity_std_m_s": [0.1]}, "velocity_std_m_s must be 3 numbers"),
-        (PushSampling, {"mass_kg": [1, 2, 3]}, r"push: mass_kg must be .*; got \[1, 2, 3\]"),
-        (PushSampling, {"share": 1.5}, r"push: share must be in \[0, 1\]; got 1.5"),
-    ],
-)
-def test_ranges_that_are_none_are_refused(sampling, change, message):
-    with pytest.raises(ValueError, match=message):
-        sampling(**change)

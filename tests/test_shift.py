@@ -205,22 +205,6 @@ def test_a_scenario_file_can_state_a_shift(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Shift(slope_rad=2.0), "slope_rad must be within a right angle; got 2.0"),
-        (lambda: Shift(base_force_n=[1.0]), "base_force_n is three numbers"),
-        (lambda: Shift(command_delay_s=-1.0), "command_delay_s must not be negative"),
-        (lambda: Shift(holes_m={"FR": 0.0}), "holes_m of foot 'FR' must be positive"),
-        (lambda: JointShift(effort_scale=0.0), "effort_scale must be positive"),
-        (lambda: JointShift(damping_scale=-1.0), "damping_scale must be positive"),
-    ],
-)
-def test_a_shift_that_is_none_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
-@pytest.mark.parametrize(
     ("shift", "message"),
     [
         (Shift(joints={"elbow": JointShift(is_locked=True)}), "no joint for shift 'elbow'; it has"),

@@ -21,8 +21,8 @@ from typer.core import TyperCommand
 
 from drake_safety.cli.console import COMMAND, TARGET, ScenarioArgument, command_line, console
 from drake_safety.extras import require_extra
+from drake_safety.files.reading import is_number
 from drake_safety.learning.segments import EpisodeError, installed_versions
-from drake_safety.robots.reading import is_number
 
 
 class Entry(NamedTuple):

@@ -32,12 +32,12 @@ from drake_safety.cli.training_folder import (
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.timeline_figure import levels_figure
+from drake_safety.files.schema import load_typed_file
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import rows_of
 from drake_safety.logs.episodes import motions_from_log
 from drake_safety.logs.robot_log import FORMATS
 from drake_safety.logs.sequences import Motion, SequenceMap, read_sequences
-from drake_safety.robots.robot_model import load_typed_file
 from drake_safety.simulation.rollouts import worker_loop
 from drake_safety.simulation.scenario import Scenario, load_scenario
 

@@ -33,10 +33,11 @@ from drake_safety.cli.training_folder import assessment_folder, goal_threshold, 
 from drake_safety.evaluation.path_figure import path_figure
 from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
 from drake_safety.evaluation.timeline_figure import timeline_figure
+from drake_safety.files.reading import did_you_mean
+from drake_safety.files.schema import load_typed
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.plants.balls import Throw
-from drake_safety.robots.reading import did_you_mean
 from drake_safety.simulation.capabilities import HasBall, HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.scenario import Scenario, load_scenario
@@ -204,7 +205,7 @@ def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
                 raise ValueError(f"--push '{text}': '{value}' is not a number") from None
         if "direction_rad" in values:
             values["direction_rad"] = float(np.radians(values["direction_rad"]))
-        throws.append(Throw(**values))
+        throws.append(load_typed(Throw, values, f"--push '{text}'"))
     return throws
 
 

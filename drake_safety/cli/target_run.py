@@ -21,10 +21,10 @@ from drake_safety.cli.targets import nearest_accepted, parse_target, print_verdi
 from drake_safety.cli.training_folder import GoalThreshold
 from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
 from drake_safety.evaluation.timeline_figure import timeline_figure
+from drake_safety.files.reading import did_you_mean
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.planning.goal_verdict import assess_goal
 from drake_safety.plants.pushes import Push
-from drake_safety.robots.reading import did_you_mean
 from drake_safety.simulation.capabilities import CanBePushed, HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.goal_motion import GoalMotion, run_to_goal

@@ -8,11 +8,11 @@ import numpy as np
 import typer
 
 from drake_safety.cli.console import COMMAND, TARGET, console
+from drake_safety.files.reading import did_you_mean, is_number
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.causes import describe_margin
 from drake_safety.planning.goal_verdict import GoalVerdict
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
-from drake_safety.robots.reading import did_you_mean, is_number
 from drake_safety.simulation.capabilities import GoalWords, HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 

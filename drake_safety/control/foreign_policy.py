@@ -13,8 +13,8 @@ import yaml
 from drake_safety.control.policy import PolicyParameters
 from drake_safety.control.policy_network import load_network
 from drake_safety.control.policy_terms import registered_terms
-from drake_safety.robots.reading import parse_yaml, reading
-from drake_safety.robots.robot_model import load_typed
+from drake_safety.files.reading import YamlLoader, parse_yaml, reading
+from drake_safety.files.schema import load_typed
 
 _THREE = ("base_lin_vel", "base_ang_vel", "projected_gravity", "velocity_commands")
 _PER_JOINT = ("joint_pos_rel", "joint_vel_rel", "last_action")
@@ -97,7 +97,7 @@ def converted_policy(path: Path, motors: Sequence[str] = ()) -> dict[str, Any]:
     return found
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(YamlLoader):
     """Reads Python's slices and tuples, which exporters write, as lists; a slice of all as null."""
 
 

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
+from pydantic import Field
 from pydrake.math import RotationMatrix
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, RobotKinematics
@@ -14,13 +15,14 @@ from drake_safety.control.observation import quaternion_of
 from drake_safety.control.policy_network import PolicyNetwork, load_network
 from drake_safety.control.policy_terms import TERMS, PolicyInput, Term, registered_terms
 from drake_safety.control.policy_terms import observation_term as observation_term
+from drake_safety.files.schema import Count, Pattern, Positive, Triple, load_typed_file, schema
 from drake_safety.robots.model_files import model_file
-from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern, load_typed_file
+from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern
 
 _Value = TypeVar("_Value")
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class ObservationTerm:
     """A part of the network's input."""
 
@@ -28,19 +30,13 @@ class ObservationTerm:
     """One of the registered terms; see :func:`observation_term`."""
     scale: list[float] = field(default_factory=lambda: [1.0])
     """Factor, one number or one per entry."""
-    clip: float = 100.0
+    clip: Annotated[float, Field(gt=0)] = 100.0
     """Largest absolute value after scaling."""
-    history: int = 1
+    history: Count = 1
     """Number of samples, the oldest first."""
 
-    def __post_init__(self) -> None:
-        if self.history < 1:
-            raise ValueError(f"term '{self.name}': history must be at least 1; got {self.history}")
-        if not self.clip > 0:
-            raise ValueError(f"term '{self.name}': clip must be positive; got {self.clip}")
 
-
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class GaitClock:
     """A clock whose phases are part of the observation."""
 
@@ -52,50 +48,42 @@ class GaitClock:
     """Norm of the command below which every phase is half a period."""
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class CommandLimits:
     """Commands (v_x, v_y, ω_z) for which the policy was trained [m/s, m/s, rad/s]."""
 
-    lowest: list[float] = field(default_factory=lambda: [-1.0, -1.0, -1.0])
-    highest: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
-    change: list[float] = field(default_factory=lambda: [math.inf, math.inf, math.inf])
+    lowest: Triple = field(default_factory=lambda: [-1.0, -1.0, -1.0])
+    highest: Triple = field(default_factory=lambda: [1.0, 1.0, 1.0])
+    change: Annotated[list[float], Field(min_length=3, max_length=3)] = field(
+        default_factory=lambda: [math.inf, math.inf, math.inf]
+    )
     """Largest change in one period."""
 
     def __post_init__(self) -> None:
-        for name in ("lowest", "highest", "change"):
-            if len(getattr(self, name)) != 3:
-                raise ValueError(
-                    f"command: {name} must be three numbers, of v_x, v_y and ω_z; got "
-                    f"{getattr(self, name)}"
-                )
         if not np.all(np.less_equal(self.lowest, self.highest)):
-            raise ValueError(
-                f"command: lowest must not exceed highest; got {self.lowest}, {self.highest}"
-            )
+            raise ValueError(f"lowest must not exceed highest; got {self.lowest}, {self.highest}")
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class WholeHistory:
     """Samples of the whole observation in the network's input."""
 
     ages: list[int] = field(default_factory=list)
     """Age of each sample in periods, 0 for the newest, in the network's order; empty for policies
     whose terms have histories of their own, or none."""
-    by: str = "time"
+    by: Literal["time", "term"] = "time"
     """``time``: one sample of all terms after the other; ``term``: all samples of a term together.
     """
 
     def __post_init__(self) -> None:
         if sorted(self.ages) != list(range(len(self.ages))):
             raise ValueError(
-                f"history: ages must name each of the newest {len(self.ages)} samples once, from "
+                f"ages must name each of the newest {len(self.ages)} samples once, from "
                 f"0; got {self.ages}"
             )
-        if self.by not in ("time", "term"):
-            raise ValueError(f"history: by must be 'time' or 'term'; got '{self.by}'")
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class PolicyParameters:
     """The schema of ``policy.yaml``."""
 
@@ -105,19 +93,19 @@ class PolicyParameters:
     """Requirement by which pip installs the network's package without its dependencies."""
     joints: list[str] = field(default_factory=list)
     """Joints in the network's order; by default those of the network's metadata."""
-    default_positions: dict[str, float] = field(default_factory=dict)
+    default_positions: dict[Pattern, float] = field(default_factory=dict)
     """Joint positions at zero action [rad], by regular expression over joint names; by default
     those of the network's metadata; 0 for joints without one."""
-    action_scale: dict[str, float] = field(default_factory=dict)
+    action_scale: dict[Pattern, float] = field(default_factory=dict)
     """Joint positions per unit of action [rad], by regular expression; by default those of the
     network's metadata."""
-    action_clip: float = 100.0
+    action_clip: Annotated[float, Field(gt=0)] = 100.0
     """Largest absolute action."""
-    gains: dict[str, JointGains] = field(default_factory=dict)
+    gains: dict[Pattern, JointGains] = field(default_factory=dict)
     """Servo gains, by regular expression; by default those of the network's metadata."""
-    rotor_inertia: dict[str, float] = field(default_factory=dict)
+    rotor_inertia: dict[Pattern, float] = field(default_factory=dict)
     """Reflected rotor inertia of the joints [kg·m²], by regular expression."""
-    period_s: float = 0.02
+    period_s: Positive = 0.02
     """Time between two actions [s]."""
     observation: list[ObservationTerm] = field(default_factory=list)
     """Terms in the network's order."""
@@ -126,13 +114,9 @@ class PolicyParameters:
     command: CommandLimits = field(default_factory=CommandLimits)
 
     def __post_init__(self) -> None:
-        if not 0 < self.period_s < math.inf:
-            raise ValueError(f"policy: period_s must be finite and positive; got {self.period_s}")
-        if not self.action_clip > 0:
-            raise ValueError(f"policy: action_clip must be positive; got {self.action_clip}")
         own = [term.name for term in self.observation if term.history > 1]
         if self.history.ages and own:
-            raise ValueError(f"policy: either history or terms with their own; got both, {own}")
+            raise ValueError(f"either history or terms with their own; got both, {own}")
 
 
 class Policy:

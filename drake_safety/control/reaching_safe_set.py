@@ -2,10 +2,11 @@
 
 import functools
 import math
-from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from drake_safety.control.kinematic_preview import KinematicPreview, chain_joints
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, planar_pose
@@ -18,6 +19,7 @@ from drake_safety.control.safe_sets import (
     support_margin,
 )
 from drake_safety.control.whole_body_model import WholeBodyModel
+from drake_safety.files.schema import NotNegative, schema
 from drake_safety.learning.inputs import is_rate
 from drake_safety.plants.obstacles import Clearance
 from drake_safety.robots.robot_size import GRAVITY_M_S2
@@ -26,33 +28,18 @@ _NUM_PREVIEWED = 8  # Samples of the plan in the whole-body preview.
 _SOON_S = 0.1  # Horizon of the extrapolation at constant velocity.
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class ReachingLimits:
     """Limits of :class:`ReachingSafeSet`."""
 
-    joint_margin_rad: float = 0.03
+    joint_margin_rad: NotNegative = 0.03
     """Least safe distance of a joint from a stop [rad]."""
-    support_clearance_m: float = 0.03
+    support_clearance_m: NotNegative = 0.03
     """Height below which a contact point is part of the support polygon [m]."""
-    fall_height_share: float = 0.7
+    fall_height_share: Annotated[float, Field(gt=0, lt=1)] = 0.7
     """Share of the base's standing height below which the robot has fallen."""
-    fall_tilt_rad: float = 0.6
+    fall_tilt_rad: Annotated[float, Field(gt=0, lt=math.pi)] = 0.6
     """Angle between the base's z axis and the vertical beyond which it has fallen [rad]."""
-
-    def __post_init__(self) -> None:
-        for name in ("joint_margin_rad", "support_clearance_m"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(
-                    f"safe set: {name} must be finite and not negative; got {getattr(self, name)}"
-                )
-        if not 0 < self.fall_height_share < 1:
-            raise ValueError(
-                f"safe set: fall_height_share must be in (0, 1); got {self.fall_height_share}"
-            )
-        if not 0 < self.fall_tilt_rad < math.pi:
-            raise ValueError(
-                f"safe set: fall_tilt_rad must be in (0, pi); got {self.fall_tilt_rad}"
-            )
 
 
 class ReachingSafeSet:

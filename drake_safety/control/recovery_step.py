@@ -1,33 +1,33 @@
 """Footholds and swing curves of a recovery step (Raibert 1986)."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
+from drake_safety.files.schema import Count, NotNegative, Positive, schema
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class RecoveryStepParameters:
     """Parameters of a recovery step."""
 
-    step_duration_s: float = 0.09
+    step_duration_s: Positive = 0.09
     """Duration of a swing [s]."""
-    lift_m: float = 0.06
+    lift_m: Positive = 0.06
     """Height of the swing trajectory [m]."""
     velocity_gain_s: float = 0.07
     """Raibert's gain: distance beyond the neutral point per speed [s]."""
-    max_reach_m: float = 0.18
+    max_reach_m: Positive = 0.18
     """Largest distance of a foothold from its hip's ground projection [m]."""
     min_lateral_m: float = 0.11
     """Smallest distance of a foothold from the base's midline, on its own side [m]."""
-    max_twist_rad: float = 0.3
+    max_twist_rad: NotNegative = 0.3
     """Largest difference of the desired base yaw of stance legs from the measured yaw [rad]; with 0
     no heading is held, and the base follows the yaw of its feet."""
     yaw_damping_s: float = 0.1
     """Offset of the desired base yaw from the heading against the yaw rate, per yaw rate [s]."""
-    min_steps: int = 2
+    min_steps: Count = 2
     """Least number of swings."""
     max_steps: int = 20
     """Largest number of swings."""
@@ -37,28 +37,18 @@ class RecoveryStepParameters:
     """Least distance of the capture point inside the support polygon for stopping [m]."""
     resume_margin_m: float = 0.02
     """Distance of the capture point below which a stopped robot steps again [m]."""
-    return_duration_s: float = 0.5
+    return_duration_s: Positive = 0.5
     """Duration of the base's return over its feet before balancing resumes [s]."""
 
     def __post_init__(self) -> None:
-        for name in ("step_duration_s", "lift_m", "max_reach_m", "return_duration_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(
-                    f"recovery step: {name} must be positive; got {getattr(self, name)}"
-                )
-        if not self.max_twist_rad >= 0:
-            raise ValueError(
-                f"recovery step: max_twist_rad must not be negative; got {self.max_twist_rad}"
-            )
         if not self.resume_margin_m <= self.settle_margin_m:
             raise ValueError(
-                f"recovery step: resume_margin_m must not exceed settle_margin_m; got "
+                f"resume_margin_m must not exceed settle_margin_m; got "
                 f"{self.resume_margin_m}, {self.settle_margin_m}"
             )
-        if not 1 <= self.min_steps <= self.max_steps:
+        if not self.min_steps <= self.max_steps:
             raise ValueError(
-                f"recovery step: 1 <= min_steps <= max_steps is required; got "
-                f"{self.min_steps}, {self.max_steps}"
+                f"min_steps must not exceed max_steps; got {self.min_steps}, {self.max_steps}"
             )
 
 

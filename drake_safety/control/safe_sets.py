@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from types import MappingProxyType
 
 import numpy as np
 
 from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.files.schema import Interval, schema
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 
 _NUM_DIRECTIONS = 8
@@ -94,13 +95,13 @@ def fall_margin(
     return min(height - lowest_height_m, kinematics.standing_height * (cos_tilt - cos_fall_tilt))
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class BalanceLimits:
     """Limits of :class:`BalanceSafeSet`."""
 
     support_clearance_m: float = 0.03
     """Height below which a contact point is part of the support polygon [m]."""
-    height_m: list[float] = field(default_factory=lambda: [0.3, 0.5])
+    height_m: Interval = field(default_factory=lambda: [0.3, 0.5])
     """Lowest and highest safe height of the base [m]."""
     fall_height_m: float = 0.2
     """Height of the base below which the robot has fallen [m]."""
@@ -108,14 +109,9 @@ class BalanceLimits:
     """Angle between the base's z axis and the vertical beyond which it has fallen [rad]."""
 
     def __post_init__(self) -> None:
-        if len(self.height_m) != 2 or not self.height_m[0] < self.height_m[1]:
-            raise ValueError(
-                f"safe set: height_m must be [lowest, highest] with lowest < highest; got "
-                f"{self.height_m}"
-            )
         if not self.fall_height_m <= self.height_m[0]:
             raise ValueError(
-                f"safe set: fall_height_m must not exceed the lowest safe height "
+                f"fall_height_m must not exceed the lowest safe height "
                 f"{self.height_m[0]}; got {self.fall_height_m}"
             )
 

@@ -1,24 +1,27 @@
 """The safe set of a walking robot: upright, high enough, and only its feet on the ground."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.control.observation import heading_velocity
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
+from drake_safety.files.schema import schema
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 
 _AXES = ("forward", "left", "yaw")
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class WalkingLimits:
     """Limits of :class:`WalkingSafeSet`."""
 
-    tilt_rad: float = 0.7
+    tilt_rad: Annotated[float, Field(gt=0, lt=math.pi)] = 0.7
     """Largest angle between the base's z axis and the vertical [rad]."""
     height_share: float = 0.6
     """Lowest height of the base, as a share of the standing height."""
@@ -28,22 +31,18 @@ class WalkingLimits:
     """How far a joint may be driven beyond a stop, which in simulation is soft [rad]."""
     fall_height_share: float = 0.45
     """Height of the base below which the robot has fallen, as a share of the standing height."""
-    fall_tilt_rad: float = 1.2
+    fall_tilt_rad: Annotated[float, Field(gt=0, lt=math.pi)] = 1.2
     """Tilt beyond which it has fallen [rad]."""
 
     def __post_init__(self) -> None:
-        for name in ("tilt_rad", "fall_tilt_rad"):
-            if not 0 < getattr(self, name) < math.pi:
-                raise ValueError(f"safe set: {name} must be in (0, π); got {getattr(self, name)}")
         if not 0 < self.fall_height_share <= self.height_share < 1:
             raise ValueError(
-                "safe set: 0 < fall_height_share <= height_share < 1; got "
+                "0 < fall_height_share <= height_share < 1; got "
                 f"{self.fall_height_share}, {self.height_share}"
             )
         if not self.tilt_rad <= self.fall_tilt_rad:
             raise ValueError(
-                f"safe set: tilt_rad must not exceed fall_tilt_rad; got {self.tilt_rad}, "
-                f"{self.fall_tilt_rad}"
+                f"tilt_rad must not exceed fall_tilt_rad; got {self.tilt_rad}, {self.fall_tilt_rad}"
             )
 
 

@@ -1,1 +1,1 @@
-"""Files and folders written whole, and the progress of long computations."""
+"""Files written whole, strict YAML and its errors, and the progress of long computations."""

@@ -14,11 +14,7 @@ from drake_safety.extras import require_extra
 from drake_safety.files.progress import StageProgress, shown
 from drake_safety.learning import adaptation, assessment_file, prediction, recalibration
 from drake_safety.learning.adaptation import Adaptation, TrainingScores
-from drake_safety.learning.assessment_parameters import (
-    MODES,
-    AdaptationParameters,
-    AssessmentParameters,
-)
+from drake_safety.learning.assessment_parameters import AdaptationParameters, AssessmentParameters
 from drake_safety.learning.blas_threads import one_blas_thread
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector, usual_rows
@@ -38,7 +34,6 @@ from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo, spli
 from drake_safety.learning.training import check_preview, known_range, learned_maps, segments_for
 
 __all__ = [
-    "MODES",
     "AdaptationParameters",
     "Assessment",
     "AssessmentParameters",

@@ -1,42 +1,25 @@
 """The schema of a scenario's `assessment`: parameters of training and adaptation."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from dataclasses import field, replace
+from typing import Annotated, Literal, Self
 
-from drake_safety.learning.distance import BACKENDS, WARPING_COSTS
+from pydantic import Field
 
-MODES = ("paper", "sharpened")
-INITIALIZATIONS = ("spectral", "random")
-LOSSES = ("squared", "norm")
-COUNTS = ("cell", "segments")
+from drake_safety.files.schema import (
+    Count,
+    Interval,
+    NotNegative,
+    Positive,
+    Share,
+    ShareBelowOne,
+    schema,
+)
+from drake_safety.learning.distance import Backend, WarpingCost
 
-
-def _expect(parameters: object, name: str, holds: bool, expected: str) -> None:
-    if not holds:
-        who, value = type(parameters).__name__, getattr(parameters, name)
-        raise ValueError(f"{who}: {name} is {value}, expected {expected}")
-
-
-_RANGES: dict[str, Callable[[Any], bool]] = {
-    ">= 0": lambda value: value >= 0.0,
-    "> 0": lambda value: value > 0.0,
-    ">= 1": lambda value: value >= 1.0,
-    "a value in [0, 1]": lambda value: 0.0 <= value <= 1.0,
-    "a value in [0, 1)": lambda value: 0.0 <= value < 1.0,
-    "a value in (0, 1)": lambda value: 0.0 < value < 1.0,
-    "one width >= 1 per layer": lambda sizes: bool(sizes) and all(size >= 1 for size in sizes),
-}
+Widths = Annotated[list[Count], Field(min_length=1)]
 
 
-def _expect_ranges(parameters: object, names: Mapping[str, str]) -> None:
-    """Checks the values of names, separated by spaces, by the range that is expected of them."""
-    for expected, separated in names.items():
-        for name in separated.split():
-            _expect(parameters, name, _RANGES[expected](getattr(parameters, name)), expected)
-
-
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class AdaptationParameters:
     """Parameters of the adaptation to feedback from the actual robot.
 
@@ -57,34 +40,18 @@ class AdaptationParameters:
             mean distance of activations from their mean (sharpened).
     """
 
-    gate: float = 0.3
-    least_uncertainty: float = 0.1
-    decay_rate: float = 0.4
-    first_uncertainty: float = 0.3
-    update_interval: int = 40
-    count: str = "cell"
-    offset_std: float = 2.0
-    slope_std: float = 0.5
-    hidden_std: float = 1.0
-
-    def __post_init__(self) -> None:
-        self.check()
-
-    def check(self) -> None:
-        """Checks all values, which may have been set since the construction."""
-        _expect_ranges(
-            self,
-            {
-                "a value in [0, 1]": "least_uncertainty first_uncertainty",
-                "> 0": "offset_std slope_std hidden_std",
-                ">= 0": "gate decay_rate",
-                ">= 1": "update_interval",
-            },
-        )
-        _expect(self, "count", self.count in COUNTS, f"one of {list(COUNTS)}")
+    gate: NotNegative = 0.3
+    least_uncertainty: Share = 0.1
+    decay_rate: NotNegative = 0.4
+    first_uncertainty: Share = 0.3
+    update_interval: Count = 40
+    count: Literal["cell", "segments"] = "cell"
+    offset_std: Positive = 2.0
+    slope_std: Positive = 0.5
+    hidden_std: Positive = 1.0
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class PaperReading:
     """What the paper leaves open about its segments, its input x and its map Psi.
 
@@ -114,36 +81,19 @@ class PaperReading:
             the lowest loss on them are kept; 0 keeps the last.
     """
 
-    stride: int = 1
+    stride: Annotated[int, Field(ge=0)] = 1
     velocities: bool = True
     standardized: bool = False
-    loss: str = "squared"
-    neighbour_weight: float = 0.0
-    hidden_sizes: list[int] = field(default_factory=lambda: [128, 128])
-    dropout: float = 0.3
-    weight_decay: float = 0.01
-    epochs: int = 60
-    held_out: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.check()
-
-    def check(self) -> None:
-        """Checks all values, which may have been set since the construction."""
-        _expect_ranges(
-            self,
-            {
-                ">= 0": "stride weight_decay",
-                ">= 1": "epochs",
-                "one width >= 1 per layer": "hidden_sizes",
-                "a value in [0, 1)": "dropout held_out",
-                "a value in [0, 1]": "neighbour_weight",
-            },
-        )
-        _expect(self, "loss", self.loss in LOSSES, f"one of {list(LOSSES)}")
+    loss: Literal["squared", "norm"] = "squared"
+    neighbour_weight: Share = 0.0
+    hidden_sizes: Widths = field(default_factory=lambda: [128, 128])
+    dropout: ShareBelowOne = 0.3
+    weight_decay: NotNegative = 0.01
+    epochs: Count = 60
+    held_out: ShareBelowOne = 0.0
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class AssessmentParameters:
     """Parameters of a safety assessment.
 
@@ -208,81 +158,52 @@ class AssessmentParameters:
         adaptation: Parameters of the adaptation.
     """
 
-    mode: str = "sharpened"
-    discount: float = 0.99
-    horizon: int = 10
-    preview_stride: int = 1
-    score_weight: float = 0.01
-    initial_uncertainty: float = 0.3
-    min_count: int = 5
-    resolution: int = 14
-    cell_length: float = 10.0
-    warping_cost: str = "squared"
-    distance_backend: str = "dtaidistance"
-    perplexity: float = 30.0
-    candidates_per_neighbour: int = 2
-    exaggeration: float = 4.0
-    initialization: str = "spectral"
-    novelty_rate: float = 0.01
+    mode: Literal["sharpened", "paper"] = "sharpened"
+    discount: Share = 0.99
+    horizon: Count = 10
+    preview_stride: Count = 1
+    score_weight: NotNegative = 0.01
+    initial_uncertainty: Share = 0.3
+    min_count: Count = 5
+    resolution: Count = 14
+    cell_length: Positive = 10.0
+    warping_cost: WarpingCost = "squared"
+    distance_backend: Backend = "dtaidistance"
+    perplexity: Annotated[float, Field(ge=1)] = 30.0
+    candidates_per_neighbour: Annotated[int, Field(ge=0)] = 2
+    exaggeration: Annotated[float, Field(ge=1)] = 4.0
+    initialization: Literal["spectral", "random"] = "spectral"
+    novelty_rate: Annotated[float, Field(gt=0, lt=1)] = 0.01
     seed: int = 0
-    learning_rate: float = 2e-3
-    batch_size: int = 512
-    epochs: int = 18
-    ensemble_size: int = 3
-    held_out: float = 0.3
-    hidden_sizes: list[int] = field(default_factory=lambda: [128, 128])
-    dropout: float = 0.2
-    target_weight: float = 0.1
-    safety_weight: float = 5.0
-    margin_weight: float = 1.0
-    margin_unit: float = 0.02
-    margin_range: list[float] = field(default_factory=lambda: [-0.03, 0.10])
-    first_row_weight: float = 6.0
-    shortest_segment: int = 0
-    raw_input_scale: float = 1.0
-    feature_unit: float = 0.0
+    learning_rate: Positive = 2e-3
+    batch_size: Count = 512
+    epochs: Count = 18
+    ensemble_size: Count = 3
+    held_out: ShareBelowOne = 0.3
+    hidden_sizes: Widths = field(default_factory=lambda: [128, 128])
+    dropout: ShareBelowOne = 0.2
+    target_weight: NotNegative = 0.1
+    safety_weight: NotNegative = 5.0
+    margin_weight: NotNegative = 1.0
+    margin_unit: Positive = 0.02
+    margin_range: Interval = field(default_factory=lambda: [-0.03, 0.10])
+    first_row_weight: Positive = 6.0
+    shortest_segment: Annotated[int, Field(ge=0)] = 0
+    raw_input_scale: Positive = 1.0
+    feature_unit: NotNegative = 0.0
     paper: PaperReading = field(default_factory=PaperReading)
     adaptation: AdaptationParameters = field(default_factory=AdaptationParameters)
 
     def __post_init__(self) -> None:
-        self.check()
+        if self.shortest_segment > self.horizon:
+            raise ValueError(
+                f"shortest_segment must not exceed horizon {self.horizon}; got "
+                f"{self.shortest_segment}"
+            )
 
     def check(self) -> None:
         """Checks all values, which may have been set since the construction."""
-        if self.mode not in MODES:
-            raise ValueError(
-                f"AssessmentParameters: unknown mode '{self.mode}'; the modes are {list(MODES)}"
-            )
-        for name, known in (
-            ("distance_backend", BACKENDS),
-            ("warping_cost", WARPING_COSTS),
-            ("initialization", INITIALIZATIONS),
-        ):
-            _expect(self, name, getattr(self, name) in known, f"one of {list(known)}")
-        _expect_ranges(
-            self,
-            {
-                "a value in [0, 1]": "discount initial_uncertainty",
-                ">= 0": "score_weight target_weight safety_weight margin_weight feature_unit "
-                "candidates_per_neighbour",
-                ">= 1": "horizon preview_stride min_count resolution batch_size epochs "
-                "ensemble_size perplexity exaggeration",
-                "> 0": "cell_length learning_rate margin_unit first_row_weight raw_input_scale",
-                "a value in (0, 1)": "novelty_rate",
-                "a value in [0, 1)": "dropout held_out",
-                "one width >= 1 per layer": "hidden_sizes",
-            },
-        )
-        is_within = 0 <= self.shortest_segment <= self.horizon
-        _expect(self, "shortest_segment", is_within, "a value in 0..horizon")
-        _expect(
-            self,
-            "margin_range",
-            len(self.margin_range) == 2 and self.margin_range[0] < self.margin_range[1],
-            "[lowest, highest]",
-        )
-        self.paper.check()
-        self.adaptation.check()
+        replace(self, paper=replace(self.paper), adaptation=replace(self.adaptation))
 
     @property
     def is_sharpened(self) -> bool:

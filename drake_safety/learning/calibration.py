@@ -14,11 +14,13 @@ Both rules use one class alone and hold for any share of unsafe episodes.
 """
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
+from drake_safety.files.schema import Share, schema
 from drake_safety.learning.segments import Segments
 
 SAFE, UNSAFE, UNKNOWN = "safe", "unsafe", "don't know"
@@ -28,21 +30,12 @@ PLAN, MOTION = "plan", "motion"
 KINDS = (PLAN, MOTION)
 
 _BELOW_ALL = 1e-6  # Distance of a threshold below the lowest score, robust against rounding.
-_RANGES = {
-    "miss_rate": (0.0, 1.0),
-    "false_alarm_rate": (0.0, 1.0),
-    "confidence": (0.0, 1.0),
-    # Below the lowest score, or above the highest one.
-    "threshold": (-2.0 * _BELOW_ALL, 1.0 + 2.0 * _BELOW_ALL),
-    "unsafe_below": (-2.0 * _BELOW_ALL, 1.0 + 2.0 * _BELOW_ALL),
-    "num_unsafe": (0, np.inf),
-    "num_safe": (0, np.inf),
-    "num_missed": (0, np.inf),
-    "num_accepted": (0, np.inf),
-}
+# Below the lowest score, or above the highest one.
+_Threshold = Annotated[float, Field(ge=-2.0 * _BELOW_ALL, le=1.0 + 2.0 * _BELOW_ALL)]
+_Number = Annotated[int, Field(ge=0)]
 
 
-@dataclass(frozen=True, kw_only=True)
+@schema(frozen=True, kw_only=True)
 class Calibration:
     """Two thresholds of the probability, and their promised rates.
 
@@ -60,34 +53,24 @@ class Calibration:
         variation: The plant of the episodes, for which alone the rates are promised.
     """
 
-    kind: str
-    miss_rate: float
-    false_alarm_rate: float
-    confidence: float | None
-    threshold: float
-    unsafe_below: float
-    num_unsafe: int
-    num_safe: int
-    num_missed: int
-    num_accepted: int
+    kind: Literal["plan", "motion"]
+    miss_rate: Share
+    false_alarm_rate: Share
+    confidence: Share | None
+    threshold: _Threshold
+    unsafe_below: _Threshold
+    num_unsafe: _Number
+    num_safe: _Number
+    num_missed: _Number
+    num_accepted: _Number
     seed: int
     scenario_hash: str
     variation: str = "nominal"
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(
-                f"calibration: unknown kind '{self.kind}'; the kinds are {list(KINDS)}"
-            )
-        for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise ValueError(
-                    f"calibration: {name} is {value}, expected a value in [{low:g}, {high:g}]"
-                )
         if not self.unsafe_below <= self.threshold:
             raise ValueError(
-                f"calibration: unsafe_below is {self.unsafe_below}, expected at most the threshold "
+                f"unsafe_below is {self.unsafe_below}, expected at most the threshold "
                 f"{self.threshold}"
             )
 

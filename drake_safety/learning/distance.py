@@ -17,13 +17,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal, get_args
 
 import numpy as np
 
 from drake_safety.extras import require_extra
 
-BACKENDS = ("dtaidistance", "tslearn")
-WARPING_COSTS = ("squared", "rooted", "absolute")
+Backend = Literal["dtaidistance", "tslearn"]
+BACKENDS = get_args(Backend)
+WarpingCost = Literal["squared", "rooted", "absolute"]
+WARPING_COSTS = get_args(WarpingCost)
 """Cost of a warping path: sum ||.||^2, its square root, or sum ||.||."""
 
 _ROWS = 32  # Segments that share their candidates.

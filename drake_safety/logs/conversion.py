@@ -37,7 +37,7 @@ def base_velocities(
     velocity: Velocity, channels: Mapping[str, Channel], rotations: Rotation
 ) -> np.ndarray:
     """Returns a velocity of the base along the world's axes, (N, 3) [m/s or rad/s]."""
-    units = LENGTH_UNITS | ANGLE_UNITS | {"": 1.0}
+    units = LENGTH_UNITS | ANGLE_UNITS
     table = units[velocity.unit] * channels[velocity.topic].table(velocity.columns)
     return table if velocity.frame == "world" else rotations.apply(table)
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from drake_safety.extras import require_extra
+from drake_safety.files.reading import reading
 from drake_safety.logs.channel import Channel, listed
 from drake_safety.logs.log_map import LogTime
-from drake_safety.robots.reading import reading
 
 Message = tuple[str, int, Any]
 """Topic, recording time [ns] and decoded message."""

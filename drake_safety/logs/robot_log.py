@@ -181,7 +181,6 @@ def _opened(
     path = Path(path)
     if not isinstance(log_map, LogMap):
         log_map = load_log_map(Path(log_map))
-    log_map.check()
     if step_s is not None and not step_s > 0:
         raise ValueError(f"read_log: step_s must be positive; got {step_s}")
     kinematics = RobotKinematics(robot)

@@ -1,25 +1,26 @@
 """Sequences of observations in .npz files, such as a policy's, as rows of a ChangeDetector."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import numpy as np
 
+from drake_safety.files.reading import did_you_mean, reading
+from drake_safety.files.schema import NotNegative, schema
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.inputs import preview_names
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.logs.channel import listed
-from drake_safety.robots.reading import did_you_mean, reading
 
 Motion = tuple[np.ndarray, np.ndarray]  # Times (K,) [s] of consecutive rows (K, n).
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class SequenceMap:
     """The schema of the map of an ``.npz`` file."""
 
-    step_s: float = 0.0
+    step_s: NotNegative = 0.0
     """Time between two steps [s], required: the detector's, or an integer fraction of it."""
     data: str = "observations"
     """Array of sequences, (num_sequences, num_steps, n), or of one, (num_steps, n)."""

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_safety.extras import require_extra
+from drake_safety.files.reading import is_number, reading
 from drake_safety.logs.channel import Channel, listed
 from drake_safety.logs.log_map import LogTime
-from drake_safety.robots.reading import is_number, reading
 
 if TYPE_CHECKING:
     import pandas as pd

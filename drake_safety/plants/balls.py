@@ -1,7 +1,6 @@
 """Balls, as free bodies, that are thrown at a robot."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from pydrake.geometry import SceneGraph
@@ -11,6 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia
 from pydrake.systems.framework import Context
 
+from drake_safety.files.schema import Positive, schema
 from drake_safety.plants.obstacles import collision_geometries
 from drake_safety.robots.model_files import package_parser
 from drake_safety.robots.robot_size import GRAVITY_M_S2
@@ -22,14 +22,14 @@ _BEFORE_M, _BEYOND_M = 2.0, 1.0  # Ends of the line of flight, relative to its a
 _PARKED = np.array([50.0, 50.0, 0.0])  # Far from the robot [m].
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class Throw:
     """A thrown ball."""
 
     time_s: float = 0.0
     """Time of impact [s]."""
-    mass_kg: float = 2.0
-    speed_m_s: float = 6.0
+    mass_kg: Positive = 2.0
+    speed_m_s: Positive = 6.0
     """Horizontal speed at impact [m/s]."""
     direction_rad: float = math.pi / 2
     """Direction of flight, as an angle from the world's x axis [rad]."""
@@ -37,11 +37,6 @@ class Throw:
     """Lateral offset of the line of flight from the base's origin [m]."""
     height_m: float = 0.0
     """Height of the line of flight over the base's origin [m]."""
-
-    def __post_init__(self) -> None:
-        for name in ("mass_kg", "speed_m_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"throw: {name} must be positive; got {getattr(self, name)}")
 
 
 def add_ball(plant: MultibodyPlant) -> ModelInstanceIndex:

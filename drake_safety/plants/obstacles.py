@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
+from pydantic import FiniteFloat
 from pydrake.geometry import (
     CollisionFilterDeclaration,
     GeometryId,
@@ -17,29 +18,21 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
 
+from drake_safety.files.schema import Triple, schema
 from drake_safety.robots.model_files import model_file, package_parser
 from drake_safety.robots.robot import Scratch, add_robot
 from drake_safety.robots.robot_model import RobotModel
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class Obstacle:
     """A static model in the world; without collision geometry it is a decoration."""
 
     model: str = ""
     """``package://…`` or an absolute path of a model file with one root link."""
-    position: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    position: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Position of the root link in the world, (3,) [m]."""
-    yaw_rad: float = 0.0
-
-    def __post_init__(self) -> None:
-        if len(self.position) != 3 or not np.isfinite(self.position).all():
-            raise ValueError(
-                f"obstacle '{self.model}': position must be three finite numbers [m]; got "
-                f"{self.position}"
-            )
-        if not np.isfinite(self.yaw_rad):
-            raise ValueError(f"obstacle '{self.model}': yaw_rad must be finite; got {self.yaw_rad}")
+    yaw_rad: FiniteFloat = 0.0
 
 
 def add_obstacles(plant: MultibodyPlant, obstacles: list[Obstacle]) -> list[ModelInstanceIndex]:

@@ -3,8 +3,8 @@
 import re
 import threading
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from dataclasses import field
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
 from pydrake.geometry import AddContactMaterial, ProximityProperties, RoleAssign, SceneGraph, Sphere
@@ -18,6 +18,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context
 
+from drake_safety.files.schema import NotNegative, Positive, Triple, schema
 from drake_safety.robots.robot_description import (
     add_description,
     add_stated_shapes,
@@ -26,51 +27,43 @@ from drake_safety.robots.robot_description import (
 from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.robots.shift import JointShift, Shift
 
-ENGINES = ("drake", "mujoco")
-"""Physics engines that a plant variation may choose."""
 _T = TypeVar("_T")
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class ObservationNoise:
     """Standard deviations of the noise on a measured state."""
 
-    position: float = 0.0
+    position: NotNegative = 0.0
     """Base position [m], base orientation and joint positions [rad]."""
-    velocity: float = 0.0
+    velocity: NotNegative = 0.0
     """Base and joint velocities [m/s, rad/s]."""
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class Payload:
     """A small mass fixed to a body of the robot."""
 
-    mass_kg: float = 1.0
-    position_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    mass_kg: Positive = 1.0
+    position_m: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Its centre in the body's frame, (3,)."""
     body: str = ""
     """The body it is fixed to; the robot's base by default."""
 
-    def __post_init__(self) -> None:
-        if not self.mass_kg > 0:
-            raise ValueError(f"payload: mass_kg must be positive; got {self.mass_kg}")
-        if len(self.position_m) != 3 or not np.isfinite(self.position_m).all():
-            raise ValueError(f"payload: position_m is three numbers [m]; got {self.position_m}")
 
-
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class PlantVariation:
     """Differences of a plant from the published robot."""
 
-    engine: str = "drake"
+    engine: Literal["drake", "mujoco"] = "drake"
     """Physics engine: ``drake`` or ``mujoco``."""
-    mass_scale: float = 1.0
+    mass_scale: Positive = 1.0
     """Factor on every body's spatial inertia."""
-    joint_friction_nm: float = 0.0
+    joint_friction_nm: NotNegative = 0.0
     """Dry (Coulomb) friction torque of every actuated joint [N·m]."""
-    joint_damping: float = 0.0
+    joint_damping: NotNegative = 0.0
     """Viscous damping added to every actuated joint [N·m·s/rad]."""
-    foot_friction: float | None = None
+    foot_friction: Positive | None = None
     """Friction coefficient of the feet; the robot's own by default."""
     observation_noise: ObservationNoise = field(default_factory=ObservationNoise)
     """Noise on the measurements of controllers and assessor."""
@@ -80,21 +73,6 @@ class PlantVariation:
     """A mass that the controllers do not model."""
     shift: Shift | None = None
     """Lasting conditions that training does not have."""
-
-    def __post_init__(self) -> None:
-        if self.engine not in ENGINES:
-            raise ValueError(
-                f"plant variation: engine must be one of {list(ENGINES)}; got '{self.engine}'"
-            )
-        for name in ("mass_scale", "foot_friction"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"plant variation: {name} must be positive; got {value}")
-        for name in ("joint_friction_nm", "joint_damping"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(
-                    f"plant variation: {name} must not be negative; got {getattr(self, name)}"
-                )
 
 
 PAYLOAD_RADIUS_M = 0.05

@@ -22,8 +22,8 @@ import numpy as np
 
 from drake_safety.extras import require_extra
 from drake_safety.files.atomic import lock_folder, replacing
+from drake_safety.files.reading import reading, shortened
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
-from drake_safety.robots.reading import reading, shortened
 from drake_safety.simulation.episode_shards import (
     from_table,
     read_shard,

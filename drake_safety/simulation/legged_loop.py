@@ -2,17 +2,18 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
+from pydantic import Field
 from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Adder, ConstantVectorSource, MatrixGain, Multiplexer
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
+from drake_safety.files.schema import Positive, schema
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
 from drake_safety.plants.obstacles import remove_visuals
@@ -39,24 +40,16 @@ controller are the longest chain, done within the plant's step in which it began
 """
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class View:
     """A camera that follows a robot's base over the ground."""
 
     azimuth_rad: float = math.radians(-42.0)
     """Direction of the camera from the robot, from the world's x axis [rad]."""
-    elevation_rad: float = math.radians(15.0)
+    elevation_rad: Annotated[float, Field(gt=-0.5 * math.pi, lt=0.5 * math.pi)] = math.radians(15.0)
     """Elevation of the camera above the robot [rad]."""
-    room: float = 0.95
+    room: Positive = 0.95
     """Free space in a picture, by the robot's extent."""
-
-    def __post_init__(self) -> None:
-        if not abs(self.elevation_rad) < 0.5 * math.pi:
-            raise ValueError(
-                f"view: elevation_rad must be within a right angle; got {self.elevation_rad}"
-            )
-        if not self.room > 0:
-            raise ValueError(f"view: room must be positive; got {self.room}")
 
     def mirrored(self) -> "View":
         """The view mirrored at the x-z plane."""

@@ -1,56 +1,40 @@
 """Random postures, targets and detours of the reaching task."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
+from pydantic import FiniteFloat
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.reaching_safe_set import ReachingSafeSet
+from drake_safety.files.schema import Interval, NotNegative, Pair, ShareBelowOne, Triple, schema
 
 _MAX_TRIES = 100
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class PostureSampling:
     """Random standing postures. Offsets are half-widths about the standing posture."""
 
-    base_offset_m: list[float] = field(default_factory=lambda: [0.02, 0.02])
+    base_offset_m: Pair[NotNegative] = field(default_factory=lambda: [0.02, 0.02])
     """Along x and along y."""
-    base_lowering_m: float = 0.08
+    base_lowering_m: NotNegative = 0.08
     """Largest lowering of the base."""
-    tilt_rad: float = 0.03
+    tilt_rad: NotNegative = 0.03
     """Of roll, pitch and yaw of the base, each."""
-    joint_offset_rad: float = 0.1
+    joint_offset_rad: NotNegative = 0.1
     """Of every joint that is not of a leg."""
-    clearance_m: float = 0.02
+    clearance_m: NotNegative = 0.02
     """Least distance of the arms to an obstacle."""
-    joint_margin_rad: float = 0.0
+    joint_margin_rad: NotNegative = 0.0
     """Least distance of every joint to the end of its safe range."""
-    sink_m: float = 0.0
+    sink_m: NotNegative = 0.0
     """Initial penetration of the contact points into the compliant ground, as at rest. Without it
     there is no contact force in the plant's first step, and the torques press the feet into the
     ground."""
-
-    def __post_init__(self) -> None:
-        if len(self.base_offset_m) != 2:
-            raise ValueError(f"start: base_offset_m must be [x, y]; got {self.base_offset_m}")
-        for name in (
-            "base_offset_m",
-            "base_lowering_m",
-            "tilt_rad",
-            "joint_offset_rad",
-            "clearance_m",
-            "joint_margin_rad",
-            "sink_m",
-        ):
-            value = np.asarray(getattr(self, name), dtype=float)
-            if not ((value >= 0) & np.isfinite(value)).all():
-                raise ValueError(
-                    f"start: {name} must be finite and not negative; got {getattr(self, name)}"
-                )
 
     def sample(
         self, safe_set: ReachingSafeSet, rng: np.random.Generator, mirror: Mirror | None = None
@@ -93,19 +77,13 @@ class PostureSampling:
         )
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class TargetSampling:
     """The box of the trained hand's targets in the world [m]; the other hand's is mirrored."""
 
-    x_m: list[float] = field(default_factory=lambda: [0.45, 1.0])
-    y_m: list[float] = field(default_factory=lambda: [-0.3, 1.3])
-    z_m: list[float] = field(default_factory=lambda: [0.5, 1.6])
-
-    def __post_init__(self) -> None:
-        for name in ("x_m", "y_m", "z_m"):
-            bounds = getattr(self, name)
-            if len(bounds) != 2 or not -np.inf < bounds[0] < bounds[1] < np.inf:
-                raise ValueError(f"target: {name} must be [lowest, highest], finite; got {bounds}")
+    x_m: Interval = field(default_factory=lambda: [0.45, 1.0])
+    y_m: Interval = field(default_factory=lambda: [-0.3, 1.3])
+    z_m: Interval = field(default_factory=lambda: [0.5, 1.6])
 
     @property
     def box(self) -> np.ndarray:
@@ -113,22 +91,22 @@ class TargetSampling:
         return np.array([self.x_m, self.y_m, self.z_m], dtype=float).T
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class FairTargets:
     """The part of the target box without trivially safe or unsafe targets, in the world [m].
 
     Bounds default to those of the target box.
     """
 
-    x_m: list[float] = field(default_factory=list)
-    y_m: list[float] = field(default_factory=list)
-    z_m: list[float] = field(default_factory=list)
+    x_m: list[FiniteFloat] = field(default_factory=list)
+    y_m: list[FiniteFloat] = field(default_factory=list)
+    z_m: list[FiniteFloat] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         for name in ("x_m", "y_m", "z_m"):
             bounds = getattr(self, name)
             if bounds and (len(bounds) != 2 or not bounds[0] < bounds[1]):
-                raise ValueError(f"fair: {name} must be [lowest, highest] or empty; got {bounds}")
+                raise ValueError(f"{name} must be [lowest, highest] or empty; got {bounds}")
 
     def box(self, target: TargetSampling) -> np.ndarray:
         """Lowest and highest corner, (2, 3) [m]."""
@@ -136,7 +114,7 @@ class FairTargets:
         return np.array(bounds, dtype=float).T
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class Detours:
     """Plans that deviate from the straight line, so that Γ can select among them.
 
@@ -144,19 +122,15 @@ class Detours:
     of the trained hand [m]: x forwards, y to the left, z up.
     """
 
-    share: float = 0.0
+    share: ShareBelowOne = 0.0
     """Share of the training episodes with a detour."""
-    lowest_m: list[float] = field(default_factory=lambda: [-0.3, -0.2, -0.1])
-    highest_m: list[float] = field(default_factory=lambda: [0.0, 0.2, 0.3])
+    lowest_m: Triple = field(default_factory=lambda: [-0.3, -0.2, -0.1])
+    highest_m: Triple = field(default_factory=lambda: [0.0, 0.2, 0.3])
 
     def __post_init__(self) -> None:
-        if not 0 <= self.share < 1:
-            raise ValueError(f"detours: share must be in [0, 1); got {self.share}")
-        lowest, highest = np.asarray(self.lowest_m), np.asarray(self.highest_m)
-        if lowest.shape != (3,) or highest.shape != (3,) or not (lowest <= highest).all():
+        if not np.less_equal(self.lowest_m, self.highest_m).all():
             raise ValueError(
-                "detours: lowest_m and highest_m must be three numbers each, lowest <= highest; "
-                f"got {self.lowest_m} and {self.highest_m}"
+                f"lowest_m must not exceed highest_m; got {self.lowest_m}, {self.highest_m}"
             )
 
     def sample(self, rng: np.random.Generator) -> np.ndarray | None:

@@ -1,9 +1,10 @@
 """Random starts, plans and balls of the balancing task."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
+from pydantic import FiniteFloat
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.trajectories import PiecewisePolynomial
 
@@ -14,47 +15,37 @@ from drake_safety.control.kinematics import (
     fit_stance,
     planar_pose,
 )
+from drake_safety.files.schema import Bounds, Pair, Share, Triple, schema
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.systems.trajectory_planner import interpolate
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class StartSampling:
     """Random initial states and plans. Offsets are half-widths about the standing posture."""
 
     foot_offset_m: float = 0.02
     """Of every contact point, along x and along y."""
-    base_offset_m: list[float] = field(default_factory=lambda: [0.08, 0.05])
+    base_offset_m: Pair[FiniteFloat] = field(default_factory=lambda: [0.08, 0.05])
     """Along x and along y of the stance frame."""
-    base_height_m: list[float] = field(default_factory=lambda: [0.36, 0.45])
+    base_height_m: Bounds[FiniteFloat] = field(default_factory=lambda: [0.36, 0.45])
     """Lowest and highest height of the base."""
     tilt_rad: float = 0.1
     """Half-width of roll, pitch and yaw, each."""
-    velocity_std_m_s: list[float] = field(default_factory=lambda: [0.5, 0.35, 0.1])
+    velocity_std_m_s: Triple = field(default_factory=lambda: [0.5, 0.35, 0.1])
     """Of the base, along x, y and z."""
     angular_velocity_std_rad_s: float = 0.4
     joint_std_rad: float = 0.02
-    tracking_offset_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    tracking_offset_m: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Of the base from the plan's start, along x, y and z: the initial tracking error. "We also add
     a random offset to the initial state to simulate the disturbances" (paper)."""
-    target_offset_m: list[float] = field(default_factory=lambda: [0.20, 0.11])
+    target_offset_m: Pair[FiniteFloat] = field(default_factory=lambda: [0.20, 0.11])
     """Where the plan ends, along x and along y of the stance frame."""
-    target_height_m: list[float] = field(default_factory=lambda: [0.34, 0.46])
+    target_height_m: Bounds[FiniteFloat] = field(default_factory=lambda: [0.34, 0.46])
     """Lowest and highest height at which the plan ends."""
-    plan_duration_s: list[float] = field(default_factory=lambda: [0.8, 1.6])
+    plan_duration_s: Bounds[FiniteFloat] = field(default_factory=lambda: [0.8, 1.6])
     """Shortest and longest duration of the planned motion."""
-
-    def __post_init__(self) -> None:
-        for name in ("base_height_m", "target_height_m", "plan_duration_s"):
-            _check_range("start", name, getattr(self, name))
-        for name, size in (
-            ("base_offset_m", 2),
-            ("velocity_std_m_s", 3),
-            ("tracking_offset_m", 3),
-            ("target_offset_m", 2),
-        ):
-            _check_size("start", name, getattr(self, name), size)
 
     def sample(self, kinematics: RobotKinematics, rng: np.random.Generator) -> EpisodeStart:
         """Samples a start with a moving base within the ranges and the feet at rest."""
@@ -83,29 +74,22 @@ class StartSampling:
         return _start(kinematics, X_WB, joints, v, p_WC, plan)
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class PushSampling:
     """Random balls, and the undisturbed motion during which they are thrown."""
 
-    share: float = 0.25
+    share: Share = 0.25
     """Share of nominal episodes that begin with the impact of a ball."""
-    mass_kg: list[float] = field(default_factory=lambda: [2.0, 4.0])
+    mass_kg: Bounds[FiniteFloat] = field(default_factory=lambda: [2.0, 4.0])
     """Lowest and highest."""
-    speed_m_s: list[float] = field(default_factory=lambda: [2.0, 11.0])
+    speed_m_s: Bounds[FiniteFloat] = field(default_factory=lambda: [2.0, 11.0])
     """Lowest and highest."""
     offset_m: float = 0.0
     """Half-width of a throw's ``offset_m``."""
     height_m: float = 0.03
     """Half-width of a throw's ``height_m``."""
-    target_offset_m: list[float] = field(default_factory=lambda: [0.05, 0.03])
+    target_offset_m: Pair[FiniteFloat] = field(default_factory=lambda: [0.05, 0.03])
     """Half-widths of the start and goal of the undisturbed motion, about the stance, x and y."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.share <= 1:
-            raise ValueError(f"push: share must be in [0, 1]; got {self.share}")
-        for name in ("mass_kg", "speed_m_s"):
-            _check_range("push", name, getattr(self, name))
-        _check_size("push", "target_offset_m", self.target_offset_m, 2)
 
     def sample(self, rng: np.random.Generator, time_s: float) -> Throw:
         """Samples a ball from any horizontal direction."""
@@ -222,16 +206,6 @@ def _start(
     joints = np.clip(joints, *kinematics.position_limits.T)
     q = kinematics.positions_at(X_WB, joints)
     return EpisodeStart(q=q, v=v, plan=plan, foot_positions=p_WC)
-
-
-def _check_range(who: str, name: str, bounds: list[float]) -> None:
-    if len(bounds) != 2 or not bounds[0] <= bounds[1]:
-        raise ValueError(f"{who}: {name} must be [lowest, highest]; got {bounds}")
-
-
-def _check_size(who: str, name: str, values: list[float], size: int) -> None:
-    if len(values) != size:
-        raise ValueError(f"{who}: {name} must be {size} numbers, along x, y, ...; got {values}")
 
 
 def _between(rng: np.random.Generator, bounds: list[float]) -> float:

@@ -6,23 +6,20 @@ import importlib
 import inspect
 import math
 import sys
-import textwrap
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, field
 from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import yaml
-from pydrake.common.yaml import yaml_dump_typed
 
+from drake_safety.files.reading import did_you_mean, parse_yaml, reading
+from drake_safety.files.schema import Positive, load_typed, schema
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
-from drake_safety.robots.reading import did_you_mean, parse_yaml, reading
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.robots.robot_model import load_typed
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.systems.safety_assessor import ON_ALARM
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -32,7 +29,7 @@ _LEAST_MONITOR_STEP_S = 0.02
 _MOST_STEPS = 10_000_000  # Of an episode, of any kind.
 
 
-@dataclass(kw_only=True)
+@schema(kw_only=True)
 class Scenario:
     """Schema of a scenario file; the fields under ``parameters`` are those of the task."""
 
@@ -43,16 +40,16 @@ class Scenario:
     robot: str = ""
     """Name of a robot of the package, or the path of a ``robot.yaml``; empty for a task with a
     plant of its own."""
-    episode_duration_s: float = 2.0
+    episode_duration_s: Positive = 2.0
     """T [s]."""
-    step_s: float = 0.04
+    step_s: Positive = 0.04
     """Time between two rows of an episode [s]; the assessment's ``preview_stride`` rows are the
     paper's step, the unit of H."""
-    time_step_s: float = 0.0025
+    time_step_s: Positive = 0.0025
     """Step of the discrete plant [s]."""
-    control_period_s: float = 0.01
+    control_period_s: Positive = 0.01
     """Period of the controller and of the safety monitor [s]."""
-    on_alarm: str = "unknown"
+    on_alarm: Literal["unknown", "report"] = "unknown"
     """What an alarm of the monitor does: ``unknown`` makes every belief "don't know", so that the
     robot recovers or refuses plans; ``report`` only reports it."""
     variations: dict[str, PlantVariation] = field(default_factory=dict)
@@ -64,27 +61,16 @@ class Scenario:
     folder = ""  # Set by the loader: the scenario file's folder, where its task may stand.
 
     def __post_init__(self) -> None:
-        for name in ("episode_duration_s", "step_s", "time_step_s", "control_period_s"):
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
+        for name in ("step_s", "time_step_s", "control_period_s"):
+            if self.episode_duration_s > _MOST_STEPS * getattr(self, name):
                 raise ValueError(
-                    f"scenario '{self.name}': {name} must be positive and finite; got {value}"
-                )
-            if self.episode_duration_s > _MOST_STEPS * value:
-                raise ValueError(
-                    f"scenario '{self.name}': {name} is {value}, so that an episode of "
+                    f"{name} is {getattr(self, name)}, so that an episode of "
                     f"{self.episode_duration_s} s has more than {_MOST_STEPS} steps"
                 )
-        if self.on_alarm not in ON_ALARM:
-            raise ValueError(
-                f"scenario '{self.name}': on_alarm must be one of {list(ON_ALARM)}; got "
-                f"'{self.on_alarm}'"
-            )
         if self.assessment.horizon * self.assessment.preview_stride > self.num_steps:
             raise ValueError(
-                f"scenario '{self.name}': the assessment horizon of {self.assessment.horizon} "
-                f"steps of {self.preview_step_s:g} s exceeds the episode of "
-                f"{self.episode_duration_s} s"
+                f"the assessment horizon of {self.assessment.horizon} steps of "
+                f"{self.preview_step_s:g} s exceeds the episode of {self.episode_duration_s} s"
             )
 
     @property
@@ -154,9 +140,16 @@ class Scenario:
 
     def to_yaml(self) -> str:
         """The scenario as canonical YAML text with all defaults."""
-        head = yaml_dump_typed(self, schema=Scenario)
-        body = yaml_dump_typed(self.parameters, schema=type(self.parameters))
-        return head + "parameters:\n" + textwrap.indent(body, "  ")
+        return yaml.safe_dump(self._values(), default_flow_style=None, sort_keys=False)
+
+    def _values(self) -> dict[str, Any]:
+        """All values but optional ones that are not set."""
+
+        def stated(items: list[tuple[str, Any]]) -> dict[str, Any]:
+            return {name: value for name, value in items if value is not None}
+
+        parameters = asdict(self.parameters, dict_factory=stated)
+        return asdict(self, dict_factory=stated) | {"parameters": parameters}
 
     def simulation_hash(self, variation: str = "nominal") -> str:
         """SHA-256 of all parameters that determine a rollout, and of the robot's files.
@@ -175,7 +168,7 @@ class Scenario:
         """
         if variation != "nominal":
             self.variation(variation)
-        text = yaml.safe_load(self.to_yaml())
+        text = self._values()
         del text["on_alarm"]  # No episode depends on it.
         text["assessment"] = {
             name: getattr(self.assessment, name) for name in ("horizon", "preview_stride")

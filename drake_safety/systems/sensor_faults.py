@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_safety.robots.reading import did_you_mean
+from drake_safety.files.reading import did_you_mean
 from drake_safety.robots.shift import Fault
 
 _TOLERANCE_S = 1e-9

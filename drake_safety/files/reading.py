@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -72,7 +73,18 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     return f" (did you mean '{near[0]}'?)" if near else ""
 
 
-def parse_yaml(text: str, who: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
+class YamlLoader(yaml.SafeLoader):
+    """Reads ``1e-3`` as a number, as YAML 1.2 does."""
+
+
+YamlLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
+    [*"-+.0123456789"],
+)
+
+
+def parse_yaml(text: str, who: str, loader: type[yaml.SafeLoader] = YamlLoader) -> Any:
     """Parses a YAML document of plain values; deep nesting and many aliases are refused."""
     try:
         value = yaml.load(text, Loader=loader)

@@ -1,0 +1,146 @@
+"""Dataclasses that check themselves, and strict YAML that is read into them."""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+from dataclasses import asdict, fields, is_dataclass
+from pathlib import Path
+from types import NoneType
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
+
+import pydantic
+import pydantic.dataclasses
+from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat
+
+from drake_safety.files.reading import did_you_mean, parse_yaml, reading, shortened
+
+_STRICT = ConfigDict(extra="forbid", defer_build=True)
+_UNKNOWN = "unexpected_keyword_argument"
+_Value = TypeVar("_Value")
+
+if TYPE_CHECKING:
+    # For mypy, only this one makes a class that `dataclasses.replace` takes.
+    from dataclasses import dataclass as schema
+else:
+    schema = functools.partial(pydantic.dataclasses.dataclass, config=_STRICT)
+    """A dataclass whose constructor checks the types and ranges of its annotations."""
+
+
+def _ascending(bounds: list[Any]) -> list[Any]:
+    if bounds != sorted(bounds):
+        raise ValueError("must be [lowest, highest]")
+    return bounds
+
+
+def _increasing(bounds: list[float]) -> list[float]:
+    if not bounds[0] < bounds[1]:
+        raise ValueError("must be [lowest, highest], lowest < highest")
+    return bounds
+
+
+def _pattern(text: str) -> str:
+    try:
+        re.compile(text)
+    except re.error as error:
+        raise ValueError(f"must be a regular expression: {error}") from None
+    return text
+
+
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+NotNegative = Annotated[FiniteFloat, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+ShareBelowOne = Annotated[float, Field(ge=0, lt=1)]
+Count = Annotated[int, Field(ge=1)]
+Pair = Annotated[list[_Value], Field(min_length=2, max_length=2)]
+Triple = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+Bounds = Annotated[Pair[_Value], AfterValidator(_ascending)]
+"""Lowest and highest, which may be the same."""
+Interval = Annotated[Pair[FiniteFloat], AfterValidator(_increasing)]
+"""Lowest and highest."""
+Pattern = Annotated[str, AfterValidator(_pattern)]
+"""A regular expression."""
+
+
+def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
+    """Reads plain values, such as those of a YAML document, into a dataclass.
+
+    A nested mapping that leaves keys out keeps their values in the field's default.
+
+    Raises:
+        ValueError: A key is unknown, or a value has another type or is out of range.
+    """
+    try:
+        text = json.dumps({"value": _completed(schema, raw)}, default=_plain)
+        document: Any = _document(schema).model_validate_json(text, strict=True)
+    except TypeError as error:  # A key that is no text.
+        raise ValueError(f"{who}: {error}") from None
+    except pydantic.ValidationError as error:
+        # An unknown key may be the reason for the others.
+        first = min(error.errors(), key=lambda one: one["type"] != _UNKNOWN)
+        raise ValueError(f"{who}: {_message(schema, first)}") from None
+    return document.value
+
+
+def load_typed_file(schema: type[_Value], path: Path, who: str) -> _Value:
+    """Reads a YAML file by :func:`load_typed`."""
+    if not path.is_file():
+        raise ValueError(f"{who} does not exist")
+    with reading(path):
+        return load_typed(schema, parse_yaml(path.read_text(encoding="utf-8"), who), who)
+
+
+@functools.cache
+def _document(schema: type) -> type[pydantic.BaseModel]:
+    # Inside it, dataclasses of the standard library, such as a user's task has, are strict too.
+    return pydantic.create_model("Document", __config__=_STRICT, value=(schema, ...))
+
+
+def _completed(schema: Any, raw: Any) -> Any:
+    try:
+        return _merged(schema(), raw)
+    except (TypeError, ValueError):
+        return raw  # It has keys without a default.
+
+
+def _merged(default: Any, raw: Any) -> Any:
+    """A default value with what is stated, to any depth of dataclasses."""
+    if not (is_dataclass(default) and isinstance(raw, dict)):
+        return raw
+    stated = {key: _merged(getattr(default, str(key), None), one) for key, one in raw.items()}
+    return {one.name: getattr(default, one.name) for one in fields(default)} | stated
+
+
+def _plain(value: Any) -> Any:
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else str(value)
+
+
+def _message(schema: Any, error: Any) -> str:
+    """The path of a key, what it must be, what it is, and what may have been meant."""
+    place, kind, got = error["loc"][1:], error["type"], shortened(repr(error["input"]))
+    name = f"'{'.'.join(map(str, place))}'" if place else "this"
+    if kind == _UNKNOWN:
+        known = _keys(schema, place[:-1])
+        return f"unknown key {name}{did_you_mean(place[-1], known)}; keys there are {known}"
+    if kind == "dataclass_type":
+        return f"{name} must be a mapping with keys of {_keys(schema, place)}; got {got}"
+    if kind == "missing":
+        return f"{name} is missing"
+    text = error["msg"].removeprefix("Value error, ")
+    if kind == "value_error" and isinstance(error["input"], dict):
+        return f"{name}: {text}" if place else text
+    text = re.sub(r"^\w+ should ", "must ", text)
+    if kind == "literal_error":
+        text += did_you_mean(error["input"], re.findall("'(.*?)'", error["ctx"]["expected"]))
+    return f"{name} {text}; got {got}"
+
+
+def _keys(schema: Any, place: tuple[str | int, ...]) -> list[str]:
+    """Keys of the dataclass at a place in a document."""
+    if NoneType in get_args(schema):
+        schema = get_args(schema)[0]
+    if not place:
+        return [one.name for one in fields(schema)]
+    inner = get_type_hints(schema)[place[0]] if is_dataclass(schema) else get_args(schema)[-1]
+    return _keys(inner, place[1:])
