@@ -310,18 +310,18 @@ def train_baselines(
         num_workers: Number of worker processes.
         progress: Called with a stage, the number done and the number wanted.
     """
-    baselines: dict[str, SafetyAssessment] = {}
     # The largest first, so that no worker is left with it at the end.
     wanted = sorted(episodes.items(), key=lambda item: -len(item[1]))
-    learned = map_items(
-        partial(_learned, assessment), wanted, num_workers=num_workers, batch_size=1
+    learned = dict(
+        map_items(
+            partial(_learned, assessment),
+            wanted,
+            num_workers=num_workers,
+            batch_size=1,
+            progress=None if progress is None else partial(progress, "learning from scratch"),
+        )
     )
-    for done, (name, baseline) in enumerate(learned):
-        if baseline is not None:
-            baselines[name] = baseline
-        if progress is not None:
-            progress("learning from scratch", done + 1, len(wanted))
-    return {name: baselines[name] for name in episodes if name in baselines}
+    return {name: one for name in episodes if (one := learned[name]) is not None}
 
 
 def _learned(
