@@ -21,14 +21,6 @@ def run_pushed_motion(loop: ClosedLoop, index: int, *, seed: int) -> tuple[Motio
 
     Goals are drawn until the undisturbed motion is safe.
 
-    Args:
-        loop: A closed loop whose plans have a goal and whose robot can be pushed.
-        index: Number of the motion in its set.
-        seed: Seed of the set.
-
-    Returns:
-        The motion undisturbed, and pushed.
-
     Raises:
         ValueError: The task has no goals or pushes, or hardly any goal is safe.
     """
@@ -62,16 +54,7 @@ def run_pushed_motions(
     num_workers: int | None = None,
     progress: Progress | None = None,
 ) -> list[Motion]:
-    """Simulates random safe motions, each undisturbed and pushed, in worker processes.
-
-    Args:
-        scenario: The scenario.
-        num_motions: Number of pairs; twice as many motions are returned.
-        seed: Seed of the set.
-        variation: The plant.
-        num_workers: Number of processes; that of cores by default.
-        progress: Called with the number done and in all.
-    """
+    """Simulates pairs of random safe motions, undisturbed and pushed, in worker processes."""
     make = worker_loop(scenario, variation, **scenario.task_class().judging_options)
     pairs = map_items(
         partial(make.run, run_pushed_motion, seed=seed),

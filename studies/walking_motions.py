@@ -31,14 +31,7 @@ def unusual_command(loop: Any, rng: np.random.Generator) -> np.ndarray:
 
 
 def run_tour(loop: Any, index: int, *, seed: int, duration_s: float) -> Motion:
-    """Follows random commands inside the policy's ranges, undisturbed, from standing.
-
-    Args:
-        loop: A loop of the walking task.
-        index: Number of the tour in its set.
-        seed: Seed of the set.
-        duration_s: Duration [s]; a fall ends it.
-    """
+    """Follows random commands inside the policy's ranges, undisturbed, until a fall."""
     return simulate(
         loop,
         lambda context: loop.reset_undisturbed(context, episode_rng(seed, index), duration_s),
@@ -48,33 +41,16 @@ def run_tour(loop: Any, index: int, *, seed: int, duration_s: float) -> Motion:
     )
 
 
-def run_push(
-    loop: Any, index: int, *, seed: int, duration_s: float, is_pushed: bool = True
-) -> Motion:
-    """Holds a random command inside the ranges, and pushes the robot once.
-
-    Args:
-        loop: A loop of the walking task.
-        index: Number of the motion in its set.
-        seed: Seed of the set.
-        duration_s: Duration [s]; it ends a little after a fall.
-        is_pushed: Whether there is a push.
-    """
+def run_push(loop: Any, index: int, *, seed: int, duration_s: float) -> Motion:
+    """Holds a random command inside the ranges, and pushes the robot once."""
     rng = episode_rng(seed, index)
-    push = loop.sample_push(rng) if is_pushed else None
+    push = loop.sample_push(rng)
     command = loop.usual_command(rng)
     return _walked(loop, index, command, rng, duration_s, push=push)
 
 
 def run_command(loop: Any, index: int, *, seed: int, duration_s: float) -> Motion:
-    """Holds a random command past the policy's ranges, from standing.
-
-    Args:
-        loop: A loop of the walking task.
-        index: Number of the motion in its set.
-        seed: Seed of the set.
-        duration_s: Duration [s]; it ends a little after a fall.
-    """
+    """Holds a random command past the policy's ranges, from standing."""
     rng = episode_rng(seed, index)
     return _walked(loop, index, unusual_command(loop, rng), rng, duration_s)
 
