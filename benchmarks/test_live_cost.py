@@ -10,8 +10,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import load_assessment, load_scenario
-from drake_safety.live.session import TICK_S, LiveSession
-from drake_safety.live.task_sessions import LiveGoals, LiveThrows
+from drake_safety.live.session import AXES, GO, TICK_S, LiveSession
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.closed_loop import ClosedLoop
 
@@ -25,7 +24,7 @@ def begin_throws(meshcat: Meshcat, scenario_name: str) -> tuple[ClosedLoop, Live
     gamma = load_assessment(scenario_name)
     loop = scenario.make_loop("actual", assessment=gamma, meshcat=meshcat, ball=True)
     threshold = scenario.parameters.recovery.threshold
-    session = LiveThrows(loop, meshcat, threshold=threshold)
+    session = LiveSession(loop, meshcat, threshold=threshold)
     loop.throw_ball(session.context, BALL, 0.2)
     return loop, session
 
@@ -34,10 +33,10 @@ def begin_goals(meshcat: Meshcat, scenario_name: str) -> tuple[ClosedLoop, LiveS
     scenario = load_scenario(scenario_name)
     gamma = load_assessment(scenario_name)
     loop = scenario.make_loop("actual", assessment=gamma, meshcat=meshcat)
-    session = LiveGoals(loop, meshcat, threshold=gamma.calibrations_["plan"].threshold)
-    for name, value in zip(session.AXES, TARGET, strict=True):
+    session = LiveSession(loop, meshcat, threshold=gamma.calibrations_["plan"].threshold)
+    for name, value in zip(AXES, TARGET, strict=True):
         session.panel.set_value(name, float(value))
-    session.panel.click(session.GO)
+    session.panel.click(GO)
     session.tick()
     return loop, session
 

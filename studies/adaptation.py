@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -30,7 +31,7 @@ from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import ADAPTATION
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.scenario import load_scenario
-from drake_safety.simulation.worker_processes import parallel_map
+from drake_safety.simulation.worker_processes import map_items
 from studies.adaptation_figure import adaptation_figure
 from studies.baselines import DirectClassifier
 from studies.harness import open_study
@@ -309,21 +310,24 @@ def train_baselines(
         num_workers: Number of worker processes.
         progress: Called with a stage, the number done and the number wanted.
     """
-    baselines: dict[str, SafetyAssessment] = {}
     # The largest first, so that no worker is left with it at the end.
     wanted = sorted(episodes.items(), key=lambda item: -len(item[1]))
-    arguments = [(name, assessment, one) for name, one in wanted]
-    for done, (name, baseline) in enumerate(parallel_map(_learned, arguments, num_workers)):
-        if baseline is not None:
-            baselines[name] = baseline
-        if progress is not None:
-            progress("learning from scratch", done + 1, len(arguments))
-    return {name: baselines[name] for name in episodes if name in baselines}
+    learned = dict(
+        map_items(
+            partial(_learned, assessment),
+            wanted,
+            num_workers=num_workers,
+            batch_size=1,
+            progress=None if progress is None else partial(progress, "learning from scratch"),
+        )
+    )
+    return {name: one for name in episodes if (one := learned[name]) is not None}
 
 
 def _learned(
-    name: str, assessment: SafetyAssessment, episodes: Episodes
+    assessment: SafetyAssessment, item: tuple[str, Episodes]
 ) -> tuple[str, SafetyAssessment | None]:
+    name, episodes = item
     parameters = copy.deepcopy(assessment.parameters)
     try:
         return name, SafetyAssessment(parameters).fit(episodes)

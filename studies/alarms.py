@@ -18,8 +18,7 @@ from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.evaluation.tables import Column
 from drake_safety.evaluation.verdict_tables import Kind
-from drake_safety.simulation.goal_motion import GoalMotion, Mishap
-from drake_safety.simulation.throws import ThrowLog
+from drake_safety.simulation.motion import Motion
 
 FALSE_ALARM_SHARE = 0.05
 """Allowed share of safe calibration motions with a false alarm, the same for all alarms."""
@@ -44,49 +43,6 @@ _TRACKING = "tracking_error_"
 _SLACK_S = 1e-9
 
 
-@dataclass(kw_only=True, eq=False)
-class WatchedMotion(Mishap):
-    """One motion, pushed or not: the monitor's inputs and the outcome.
-
-    Attributes:
-        index: Number of the motion in its set; an undisturbed and a pushed one share it.
-        push_time_s: Start of the push [s]; infinite without one.
-        time_s: [s], (N,).
-        state: (N, n_s), the assessor's input.
-        desired_preview: (N, H n_z).
-        features: (N, n_f).
-        margins: (N, n_c), of the true state.
-    """
-
-    index: int
-    push_time_s: float
-    time_s: np.ndarray
-    state: np.ndarray
-    desired_preview: np.ndarray
-    features: np.ndarray
-    margins: np.ndarray
-
-    @classmethod
-    def of_throw(cls, log: ThrowLog) -> WatchedMotion:
-        """Makes a motion of a throw without recovery; the push is the ball's impact."""
-        names = ("index", "time_s", *SEEN, "margins", "leave_time_s", "fall_time_s")
-        values = {name: getattr(log, name) for name in names}
-        return cls(push_time_s=log.throw.time_s, **values)
-
-    @classmethod
-    def of_goal_motion(cls, index: int, motion: GoalMotion) -> WatchedMotion:
-        """Makes a motion of a motion to a goal that was logged with the ports ``SEEN``."""
-        return cls(
-            index=index,
-            push_time_s=math.inf if motion.push is None else motion.push.time_s,
-            time_s=motion.time_s,
-            margins=motion.margins,
-            leave_time_s=motion.leave_time_s,
-            fall_time_s=motion.fall_time_s,
-            **{name: motion.extra[name] for name in SEEN},
-        )
-
-
 @dataclass(frozen=True, kw_only=True)
 class Alarm:
     """A monitored value.
@@ -97,14 +53,14 @@ class Alarm:
     """
 
     name: str
-    value: Callable[[WatchedMotion], np.ndarray]
+    value: Callable[[Motion], np.ndarray]
 
 
 def scorer_alarm(scorer: Scorer) -> Alarm:
     """An alarm on the safety probability of a scorer."""
     return Alarm(
         name=scorer.name,
-        value=lambda one: scorer.probability(one.state, one.desired_preview, one.features),
+        value=lambda one: scorer.probability(*(one[port] for port in SEEN)),
     )
 
 
@@ -124,8 +80,8 @@ def threshold_alarms(
     """
     features, states = list(feature_names), list(state_names)
 
-    def of_feature(column: int) -> Callable[[WatchedMotion], np.ndarray]:
-        return lambda motion: motion.features[:, column]
+    def of_feature(column: int) -> Callable[[Motion], np.ndarray]:
+        return lambda motion: motion["features"][:, column]
 
     alarms = [
         Alarm(name=name, value=of_feature(features.index(feature)))
@@ -136,13 +92,13 @@ def threshold_alarms(
         alarms.append(
             Alarm(
                 name="tracking_error",
-                value=lambda motion: -np.linalg.norm(motion.features[:, tracking], axis=1),
+                value=lambda motion: -np.linalg.norm(motion["features"][:, tracking], axis=1),
             )
         )
     if set(_ROTATION) <= set(states):
         rotation = [states.index(name) for name in _ROTATION]
-        alarms.append(Alarm(name="tilt", value=lambda motion: -tilt(motion.state[:, rotation])))
-    alarms.append(Alarm(name="smallest_margin", value=lambda motion: motion.margins.min(axis=1)))
+        alarms.append(Alarm(name="tilt", value=lambda motion: -tilt(motion["state"][:, rotation])))
+    alarms.append(Alarm(name="smallest_margin", value=lambda motion: motion["margins"].min(axis=1)))
     return alarms
 
 
@@ -157,19 +113,17 @@ def tilt(rotation: np.ndarray) -> np.ndarray:
     return np.arccos(np.clip(cosine + share**2 * (1.0 - cosine), -1.0, 1.0))
 
 
-def accepted(
-    motions: Sequence[WatchedMotion], scorer: Scorer, threshold: float
-) -> list[WatchedMotion]:
+def accepted(motions: Sequence[Motion], scorer: Scorer, threshold: float) -> list[Motion]:
     """The motions whose first row has at least this probability, so that the robot begins them."""
     if not motions:
         return []
-    first_rows = (np.stack([getattr(motion, name)[0] for motion in motions]) for name in SEEN)
+    first_rows = (np.stack([motion[port][0] for motion in motions]) for port in SEEN)
     is_accepted = scorer.probability(*first_rows) >= threshold
     return [motion for motion, begins in zip(motions, is_accepted, strict=True) if begins]
 
 
 def first_alarm(
-    motion: WatchedMotion, value: np.ndarray, threshold: float, *, since_s: float = 0.0
+    motion: Motion, value: np.ndarray, threshold: float, *, since_s: float = 0.0
 ) -> float:
     """Time of the first value below a threshold [s]; infinite if there is none.
 
@@ -183,7 +137,7 @@ def first_alarm(
     return float(motion.time_s[int(np.argmax(is_alarm))]) if is_alarm.any() else math.inf
 
 
-def lowest_value(motion: WatchedMotion, value: np.ndarray) -> float:
+def lowest_value(motion: Motion, value: np.ndarray) -> float:
     """The lowest value (N,) of a motion; if it leaves the safe set, from the push until then."""
     value = np.where(np.isnan(value), -math.inf, value)
     if motion.has_left:
@@ -218,8 +172,8 @@ def equal_share_threshold(lowest: np.ndarray, share: float) -> float:
 
 def evaluate_alarms(
     alarms: Sequence[Alarm],
-    calibration: Sequence[WatchedMotion],
-    test: Sequence[WatchedMotion],
+    calibration: Sequence[Motion],
+    test: Sequence[Motion],
     *,
     false_alarm_share: float = FALSE_ALARM_SHARE,
     num_rows: int = NUM_ROWS,
@@ -252,7 +206,7 @@ def evaluate_alarms(
     return estimates
 
 
-def _motion_estimates(judged: Sequence[WatchedMotion], num_test: int) -> dict[str, Estimate]:
+def _motion_estimates(judged: Sequence[Motion], num_test: int) -> dict[str, Estimate]:
     left = [motion for motion in judged if motion.has_left]
     hours = sum(float(motion.time_s[-1]) for motion in judged if not motion.has_left) / 3600.0
     return {
@@ -267,7 +221,7 @@ def _motion_estimates(judged: Sequence[WatchedMotion], num_test: int) -> dict[st
 
 
 def _alarm_estimates(
-    judged: Sequence[WatchedMotion], values: Sequence[np.ndarray], threshold: float
+    judged: Sequence[Motion], values: Sequence[np.ndarray], threshold: float
 ) -> dict[str, Estimate]:
     watched = list(zip(judged, values, strict=True))
     safe = [(motion, value) for motion, value in watched if not motion.has_left]

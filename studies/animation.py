@@ -12,9 +12,7 @@ import typer
 from PIL import Image
 
 from drake_safety.cli.console import AssessmentOption, ScenarioArgument, print_path
-from drake_safety.cli.run import parse_pushes
-from drake_safety.cli.run_settings import LOG_PERIOD_S
-from drake_safety.cli.target_run import alarm_row, named_push
+from drake_safety.cli.run import alarm_row, motion_threshold, named_push, parse_pushes
 from drake_safety.cli.targets import TargetOption, parse_target
 from drake_safety.cli.training_folder import (
     MODES,
@@ -32,7 +30,7 @@ from drake_safety.evaluation.figure_style import (
 )
 from drake_safety.evaluation.stills import StillCamera, stack_positions
 from drake_safety.learning.seeds import DEMONSTRATION
-from drake_safety.simulation.goal_motion import run_to_goal
+from drake_safety.simulation.rollouts import run_to_goal
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.throws import run_throw
 
@@ -60,26 +58,23 @@ def animation(
     loaded = load_scenario(scenario)
     folder = assessment_folder(loaded, assessment).path
     gamma = load_assessment(folder, MODES[0])
-    options: dict[str, Any] = {"seed": seed, "duration_s": duration, "log_period_s": LOG_PERIOD_S}
-    log: Any
+    options: dict[str, Any] = {"seed": seed, "duration_s": duration}
     if target is None:
         loop = loaded.make_loop(variation, assessment=gamma, ball=True)
         throws = parse_pushes(loaded, push or [])
         log = run_throw(loop, 0, throws=throws, ports=(_PORT, "ball_state"), **options)
-        states = {loop.robot.name: log.plant_state, "ball": log.extra["ball_state"]}
+        states = {loop.robot.name: log["plant_state"], "ball": log["ball_state"]}
         threshold = loaded.parameters.recovery.threshold
         events = [start for start, _ in log.recovery_intervals_s]
     else:
         loop = loaded.make_loop(variation, assessment=gamma)
         goal, pushed = parse_target(loop, target), named_push(loop, push or [])
         log = run_to_goal(loop, goal, push=pushed, ports=(_PORT,), **options)
-        states = {loop.robot.name: log.plant_state}
-        threshold = goal_threshold(folder, gamma).threshold
-        if "motion" in gamma.calibrations_:
-            threshold = gamma.calibrations_["motion"].threshold
+        states = {loop.robot.name: log["plant_state"]}
+        threshold, _ = motion_threshold(gamma, goal_threshold(folder, gamma))
         alarm = alarm_row(log, threshold)
         events = [] if alarm is None else [float(log.time_s[alarm])]
-    probability, positions = log.extra[_PORT][:, 0], stack_positions(loop, states)
+    probability, positions = log[_PORT][:, 0], stack_positions(loop, states)
     save_animation(loop, log.time_s, positions, probability, threshold, out, events)
     print_path("animation", out)
 

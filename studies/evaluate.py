@@ -49,11 +49,11 @@ from drake_safety.simulation.capabilities import (
 )
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import load_episodes
+from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.throws import run_throws
 from studies.alarms import (
     ALARMS,
-    WatchedMotion,
     accepted,
     evaluate_alarms,
     scorer_alarm,
@@ -227,8 +227,7 @@ def _add_throws(
     persistence_s = evaluation.scenario.parameters.recovery.persistence_s
     rules = classifier_rules(classifiers, calibration, persistence_s)
     logs = add_throws(evaluation, num_throws, rules)
-    sets = ([WatchedMotion.of_throw(log) for log in one] for one in (calibration, logs))
-    evaluation.add(_alarm_estimates(evaluation, loop, classifiers, *sets))
+    evaluation.add(_alarm_estimates(evaluation, loop, classifiers, calibration, logs))
 
 
 def _add_pushes(
@@ -264,8 +263,8 @@ def _alarm_estimates(
     evaluation: Evaluation,
     loop: Any,
     classifiers: Sequence[Scorer],
-    calibration: Sequence[WatchedMotion],
-    test: Sequence[WatchedMotion],
+    calibration: Sequence[Motion],
+    test: Sequence[Motion],
 ) -> dict[str, Estimate]:
     if all(motion.has_left for motion in calibration):
         return {}  # Thresholds need motions that stay safe.

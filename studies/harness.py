@@ -32,7 +32,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.scenario import Scenario, load_scenario
-from drake_safety.simulation.worker_processes import Progress, parallel_map
+from drake_safety.simulation.worker_processes import Progress, map_items
 
 EpisodesOption = Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)]
 CalibrationOption = Annotated[int, typer.Option(help="Other ones, for thresholds.", min=20)]
@@ -166,20 +166,22 @@ def kept(
     folder.mkdir(parents=True, exist_ok=True)
     files = {name: folder / f"{name}.npz" for name in work}
     missing = [name for name, file in files.items() if not file.is_file()]
-    done = len(work) - len(missing)
-    if progress is not None:
-        progress(done, len(work))
-    arguments = [(name, function, work[name]) for name in missing]
-    for name, arrays in parallel_map(_called, arguments, workers):
+    found = map_items(
+        partial(_called, function),
+        [(name, work[name]) for name in missing],
+        num_workers=workers,
+        batch_size=1,
+        progress=progress,
+        num_done=len(work) - len(missing),
+    )
+    for name, arrays in found:
         with replacing(files[name]) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
-        done += 1
-        if progress is not None:
-            progress(done, len(work))
     return {name: _loaded(file) for name, file in files.items()}
 
 
-def _called(name: str, function: Callable[..., Arrays], arguments: tuple) -> tuple[str, Arrays]:
+def _called(function: Callable[..., Arrays], item: tuple[str, tuple]) -> tuple[str, Any]:
+    name, arguments = item
     return name, function(*arguments)
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.evaluation.shifts import PlantShift, shifted_scenario
@@ -34,7 +34,7 @@ from drake_safety.simulation.rollouts import (
     collect_episodes,
     episode_rng,
     episodes_info,
-    record_motion,
+    run_motion,
     worker_loop,
 )
 from drake_safety.simulation.scenario import Scenario
@@ -224,17 +224,17 @@ def run_changed(
     Args:
         path: Folder for the episodes.
     """
-    loop = worker_loop(scenario, "nominal", {})
+    make = worker_loop(scenario)
     step_s = scenario.monitor_step_s
     info = replace(
-        episodes_info(loop, seed, {"changes": fingerprint(PLANTS, EPISODE_S, ONSET_S)}),
+        episodes_info(make(), seed, {"changes": fingerprint(PLANTS, EPISODE_S, ONSET_S)}),
         step_s=step_s,
         num_steps=round(EPISODE_S / step_s),
     )
     found = collect_episodes(
         info,
         num,
-        partial(_changed_batch, scenario, seed),
+        partial(make.run, _drawn_episode, scenario, seed),
         num_workers=num_workers,
         path=path,
         progress=progress,
@@ -243,16 +243,12 @@ def run_changed(
     return Episodes(info, [one for one in found if one.num_steps >= least])
 
 
-def _changed_batch(scenario: Scenario, seed: int, indices: list[int]) -> list[Episode]:
-    loop: Any = worker_loop(scenario, "nominal", {})
-    episodes = []
-    for index in indices:
-        change, other = drawn_change(loop.kinematics, loop.variation, seed, index), loop
-        if change.variation is not None:
-            shift = PlantShift(kind="plant", variation=change.variation)
-            other = shifted_scenario(scenario, "changed", shift).make_loop("changed")
-        episodes.append(changed_episode(loop, other, change, seed, index))
-    return episodes
+def _drawn_episode(loop: Any, scenario: Scenario, seed: int, index: int) -> Episode:
+    change, other = drawn_change(loop.kinematics, loop.variation, seed, index), loop
+    if change.variation is not None:
+        shift = PlantShift(kind="plant", variation=change.variation)
+        other = shifted_scenario(scenario, "changed", shift).make_loop("changed")
+    return changed_episode(loop, other, change, seed, index)
 
 
 def changed_episode(loop: Any, other: Any, change: Change, seed: int, index: int) -> Episode:
@@ -260,20 +256,24 @@ def changed_episode(loop: Any, other: Any, change: Change, seed: int, index: int
 
     State, plan and the controller's memory are handed over.
     """
-    rng, who = episode_rng(seed, index), f"episode {index} (seed {seed})"
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.remove_visuals(context)
-    loop.reset_undisturbed(context, rng, EPISODE_S)
-    before = record_motion(simulator, ONSET_S, who=who, index=index)
+    rng, contexts = episode_rng(seed, index), []
+
+    def begin(context: Context) -> None:
+        loop.reset_undisturbed(context, rng, EPISODE_S)
+        contexts.append(context)
+
+    before = run_motion(loop, index, seed=seed, until_s=ONSET_S, start=begin)
     if not before.is_safe:
         return before
-    start = loop.start_of(context)
-    simulator = Simulator(other)
-    context = simulator.get_mutable_context()
-    other.remove_visuals(context)
-    other.reset_to(context, rng, start if change.start is None else change.start(start))
-    after = record_motion(simulator, EPISODE_S - ONSET_S, who=who, index=index)
+    start = loop.start_of(contexts[0])
+    start = start if change.start is None else change.start(start)
+    after = run_motion(
+        other,
+        index,
+        seed=seed,
+        until_s=EPISODE_S - ONSET_S,
+        start=lambda context: other.reset_to(context, rng, start),
+    )
     rows: dict[str, Any] = {
         name: np.concatenate([getattr(before, name)[:-1], getattr(after, name)])
         for name in RECORDED

@@ -166,7 +166,7 @@ def _candidates(loop: ClosedLoop, context: Any, seed: int, index: int, num_plans
 
 
 def _run_candidates(scenario: Scenario, seed: int, num_plans: int, index: int) -> Arrays:
-    loop = worker_loop(scenario, "nominal", scenario.task_class().judging_options)
+    loop = worker_loop(scenario, **scenario.task_class().judging_options)()
     plans = _candidates(loop, loop.CreateDefaultContext(), seed, index, num_plans)
     motions = [run_episode(loop, index, seed=seed, plan=plan) for plan in plans]
     first = {

@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.simulation.capabilities import CanBePushed, HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.goal_motion import run_to_goal
-from drake_safety.simulation.rollouts import episode_rng, worker_loop
+from drake_safety.simulation.motion import Motion
+from drake_safety.simulation.rollouts import episode_rng, run_to_goal, worker_loop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.worker_processes import Progress, run_batches
-from studies.alarms import WatchedMotion
+from drake_safety.simulation.worker_processes import Progress, map_items
 
 _MAX_TRIES = 50
 
 
-def run_pushed_motion(
-    loop: ClosedLoop, index: int, *, seed: int
-) -> tuple[WatchedMotion, WatchedMotion]:
+def run_pushed_motion(loop: ClosedLoop, index: int, *, seed: int) -> tuple[Motion, Motion]:
     """Simulates a random motion that is safe undisturbed, and once more with a random push.
 
     Goals are drawn until the undisturbed motion is safe.
-
-    Args:
-        loop: A closed loop whose plans have a goal and whose robot can be pushed.
-        index: Number of the motion in its set.
-        seed: Seed of the set.
-
-    Returns:
-        The motion undisturbed, and pushed.
 
     Raises:
         ValueError: The task has no goals or pushes, or hardly any goal is safe.
@@ -38,20 +28,17 @@ def run_pushed_motion(
     push = require(loop, CanBePushed).sample_push(rng)
     box = require(loop, HasGoals).target_box
     noise_seed = int(rng.integers(2**31))
-    duration_s = loop.scenario.episode_duration_s
+    options: dict[str, Any] = {
+        "duration_s": loop.scenario.episode_duration_s,
+        "seed": noise_seed,
+        "ports": SEEN,
+        "index": index,
+    }
     for _ in range(_MAX_TRIES):
         goal = rng.uniform(*box)
-        undisturbed = run_to_goal(
-            loop, goal, duration_s=duration_s, seed=noise_seed, ports=SEEN, until_unsafe=True
-        )
+        undisturbed = run_to_goal(loop, goal, after_leaving_s=0.0, **options)
         if not undisturbed.has_left:
-            pushed = run_to_goal(
-                loop, goal, push=push, duration_s=duration_s, seed=noise_seed, ports=SEEN
-            )
-            return (
-                WatchedMotion.of_goal_motion(index, undisturbed),
-                WatchedMotion.of_goal_motion(index, pushed),
-            )
+            return undisturbed, run_to_goal(loop, goal, push=push, **options)
     raise ValueError(
         f"pushed motion {index} of '{loop.scenario.name}': none of {_MAX_TRIES} random goals is "
         "reached safely without a push"
@@ -66,29 +53,14 @@ def run_pushed_motions(
     variation: str = "actual",
     num_workers: int | None = None,
     progress: Progress | None = None,
-) -> list[WatchedMotion]:
-    """Simulates random safe motions, each undisturbed and pushed, in worker processes.
-
-    Args:
-        scenario: The scenario.
-        num_motions: Number of pairs; twice as many motions are returned.
-        seed: Seed of the set.
-        variation: The plant.
-        num_workers: Number of processes; that of cores by default.
-        progress: Called with the number done and in all.
-    """
-    pairs = run_batches(
-        partial(_motion_batch, scenario, variation, seed),
-        list(range(num_motions)),
+) -> list[Motion]:
+    """Simulates pairs of random safe motions, undisturbed and pushed, in worker processes."""
+    make = worker_loop(scenario, variation, **scenario.task_class().judging_options)
+    pairs = map_items(
+        partial(make.run, run_pushed_motion, seed=seed),
+        range(num_motions),
         num_workers=num_workers,
         progress=progress,
         stage="pushed motions",
     )
     return [motion for pair in sorted(pairs, key=lambda p: p[0].index) for motion in pair]
-
-
-def _motion_batch(
-    scenario: Scenario, variation: str, seed: int, indices: list[int]
-) -> list[tuple[WatchedMotion, WatchedMotion]]:
-    loop = worker_loop(scenario, variation, scenario.task_class().judging_options)
-    return [run_pushed_motion(loop, index, seed=seed) for index in indices]

@@ -23,7 +23,7 @@ from drake_safety.evaluation.shift_study import (
     SEEN,
     Judge,
     JudgedShift,
-    Motion,
+    MotionRows,
     MotionSet,
     Verdicts,
     assessment_judge,
@@ -39,7 +39,7 @@ from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import episode_rng, run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.worker_processes import run_batches
+from drake_safety.simulation.worker_processes import map_items
 from studies.baselines import classifier_scorers
 
 _NUM_TREES = 100
@@ -196,12 +196,13 @@ def run_changed_starts(
         By name the kind, "plan" or "posture", and the motions.
     """
     found: dict[str, MotionSet] = {}
-    if not isinstance(scenario.make_loop(), LeggedLoop):
+    make = worker_loop(scenario)
+    if not isinstance(make(), LeggedLoop):
         return found
     for name in (*STARTS, *POSTURES, "falling"):
-        results = run_batches(
-            partial(_changed_batch, scenario, name, seed),
-            list(range(num_motions)),
+        results = map_items(
+            partial(make.run, _changed_motion, name, seed),
+            range(num_motions),
             num_workers=num_workers,
         )
         motions = [motion for motion in results if len(motion.state)]
@@ -210,12 +211,7 @@ def run_changed_starts(
     return found
 
 
-def _changed_batch(scenario: Scenario, name: str, seed: int, indices: list[int]) -> list[Motion]:
-    loop = worker_loop(scenario, "nominal", {})
-    return [_changed_motion(loop, name, seed, index) for index in indices]
-
-
-def _changed_motion(loop: ClosedLoop, name: str, seed: int, index: int) -> Motion:
+def _changed_motion(loop: ClosedLoop, name: str, seed: int, index: int) -> MotionRows:
     assert isinstance(loop, LeggedLoop)
     if name == "falling":
         return _fall(loop, seed, index)
@@ -224,12 +220,12 @@ def _changed_motion(loop: ClosedLoop, name: str, seed: int, index: int) -> Motio
     start = loop.start_of(context)
     if name in STARTS:
         start = STARTS[name](start, loop.kinematics)
-        return Motion.of_episode(run_episode(loop, index, seed=seed, start=start))
+        return MotionRows.of_episode(run_episode(loop, index, seed=seed, start=start))
     loop.reset_to(context, episode_rng(seed, index), POSTURES[name](start, loop.kinematics))
     return _rows_of(loop, [context])
 
 
-def _fall(loop: LeggedLoop, seed: int, index: int) -> Motion:
+def _fall(loop: LeggedLoop, seed: int, index: int) -> MotionRows:
     """The rows of a nominal episode outside the safe set, if the robot falls."""
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
@@ -250,17 +246,19 @@ def _fall(loop: LeggedLoop, seed: int, index: int) -> Motion:
     return _rows_of(loop, rows if has_fallen else [])
 
 
-def _rows_of(loop: ClosedLoop, contexts: Sequence) -> Motion:
+def _rows_of(loop: ClosedLoop, contexts: Sequence) -> MotionRows:
     def stacked(name: str) -> np.ndarray:
         port = loop.GetOutputPort(name)
         rows = [port.Eval(context).copy() for context in contexts]
         return np.stack(rows) if rows else np.empty((0, port.size()))
 
     is_outside = np.any(stacked("margins") < 0.0, axis=1)
-    return Motion(**{name: stacked(name) for name in SEEN}, is_outside=is_outside, is_unsafe=True)
+    return MotionRows(
+        **{name: stacked(name) for name in SEEN}, is_outside=is_outside, is_unsafe=True
+    )
 
 
-def junk(motions: Sequence[Motion], seed: int) -> dict[str, MotionSet]:
+def junk(motions: Sequence[MotionRows], seed: int) -> dict[str, MotionSet]:
     """Inputs that contradict themselves, in which no robot can be.
 
     "Another row" is one of another motion: those of the same motion may agree with each other.
@@ -299,7 +297,7 @@ def junk(motions: Sequence[Motion], seed: int) -> dict[str, MotionSet]:
         found[name] = (
             "junk",
             [
-                Motion(
+                MotionRows(
                     **{key: values[key][motion == i] for key in SEEN},
                     is_outside=np.zeros(int((motion == i).sum()), dtype=bool),
                     is_unsafe=True,
@@ -371,7 +369,7 @@ def add_all_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -
     }
     seed = evaluation.seeds["shifts"]
 
-    def others(nominal: Sequence[Motion]) -> dict[str, MotionSet]:
+    def others(nominal: Sequence[MotionRows]) -> dict[str, MotionSet]:
         changed = run_changed_starts(scenario, num_motions, seed, evaluation.workers)
         return changed | junk(nominal, seed)
 

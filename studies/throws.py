@@ -8,11 +8,11 @@ import numpy as np
 
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.throw_study import TriggerRule, log_probability
-from drake_safety.simulation.throws import ThrowLog
+from drake_safety.simulation.motion import Motion
 
 
 def choose_threshold(
-    logs: Sequence[ThrowLog],
+    logs: Sequence[Motion],
     scorer: Scorer,
     persistence_s: float = 0.0,
     *,
@@ -49,7 +49,7 @@ def choose_threshold(
 
 
 def classifier_rules(
-    classifiers: Sequence[Scorer], logs: Sequence[ThrowLog], persistence_s: float
+    classifiers: Sequence[Scorer], logs: Sequence[Motion], persistence_s: float
 ) -> list[TriggerRule]:
     """The classifiers as triggers, with thresholds chosen on calibration throws."""
     return [

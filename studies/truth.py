@@ -29,9 +29,10 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes, split
+from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.worker_processes import Progress, batches, parallel_map
+from drake_safety.simulation.worker_processes import Progress, map_items
 from studies.harness import EpisodesOption, SeedOption, open_study
 
 THRESHOLD = 0.5
@@ -161,7 +162,8 @@ def simulate_truth(
     Raises:
         ValueError: The task has no such plane.
     """
-    loop = scenario.make_loop()
+    make = worker_loop(scenario)
+    loop = make()
     planes = loop.state_planes
     if plane not in planes:
         raise ValueError(
@@ -169,14 +171,8 @@ def simulate_truth(
         )
     points = planes[plane].points(resolution)
     flat = points.reshape(-1, 2)
-    parts = batches(list(range(len(flat))))
-    rows: dict[int, tuple] = {}
-    for found in parallel_map(
-        _outcomes, [(scenario, plane, part, flat[part]) for part in parts], num_workers
-    ):
-        rows |= found
-        if progress is not None:
-            progress(len(rows), len(flat))
+    run = partial(make.run, _outcome, plane)
+    rows = dict(map_items(run, enumerate(flat), num_workers=num_workers, progress=progress))
     columns = zip(*(rows[index] for index in range(len(flat))), strict=True)
     shape = (resolution, resolution)
     is_safe, state, preview, features = (np.array(column).reshape(*shape, -1) for column in columns)
@@ -191,21 +187,13 @@ def simulate_truth(
     )
 
 
-def _outcomes(
-    scenario: Scenario, plane: str, indices: list[int], points: np.ndarray
-) -> dict[int, tuple]:
-    loop = worker_loop(scenario, "nominal", {})
-    start = loop.state_planes[plane].start
-    found = {}
-    for index, point in zip(indices, points, strict=True):
-        episode = run_episode(loop, index, start=start(point))
-        found[index] = (
-            episode.is_safe,
-            episode.state[0],
-            episode.desired_preview[0],
-            episode.features[0],
-        )
-    return found
+def _outcome(
+    loop: ClosedLoop, plane: str, item: tuple[int, np.ndarray]
+) -> tuple[int, tuple[bool, np.ndarray, np.ndarray, np.ndarray]]:
+    index, point = item
+    episode = run_episode(loop, index, start=loop.state_planes[plane].start(point))
+    inputs = episode.state[0], episode.desired_preview[0], episode.features[0]
+    return index, (episode.is_safe, *inputs)
 
 
 def agreement(

@@ -20,10 +20,10 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.dataset import load_episodes
+from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import Scenario
 from studies.alarms import (
     Alarm,
-    WatchedMotion,
     first_alarm,
     lowest_value,
     scorer_alarm,
@@ -31,7 +31,7 @@ from studies.alarms import (
 )
 from studies.baselines import classifier_scorers
 from studies.harness import open_study
-from studies.walking_motions import WalkedMotion, run_motions
+from studies.walking_motions import run_motions
 
 EARLY_S = 0.2
 """Time before a fall that an alarm should leave [s]."""
@@ -75,7 +75,7 @@ def walking(
             branch: str = "",
             duration_s: float = 0.0,
             **options: Any,
-        ) -> list[WalkedMotion]:
+        ) -> list[Motion]:
             which = walker
             if branch:
                 options["recovery"] = True
@@ -144,26 +144,26 @@ def walking_alarms(
         *threshold_alarms(loop.state_names, loop.feature_names, watched),
     ]
     column = loop.feature_names.index("action_change")
-    alarms.append(Alarm(name="action_change", value=lambda one: -one.features[:, column]))
+    alarms.append(Alarm(name="action_change", value=lambda one: -one["features"][:, column]))
     return alarms
 
 
 def _in_logits(alarm: Alarm) -> Alarm:
     """An alarm on the logit of a probability, whose lowest values are spread."""
 
-    def value(motion: WatchedMotion) -> np.ndarray:
+    def value(motion: Motion) -> np.ndarray:
         p = np.clip(alarm.value(motion), _LEAST, 1.0 - _LEAST)
         return np.log(p / (1.0 - p))
 
     return Alarm(name=alarm.name, value=value)
 
 
-def _values(alarm: Alarm, motion: WalkedMotion) -> np.ndarray:
+def _values(alarm: Alarm, motion: Motion) -> np.ndarray:
     """The alarm's value of each row; NaN, "don't know", is below every threshold."""
     return np.nan_to_num(alarm.value(motion), nan=-math.inf)
 
 
-def alarm_thresholds(alarms: Sequence[Alarm], calm: Sequence[WalkedMotion]) -> dict[str, float]:
+def alarm_thresholds(alarms: Sequence[Alarm], calm: Sequence[Motion]) -> dict[str, float]:
     """Thresholds that give no alarm on undisturbed tours, with a reserve.
 
     The reserve below the lowest value is half of its distance to the median of the tours' lowest
@@ -189,7 +189,7 @@ def alarm_thresholds(alarms: Sequence[Alarm], calm: Sequence[WalkedMotion]) -> d
 def alarm_estimates(
     alarms: Sequence[Alarm],
     thresholds: Mapping[str, float],
-    pushed: Sequence[WalkedMotion],
+    pushed: Sequence[Motion],
     push_s: float,
 ) -> dict[str, Estimate]:
     """Shares of falls announced, lead times, and alarms in motions without a fall.
@@ -225,14 +225,14 @@ def alarm_estimates(
     return estimates
 
 
-def _lead(alarm: Alarm, motion: WalkedMotion, threshold: float) -> float:
+def _lead(alarm: Alarm, motion: Motion, threshold: float) -> float:
     since = motion.push_time_s
     alarm_s = first_alarm(motion, _values(alarm, motion), threshold, since_s=since)
     return motion.fall_time_s - alarm_s if alarm_s <= motion.fall_time_s else -math.inf
 
 
 def tour_estimates(
-    alarms: Sequence[Alarm], thresholds: Mapping[str, float], tours: Sequence[WalkedMotion]
+    alarms: Sequence[Alarm], thresholds: Mapping[str, float], tours: Sequence[Motion]
 ) -> dict[str, Estimate]:
     """Shares of tours with a fall, and false alarms an hour on the others.
 
@@ -260,7 +260,7 @@ def tour_estimates(
 
 
 def recovery_estimates(
-    branch: str, alone: Sequence[WalkedMotion], again: Sequence[WalkedMotion]
+    branch: str, alone: Sequence[Motion], again: Sequence[Motion]
 ) -> dict[str, Estimate]:
     """Share of falls saved by a branch, and impact speeds of those that it does not save.
 
@@ -272,17 +272,23 @@ def recovery_estimates(
     not_saved = [(a, b) for a, b in zip(alone, again, strict=True) if b.has_fallen]
     return {
         f"recovery.{branch}.saved": proportion(len(alone) - len(not_saved), len(alone)),
-        f"recovery.{branch}.impact_m_s": median(np.array([b.impact_m_s for _, b in not_saved])),
+        f"recovery.{branch}.impact_m_s": median(np.array([_impact(b) for _, b in not_saved])),
         f"recovery.{branch}.impact_without_m_s": median(
-            np.array([a.impact_m_s for a, _ in not_saved])
+            np.array([_impact(a) for a, _ in not_saved])
         ),
     }
 
 
+def _impact(motion: Motion) -> float:
+    """Largest downward velocity of the base since the push [m/s]."""
+    since_s = motion.push_time_s if math.isfinite(motion.push_time_s) else 0.0
+    return float(motion["downward_m_s"][motion.time_s >= since_s].max(initial=0.0))
+
+
 def guard_estimates(
-    unguarded: Sequence[WalkedMotion],
-    guarded: Sequence[WalkedMotion],
-    inside: Sequence[WalkedMotion],
+    unguarded: Sequence[Motion],
+    guarded: Sequence[Motion],
+    inside: Sequence[Motion],
 ) -> dict[str, Estimate]:
     """Falls with and without the guard, and the share of time in which it changes a command.
 
@@ -293,7 +299,7 @@ def guard_estimates(
     """
     without = sum(motion.has_fallen for motion in unguarded)
     with_guard = sum(motion.has_fallen for motion in guarded)
-    kept = np.array([float(np.mean(motion.is_changed == 0)) for motion in inside])
+    kept = np.array([float(np.mean(motion["guard_active"] == 0)) for motion in inside])
     estimates = {
         "guard.falls_without": proportion(without, len(unguarded)),
         "guard.falls_with": proportion(with_guard, len(guarded)),
@@ -312,9 +318,7 @@ def guard_estimates(
     return estimates
 
 
-def speed_estimates(
-    ours: Sequence[WalkedMotion], theirs: Sequence[WalkedMotion]
-) -> dict[str, Estimate]:
+def speed_estimates(ours: Sequence[Motion], theirs: Sequence[Motion]) -> dict[str, Estimate]:
     """Difference of mean planar velocities between two engines, over the same commands.
 
     Args:
@@ -323,8 +327,8 @@ def speed_estimates(
     """
     pairs = []
     for a, b in zip(ours, theirs, strict=True):
-        rows = min(len(a.output), len(b.output))
+        rows = min(len(a.time_s), len(b.time_s))
         if not (a.has_fallen or b.has_fallen):
-            pairs.append((a.output[:rows].mean(axis=0), b.output[:rows].mean(axis=0)))
+            pairs.append((a["output"][:rows].mean(axis=0), b["output"][:rows].mean(axis=0)))
     difference = np.array([np.linalg.norm((a - b)[:2]) for a, b in pairs])
     return {"speed.difference_to_mujoco_m_s": median(difference)}

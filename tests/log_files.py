@@ -2,16 +2,16 @@
 
 import dataclasses
 import functools
+import math
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
 from scipy.spatial.transform import Rotation
 
 from cart_episodes import ARRAYS
 from drake_safety import load_scenario
 from drake_safety.logs.robot_log import RobotLog
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.simulation.episode_recorder import advance_to
+from drake_safety.simulation.motion import simulate
 from drake_safety.simulation.rollouts import episode_rng
 
 ORIGIN_NS = 1_700_000_000_123_000_000
@@ -45,19 +45,22 @@ def balancing_loop():
 def record(loop, index=0, **goal):
     """An episode's run at the plant's own rate, to the end of its time whatever happens."""
     scenario = loop.scenario
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset(context, episode_rng(0, index), **goal)
-    feet = loop.start_of(context).foot_positions
-    simulator.Initialize()
-    step_s = scenario.time_step_s
-    times = step_s * np.arange(round(scenario.episode_duration_s / step_s) + 1)
-    states, desired = [], []
-    for time_s in times:
-        advance_to(simulator, time_s)
-        states.append(loop.GetOutputPort("plant_state").Eval(context).copy())
-        desired.append(loop.GetOutputPort("desired_output").Eval(context).copy())
-    q, v = np.split(np.array(states), [loop.kinematics.num_positions], axis=1)
+    starts = []
+
+    def start(context):
+        loop.reset(context, episode_rng(0, index), **goal)
+        starts.append(loop.start_of(context))
+
+    motion = simulate(
+        loop,
+        start,
+        ["plant_state", "desired_output"],
+        duration_s=scenario.episode_duration_s,
+        step_s=scenario.time_step_s,
+        after_fall_s=math.inf,
+    )
+    q, v = np.split(motion["plant_state"].copy(), [loop.kinematics.num_positions], axis=1)
+    times, feet = motion.time_s, starts[0].foot_positions
     q[:, :4] /= np.linalg.norm(q[:, :4], axis=1, keepdims=True)
     return RobotLog(
         path="recorded",
@@ -65,7 +68,7 @@ def record(loop, index=0, **goal):
         time_s=times,
         q=q,
         v=v,
-        desired_output=np.array(desired),
+        desired_output=motion["desired_output"],
         foot_positions=None if feet is None else np.tile(feet.ravel(), (len(times), 1)),
     )
 

@@ -6,9 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_safety.cli.run_settings import events_table
+from drake_safety.cli.run import events_table
 from drake_safety.evaluation.timeline_figure import levels_figure
 from drake_safety.learning.change_detector import RECOVERED_LEVEL, RECOVERY_S, Alarm
+from drake_safety.simulation.motion import Motion
 from sprung_motions import INFO, STEP_S, learned, motion
 
 pytestmark = pytest.mark.train
@@ -47,15 +48,16 @@ def test_the_events_of_a_run_have_begin_and_end_of_every_alarm():
     alarm[10:20] = alarm[40:] = 1.0
     cause = np.full(50, "", dtype=object)
     cause[10:20], cause[40:] = "inputs frozen", "pushed steadily down"
-    extra = {"safety_probability": np.ones((50, 1)), "alarm": alarm, "alarm_cause": cause}
+    ports = {"safety_probability": np.ones((50, 1)), "alarm": alarm, "alarm_cause": cause}
     told = [
         [*zip(*(column.cells for column in table.columns), strict=True)]
         for table in (
-            events_table([(0.5, "ball")], time_s, extra, SimpleNamespace(calibrations_={})),
-            events_table([], time_s, extra, SimpleNamespace(calibrations_={"plan": None})),
-            events_table(
-                [], time_s, {"safety_probability": alarm}, SimpleNamespace(calibrations_={})
-            ),
+            events_table(events, Motion(time_s=time_s, ports=given), SimpleNamespace(**gamma))
+            for events, given, gamma in (
+                ([(0.5, "ball")], ports, {"calibrations_": {}}),
+                ([], ports, {"calibrations_": {"plan": None}}),
+                ([], {"safety_probability": alarm}, {"calibrations_": {}}),
+            )
         )
     ]
     assert told[0] == [

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from drake_safety.evaluation.scorers import Scorer
+from drake_safety.simulation.motion import Motion
 from studies.alarms import (
     Alarm,
-    WatchedMotion,
     accepted,
     equal_share_threshold,
     evaluate_alarms,
@@ -27,14 +27,11 @@ def motion_of(index, values, *, leaves=False, falls=False, push_time_s=PUSH_S):
     for start_s, value in values.items():
         state[time_s >= start_s - 1e-9] = value
     rows = np.zeros((len(time_s), 1))
-    return WatchedMotion(
+    return Motion(
         index=index,
         push_time_s=push_time_s,
         time_s=time_s,
-        state=state,
-        desired_preview=rows,
-        features=rows,
-        margins=rows,
+        ports={"state": state, "desired_preview": rows, "features": rows, "margins": rows},
         leave_time_s=LEAVE_S if leaves else math.inf,
         fall_time_s=FALL_S if falls else math.inf,
     )
@@ -42,7 +39,7 @@ def motion_of(index, values, *, leaves=False, falls=False, push_time_s=PUSH_S):
 
 def seen(delay_rows=0):
     def value(motion):
-        calm = motion.state[:, 0]
+        calm = motion["state"][:, 0]
         return np.concatenate([np.ones(delay_rows), calm[: len(calm) - delay_rows]])
 
     return Alarm(name="sharpened", value=value)
@@ -98,7 +95,7 @@ def test_false_alarms_are_counted_once_a_motion_over_all_hours():
 
 
 def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
-    alarm = Alarm(name="one", value=lambda m: 39.37 * m.state[:, 0] - 20.0)
+    alarm = Alarm(name="one", value=lambda m: 39.37 * m["state"][:, 0] - 20.0)
 
     def num_cries(threshold):
         return sum(math.isfinite(first_alarm(m, alarm.value(m), threshold)) for m in CALM)
@@ -113,7 +110,7 @@ def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
 
 def test_who_does_not_know_cries():
     motion = motion_of(0, {2.0: np.nan})
-    value = motion.state[:, 0]
+    value = motion["state"][:, 0]
     assert first_alarm(motion, value, -1e9) == 2.0
     assert first_alarm(motion, value, 0.5, since_s=2.25) == pytest.approx(2.3)
     assert lowest_value(motion, value) == -math.inf
@@ -122,9 +119,9 @@ def test_who_does_not_know_cries():
 
 def test_of_a_motion_that_leaves_only_what_is_between_push_and_leaving_counts():
     motion = motion_of(0, {0.2: 0.0, 0.4: 0.8, 1.3: 0.5, 1.4: 0.1}, leaves=True)
-    assert lowest_value(motion, motion.state[:, 0]) == 0.5
+    assert lowest_value(motion, motion["state"][:, 0]) == 0.5
     at_once = motion_of(0, {1.4: 0.1}, leaves=True, push_time_s=1.4)
-    assert lowest_value(at_once, at_once.state[:, 0]) == math.inf
+    assert lowest_value(at_once, at_once["state"][:, 0]) == math.inf
 
 
 def test_motions_that_leave_before_the_push_are_left_out():
@@ -152,9 +149,11 @@ def test_what_an_engineer_would_watch_is_found_by_name():
         ["rotation_x", "rotation_y", "rotation_z"], names, {"support_margin": "edge"}
     )
     motion = motion_of(0, {})
-    motion.features = np.array([[0.1, 3.0, -4.0]])
-    motion.state = np.array([[0.0, -0.2, 0.0]])
-    motion.margins = np.array([[0.5, -0.1]])
+    motion.ports |= {
+        "features": np.array([[0.1, 3.0, -4.0]]),
+        "state": np.array([[0.0, -0.2, 0.0]]),
+        "margins": np.array([[0.5, -0.1]]),
+    }
     values = {alarm.name: alarm.value(motion)[0] for alarm in alarms}
     assert values == pytest.approx(
         {"support_margin": 0.1, "tracking_error": -5.0, "tilt": -0.2, "smallest_margin": -0.1}

@@ -166,7 +166,7 @@ def test_faults_are_of_recordings_in_turn_and_known_by_name():
 
 @pytest.fixture(scope="module")
 def loop():
-    return worker_loop(load_scenario(SCENARIO), "nominal", {})
+    return worker_loop(load_scenario(SCENARIO))()
 
 
 def drawn(loop, kind, turn):

@@ -6,14 +6,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import command_line
 from drake_safety.cli import join_targets
-from drake_safety.cli.target_run import alarm_row, named_push
+from drake_safety.cli.run import alarm_row, named_push
 from drake_safety.cli.targets import parse_target
 from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file, goal_threshold
 from drake_safety.evaluation.metrics import Estimate
@@ -21,6 +20,7 @@ from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import Calibration
 from drake_safety.planning.goal_verdict import assess_goal
+from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import load_scenario
 from reaching_targets import CAUSE, FAR, NEAR, SCENARIO, made_up_episodes
 
@@ -165,13 +165,11 @@ def test_a_run_with_the_shipped_assessment_writes_to_the_working_folder(
     call, shipped, nothing_near, tmp_path, monkeypatch
 ):
     folders = []
-    monkeypatch.setattr(
-        "drake_safety.cli.run.run_to_target",
-        lambda settings, *arguments, **options: folders.append(settings.folder) or True,
-    )
-    assert call("run", SCENARIO, "--target", "blue_box")[0] == 0
+    monkeypatch.setattr("drake_safety.cli.run._go", lambda *_, **options: ())
+    monkeypatch.setattr("drake_safety.cli.run._save", lambda folder, viewer: folders.append(folder))
+    assert call("run", SCENARIO, "--target", "blue_box", "--force")[0] == 0
     assert folders == [Path("runs") / f"{SCENARIO}-shipped" / "run"]
-    assert call("run", SCENARIO, "--target", "blue_box", "--out", tmp_path)[0] == 0
+    assert call("run", SCENARIO, "--target", "blue_box", "--force", "--out", tmp_path)[0] == 0
     assert folders[1:] == [tmp_path / "run"]
 
 
@@ -245,7 +243,7 @@ def test_options_that_a_task_or_a_run_does_not_know_are_refused(call, folder, ar
 @pytest.fixture
 def nothing_near(monkeypatch):
     """Spares the search for what would be accepted."""
-    monkeypatch.setattr("drake_safety.cli.target_run.nearest_accepted", lambda *arguments: None)
+    monkeypatch.setattr("drake_safety.cli.run.nearest_accepted", lambda *arguments: None)
 
 
 def test_a_run_obeys_a_refusal(call, folder, nothing_near):
@@ -258,13 +256,13 @@ def test_a_run_obeys_a_refusal(call, folder, nothing_near):
 
 def test_a_run_goes_where_it_is_let(call, folder, monkeypatch):
     calibrate(folder, 0.0)
-    started = []
-    recording = SimpleNamespace(viewer=None, start=lambda: started.append(1), save=lambda *_: None)
-    monkeypatch.setattr("drake_safety.cli.target_run.Recording", lambda settings: recording)
-    monkeypatch.setattr("drake_safety.cli.target_run.draw_motion", lambda *arguments: None)
+    saved = []
+    monkeypatch.setattr("drake_safety.cli.run._save", lambda *shown: saved.append(shown))
+    monkeypatch.setattr("drake_safety.cli.run._timeline", lambda *_, **options: None)
     options = ("--assessment", folder, "--target", *NEAR, "--duration", 0.1)
     assert call("run", SCENARIO, *options)[0] == 0
-    assert started == [1]
+    ((_, _, figures, events, _),) = saved
+    assert figures.keys() == {"timeline"} and events.row_count >= 2
 
 
 @pytest.mark.slow
@@ -332,5 +330,5 @@ def test_a_push_is_one_that_the_scenario_names(loop):
     ],
 )
 def test_the_alarm_is_the_first_fall_of_a_gamma_that_was_accepted(gamma, row):
-    motion = SimpleNamespace(extra={"safety_probability": np.array(gamma)[:, None]})
+    motion = Motion(time_s=np.arange(len(gamma)), ports={"safety_probability": np.array([gamma]).T})
     assert alarm_row(motion, 0.5) == row

@@ -12,7 +12,7 @@ from balancing_loops import PACKAGED, packaged_loop, scenario_of, standing_loop,
 from drake_safety import load_scenario, run_episode
 from drake_safety.control.observation import stance_state
 from drake_safety.plants.balls import Throw
-from drake_safety.simulation.episode_recorder import Recorder
+from drake_safety.simulation.motion import Recorder
 from drake_safety.simulation.scenario import parse_scenario
 from legged_robots import ROBOT_NAMES, edited, robot_kinematics, write_hexapod
 

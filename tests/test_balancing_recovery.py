@@ -69,7 +69,7 @@ def test_recovery_from_the_demonstrations_strong_ball_is_short_and_holds_the_hea
     ((start_s, end_s),) = log.recovery_intervals_s
     step = loop.scenario.parameters.recovery.step
     assert end_s - start_s < 13 * step.step_duration_s + step.return_duration_s
-    w, x, y, z = log.plant_state[:, :4].T
+    w, x, y, z = log["plant_state"][:, :4].T
     yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)))
     turned = yaw - yaw[log.time_s < 0.5][-1]
     assert np.abs(turned).max() < np.radians(30)

@@ -110,7 +110,7 @@ def test_a_scheduler_that_does_not_answer_or_has_no_workers_is_an_error(tmp_path
 
 def test_a_worker_with_other_versions_is_refused_by_name():
     with pytest.raises(ValueError, match=r"has drake 1\S+, expected 0.1, as here"):
-        worker_processes._called({"drake": "0.1"}, print)
+        worker_processes._called({"drake": "0.1"}, print, [])
 
 
 @pytest.mark.train

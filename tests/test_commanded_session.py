@@ -5,7 +5,7 @@ import pytest
 from pydrake.geometry import Meshcat
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
-from drake_safety.live.task_sessions import LiveCommands
+from drake_safety.live.session import GUARD, HALT, PUSH, START, LiveSession
 from live_scenarios import quick
 
 pytestmark = pytest.mark.train
@@ -17,7 +17,7 @@ def session():
     assessment = SafetyAssessment(scenario.assessment).fit(run_episodes(scenario, 8, num_workers=1))
     meshcat = Meshcat()
     loop = scenario.make_loop("nominal", assessment=assessment, meshcat=meshcat, guard=True)
-    return LiveCommands(loop, meshcat, threshold=0.5)
+    return LiveSession(loop, meshcat, threshold=0.5)
 
 
 def ticks(session, *names, num=1):
@@ -28,7 +28,7 @@ def ticks(session, *names, num=1):
 
 
 def test_keys_change_the_command_within_the_range_of_training(session):
-    ticks(session, session.START)
+    ticks(session, START)
     np.testing.assert_array_equal(session.command, np.zeros(3))
     ticks(session, "Faster", "Turn left")
     high = session.loop.target_box[1]
@@ -37,26 +37,26 @@ def test_keys_change_the_command_within_the_range_of_training(session):
     for _ in range(10):
         ticks(session, "Faster")
     assert session.command[0] == high[0]
-    ticks(session, session.HALT, num=4)
+    ticks(session, HALT, num=4)
     np.testing.assert_array_equal(session.command, np.zeros(3))
     np.testing.assert_allclose(preview.Eval(session.context), 0.0, atol=1e-9)
 
 
 def test_without_the_guard_what_is_asked_is_passed_on(session):
-    ticks(session, session.START, session.GUARD)
+    ticks(session, START, GUARD)
     assert not session.is_guarded
     ticks(session, *["Faster"], num=4)
     asked = session.loop.GetOutputPort("desired_output").Eval(session.context)
     np.testing.assert_allclose(asked, session.command)
     assert session.loop.GetOutputPort("guard_active").Eval(session.context)[0] == 0.0
-    ticks(session, session.GUARD)
+    ticks(session, GUARD)
     assert session.is_guarded
 
 
 def test_a_push_moves_the_robot_and_a_fall_is_followed_by_standing(session):
-    ticks(session, session.START, num=3)
+    ticks(session, START, num=3)
     before = session.loop.GetOutputPort("output").Eval(session.context).copy()
-    ticks(session, session.PUSH, num=5)
+    ticks(session, PUSH, num=5)
     after = session.loop.GetOutputPort("output").Eval(session.context)
     assert np.linalg.norm((after - before)[:2]) > 0.5
     assert "pushed with" in session.panel.status.note

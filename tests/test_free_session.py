@@ -1,8 +1,10 @@
 import contextlib
 import dataclasses
+import json
 import threading
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,10 +14,10 @@ from cart_pole_task import SCENARIO, CartPole
 from command_line import call
 from drake_safety import AddSafetyAssessor, SafetyAssessment, load_scenario, run_episodes
 from drake_safety.cli.training_folder import assessment_file
-from drake_safety.live.session import BREAK_S, STOP, TICK_S
-from drake_safety.live.task_sessions import LiveEpisodes, LiveGoals
+from drake_safety.live.session import BREAK_S, FORCE, PUSH, START, STOP, TICK_S, LiveSession
+from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
-from drake_safety.simulation.free_motion import run_free
+from drake_safety.simulation.motion import simulate
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import Gliding, gliding
 from live_scenarios import quick
@@ -31,6 +33,20 @@ class BareCartPole(CartPole):
 
     def __init__(self, scenario, variation="nominal", *, assessment=None):
         super().__init__(scenario, variation, assessment=assessment)
+
+
+class Pushed(Gliding):
+    """One that can be pushed."""
+
+    pushes: ClassVar[dict] = {}
+
+    def sample_push(self, rng):
+        return Push(force_n=[rng.uniform(2.0, 3.0), 0.0, 0.0])
+
+    def set_push(self, context, push):
+        x, _ = self.GetOutputPort("state").Eval(context)
+        mass_context = self.mass.GetMyMutableContextFromRoot(context)
+        mass_context.SetDiscreteState([x, push.force_n[0]])
 
 
 class FewPorts(Gliding):
@@ -66,7 +82,7 @@ def shuttle_loop():
 
 @pytest.fixture
 def session(cart_loop, meshcat):
-    return LiveEpisodes(cart_loop, meshcat, threshold=0.5)
+    return LiveSession(cart_loop, meshcat, threshold=0.5)
 
 
 def set_state(session, *state):
@@ -121,16 +137,16 @@ def test_starts_are_those_of_the_seed_and_a_click_begins_the_next(cart_loop, mes
     state = cart_loop.GetOutputPort("state")
     starts = []
     for _ in range(2):
-        session = LiveEpisodes(cart_loop, meshcat, threshold=0.5, seed=3)
+        session = LiveSession(cart_loop, meshcat, threshold=0.5, seed=3)
         starts.append(state.Eval(session.context).copy())
         ticks(session, 0.4)
-        session.panel.click(session.START)
+        session.panel.click(START)
         session.tick()
         assert session.context.get_time() == pytest.approx(TICK_S)
         starts.append(state.Eval(session.context).copy())
     np.testing.assert_array_equal(starts[:2], starts[2:])
     assert np.abs(starts[0] - starts[1]).max() > 0.1
-    assert session.panel.buttons == {STOP: "Escape", session.START: "KeyR"}
+    assert session.panel.buttons == {STOP: "Escape", START: "KeyR"}
 
 
 def test_an_episode_whose_duration_has_passed_is_followed_by_the_next(session):
@@ -156,7 +172,7 @@ def test_that_it_left_the_safe_set_is_shown_until_the_next_start(session):
 def test_a_simulation_that_fails_is_shown_and_the_next_begins(meshcat, failure, told):
     scenario = quick(gliding(failure=failure, speed_m_s=4.0))
     loop = scenario.make_loop(assessment=learned(scenario), meshcat=meshcat)
-    session = LiveEpisodes(loop, meshcat, threshold=0.5)
+    session = LiveSession(loop, meshcat, threshold=0.5)
     while session.tick():
         pass
     num_waits = 1
@@ -167,27 +183,27 @@ def test_a_simulation_that_fails_is_shown_and_the_next_begins(meshcat, failure, 
     assert num_waits * BREAK_S == pytest.approx(SHOWN_S, abs=2 * BREAK_S)
     assert session.context.get_time() == pytest.approx(TICK_S)
     loop.mass.parameters.fails_at_start = True
-    session = LiveEpisodes(loop, meshcat, threshold=0.5)
+    session = LiveSession(loop, meshcat, threshold=0.5)
     assert session.panel.status.note == "no start"
     loop.mass.parameters.fails_at_start = False
-    session.panel.click(session.START)
+    session.panel.click(START)
     assert session.tick()
 
 
-def test_what_can_be_pushed_has_a_button_for_it(shuttle_loop, meshcat):
-    session = LiveEpisodes(shuttle_loop, meshcat, threshold=0.5)
-    before = shuttle_loop.GetOutputPort("state").Eval(session.context)[3:].copy()
-    session.panel.click(session.PUSH)
-    ticks(session, 0.16)
-    after = shuttle_loop.GetOutputPort("state").Eval(session.context)[3:]
-    assert np.linalg.norm(after - before) > 0.1
+def test_what_can_be_pushed_has_a_button_for_it(meshcat):
+    scenario = quick(gliding())
+    loop = Pushed(scenario, assessment=learned(scenario))
+    session = LiveSession(loop, meshcat, threshold=0.5)
+    session.panel.click(PUSH)
+    ticks(session, 0.04)
+    assert loop.GetOutputPort("state").Eval(session.context)[1] >= 2.0
     assert session.panel.status.note.startswith("pushed with")
 
 
 def test_goals_need_no_legs(shuttle_loop, meshcat):
-    session = LiveGoals(shuttle_loop, meshcat, threshold=0.5)
+    session = LiveSession(shuttle_loop, meshcat, threshold=0.5)
     assert not session.tick()
-    session.panel.click(session.FORCE)
+    session.panel.click(FORCE)
     ticks(session, 0.4)
     assert not session.has_fallen
 
@@ -197,9 +213,9 @@ def test_ports_that_are_not_exported_are_named(meshcat):
     loop = FewPorts(scenario, assessment=learned(scenario))
     message = r"'FewPorts' exports no port \['cause_probability'"
     with pytest.raises(ValueError, match=message):
-        LiveEpisodes(loop, meshcat, threshold=0.5)
+        LiveSession(loop, meshcat, threshold=0.5)
     with pytest.raises(ValueError, match=message):
-        run_free(loop, seed=0, duration_s=0.4, ports=("cause_probability",))
+        simulate(loop, lambda context: None, ["cause_probability"], duration_s=0.4)
 
 
 def trained(folder, task):
@@ -212,7 +228,7 @@ def trained(folder, task):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["cart_pole_task:CartPole", "test_free_session:BareCartPole"])
-def test_such_a_task_can_be_played_and_an_empty_scene_is_warned_of(
+def test_such_a_task_can_be_played_and_run_and_an_empty_scene_is_warned_of(
     monkeypatch, capsys, tmp_path, task
 ):
     page = pytest.importorskip("drake_safety.live.page")
@@ -235,3 +251,17 @@ def test_such_a_task_can_be_played_and_an_empty_scene_is_warned_of(
         assert (warning in told) == ("draws nothing" in told) == ("Bare" in task)
         assert command == "run" or "real-time factor" in told
     assert shown[0].status.state == "stopped"
+    run = tmp_path / "run"
+    names = {path.name for path in run.iterdir()}
+    assert names == {"recording.html", "run.json", "timeline.png", "timeline.svg"}
+    rows = json.loads((run / "run.json").read_text())["rows"]
+    assert rows[0][:2] == ["0.00", "the episode starts"]
+    assert "end" in rows[-1][1] or "left" in rows[-1][1]
+    assert "meshcat" in (run / "recording.html").read_text()[:200_000].lower()
+    assert "the episode starts" in told
+    for options, message in (
+        (["--push", "ball"], f"run: --push: task '{task.split(':')[1]}' has no ball to throw"),
+        (["--target", "1 2 3"], "has no plans with a goal"),
+    ):
+        assert call(monkeypatch, "run", *arguments, *options) == 2
+        assert message in " ".join(capsys.readouterr().out.split())

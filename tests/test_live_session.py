@@ -11,8 +11,20 @@ from pydrake.geometry import Meshcat
 from command_line import call
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.cli.console import LOOPBACK, open_viewer
-from drake_safety.live.session import STOP, TICK_S, Pace
-from drake_safety.live.task_sessions import LiveGoals, LiveThrows
+from drake_safety.live.session import (
+    AXES,
+    DIRECTION,
+    FORCE,
+    GO,
+    MASS,
+    SPEED,
+    START,
+    STOP,
+    THROW,
+    TICK_S,
+    LiveSession,
+    Pace,
+)
 from live_scenarios import quick
 from reaching_targets import NEAR, made_up_episodes
 
@@ -20,7 +32,7 @@ FAR = ("0.95", "0.5", "1.05")
 
 
 def move(session, values):
-    for name, value in zip(session.AXES, values, strict=True):
+    for name, value in zip(AXES, values, strict=True):
         session.panel.set_value(name, float(value))
 
 
@@ -39,7 +51,7 @@ def throws_loop(meshcat):
 
 @pytest.fixture
 def throws(throws_loop, meshcat):
-    return LiveThrows(throws_loop, meshcat, threshold=0.4)
+    return LiveSession(throws_loop, meshcat, threshold=0.4)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +64,7 @@ def goals_loop(meshcat):
 
 @pytest.fixture
 def goals(goals_loop, meshcat):
-    return LiveGoals(goals_loop, meshcat, threshold=0.4)
+    return LiveSession(goals_loop, meshcat, threshold=0.4)
 
 
 @pytest.mark.train
@@ -70,9 +82,9 @@ def test_a_click_throws_the_ball_of_the_sliders_once(throws):
     ball = throws.loop.GetOutputPort("ball_state")
     throws.tick()
     assert np.linalg.norm(ball.Eval(throws.context)[4:6]) > 5  # Far away.
-    for name, value in ((throws.MASS, 2.0), (throws.SPEED, 4.0), (throws.DIRECTION, 90.0)):
+    for name, value in ((MASS, 2.0), (SPEED, 4.0), (DIRECTION, 90.0)):
         throws.panel.set_value(name, value)
-    throws.panel.click(throws.THROW)
+    throws.panel.click(THROW)
     throws.tick()
     state = ball.Eval(throws.context)
     assert state[-3:-1] == pytest.approx([0.0, 4.0], abs=1e-6)
@@ -96,7 +108,7 @@ def test_a_robot_that_has_fallen_is_stood_up_again_after_a_while(throws):
     for _ in range(round(1.5 / TICK_S) + 1):
         throws.tick()
     assert not throws.has_fallen
-    assert context.get_time() <= 2 * TICK_S
+    assert throws.context.get_time() <= 2 * TICK_S
 
 
 @pytest.mark.train
@@ -141,7 +153,7 @@ def test_moving_the_target_changes_the_verdict_and_moves_nothing_else(goals):
 @pytest.mark.train
 def test_go_is_refused_where_gamma_refuses_and_an_accepted_target_nearby_is_told(goals):
     move(goals, FAR)
-    goals.panel.click(goals.GO)
+    goals.panel.click(GO)
     assert not goals.tick()
     assert goals.context.get_time() == 0.0
     assert goals.nearest is not None
@@ -150,10 +162,10 @@ def test_go_is_refused_where_gamma_refuses_and_an_accepted_target_nearby_is_told
 
 
 @pytest.mark.train
-@pytest.mark.parametrize(("target", "button"), [(NEAR, "GO"), (FAR, "FORCE")])
+@pytest.mark.parametrize(("target", "button"), [(NEAR, GO), (FAR, FORCE)])
 def test_the_robot_goes_where_it_may_or_is_forced_to(goals, target, button):
     move(goals, target)
-    goals.panel.click(getattr(goals, button))
+    goals.panel.click(button)
     assert goals.tick()
     assert goals.context.get_time() == pytest.approx(TICK_S)
     before = goals.loop.GetOutputPort("output").Eval(goals.context).copy()
@@ -162,7 +174,7 @@ def test_the_robot_goes_where_it_may_or_is_forced_to(goals, target, button):
     wanted = np.array(target, dtype=float)
     after = goals.loop.GetOutputPort("output").Eval(goals.context)
     assert np.linalg.norm(after - wanted) < np.linalg.norm(before - wanted) - 0.02
-    goals.panel.click(goals.START)
+    goals.panel.click(START)
     assert not goals.tick()
     assert goals.context.get_time() == 0.0
 
@@ -170,7 +182,7 @@ def test_the_robot_goes_where_it_may_or_is_forced_to(goals, target, button):
 def test_a_loop_without_gamma_cannot_be_played_with(meshcat):
     loop = load_scenario("laikago_balancing").make_loop()
     with pytest.raises(ValueError, match="without an assessment"):
-        LiveThrows(loop, meshcat, threshold=0.4)
+        LiveSession(loop, meshcat, threshold=0.4)
 
 
 def test_play_without_an_assessment_or_a_library_for_pages_says_what_to_do_first(

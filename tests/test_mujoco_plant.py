@@ -12,7 +12,7 @@ from balancing_loops import scenario_of
 from drake_safety import load_scenario, run_episode, run_episodes
 from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.simulation.throws import ViolationCounter
+from drake_safety.simulation.throws import Violations
 from legged_robots import robot_kinematics
 
 MUJOCO = PlantVariation(engine="mujoco")
@@ -193,7 +193,7 @@ def test_a_ball_is_refused_by_default_too_where_pushes_are_sampled():
         with pytest.raises(ValueError, match=r"engine 'mujoco' has no ball.*pass ball=False"):
             scenario.make_loop("mujoco", **options)
     with pytest.raises(ValueError, match=r"read from Drake's plant; variation 'mujoco'"):
-        ViolationCounter(scenario.make_loop("mujoco", ball=False))
+        Violations(scenario.make_loop("mujoco", ball=False))
 
 
 def test_the_choice_of_engine_is_part_of_the_hash_and_its_default_is_not():

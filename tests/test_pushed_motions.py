@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 
 from drake_safety.control.safe_sets import BalanceSafeSet
-from drake_safety.plants.balls import Throw
 from drake_safety.simulation.scenario import load_scenario
-from drake_safety.simulation.throws import ThrowLog
 from shuttle_task import shuttling
-from studies.alarms import WatchedMotion
 from studies.pushed_motions import run_pushed_motion, run_pushed_motions
 
 
@@ -24,18 +21,20 @@ def test_every_motion_is_safe_until_somebody_pushes_and_the_same_until_then(moti
         assert not one.has_left and one.push_time_s == math.inf
         before = other.time_s <= other.push_time_s + 1e-9
         assert 0.1 <= other.push_time_s <= 0.3 + 1e-9
-        np.testing.assert_array_equal(one.state[: before.sum()], other.state[before])
+        np.testing.assert_array_equal(one["state"][: before.sum()], other["state"][before])
         assert not other.leave_time_s <= other.push_time_s
-        assert np.abs(other.state[-1, :3] - one.state[len(other.state) - 1, :3]).max() > 1e-3
+        assert (
+            np.abs(other["state"][-1, :3] - one["state"][len(other["state"]) - 1, :3]).max() > 1e-3
+        )
     assert 0 < sum(motion.has_left for motion in pushed) < 12
 
 
 def test_when_it_leaves_and_falls_is_what_the_margins_say(motions):
     for motion in motions:
-        outside = motion.margins.min(axis=1) < 0
+        outside = motion["margins"].min(axis=1) < 0
         first = motion.time_s[np.argmax(outside)] if outside.any() else math.inf
         assert motion.leave_time_s == pytest.approx(first)
-        fell = motion.margins[:, 1] < 0
+        fell = motion["margins"][:, 1] < 0
         assert motion.has_fallen == fell.any()
         assert not fell[:-1].any()
 
@@ -43,7 +42,7 @@ def test_when_it_leaves_and_falls_is_what_the_margins_say(motions):
 def test_a_motion_follows_from_its_seed_and_index_alone(motions):
     loop = shuttling().make_loop()
     for again, before in zip(run_pushed_motion(loop, 5, seed=4), motions[10:12], strict=True):
-        np.testing.assert_array_equal(again.state, before.state)
+        np.testing.assert_array_equal(again["state"], before["state"])
         assert again.push_time_s == before.push_time_s
 
 
@@ -52,27 +51,6 @@ def test_goals_that_nobody_reaches_safely_are_no_place_to_be_pushed_on_the_way_t
     monkeypatch.setattr(type(loop), "target_box", np.array([[1.3, 0.0, 0.2], [1.4, 0.1, 0.3]]))
     with pytest.raises(ValueError, match="none of 50 random goals is reached safely"):
         run_pushed_motion(loop, 0, seed=4)
-
-
-def test_the_push_of_a_throw_is_the_touch():
-    rows = np.zeros((3, 1))
-    log = ThrowLog(
-        index=7,
-        throw=Throw(time_s=0.6),
-        time_s=np.array([0.5, 0.6, 0.7]),
-        state=rows,
-        desired_preview=rows,
-        features=rows,
-        margins=rows,
-        plant_state=rows,
-        trigger_time_s=math.nan,
-        fall_time_s=math.inf,
-        leave_time_s=0.7,
-        recovery_active=np.zeros(3),
-    )
-    motion = WatchedMotion.of_throw(log)
-    assert (motion.index, motion.push_time_s, motion.leave_time_s) == (7, 0.6, 0.7)
-    assert motion.has_left and not motion.has_fallen
 
 
 @pytest.mark.parametrize("name", ["laikago_balancing", "atlas_reaching"])

@@ -6,8 +6,8 @@ from pydrake.systems.analysis import Simulator
 from drake_safety import load_scenario
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import stance_state
+from drake_safety.learning.segments import RECORDED
 from drake_safety.plants.obstacles import Obstacle
-from drake_safety.simulation.closed_loop import RECORDED_PORTS
 from drake_safety.simulation.rollouts import episode_rng
 from legged_robots import edited, write_biped, write_hexapod, write_porter
 from reaching_loops import (
@@ -58,7 +58,7 @@ def test_what_is_asked_at_plan_time_is_what_an_episode_begins_with(variation):
     context = loop.CreateDefaultContext()
     loop.reset(context, episode_rng(0, 0), EASY)
     episode = easy_episode(variation)
-    for name in RECORDED_PORTS[:-1]:
+    for name in RECORDED[:-1]:
         np.testing.assert_array_equal(evaluated(loop, context, name), getattr(episode, name)[0])
 
 
@@ -71,9 +71,9 @@ def test_a_reset_is_the_same_for_the_same_generator():
         simulator = Simulator(loop, context)
         simulator.Initialize()
         simulator.AdvanceTo(0.1)
-        rows.append({name: evaluated(loop, context, name).copy() for name in RECORDED_PORTS})
+        rows.append({name: evaluated(loop, context, name).copy() for name in RECORDED})
         context = simulator.get_mutable_context()
-    for name in RECORDED_PORTS:
+    for name in RECORDED:
         np.testing.assert_array_equal(rows[2][name], rows[0][name])
     assert not np.allclose(rows[1]["true_state"], rows[0]["true_state"], atol=1e-3)
 

@@ -12,9 +12,9 @@ from cart_episodes import ARRAYS, assert_identical
 from drake_safety import load_scenario, run_episode, run_episodes
 from drake_safety.learning.segments import DIVERGED, EpisodeError
 from drake_safety.simulation.dataset import completed, load_episodes
-from drake_safety.simulation.episode_recorder import advance_to
+from drake_safety.simulation.motion import advance_to
 from drake_safety.simulation.rollouts import episode_rng, worker_loop
-from drake_safety.simulation.worker_processes import parallel_map
+from drake_safety.simulation.worker_processes import map_items
 from gliding_task import gliding
 from legged_robots import write_hexapod
 from shuttle_task import BOX, shuttling
@@ -178,11 +178,11 @@ def test_a_finished_set_on_disk_is_read_not_simulated(tmp_path):
 
 
 @pytest.mark.parametrize("num_workers", [1, 2])
-def test_a_parallel_map_calls_every_argument_once_and_fails_with_its_failure(num_workers):
-    results = parallel_map(math.sqrt, [(i,) for i in range(9)], num_workers)
+def test_every_item_is_called_once_and_a_failure_is_that_of_its_item(num_workers):
+    results = map_items(math.sqrt, range(9), num_workers=num_workers)
     assert sorted(results) == [math.sqrt(i) for i in range(9)]
     with pytest.raises(ValueError, match=r"domain|nonnegative"):
-        list(parallel_map(math.sqrt, [(1,), (-1,), (2,)], num_workers))
+        list(map_items(math.sqrt, [1, -1, 2], num_workers=num_workers, batch_size=1))
 
 
 def balancing(episode_duration_s):
@@ -222,7 +222,7 @@ def test_a_robot_whose_file_has_changed_is_simulated_anew(tmp_path):
     for stiffness in ("200.0", "60.0"):
         robot.write_text(robot.read_text().replace("stiffness: 200.0", f"stiffness: {stiffness}"))
         hashes.add(load_scenario(path).simulation_hash())
-        loop = worker_loop(load_scenario(path), "nominal", {})
+        loop = worker_loop(load_scenario(path))()
         simulator = Simulator(loop)
         loop.reset(simulator.get_mutable_context(), episode_rng(0, 0))
         simulator.AdvanceTo(0.05)

@@ -7,7 +7,7 @@ from drake_safety import AssessmentParameters, SafetyAssessment, load_assessment
 from drake_safety.evaluation.shift_study import (
     CONFIDENT,
     JudgedShift,
-    Motion,
+    MotionRows,
     Verdicts,
     assessment_judge,
     motions_of,
@@ -47,7 +47,7 @@ def nominal():
 
 def motion(num_rows, probability, *, is_unsafe):
     """A motion whose state is the probability that the double below returns."""
-    return Motion(
+    return MotionRows(
         state=np.full((num_rows, 6), float(probability)),
         desired_preview=np.zeros((num_rows, 30)),
         features=np.zeros((num_rows, 5)),

@@ -6,43 +6,38 @@ import pytest
 from drake_safety.evaluation import throw_study
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws
-from drake_safety.plants.balls import Throw
-from drake_safety.simulation.throws import ThrowLog
+from drake_safety.simulation.motion import Motion
+from drake_safety.simulation.throws import VIOLATIONS
 from studies.throws import choose_threshold, classifier_rules
 
 IMPACT_S, LEAVE_S, FALL_S = 0.5, 0.8, 1.0
 TIME_S = np.arange(0.0, 1.02, 0.02)
 
 
-def log_of(index, *, leaves=False, falls=False, trigger_time_s=math.nan):
+def log_of(index, *, leaves=False, falls=False):
     """A log in which the only state is how calm the robot is: 1 until the touch, then less."""
     lowest = 0.1 if falls else 0.3 if leaves else 0.9 - 0.01 * index
     calm = np.where(TIME_S < IMPACT_S - 1e-9, 1.0, lowest)
     rows = np.zeros((len(TIME_S), 1))
-    return ThrowLog(
+    ports = dict.fromkeys(("desired_preview", "features", "recovery_active"), rows)
+    violations = np.zeros((len(TIME_S), len(VIOLATIONS)), dtype=bool)
+    return Motion(
         index=index,
-        throw=Throw(time_s=IMPACT_S),
+        push_time_s=IMPACT_S,
         time_s=TIME_S,
-        state=calm[:, None],
-        desired_preview=rows,
-        features=rows,
-        margins=rows,
-        plant_state=rows,
-        trigger_time_s=trigger_time_s,
+        ports={"state": calm[:, None], "violations": violations, **ports},
         fall_time_s=FALL_S if falls else math.inf,
         leave_time_s=LEAVE_S if leaves or falls else math.inf,
-        recovery_active=np.zeros(len(TIME_S)),
-        violations={"legs_collide": 0},
     )
 
 
 def every_third_falls(scenario, indices, *, trigger_times_s=None, **options):
     """In place of `run_throws`: recovery saves whom it is in time."""
     logs = []
-    for index in indices:
-        time_s = math.nan if trigger_times_s is None else trigger_times_s[index]
+    times_s = [math.nan] * len(indices) if trigger_times_s is None else trigger_times_s
+    for index, time_s in zip(indices, times_s, strict=True):
         falls = index % 3 == 0 and not time_s < IMPACT_S + 0.1
-        logs.append(log_of(index, falls=falls, trigger_time_s=time_s))
+        logs.append(log_of(index, falls=falls))
     return logs
 
 
@@ -78,7 +73,7 @@ def test_a_rule_in_time_saves_every_throw_and_a_late_one_none(monkeypatch):
 
 def test_the_chosen_threshold_is_the_highest_with_few_enough_false_triggers():
     logs = [log_of(index) for index in range(40)]
-    lowest = np.array([log.state[:, 0].min() for log in logs])
+    lowest = np.array([log["state"][:, 0].min() for log in logs])
     for bound in (0.0, 0.1, 0.5):
         threshold = choose_threshold(logs, CALM, max_false_share=bound)
         assert (lowest < threshold).mean() <= bound

@@ -11,8 +11,7 @@ from drake_safety import load_scenario, run_episode
 from drake_safety.control.observation import heading_velocity, walking_state
 from drake_safety.diagrams.walking_parameters import CommandSampling, WalkingRecovery, profile
 from drake_safety.simulation.contract import check_contract
-from drake_safety.simulation.goal_motion import run_to_goal
-from drake_safety.simulation.rollouts import episode_rng
+from drake_safety.simulation.rollouts import episode_rng, run_to_goal
 
 NAMES = ["g1_walking", "go2_walking", "t1_walking"]
 
@@ -166,7 +165,7 @@ def test_a_push_accelerates_the_robot():
     loop = load_scenario("go2_walking").make_loop()
     push = replace(loop.pushes["side"], time_s=0.2, duration_s=0.1, force_n=[0.0, 300.0, 0.0])
     motion = run_to_goal(loop, np.zeros(3), push=push, duration_s=0.34)
-    assert motion.output[-1, 1] > 1.0
+    assert motion["output"][-1, 1] > 1.0
     sampled = [loop.sample_push(episode_rng(0, i)) for i in range(20)]
     low, high = loop.scenario.parameters.random_pushes.force_n
     assert all(low <= one.strength_n <= high for one in sampled)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from drake_safety import load_scenario
+from drake_safety.simulation.motion import Motion
 from studies.alarms import Alarm
 from studies.walking import (
     alarm_estimates,
@@ -14,27 +15,25 @@ from studies.walking import (
     speed_estimates,
     tour_estimates,
 )
-from studies.walking_motions import WalkedMotion, run_motions, unusual_command
+from studies.walking_motions import run_motions, unusual_command
 
-ALARM = Alarm(name="value", value=lambda motion: motion.features[:, 0])
+ALARM = Alarm(name="value", value=lambda motion: motion["features"][:, 0])
 
 
 def motion(values, *, push_s=math.inf, leave_s=math.inf, fall_s=math.inf, changed=0.0, impact=0.0):
     n = len(values)
-    return WalkedMotion(
+    return Motion(
         index=0,
         push_time_s=push_s,
         leave_time_s=leave_s,
         fall_time_s=fall_s,
         time_s=0.1 * np.arange(n),
-        state=np.zeros((n, 1)),
-        desired_preview=np.zeros((n, 3)),
-        features=np.array(values, dtype=float)[:, None],
-        margins=np.ones((n, 1)),
-        output=np.tile([0.5, 0.0, 0.1], (n, 1)),
-        desired_output=np.zeros((n, 3)),
-        is_changed=np.full(n, changed),
-        impact_m_s=impact,
+        ports={
+            "features": np.array(values, dtype=float)[:, None],
+            "output": np.tile([0.5, 0.0, 0.1], (n, 1)),
+            "guard_active": np.full((n, 1), changed),
+            "downward_m_s": np.full((n, 1), impact),
+        },
     )
 
 
@@ -100,7 +99,7 @@ def test_motions_are_kept_and_commands_are_inside_or_past_the_ranges(tmp_path: P
     written = (tmp_path / "00000.npz").stat().st_mtime_ns
     again = run_motions(scenario, "tour", [0, 1], **options)
     assert (tmp_path / "00000.npz").stat().st_mtime_ns == written
-    np.testing.assert_array_equal(again[0].state, first.state)
+    np.testing.assert_array_equal(again[0]["state"], first["state"])
     (tmp_path / "00001.npz").write_bytes(b"no motion")
     with pytest.raises(ValueError, match=r"00001\.npz is damaged"):
         run_motions(scenario, "tour", [1], **options)

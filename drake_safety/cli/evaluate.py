@@ -41,7 +41,13 @@ from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
-from drake_safety.evaluation.shift_study import Judge, JudgedShift, Motion, MotionSet, shifts_tables
+from drake_safety.evaluation.shift_study import (
+    Judge,
+    JudgedShift,
+    MotionRows,
+    MotionSet,
+    shifts_tables,
+)
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
 from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws, trigger_rules
@@ -54,9 +60,9 @@ from drake_safety.learning.calibration import PLAN, episode_scores
 from drake_safety.learning.seeds import EVALUATION, MOTION, SHIFTS, SeedBlock
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.capabilities import HasBall, HasGoals, require
+from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
-from drake_safety.simulation.throws import ThrowLog
 
 SHIFTS_FILE = "shifts.json"
 _DEFAULT_THROWS = 600
@@ -236,7 +242,7 @@ def add_reliability(evaluation: Evaluation, test: Episodes) -> None:
 
 def add_throws(
     evaluation: Evaluation, num_throws: int, rules: Sequence[TriggerRule] = ()
-) -> list[ThrowLog]:
+) -> list[Motion]:
     """Evaluates either mode, and other rules, as triggers of recovery; returns the throws."""
     recovery = evaluation.scenario.parameters.recovery
     own = trigger_rules(*evaluation.assessments.values(), threshold=recovery.threshold)
@@ -258,7 +264,7 @@ def add_shifts(
     num_motions: int,
     num_nominal: int,
     judges: Mapping[str, Judge] | None = None,
-    others: Callable[[Sequence[Motion]], Mapping[str, MotionSet]] = lambda nominal: {},
+    others: Callable[[Sequence[MotionRows]], Mapping[str, MotionSet]] = lambda nominal: {},
     more: Callable[[JudgedShift], Mapping[str, Estimate]] = lambda judged: {},
 ) -> dict[str, Any]:
     """Evaluates both modes, or other methods, on changed plants and faulty sensors.

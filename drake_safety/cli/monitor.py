@@ -109,7 +109,7 @@ def _motions(
         yield from ((what | {"sequence": i}, motions) for i, motions in enumerate(read))
     else:
         pieces = log_pieces(scenario, [file], log_map)
-        loop = worker_loop(scenario, "actual", {})
+        loop = worker_loop(scenario, "actual")()
         found = motions_from_log(pieces, loop, step_s=gamma.detector_.step_s)
         left = {"left_safe_set": next((one.cause for one in found if not one.is_safe), "")}
         yield what | left, [(one.time_s, rows_of(one)) for one in found]

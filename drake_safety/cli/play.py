@@ -22,7 +22,6 @@ from drake_safety.cli.targets import HandOption
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.live.session import LiveSession
-from drake_safety.live.task_sessions import LiveCommands, LiveEpisodes, LiveGoals, LiveThrows
 from drake_safety.simulation.capabilities import FollowsCommands, HasBall, HasGoals
 from drake_safety.simulation.scenario import load_scenario
 
@@ -62,33 +61,22 @@ def play(
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     # Check the capabilities of the task before a browser is opened.
     asked = loaded.make_loop(variation, assessment=gamma, **options)
-    has_goals, is_commanded = isinstance(asked, HasGoals), isinstance(asked, FollowsCommands)
-    has_ball = isinstance(asked, HasBall) and not has_goals
-    if is_commanded:
-        options["guard"] = True
-    elif has_ball:
-        options["ball"] = True
+    rule = goal_threshold(folder.path, gamma)
+    threshold = rule.threshold
+    if isinstance(asked, FollowsCommands):
+        options["guard"], threshold = True, loaded.parameters.guard.threshold
+    elif isinstance(asked, HasBall) and not isinstance(asked, HasGoals):
+        options["ball"], threshold = True, loaded.parameters.recovery.threshold
     print_shipped(folder, gamma)
+    if not options.keys() & {"guard", "ball"}:
+        told = f"threshold {threshold:.3g}, {rule.origin}"
+        console.print(told, highlight=False, soft_wrap=True)
     page_port = _page_port(host, port)
     meshcat = open_viewer(host, page_port + 1, has_rate=False)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=meshcat, **options)
-    session: LiveSession
-    if is_commanded:
-        threshold = loaded.parameters.guard.threshold
-        session = LiveCommands(loop, meshcat, threshold=threshold, seed=seed)
-    elif has_ball:
-        threshold = loaded.parameters.recovery.threshold
-        session = LiveThrows(loop, meshcat, threshold=threshold, seed=seed)
-    else:
-        rule = goal_threshold(folder.path, gamma)
-        told = f"threshold {rule.threshold:.3g}, {rule.origin}"
-        console.print(told, highlight=False, soft_wrap=True)
-        if has_goals:
-            session = LiveGoals(
-                loop, meshcat, threshold=rule.threshold, unsafe_below=rule.unsafe_below, seed=seed
-            )
-        else:
-            session = LiveEpisodes(loop, meshcat, threshold=rule.threshold, seed=seed)
+    session = LiveSession(
+        loop, meshcat, threshold=threshold, unsafe_below=rule.unsafe_below, seed=seed
+    )
     warn_of_empty_scene(meshcat, loaded.task)
     address = meshcat.web_url().rpartition(":")[0]
     with serve_page(session.panel, host=host, port=page_port, scene_port=meshcat.port()):

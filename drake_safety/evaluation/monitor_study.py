@@ -20,9 +20,9 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector, rows_of, usual_rows
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes
-from drake_safety.simulation.rollouts import motion_batch
+from drake_safety.simulation.rollouts import run_motion, worker_loop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.worker_processes import run_batches
+from drake_safety.simulation.worker_processes import map_items
 
 SPANS_S = (10.0, 60.0)
 """Times since a change over which confident errors are counted [s]."""
@@ -40,20 +40,13 @@ def run_monitored(
     num_workers: int | None = None,
 ) -> list[Episode]:
     """Simulates undisturbed motions of a plant; those without an alarm last a minute."""
+    make = worker_loop(scenario, variation, **(options or {}))
 
     def simulated(indices: list[int], until_s: float) -> dict[int, Episode]:
-        simulate = partial(
-            motion_batch,
-            scenario,
-            variation,
-            dict(options or {}),
-            seed,
-            until_s=until_s,
-            with_features=True,
-        )
+        run = partial(make.run, run_motion, seed=seed, until_s=until_s, with_features=True)
         if num_workers == 1:  # A worker process has none of its own.
-            return {one.index: one for one in simulate(indices)}
-        found = run_batches(simulate, indices, num_workers=num_workers, batch_size=1)
+            return {index: run(index) for index in indices}
+        found = map_items(run, indices, num_workers=num_workers, batch_size=1)
         return {one.index: one for one in found}
 
     motions = simulated([*range(num_motions)], _FIRST_S)

@@ -56,7 +56,7 @@ _MEANING = (
 
 
 @dataclass(kw_only=True, eq=False)
-class Motion:
+class MotionRows:
     """The inputs of one motion, in the order of time, and its outcome.
 
     Attributes:
@@ -74,7 +74,7 @@ class Motion:
     is_unsafe: bool
 
     @classmethod
-    def of_episode(cls, episode: Episode) -> Motion:
+    def of_episode(cls, episode: Episode) -> MotionRows:
         """The rows of an episode from its first undisturbed one."""
         rows = slice(episode.first_step, None)
         return cls(
@@ -84,13 +84,13 @@ class Motion:
         )
 
 
-MotionSet = tuple[str, list[Motion]]
+MotionSet = tuple[str, list[MotionRows]]
 """Kind of a shift, "nominal", "plant" or "sensor", and motions under it."""
 
 
-def motions_of(episodes: Episodes) -> list[Motion]:
+def motions_of(episodes: Episodes) -> list[MotionRows]:
     """The motions of episodes; those that diverged are left out."""
-    motions = [Motion.of_episode(one) for one in episodes if one.cause != DIVERGED]
+    motions = [MotionRows.of_episode(one) for one in episodes if one.cause != DIVERGED]
     return [one for one in motions if len(one.state)]
 
 
@@ -134,13 +134,16 @@ class JudgedShift:
         verdicts: By method, on all rows of all motions; "gamma" is Γ.
     """
 
-    motions: Sequence[Motion]
+    motions: Sequence[MotionRows]
     assessment: SafetyAssessment
     verdicts: Mapping[str, Verdicts]
 
     @classmethod
     def judged_by(
-        cls, judges: Mapping[str, Judge], motions: Sequence[Motion], assessment: SafetyAssessment
+        cls,
+        judges: Mapping[str, Judge],
+        motions: Sequence[MotionRows],
+        assessment: SafetyAssessment,
     ) -> JudgedShift:
         """Judges all rows by every method."""
         rows = [np.concatenate([getattr(m, k) for m in motions]) for k in (*SEEN, "is_outside")]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -11,10 +11,12 @@ import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
+from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.throws import ThrowLog, run_throws, trigger_time
+from drake_safety.simulation.throws import VIOLATIONS, run_throws, trigger_time
 
 PAPER_THRESHOLD = 0.6
 """Γ_thre of the paper, on b_safe, the probability in the paper's mode."""
@@ -40,12 +42,12 @@ def trigger_rules(
     ]
 
 
-def log_probability(log: ThrowLog, scorer: Scorer, persistence_s: float = 0.0) -> np.ndarray:
+def log_probability(log: Motion, scorer: Scorer, persistence_s: float = 0.0) -> np.ndarray:
     """Safety probability of a scorer at every row of a log as a `RecoveryTrigger` takes it, (N,).
 
     Where nothing is known, the highest within ``persistence_s`` counts; before it has passed, 1.
     """
-    probability = scorer.probability(log.state, log.desired_preview, log.features)
+    probability = scorer.probability(*(log[name] for name in SEEN))
     if len(probability) < 2 or not persistence_s:
         return probability
     num_waited = math.ceil(persistence_s / (log.time_s[1] - log.time_s[0]) - 1e-6)
@@ -64,7 +66,7 @@ def evaluate_throws(
     variation: str = "actual",
     num_workers: int | None = None,
     progress: StageProgress | None = None,
-) -> tuple[dict[str, Estimate], list[ThrowLog]]:
+) -> tuple[dict[str, Estimate], list[Motion]]:
     """Throws balls at the actual plant and compares the triggers of rules and their outcomes.
 
     "Don't know" triggers when it has lasted ``persistence_s``. Returns the estimates by dotted key,
@@ -91,9 +93,13 @@ def evaluate_throws(
         for name, times in triggers.items()
     }
     # Rules often trigger at the same instant: each distinct recovery is simulated once.
-    simulated = _simulate_recoveries(
-        throw, {pair for times in triggered.values() for pair in times.items()}, report
+    wanted = sorted({pair for times in triggered.values() for pair in times.items()})
+    again = throw(
+        [index for index, _ in wanted],
+        trigger_times_s=[time_s for _, time_s in wanted],
+        progress=partial(report, "throws, with recovery"),
     )
+    simulated = dict(zip(wanted, again, strict=True))
     estimates = _estimates_without_recovery(logs)
     for rule in rules:
         recovered = {i: simulated[i, time] for i, time in triggered[rule.name].items()}
@@ -103,52 +109,29 @@ def evaluate_throws(
     return estimates, logs
 
 
-def _simulate_recoveries(
-    throw: Callable[..., list[ThrowLog]],
-    wanted: Collection[tuple[int, float]],
-    report: StageProgress,
-) -> dict[tuple[int, float], ThrowLog]:
-    """The log of each pair of index and trigger time [s], in rounds of different indices."""
-    rounds: list[dict[int, float]] = []
-    for index, time_s in sorted(wanted):
-        free = next((one for one in rounds if index not in one), None)
-        if free is None:
-            rounds.append(free := {})
-        free[index] = time_s
-    logs: dict[tuple[int, float], ThrowLog] = {}
-    for times_s in rounds:
-
-        def report_round(done: int, _: int, done_before: int = len(logs)) -> None:
-            report("throws, with recovery", done_before + done, len(wanted))
-
-        for log in throw(sorted(times_s), trigger_times_s=times_s, progress=report_round):
-            logs[log.index, times_s[log.index]] = log
-    return logs
-
-
-def _estimates_without_recovery(logs: Sequence[ThrowLog]) -> dict[str, Estimate]:
+def _estimates_without_recovery(logs: Sequence[Motion]) -> dict[str, Estimate]:
     left = [log for log in logs if log.has_left]
     fell = [log for log in logs if log.has_fallen]
     return {
         "throws.falls_without_recovery": proportion(len(fell), len(logs)),
         "throws.leaves_safe_set_without_recovery": proportion(len(left), len(logs)),
         "throws.impact_to_leaving_s": median(
-            np.array([log.leave_time_s - log.throw.time_s for log in left])
+            np.array([log.leave_time_s - log.push_time_s for log in left])
         ),
         "throws.impact_to_fall_s": median(
-            np.array([log.fall_time_s - log.throw.time_s for log in fell])
+            np.array([log.fall_time_s - log.push_time_s for log in fell])
         ),
     }
 
 
 def _rule_estimates(
-    logs: Sequence[ThrowLog], times: np.ndarray, recovered: Mapping[int, ThrowLog]
+    logs: Sequence[Motion], times: np.ndarray, recovered: Mapping[int, Motion]
 ) -> dict[str, Estimate]:
     """Estimates of a rule from its trigger times (N,), NaN for never, and its recoveries."""
     n = len(logs)
     calm = [i for i, log in enumerate(logs) if not log.has_left]
     fell = [i for i, log in enumerate(logs) if log.has_fallen]
-    touch = np.array([log.throw.time_s for log in logs])
+    touch = np.array([log.push_time_s for log in logs])
     fall = np.array([log.fall_time_s for log in logs])
     is_triggered = ~np.isnan(times)
     falls = sum(recovered.get(log.index, log).has_fallen for log in logs)
@@ -169,11 +152,12 @@ def _rule_estimates(
             int(is_triggered[calm].sum()),
         ),
         "settled": proportion(
-            sum(log.recovery_active[-1] == 0 for log in successes), len(successes)
+            sum(log["recovery_active"][-1, 0] == 0 for log in successes), len(successes)
         ),
     }
-    for kind in sorted({kind for log in recovered.values() for kind in log.violations}):
+    for kind in sorted(VIOLATIONS) if recovered else ():
+        column = VIOLATIONS.index(kind)
         estimates[f"recoveries_with_{kind}"] = proportion(
-            sum(log.violations[kind] > 0 for log in successes), len(successes)
+            sum(bool(log["violations"][:, column].any()) for log in successes), len(successes)
         )
     return estimates

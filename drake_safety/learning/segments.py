@@ -25,6 +25,8 @@ RECORDED = (
     "margins",
 )
 """Arrays that an episode holds per row, besides its time."""
+LARGEST = 1e12
+"""Any quantity in SI units is smaller; a larger one means that the simulation diverged."""
 DIVERGED = "diverged"
 """Cause of an episode whose simulation failed; it has no safety label."""
 

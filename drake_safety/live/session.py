@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import textwrap
 import time
-from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
-from pydrake.geometry import Meshcat
+from pydrake.geometry import Meshcat, Rgba, Sphere
+from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from drake_safety.learning.causes import likely_cause
+from drake_safety.learning.causes import describe_margin, likely_cause
 from drake_safety.learning.prediction import is_unknown
-from drake_safety.live.following_camera import FollowingCamera
-from drake_safety.live.panel import LivePanel
-from drake_safety.simulation.capabilities import CanBePushed, CanFall
+from drake_safety.learning.segments import DivergenceError
+from drake_safety.live.following_camera import WORLD, FollowingCamera
+from drake_safety.live.panel import COLOURS, LivePanel
+from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
+from drake_safety.planning.nearest_goal import nearest_accepted_goal
+from drake_safety.plants.balls import Throw
+from drake_safety.simulation.capabilities import (
+    CanBePushed,
+    CanFall,
+    FollowsCommands,
+    HasBall,
+    HasGoals,
+    goal_words,
+)
 from drake_safety.simulation.closed_loop import ClosedLoop, require_ports
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import episode_rng
@@ -24,10 +40,33 @@ TICK_S = 0.04
 """Simulated time per tick [s]."""
 BREAK_S = 0.02
 """Real time between ticks while nothing is simulated [s]."""
-STOP = "Stop"
+STOP, START = "Stop", "Start again"
+THROW, PUSH = "Throw", "Push"
+ASK, GO, FORCE = "Ask", "Go", "Go all the same"
+HALT, GUARD = "Halt", "Guard on/off"
+MASS, SPEED, DIRECTION = "mass [kg]", "speed [m/s]", "towards [deg]"
+"""Sliders of a ball."""
+AXES = ("x [m]", "y [m]", "z [m]")
+"""Sliders of a target."""
+STEPS = (
+    ("Faster", "ArrowUp", 0, 1),
+    ("Slower", "ArrowDown", 0, -1),
+    ("Turn left", "ArrowLeft", 2, 1),
+    ("Turn right", "ArrowRight", 2, -1),
+    ("Left", "KeyA", 1, 1),
+    ("Right", "KeyD", 1, -1),
+)
+"""Name and key of each button that changes a command, the entry of it, and the sign of the step."""
 
 _PORTS = ("safety_probability", "belief", "cause_probability", "predicted_margins")
 _LYING_S = 1.5  # From a fall to the next start.
+_SHOWN_S = 1.5  # From the end of an episode to the next start.
+_FLIGHT_S = 0.2  # From a ball's release to its impact, so that it is visible.
+_NUM_CANDIDATES = 24  # Per batch of the search: few, because the user waits for the answer.
+_SIZE_M = 1.0  # Of a plant without legs, for markers.
+_NUM_STEPS = 8  # Key presses from zero to the farthest command of training.
+_NUM_CHARACTERS = 160  # Of an error.
+_TARGET, _NEAREST = f"{WORLD}/target", f"{WORLD}/nearest_accepted"
 
 
 @dataclass
@@ -49,78 +88,123 @@ class Pace:
         return self.simulated_s / self.busy_s if self.busy_s > 0 else math.nan
 
 
-class LiveSession(ABC):
+class LiveSession:
     """A closed loop with Γ in Meshcat that reacts to the controls of its panel.
 
-    It starts anew when :attr:`START` is clicked. A subclass says how it starts, what its other
-    controls do, and what is shown.
+    What the controls do follows from what the loop can: commands change while a robot walks, it
+    moves to targets that Γ accepts, or balls are thrown at it. Any other task runs episode after
+    episode from random starts: an episode ends 1.5 s after the state left the safe set, or 1.5 s
+    after its duration. A simulation that fails is shown for 1.5 s; then it starts anew.
 
     The loop is built with this Meshcat and with an assessment.
+
+    Attributes:
+        threshold: Lowest probability that is shown as "safe", and of accepted targets.
+        unsafe_below: Probability below which a target is unsafe; in between is "don't know".
+        pace: Simulated and real time.
+        cause: The constraint that was violated first since the start; "" for none.
+        command: The present command, (3,), of a loop that follows commands.
+        is_guarded: Whether a guard replaces commands that are not accepted.
+        verdict, nearest: On the present target, and the nearest accepted one; None if not asked.
     """
 
-    START = "Stand up again"
-    BUTTONS: tuple[tuple[str, str], ...] = ()
-    """Name and key of each button besides Stop and that of the start."""
-    STARTS_AGAIN = True
-    """Whether it also starts anew when a motion is over."""
-
-    def __init__(self, loop: ClosedLoop, meshcat: Meshcat, *, threshold: float, seed: int = 0):
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        meshcat: Meshcat,
+        *,
+        threshold: float,
+        unsafe_below: float | None = None,
+        seed: int = 0,
+    ):
         if loop.assessment is None:
             raise ValueError("live session: the loop was built without an assessment")
         require_ports(loop, _PORTS, "live session: ")
-        self.loop = loop
-        self.assessment = loop.assessment
-        self.meshcat = meshcat
-        self.threshold = threshold
+        self.loop: Any = loop  # What it can do is asked below.
+        self.assessment, self.meshcat = loop.assessment, meshcat
+        self.threshold, self.unsafe_below = threshold, unsafe_below
         self.pace = Pace()
-        self._seed = seed
-        self._num_resets = 0
-        self._end_s = math.inf  # Of the motion; then it starts anew.
+        self.cause = ""
+        self.command = np.zeros(3)
+        self.is_guarded = True
+        self.verdict: GoalVerdict | None = None
+        self.nearest: GoalVerdict | None = None
+        self._goal = np.full(3, np.nan)
+        self._seed, self._num_resets = seed, 0
+        self._end_s = math.inf  # Of the motion.
+        self._num_waits = 0  # Ticks for which a failure is still shown.
         self._said, self._said_until_s = "", -math.inf
-        self._renew_context()
         self._camera = FollowingCamera(loop, meshcat) if isinstance(loop, LeggedLoop) else None
-        self._fall_column = None
-        if isinstance(loop, CanFall):
-            self._fall_column = loop.constraint_names.index(loop.fall_name)
         self.panel = LivePanel(title=loop.scenario.name, threshold=threshold)
-        for name, key in ((STOP, "Escape"), *self.BUTTONS, (self.START, "KeyR")):
-            self.panel.add_button(name, key)
+        self.panel.add_button(STOP, "Escape")
+        self._actions: dict[str, Callable[[], object]] = {}
+        self._is_commanded = isinstance(loop, FollowsCommands)
+        self._has_goals = isinstance(loop, HasGoals) and not self._is_commanded
+        self._has_balls = isinstance(loop, HasBall) and not isinstance(loop, HasGoals)
+        self._runs_episodes = not (self._is_commanded or self._has_goals or self._has_balls)
+        self._fall_column = (
+            loop.constraint_names.index(loop.fall_name) if isinstance(loop, CanFall) else None
+        )
+        if self._is_commanded:
+            for name, key, entry, sign in STEPS:
+                self._add(name, key, partial(self._step, entry, sign))
+            self._add(HALT, "KeyH", partial(self._set_command, np.zeros(3)))
+            self._add(PUSH, "Space", self._push)
+            self._add(GUARD, "KeyG", self._switch_guard)
+        elif self._has_goals:
+            self._add(ASK, "KeyA", partial(self._assess, is_thorough=True))
+            self._add(GO, "Space", partial(self._go, is_forced=False))
+            self._add(FORCE, "", partial(self._go, is_forced=True))
+            self._add_target()
+        elif self._has_balls:
+            self._add(THROW, "Space", self._throw)
+            self.panel.add_slider(MASS, 1.0, 5.0, 0.5, 3.0)
+            self.panel.add_slider(SPEED, 1.0, 11.0, 0.5, 8.0)
+            self.panel.add_slider(DIRECTION, -180.0, 180.0, 15.0, -75.0)
+        elif isinstance(loop, CanBePushed):
+            self._add(PUSH, "Space", self._push)
+        self.panel.add_button(START, "KeyR")
+        with self._shows_failure():
+            self._start()
 
     @property
     def probability(self) -> float:
         """The probability as shown; NaN before the first."""
         return self.panel.probability
 
-    @abstractmethod
-    def _start(self) -> None:
-        """Resets the Context, and calls `_begin`."""
-
-    @abstractmethod
-    def _react(self) -> None:
-        """Reacts to the controls."""
-
-    @abstractmethod
-    def _show_status(self) -> None:
-        """Shows what the robot does."""
+    @property
+    def has_fallen(self) -> bool:
+        """Whether the robot has fallen; False where nothing can fall."""
+        column = self._fall_column
+        return column is not None and bool(self._eval("margins")[column] < 0)
 
     def tick(self) -> bool:
-        """Reacts to the controls, advances by one tick, and shows belief and verdict."""
-        if self.panel.take_click(self.START) or (self.STARTS_AGAIN and self._is_over):
-            self._start()
-        self._react()
-        if self._is_over:
+        """Reacts to the controls, advances by one tick, and shows belief and verdict.
+
+        Returns:
+            Whether it was simulated.
+        """
+        is_asked = self.panel.take_click(START)
+        if self._num_waits > 0 and not is_asked:
+            self._num_waits -= 1
             return False
-        self._simulator.AdvanceTo(self.context.get_time() + TICK_S)
-        probability, belief = self._eval("safety_probability")[0], self._eval("belief")
-        self.panel.show_belief(probability, belief, self.context.get_time())
-        if self._camera is not None:
-            self._camera.follow(self.context)
-        self._show_status()
-        if self.loop.HasOutputPort("alarm") and self._eval("alarm")[0] > 0.5:
-            cause = self.loop.GetOutputPort("alarm_cause").Eval(self.context)
-            note = f"{self.panel.status.note}; monitor: {cause}".removeprefix("; ")
-            self.panel.status = replace(self.panel.status, note=note)
-        return True
+        with self._shows_failure():
+            if is_asked or (self._is_over and not self._has_goals):
+                self._start()
+            self._react()
+            if self._is_over:
+                return False
+            self._simulator.AdvanceTo(self.context.get_time() + TICK_S)
+            probability, belief = self._eval("safety_probability")[0], self._eval("belief")
+            self.panel.show_belief(probability, belief, self.context.get_time())
+            if self._camera is not None:
+                self._camera.follow(self.context)
+            self._show_status()
+            if self.loop.HasOutputPort("alarm") and self._eval("alarm")[0] > 0.5:
+                cause = self.loop.GetOutputPort("alarm_cause").Eval(self.context)
+                note = f"{self.panel.status.note}; monitor: {cause}".removeprefix("; ")
+                self.panel.status = replace(self.panel.status, note=note)
+        return self._num_waits == 0
 
     def run(self, *, is_paced: bool = True) -> None:
         """Ticks, in real time or as fast as possible, until Stop is clicked; the panel says so."""
@@ -145,16 +229,36 @@ class LiveSession(ABC):
         finally:
             self.panel.stop()
 
+    def _add(self, name: str, key: str, action: Callable[[], object]) -> None:
+        self.panel.add_button(name, key)
+        self._actions[name] = action
+
     def _next_rng(self) -> np.random.Generator:
         self._num_resets += 1
         return episode_rng(self._seed, self._num_resets - 1)
 
-    def _renew_context(self) -> None:
-        """Replaces the Context by the default one."""
-        self._simulator = Simulator(self.loop)
+    def _start(self) -> None:
+        """Resets the robot, with a Context of default values."""
+        loop, end_s = self.loop, math.inf
+        self._simulator = Simulator(loop)
         self.context = self._simulator.get_mutable_context()
+        self.cause, self._num_waits = "", 0
+        if self._is_commanded:
+            self.command = np.zeros(3)
+            loop.reset_standing(self.context, self.command, self._next_rng())
+            loop.set_guarded(self.context, self.is_guarded)
+        elif self._has_goals:
+            # Shows the posture only; no motion begins.
+            loop.reset_standing(self.context, loop.target_box.mean(axis=0))
+            end_s, self._goal = -math.inf, np.full(3, np.nan)
+        elif self._has_balls:
+            loop.reset_calm(self.context, self._next_rng())
+        else:
+            loop.reset(self.context, self._next_rng())
+            end_s = loop.scenario.episode_duration_s + _SHOWN_S
+        self._begin(end_s)
 
-    def _begin(self, end_s: float = math.inf) -> None:
+    def _begin(self, end_s: float) -> None:
         """Initializes the simulator after a reset, and redraws."""
         self._end_s, self._said_until_s = end_s, -math.inf
         self._simulator.Initialize()
@@ -166,22 +270,85 @@ class LiveSession(ABC):
     def _is_over(self) -> bool:
         return self.context.get_time() >= self._end_s - 1e-9
 
-    def _show_by_probability(self, note: str, doing: str = "") -> None:
+    def _react(self) -> None:
+        """Does what was clicked, and assesses a target that was moved."""
+        for name, action in self._actions.items():
+            if self.panel.take_click(name):
+                action()
+        if self._has_goals and not np.array_equal(self._slid_goal(), self._goal):
+            self._assess(is_thorough=False)
+
+    @contextlib.contextmanager
+    def _shows_failure(self) -> Iterator[None]:
+        """Shows why a simulation failed, and lets the next one begin a while later."""
+        try:
+            yield
+        except RuntimeError as error:
+            # Drake's solvers raise it, and so does a task whose simulation diverges.
+            note = textwrap.shorten(str(error), _NUM_CHARACTERS)
+            self.panel.show("the simulation failed", note=note, tone="unsafe")
+            self._num_waits = round(_SHOWN_S / BREAK_S)
+            self._end_s = -math.inf
+
+    def _show_status(self) -> None:
+        loop, now_s, margins = self.loop, self.context.get_time(), self._eval("margins")
+        if not np.isfinite(margins).all():
+            raise DivergenceError(f"a margin is not finite at {now_s:.2f} s")
+        violated = loop.constraint_names[int(np.argmin(margins))] if margins.min() < 0 else ""
+        if violated and not self.cause:
+            self.cause = violated
+            if self._runs_episodes:
+                self._end_s = now_s + _SHOWN_S
+        note = self._note()
+        if self.has_fallen:
+            self._end_s = min(self._end_s, now_s + _LYING_S)
+            self.panel.show("fallen", note=note, tone="unsafe")
+        elif self._is_on("recovery_active"):
+            self.panel.show("recovering", cause=self._cause(), note=note, tone="recovery")
+        elif left := (self.cause if self._runs_episodes else violated):
+            name = left.replace("_", " ")
+            self.panel.show(f"left the safe set: {name}", note=note, tone="unsafe")
+        elif self._has_goals:
+            self._show_way(note)
+        elif self._is_on("guard_active") and self.is_guarded:
+            passed = goal_words(loop).value(np.round(self._eval("desired_output"), 2))
+            told = f"{passed}; asked: {note}"
+            self.panel.show("guard: another command", note=told, tone="recovery")
+        else:
+            self._show_by_probability(note)
+
+    def _note(self) -> str:
+        """What was said last, or what a key does."""
+        if self.context.get_time() < self._said_until_s:
+            note = self._said
+        elif self._is_commanded:
+            note = goal_words(self.loop).value(self.command)
+        elif self._has_goals:
+            note = "R stands it up again"
+        elif self._has_balls:
+            note = "Space throws a ball"
+        elif self.cause:
+            note = "the next start follows"
+        elif self.context.get_time() >= (duration_s := self.loop.scenario.episode_duration_s):
+            note = f"the episode's {duration_s:g} s have passed; the next start follows"
+        else:
+            note = "R starts anew"
+        return note if self.is_guarded else f"{note}; guard off"
+
+    def _say(self, note: str, seconds: float) -> None:
+        self._said, self._said_until_s = note, self.context.get_time() + seconds
+
+    def _show_by_probability(self, note: str) -> None:
         """Shows "safe", "unsafe" or "don't know", and what the robot does."""
-        doing = f": {doing}" if doing else ""
+        doing = ": balancing" if self._has_balls else ""
+        if self._is_commanded:
+            doing = ": walking" if self.command.any() else ": standing"
         if self.probability >= self.threshold:
             self.panel.show(f"safe{doing}", note=note, tone="safe")
         elif is_unknown(self._eval("belief"), self.assessment.parameters.initial_uncertainty):
             self.panel.show(f"don't know{doing}", note=note)
         else:
             self.panel.show(f"unsafe{doing}", cause=self._cause(), note=note, tone="unsafe")
-
-    def _say(self, note: str, seconds: float) -> None:
-        """Has `_note` return this for a while."""
-        self._said, self._said_until_s = note, self.context.get_time() + seconds
-
-    def _note(self, otherwise: str) -> str:
-        return self._said if self.context.get_time() < self._said_until_s else otherwise
 
     def _cause(self) -> str:
         """The constraint that is most likely to be violated; "" for none."""
@@ -195,23 +362,104 @@ class LiveSession(ABC):
     def _eval(self, port: str) -> np.ndarray:
         return self.loop.GetOutputPort(port).Eval(self.context)
 
-    def _push(self, pushed: CanBePushed) -> None:
+    def _is_on(self, port: str) -> bool:
+        return self.loop.HasOutputPort(port) and self._eval(port)[0] > 0
+
+    def _push(self) -> None:
         """Begins a random push."""
-        push = pushed.sample_push(self._next_rng())
+        push = self.loop.sample_push(self._next_rng())
         start_s = self.context.get_time() + 0.5 * TICK_S
-        pushed.set_push(self.context, replace(push, time_s=start_s))
+        self.loop.set_push(self.context, replace(push, time_s=start_s))
         self._say(f"pushed with {push.strength_n:.0f} N for {push.duration_s:g} s", 2.0)
 
-    @property
-    def has_fallen(self) -> bool:
-        """Whether the robot has fallen; False where nothing can fall."""
-        column = self._fall_column
-        return column is not None and bool(self._eval("margins")[column] < 0)
+    def _throw(self) -> None:
+        mass, speed, direction = map(self.panel.value, (MASS, SPEED, DIRECTION))
+        throw = Throw(mass_kg=mass, speed_m_s=speed, direction_rad=math.radians(direction))
+        try:
+            self.loop.throw_ball(self.context, throw, _FLIGHT_S)
+            self._say(f"ball of {mass:g} kg at {speed:g} m/s towards {direction:g}°", 3.0)
+        except ValueError:  # The robot has fallen, or the ball's path misses its base.
+            self._say("this ball would miss the robot", 3.0)
 
-    def _show_fall(self, note: str) -> bool:
-        """Shows that the robot has fallen, if it has, and ends the motion a while later."""
-        if not self.has_fallen:
-            return False
-        self._end_s = min(self._end_s, self.context.get_time() + _LYING_S)
-        self.panel.show("fallen", note=note, tone="unsafe")
-        return True
+    def _step(self, entry: int, sign: int) -> None:
+        box = self.loop.target_box
+        command = self.command.copy()
+        command[entry] += sign * np.abs(box).max(axis=0)[entry] / _NUM_STEPS
+        self._set_command(np.clip(command, *box))
+
+    def _set_command(self, command: np.ndarray) -> None:
+        if not np.array_equal(command, self.command):
+            self.command = command
+            self.loop.set_command(self.context, command)
+
+    def _switch_guard(self) -> None:
+        self.is_guarded = not self.is_guarded
+        self.loop.set_guarded(self.context, self.is_guarded)
+
+    def _add_target(self) -> None:
+        """Adds sliders and markers of a target."""
+        box = self.loop.target_box
+        start = next(iter(self.loop.named_targets.values()), box.mean(axis=0))
+        for name, low, high, value in zip(AXES, *box.tolist(), start, strict=True):
+            self.panel.add_slider(name, low, high, 0.01, value)
+        radius_m = 0.03 * (self._camera.size_m if self._camera else _SIZE_M)
+        self.meshcat.SetObject(_TARGET, Sphere(radius_m), Rgba(*COLOURS["plain"], 0.8))
+        self.meshcat.SetObject(_NEAREST, Sphere(radius_m), Rgba(*COLOURS["safe"], 0.8))
+
+    def _slid_goal(self) -> np.ndarray:
+        return np.array([self.panel.value(name) for name in AXES])
+
+    def _go(self, *, is_forced: bool) -> None:
+        """Starts the motion to a target that is accepted, or forced."""
+        verdict = self._assess(is_thorough=not is_forced)
+        if verdict.is_accepted or is_forced:
+            self.loop.reset_standing(self.context, verdict.goal, self._next_rng())
+            self._begin(self.loop.scenario.episode_duration_s + 1.0)
+
+    def _assess(self, *, is_thorough: bool) -> GoalVerdict:
+        """Assesses and shows the target; thoroughly also the nearest one that is accepted."""
+        self._goal = goal = self._slid_goal()
+        self.meshcat.SetTransform(_TARGET, RigidTransform(goal))
+        self.meshcat.SetProperty(_NEAREST, "visible", False)
+        asked = (self.loop, self.assessment, goal)
+        self.verdict = verdict = assess_goal(
+            *asked, threshold=self.threshold, unsafe_below=self.unsafe_below
+        )
+        self.nearest = None
+        if is_thorough and not verdict.is_accepted:
+            self.nearest = nearest_accepted_goal(
+                *asked,
+                threshold=self.threshold,
+                rng=np.random.default_rng(self._seed),
+                num_candidates=_NUM_CANDIDATES,
+            )
+        self.panel.show_belief(verdict.probability, verdict.belief)
+        self._show_verdict(verdict, is_thorough=is_thorough)
+        return verdict
+
+    def _show_verdict(self, verdict: GoalVerdict, *, is_thorough: bool) -> None:
+        told = f"probability {verdict.probability:.2f}"
+        if verdict.is_accepted:
+            self.panel.show(f"accepted: {told}", note="Space goes there", tone="safe")
+            return
+        if verdict.reason:
+            told = "don't know"
+        cause = describe_margin(verdict.cause, verdict.cause_margin, self.loop.angular_constraints)
+        notes = [] if cause else [verdict.reason]
+        if self.nearest is not None:
+            distance_m = float(np.linalg.norm(self.nearest.goal - verdict.goal))
+            notes.append(f"accepted {100 * distance_m:.0f} cm away")
+            self.meshcat.SetTransform(_NEAREST, RigidTransform(self.nearest.goal))
+            self.meshcat.SetProperty(_NEAREST, "visible", True)
+        elif is_thorough:
+            notes.append("nothing near is accepted")
+        note = "; ".join(filter(None, notes))
+        self.panel.show(f"refused: {told}", cause=cause, note=note, tone="unsafe")
+
+    def _show_way(self, note: str) -> None:
+        if self._is_over:
+            miss_m = float(np.linalg.norm(self._eval("output") - self._goal))
+            self.panel.show("there", note=f"{100 * miss_m:.1f} cm off", tone="recovery")
+        else:
+            note = f"the {self.loop.hand} hand reaches"
+            self.panel.show("on the way", note=note, tone="safe")

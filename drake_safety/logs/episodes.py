@@ -16,10 +16,9 @@ from drake_safety.learning.seeds import NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.logs.conversion import values_at
 from drake_safety.logs.robot_log import RobotLog
-from drake_safety.simulation.closed_loop import RECORDED_PORTS
-from drake_safety.simulation.episode_recorder import Recorder
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
+from drake_safety.simulation.motion import Recorder
 from drake_safety.simulation.rollouts import MOTION_PIECE_S, episodes_info
 from drake_safety.simulation.scenario import Scenario
 
@@ -246,7 +245,7 @@ def _episode(
     if is_out.any():
         end_s = ticks[int(np.argmax(is_out))]
         times = np.append(times[times < end_s - _ROUNDING_S], end_s)
-    recorder = Recorder(loop, RECORDED_PORTS)
+    recorder = Recorder(loop)
     context.SetTime(0.0)
     for time_s, state in zip(times, log.states_at(begin_s + times), strict=True):
         # What the robot was commanded is not logged: the loop's own controller says it.

@@ -19,9 +19,7 @@ if TYPE_CHECKING:
     from drake_safety.simulation.episode_start import StatePlane
     from drake_safety.simulation.finding import Finding
 
-RECORDED_PORTS = RECORDED
-"""Output ports recorded in episodes."""
-REQUIRED_PORTS = (*RECORDED_PORTS, "safe")
+REQUIRED_PORTS = (*RECORDED, "safe")
 """Output ports of every task."""
 ASSESSMENT_PORTS = ("safety_probability", "belief")
 """Further output ports of a task with an assessment."""

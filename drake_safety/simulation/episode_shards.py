@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drake_safety.extras import require_extra
-from drake_safety.learning.segments import DIVERGED, Episode, EpisodesInfo
-from drake_safety.simulation.episode_recorder import LARGEST
+from drake_safety.learning.segments import DIVERGED, LARGEST, Episode, EpisodesInfo
 
 if TYPE_CHECKING:
     import pyarrow as pa

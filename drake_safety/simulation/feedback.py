@@ -22,7 +22,7 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import episodes_info, run_episode, run_episodes, worker_loop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.worker_processes import Progress, run_batches
+from drake_safety.simulation.worker_processes import Progress, map_items
 from drake_safety.systems.feedback_recorder import FeedbackRecorder, RecordedWindow
 
 _TWINS = "nominal"
@@ -150,11 +150,11 @@ def run_twins(
     Raises:
         ValueError: The task cannot begin with a given start.
     """
-    # pydrake never frees a system in Python: one loop serves every call.
-    info = episodes_info(worker_loop(scenario, _TWINS, {}), seed)
-    twins = run_batches(
-        partial(_twin_batch, scenario, seed),
-        list(windows),
+    make = worker_loop(scenario, _TWINS)
+    info = episodes_info(make(), seed)
+    twins = map_items(
+        partial(make.run, _twin, seed=seed),
+        windows,
         num_workers=num_workers,
         progress=progress,
         stage="nominal twins",
@@ -170,7 +170,7 @@ def pair_starts(
     seed: int = ADAPTATION.first,
 ) -> EpisodePairs:
     """Simulates the nominal twins of episodes with known starts, in this process."""
-    loop = worker_loop(scenario, _TWINS, {})
+    loop = worker_loop(scenario, _TWINS)()
     twins = [
         run_episode(loop, episode.index, seed=seed, start=start)
         for episode, start in zip(actual, starts, strict=True)
@@ -182,12 +182,8 @@ def pair_starts(
     )
 
 
-def _twin_batch(scenario: Scenario, seed: int, windows: list[RecordedWindow]) -> list[Episode]:
-    loop = worker_loop(scenario, _TWINS, {})
-    return [
-        run_episode(loop, window.episode.index, seed=seed, start=window_start(loop, window))
-        for window in windows
-    ]
+def _twin(loop: ClosedLoop, window: RecordedWindow, *, seed: int) -> Episode:
+    return run_episode(loop, window.episode.index, seed=seed, start=window_start(loop, window))
 
 
 def feedback_of_windows(

@@ -10,7 +10,6 @@ from os import PathLike
 from typing import Any
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram
 
 from drake_safety.learning.segments import (
@@ -22,9 +21,9 @@ from drake_safety.learning.segments import (
 )
 from drake_safety.simulation.contract import REQUIRED_PORTS
 from drake_safety.simulation.dataset import is_same
-from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
+from drake_safety.simulation.motion import simulate
 from drake_safety.simulation.rollouts import collect_episodes, episode_rng
-from drake_safety.simulation.worker_processes import Progress, Sent
+from drake_safety.simulation.worker_processes import MadeOnce, Progress, Sent
 
 _OPTIONAL_PORTS = ("true_state", "desired_output", "features", "safe")
 
@@ -110,17 +109,16 @@ def record_episodes(
     period_s = step_s / 10 if monitor_period_s is None else monitor_period_s
     if not period_s > 0:
         raise ValueError(f"record_episodes: monitor_period_s must be positive; got {period_s}")
-    timing = EpisodeTiming(
-        step_s=step_s, num_steps=round(duration_s / step_s), monitor_period_s=period_s
-    )
-    make, reset = Sent(partial(make_diagram, **dict(parameters or {}))), Sent(reset)
+    num_steps = round(duration_s / step_s)
     # The diagram is built anew for each call: a function does not tell whether its result changed.
-    run = uuid.uuid4().hex
-    used, sizes = _used_ports(_worker_diagram(make, run), dict(ports or {}))
-    identity = (name, timing, used, sorted((parameters or {}).items()))
+    key = uuid.uuid4().hex
+    make = MadeOnce(key, Sent(partial(make_diagram, **dict(parameters or {}))))
+    used, sizes = _used_ports(make(), dict(ports or {}))
+    times = f"EpisodeTiming({step_s=}, {num_steps=}, monitor_period_s={period_s!r})"
+    identity = f"({name!r}, {times}, {used}, {sorted((parameters or {}).items())})"
     info = EpisodesInfo(
         scenario=name,
-        scenario_hash=hashlib.sha256(repr(identity).encode()).hexdigest(),
+        scenario_hash=hashlib.sha256(identity.encode()).hexdigest(),
         variation="nominal",
         seed=seed,
         step_s=step_s,
@@ -130,55 +128,59 @@ def record_episodes(
         feature_names=_names("feature", feature_names, sizes.get("features", 0)),
         constraint_names=_names("constraint", constraint_names, sizes["margins"]),
         versions=installed_versions("drake", "numpy"),
-        num_steps=timing.num_steps,
+        num_steps=num_steps,
     )
     return collect_episodes(
         info,
         num_episodes,
-        partial(_record_batch, run, make, reset, used, timing, info),
+        partial(make.run, _record, Sent(reset), used, period_s, info),
         num_workers=num_workers,
         path=path,
         progress=progress,
     )
 
 
-def _record_batch(
-    run: str,
-    make: Callable[[], Diagram],
+def _record(
+    diagram: Diagram,
     reset: Reset,
     ports: dict[str, str],
-    timing: EpisodeTiming,
+    watch_period_s: float,
     info: EpisodesInfo,
-    indices: list[int],
-) -> list[Episode]:
-    diagram = _worker_diagram(make, run)
+    index: int,
+) -> Episode:
+    who = f"episode {index} of '{info.scenario}' (seed {info.seed})"
 
-    def record(index: int) -> Episode:
-        who = f"episode {index} of '{info.scenario}' (seed {info.seed})"
-        simulator = Simulator(diagram)
+    def start(context: Context) -> int | None:
         try:
-            rng = episode_rng(info.seed, index)
-            first_step = reset(diagram, simulator.get_mutable_context(), rng)
+            return reset(diagram, context, episode_rng(info.seed, index))
         except Exception as error:
             raise EpisodeError(f"{who}, reset: {type(error).__name__}: {error}") from error
-        return record_episode(
-            simulator,
-            ports,
-            timing,
-            constraint_names=info.constraint_names,
-            who=who,
-            index=index,
-            first_step=first_step or 0,
-        )
 
-    episodes = [record(index) for index in indices]
-    if indices[0] == 0 and not is_same(episodes[0], record(0)):
+    def episode() -> Episode:
+        return simulate(
+            diagram,
+            start,
+            {name: port for name, port in ports.items() if name != "safe"},
+            duration_s=info.num_steps * info.step_s,
+            step_s=info.step_s,
+            watch_period_s=watch_period_s,
+            after_leaving_s=0.0,
+            margins=ports["margins"],
+            safe=ports.get("safe"),
+            constraint_names=info.constraint_names,
+            may_fail=True,
+            index=index,
+            who=who,
+        ).episode()
+
+    found = episode()
+    if index == 0 and not is_same(found, episode()):
         raise ValueError(
             f"record_episodes: episode 0 of '{info.scenario}', simulated a second time, differs: "
             "the diagram, or its reset, keeps state outside its Context, such as in an attribute "
             "of a system; declare it as state"
         )
-    return episodes
+    return found
 
 
 def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str], dict[str, int]]:
@@ -230,14 +232,3 @@ def _names(what: str, given: Sequence[str] | None, size: int) -> list[str]:
             f"record_episodes: {what}_names has {len(given)} names, the port has {size} entries"
         )
     return list(given)
-
-
-_DIAGRAMS: dict[str, Diagram] = {}
-
-
-def _worker_diagram(make: Callable[[], Diagram], run: str) -> Diagram:
-    """The diagram of a worker process, built once for each call of :func:`record_episodes`."""
-    if run not in _DIAGRAMS:
-        _DIAGRAMS.clear()
-        _DIAGRAMS[run] = make()
-    return _DIAGRAMS[run]

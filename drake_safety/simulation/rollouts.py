@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
@@ -14,34 +14,47 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
 
 from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
 from drake_safety.learning.seeds import MOTION
 from drake_safety.learning.segments import (
     DIVERGED,
+    RECORDED,
     Episode,
     Episodes,
     EpisodesInfo,
     installed_versions,
 )
+from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import (
+    CanBePushed,
     CanStartAnywhere,
     HasGoals,
     MovesUndisturbed,
     OffersPlans,
     require,
 )
-from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop
+from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, is_same, load_episodes
-from drake_safety.simulation.episode_recorder import EpisodeTiming, record_episode
 from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.motion import Motion, simulate
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.worker_processes import BATCH_SIZE, Progress, run_batches
+from drake_safety.simulation.worker_processes import BATCH_SIZE, MadeOnce, Progress, map_items
 
 MOTION_PIECE_S = 60.0
 """Duration of one undisturbed motion [s]."""
 _LOGGER = logging.getLogger("drake_safety")
+
+
+def worker_loop(
+    scenario: Scenario, variation: str = "nominal", **options: Any
+) -> MadeOnce[ClosedLoop]:
+    """Makes the loop of a process, once per scenario, variation, options and robot."""
+    # The hash covers the robot's files, and the text what the hash leaves out, such as a threshold.
+    hash_ = scenario.simulation_hash(variation)
+    key = (hash_, scenario.to_yaml(), variation, repr(sorted(options.items())))
+    return MadeOnce(key, partial(scenario.make_loop, variation, **options))
 
 
 def episode_rng(seed: int, index: int) -> np.random.Generator:
@@ -111,38 +124,65 @@ def run_episode(
     if is_standing and goal is None:
         raise ValueError("run_episode: an episode from the standing posture requires a goal")
     scenario = loop.scenario
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.remove_visuals(context)
-    rng = episode_rng(seed, index)
-    first_step = 0
-    if start is not None:
-        require(loop, CanStartAnywhere).reset_to(context, rng, start)
-    elif goal is None:
-        first_step = loop.reset(context, rng)
-    elif is_standing:
-        require(loop, HasGoals).reset_standing(context, goal, rng)
-    else:
-        first_step = require(loop, HasGoals).reset(context, rng, goal)
-    if plan is not None:
-        require(loop, OffersPlans).set_plan(context, plan)
-    episode = record_episode(
-        simulator,
-        {name: name for name in REQUIRED_PORTS},
-        EpisodeTiming(
-            step_s=scenario.step_s,
-            num_steps=scenario.num_steps,
-            monitor_period_s=loop.monitor_period_s,
-        ),
-        constraint_names=loop.constraint_names,
-        who=f"episode {index} of '{scenario.name}' (seed {seed})",
+
+    def begin(context: Context) -> int:
+        rng, first_step = episode_rng(seed, index), 0
+        if start is not None:
+            require(loop, CanStartAnywhere).reset_to(context, rng, start)
+        elif goal is None:
+            first_step = loop.reset(context, rng)
+        elif is_standing:
+            require(loop, HasGoals).reset_standing(context, goal, rng)
+        else:
+            first_step = require(loop, HasGoals).reset(context, rng, goal)
+        if plan is not None:
+            require(loop, OffersPlans).set_plan(context, plan)
+        return first_step
+
+    counted = filter(loop.HasOutputPort, ["num_controller_failures"])
+    return simulate(
+        loop,
+        begin,
+        (*RECORDED, *counted),
+        duration_s=scenario.episode_duration_s,
+        step_s=scenario.step_s,
+        watch_period_s=loop.monitor_period_s,
+        after_leaving_s=0.0,
+        may_fail=True,
         index=index,
-        first_step=first_step,
-    )
-    if loop.HasOutputPort("num_controller_failures"):
-        num_failures = loop.GetOutputPort("num_controller_failures").Eval(context)[0]
-        episode.num_controller_failures = int(num_failures)
-    return episode
+        who=f"episode {index} of '{scenario.name}' (seed {seed})",
+    ).episode()
+
+
+def run_to_goal(
+    loop: ClosedLoop,
+    goal: np.ndarray,
+    *,
+    push: Push | None = None,
+    seed: int = 0,
+    ports: Iterable[str] = (),
+    **options: Any,
+) -> Motion:
+    """Simulates the motion from the standing posture to a goal, safe or not, until it falls.
+
+    Args:
+        goal: In the world, (3,) [m].
+        ports: Ports to log besides ``output``, ``margins`` and ``plant_state``.
+        **options: Those of :func:`~drake_safety.simulation.motion.simulate`, as ``duration_s``.
+
+    Raises:
+        ValueError: The task's plans have no goal, its robot cannot be pushed, or has no such body.
+        EpisodeError: A system of the loop raised an error, or the simulation failed.
+    """
+
+    def begin(context: Context) -> None:
+        require(loop, HasGoals).reset_standing(context, goal, episode_rng(seed, 0))
+        if push is not None:
+            require(loop, CanBePushed).set_push(context, push)
+
+    motion = simulate(loop, begin, ("output", "margins", "plant_state", *ports), **options)
+    motion.push_time_s = math.inf if push is None else push.time_s
+    return motion
 
 
 def inputs_at(loop: ClosedLoop, start: EpisodeStart) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -193,14 +233,15 @@ def run_motions(
         ValueError: The folder holds another set or one that is not the same any more.
         EpisodeError: A system of the loop raised an error, which is its cause.
     """
-    loop = worker_loop(scenario, variation, loop_options)
+    make = worker_loop(scenario, variation, **loop_options)
+    loop = make()
     piece_s = min(_piece_s(loop), until_s)
     info = episodes_info(loop, seed, {**loop_options, "undisturbed_s": piece_s})
     step_s = scenario.monitor_step_s
     return collect_episodes(
         replace(info, step_s=step_s, num_steps=round(piece_s / step_s)),
         math.ceil(duration_s / piece_s - 1e-6),
-        partial(motion_batch, scenario, variation, loop_options, seed, until_s=until_s),
+        partial(make.run, run_motion, seed=seed, until_s=until_s),
         num_workers=num_workers,
         path=path,
         progress=progress,
@@ -221,63 +262,40 @@ def run_motion(
     seed: int = MOTION.first,
     until_s: float = math.inf,
     with_features: bool = False,
+    start: Callable[[Context], None] | None = None,
 ) -> Episode:
     """Simulates one undisturbed motion; see `run_motions`.
 
     Args:
+        start: Sets state and plan of the root Context, in place of random ones.
         until_s: Time at which it ends, if not sooner [s].
         with_features: Whether to record features that the monitor does not read, too.
     """
     scenario, piece_s = loop.scenario, _piece_s(loop)
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.remove_visuals(context)
-    rng = episode_rng(seed, index)
-    first_step = 0
-    if isinstance(loop, MovesUndisturbed):
-        loop.reset_undisturbed(context, rng, piece_s)
-    else:
-        first_step = math.ceil(loop.reset(context, rng) * scenario.step_s / scenario.monitor_step_s)
-    return record_motion(
-        simulator,
-        min(piece_s, until_s),
-        who=f"motion {index} of '{scenario.name}' (seed {seed})",
-        index=index,
-        first_step=first_step,
-        with_features=with_features,
-    )
+    step_s = scenario.monitor_step_s
 
+    def begin(context: Context) -> int | None:
+        if start is not None:
+            return start(context)
+        rng = episode_rng(seed, index)
+        if isinstance(loop, MovesUndisturbed):
+            return loop.reset_undisturbed(context, rng, piece_s)
+        return math.ceil(loop.reset(context, rng) * scenario.step_s / step_s)
 
-def record_motion(
-    simulator: Simulator,
-    duration_s: float,
-    *,
-    who: str,
-    index: int = 0,
-    first_step: int = 0,
-    with_features: bool = False,
-) -> Episode:
-    """Simulates a loop from its state at time 0, with the rows of `run_motion`."""
-    loop = simulator.get_system()
-    step_s = loop.scenario.monitor_step_s
     # Features may cost more than the simulation.
     left_out = "features" if loop.monitored_features == [] and not with_features else ""
-    motion = record_episode(
-        simulator,
-        {name: name for name in REQUIRED_PORTS if name != left_out},
-        EpisodeTiming(
-            step_s=step_s,
-            num_steps=round(duration_s / step_s),
-            monitor_period_s=loop.monitor_period_s,
-        ),
-        constraint_names=loop.constraint_names,
-        who=who,
+    return simulate(
+        loop,
+        begin,
+        [name for name in RECORDED if name != left_out],
+        duration_s=min(piece_s, until_s),
+        step_s=step_s,
+        watch_period_s=loop.monitor_period_s,
+        after_leaving_s=0.0,
+        may_fail=True,
         index=index,
-        first_step=first_step,
-    )
-    if left_out:
-        motion.features = np.zeros((len(motion.time_s), len(loop.feature_names)))
-    return motion
+        who=f"motion {index} of '{scenario.name}' (seed {seed})",
+    ).episode(len(loop.feature_names))
 
 
 def run_episodes(
@@ -317,13 +335,15 @@ def run_episodes(
     if path is not None and goals is not None:
         # The hash of a folder's set does not cover goals.
         raise ValueError("run_episodes: episodes with goals are not kept; leave out 'path'")
-    loop = worker_loop(scenario, variation, loop_options)
+    make = worker_loop(scenario, variation, **loop_options)
+    run = partial(make.run, run_episode, seed=seed, is_standing=is_standing)
     if goals is not None:
-        goals = _checked_goals(loop, goals, num_episodes)
+        goals = _checked_goals(make(), goals, num_episodes)
+        run = partial(make.run, _run_to_own_goal, goals, seed=seed, is_standing=is_standing)
     return collect_episodes(
-        episodes_info(loop, seed, loop_options),
+        episodes_info(make(), seed, loop_options),
         num_episodes,
-        partial(_episode_batch, scenario, variation, loop_options, seed, goals, is_standing),
+        run,
         num_workers=num_workers,
         path=path,
         progress=progress,
@@ -331,10 +351,14 @@ def run_episodes(
     )
 
 
+def _run_to_own_goal(loop: ClosedLoop, goals: np.ndarray, index: int, **options: Any) -> Episode:
+    return run_episode(loop, index, goal=goals[index], **options)
+
+
 def collect_episodes(
     info: EpisodesInfo,
     num_episodes: int,
-    simulate: Callable[[list[int]], list[Episode]],
+    run: Callable[[int], Episode],
     *,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
@@ -344,20 +368,20 @@ def collect_episodes(
 ) -> Episodes:
     """Simulates the episodes of a set that a folder does not hold yet, in worker processes.
 
-    ``simulate`` returns the episodes of some indices; for the rest see :func:`run_episodes`.
+    ``run`` returns the episode of an index; for the rest see :func:`run_episodes`.
     """
     with nullcontext() if path is None else EpisodeWriter(path, info, extra) as writer:
         episodes: list[Episode] = []
         if writer is not None:
             episodes += (e for e in load_episodes(writer.path) if e.index < num_episodes)
             if episodes:
-                _check_kept(writer.path, episodes, simulate)
+                _check_kept(writer.path, episodes, run)
                 _LOGGER.warning(
                     "%d of %d episodes are kept from %s", len(episodes), num_episodes, path
                 )
         kept = {episode.index for episode in episodes}
-        results = run_batches(
-            simulate,
+        results = map_items(
+            run,
             [index for index in range(num_episodes) if index not in kept],
             num_workers=num_workers,
             progress=progress,
@@ -383,13 +407,11 @@ def collect_episodes(
     return collected
 
 
-def _check_kept(
-    path: Path, kept: list[Episode], simulate: Callable[[list[int]], list[Episode]]
-) -> None:
+def _check_kept(path: Path, kept: list[Episode], run: Callable[[int], Episode]) -> None:
     """Simulates one episode again, a long unsafe one if there is one."""
     one = min(kept, key=lambda episode: (episode.is_safe, -episode.num_steps, episode.index))
     with ONE_BLAS_THREAD:
-        (again,) = simulate([one.index])
+        again = run(one.index)
     if not is_same(one, again):
         raise ValueError(
             f"{path} holds {len(kept)} episodes of this set that are not the same any more: "
@@ -412,57 +434,3 @@ def _checked_goals(loop: ClosedLoop, goals: np.ndarray, num_episodes: int) -> np
         first = int(np.argmin(is_finite))
         raise ValueError(f"run_episodes: goals must be finite; goal {first} is {goals[first]}")
     return goals
-
-
-_LOOPS: dict[tuple, ClosedLoop] = {}
-
-
-def worker_loop(scenario: Scenario, variation: str, options: dict[str, Any]) -> ClosedLoop:
-    """The loop of this process, built once per scenario, variation, options and robot.
-
-    pydrake never frees a system in Python, so a loop built for every call would cost 2.4 MB each.
-
-    The key has the hash, which covers the robot's files, and the scenario's text, which covers
-    what the hash leaves out, such as a threshold.
-    """
-    hash_ = scenario.simulation_hash(variation)
-    key = (hash_, scenario.to_yaml(), variation, repr(sorted(options.items())))
-    if key not in _LOOPS:
-        _LOOPS.clear()
-        _LOOPS[key] = scenario.make_loop(variation, **options)
-    return _LOOPS[key]
-
-
-def motion_batch(
-    scenario: Scenario,
-    variation: str,
-    options: dict[str, Any],
-    seed: int,
-    indices: list[int],
-    **limits: Any,
-) -> list[Episode]:
-    """Simulates undisturbed motions in this process; for `limits` see `run_motion`."""
-    loop = worker_loop(scenario, variation, options)
-    return [run_motion(loop, index, seed=seed, **limits) for index in indices]
-
-
-def _episode_batch(
-    scenario: Scenario,
-    variation: str,
-    options: dict[str, Any],
-    seed: int,
-    goals: np.ndarray | None,
-    is_standing: bool,
-    indices: list[int],
-) -> list[Episode]:
-    loop = worker_loop(scenario, variation, options)
-    return [
-        run_episode(
-            loop,
-            index,
-            seed=seed,
-            goal=None if goals is None else goals[index],
-            is_standing=is_standing,
-        )
-        for index in indices
-    ]

@@ -8,74 +8,33 @@ again, from the same seed, with the trigger at the time found.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
 from drake_safety.plants.balls import Throw
-from drake_safety.simulation.capabilities import CanFall, HasBall, require
+from drake_safety.simulation.capabilities import HasBall, require
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.episode_recorder import Recorder, advance_to
-from drake_safety.simulation.goal_motion import Mishap
 from drake_safety.simulation.legged_loop import LeggedLoop
+from drake_safety.simulation.motion import Motion, simulate
 from drake_safety.simulation.rollouts import episode_rng, worker_loop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.worker_processes import Progress, run_batches
+from drake_safety.simulation.worker_processes import Progress, map_items
 
+VIOLATIONS = ("legs_collide", "joint_position", "joint_velocity", "joint_effort")
+"""Physically implausible states; see :class:`Violations`."""
 _FLIGHT_S = 0.1  # From the ball's release to its impact.
 _EARLIEST_S, _LATEST_S = 0.4, 1.2  # Impact of a random ball.
 _AFTER_S = 2.5  # From the first impact to the end.
 _PORTS = ("state", "desired_preview", "features", "margins", "plant_state")
 
 
-@dataclass(kw_only=True, eq=False)
-class ThrowLog(Mishap):
-    """Log of one throw, with a row every ``log_period_s``.
-
-    Attributes:
-        throw: Mass, speed, direction; ``throw.time_s`` is the time of impact [s].
-        time_s: [s], (N,).
-        state: (N, n_s), the assessor's input.
-        desired_preview: (N, H n_z).
-        features: (N, n_f).
-        margins: (N, n_c), of the true state.
-        plant_state: (N, n_q + n_v) of the robot alone.
-        trigger_time_s: Time at which recovery was triggered [s]; NaN if it was not.
-        recovery_active: (N,), whether recovery was active.
-        violations: Number of rows with each violation: see :class:`ViolationCounter`.
-        extra: Other ports, (N, size) each.
-    """
-
-    index: int
-    throw: Throw
-    time_s: np.ndarray
-    state: np.ndarray
-    desired_preview: np.ndarray
-    features: np.ndarray
-    margins: np.ndarray
-    plant_state: np.ndarray
-    trigger_time_s: float
-    recovery_active: np.ndarray
-    violations: dict[str, int] = field(default_factory=dict)
-    extra: dict[str, np.ndarray] = field(default_factory=dict)
-
-    @property
-    def recovery_intervals_s(self) -> list[tuple[float, float]]:
-        """First and last time of each recovery [s]; one still active at the end ends there."""
-        is_first = np.diff(self.recovery_active, prepend=0.0) > 0
-        is_last = np.diff(self.recovery_active, append=0.0) < 0
-        starts, ends = self.time_s[is_first].tolist(), self.time_s[is_last].tolist()
-        return list(zip(starts, ends, strict=True))
-
-
-class ViolationCounter:
-    """Counts the rows of a log with physically implausible states, which invalidate a success.
+class Violations:
+    """Tells which of `VIOLATIONS` a state has: it is implausible, which invalidates a success.
 
     - ``legs_collide``: two bodies of the robot that are not neighbours penetrate each other;
     - ``joint_position``: a joint more than 0.02 rad beyond a stop;
@@ -109,54 +68,30 @@ class ViolationCounter:
             name = actuator.joint().name()
             joint_limits[name] = joint_limits.get(name, 0.0) + actuator.effort_limit()
         self._effort_limits = np.array([joint_limits[a.joint().name()] for a in actuators])
-        self.counts = dict.fromkeys(
-            ("legs_collide", "joint_position", "joint_velocity", "joint_effort"), 0
-        )
 
-    def count(self, context: Context) -> None:
-        """Counts the violations at one time."""
+    def __call__(self, context: Context) -> list[bool]:
+        """Whether the state of a root Context has each violation."""
         plant, instance = self._loop.plant, self._loop.robot_instance
         plant_context = plant.GetMyContextFromRoot(context)
         contacts = plant.get_contact_results_output_port().Eval(plant_context)
-        for i in range(contacts.num_point_pair_contacts()):
-            info = contacts.point_pair_contact_info(i)
-            if (
-                info.bodyA_index() in self._bodies
-                and info.bodyB_index() in self._bodies
-                and info.point_pair().depth > self._PENETRATION_M
-            ):
-                self.counts["legs_collide"] += 1
-                break
+        infos = map(contacts.point_pair_contact_info, range(contacts.num_point_pair_contacts()))
+        legs_collide = any(
+            info.bodyA_index() in self._bodies
+            and info.bodyB_index() in self._bodies
+            and info.point_pair().depth > self._PENETRATION_M
+            for info in infos
+        )
         q = plant.GetPositions(plant_context, instance)[NUM_BASE_POSITIONS:]
         v = plant.GetVelocities(plant_context, instance)[NUM_BASE_VELOCITIES:]
         lowest, highest = self._position_limits.T
         beyond = np.maximum(lowest - q, q - highest).max()
-        self.counts["joint_position"] += bool(beyond > self._POSITION_SLACK_RAD)
-        self.counts["joint_velocity"] += bool(np.any(np.abs(v) > self._velocity_limits))
         effort = plant.get_net_actuation_output_port(instance).Eval(plant_context)
-        self.counts["joint_effort"] += bool(np.any(np.abs(effort) > self._effort_limits + 1e-6))
-
-
-def play_throws(
-    loop: ClosedLoop,
-    simulator: Simulator,
-    throws: Iterable[Throw],
-    *,
-    duration_s: float,
-    log_period_s: float,
-) -> Iterator[float]:
-    """Advances a simulation while balls are thrown; yields the time of every row of a log [s]."""
-    thrown = require(loop, HasBall)
-    waiting = sorted(throws, key=lambda throw: throw.time_s)
-    for row in range(round(duration_s / log_period_s) + 1):
-        time = row * log_period_s
-        while waiting and waiting[0].time_s - _FLIGHT_S <= time:
-            throw = waiting.pop(0)
-            release_s = max(throw.time_s - _FLIGHT_S, 0.0)
-            advance_to(simulator, release_s)
-            thrown.throw_ball(simulator.get_mutable_context(), throw, throw.time_s - release_s)
-        advance_to(simulator, time)
-        yield time
+        return [
+            legs_collide,
+            bool(beyond > self._POSITION_SLACK_RAD),
+            bool(np.any(np.abs(v) > self._velocity_limits)),
+            bool(np.any(np.abs(effort) > self._effort_limits + 1e-6)),
+        ]
 
 
 def run_throw(
@@ -167,72 +102,68 @@ def run_throw(
     trigger_time_s: float = math.nan,
     throws: list[Throw] | None = None,
     duration_s: float | None = None,
-    log_period_s: float = 0.02,
-    ports: tuple[str, ...] = (),
-    realtime_rate: float = 0.0,
-) -> ThrowLog:
-    """Throws one random ball, or given ones, at a robot in undisturbed motion.
+    ports: Iterable[str] = (),
+    **options: Any,
+) -> Motion:
+    """Throws one random ball, or given ones, at a robot in undisturbed motion, until it falls.
 
     Args:
         loop: A closed loop with a ball. If it has an input port ``safety_probability`` (recovery
             without an assessment), recovery is triggered at ``trigger_time_s``; otherwise by Γ.
         index: Number of the throw; it and the seed determine start, plan and ball.
         duration_s: End time [s]; by default 2.5 s after the first impact.
+        ports: Ports to log besides the assessor's inputs, ``margins``, ``plant_state``,
+            ``recovery_active`` if there is one, and ``violations``, (N, 4), whether the state has
+            each of `VIOLATIONS`.
+        **options: Those of :func:`~drake_safety.simulation.motion.simulate`.
+
+    Raises:
+        ValueError: The loop has no ball, or another engine than Drake.
+        EpisodeError: A system of the loop raised an error, or the simulation failed.
     """
-    rng = episode_rng(seed, index)
-    simulator = Simulator(loop)
-    simulator.set_target_realtime_rate(realtime_rate)
-    context = simulator.get_mutable_context()
-    thrown = require(loop, HasBall)
-    thrown.reset_calm(context, rng)
+    rng, thrown = episode_rng(seed, index), require(loop, HasBall)
+    thrown.reset_calm(loop.CreateDefaultContext(), rng)  # The ball is drawn after the start.
     sampled = thrown.sample_throw(rng, rng.uniform(_EARLIEST_S, _LATEST_S))
     throws = [sampled] if throws is None else throws
-    first = throws[0] if throws else sampled
-    if duration_s is None:
-        duration_s = first.time_s + _AFTER_S
-    probability = None
-    if loop.HasInputPort("safety_probability"):
-        probability = loop.GetInputPort("safety_probability")
-        probability.FixValue(context, [1.0])
+    impact_s = (throws[0] if throws else sampled).time_s
     has_recovery = loop.HasOutputPort("recovery_active")
-    simulator.Initialize()
-    recorder = Recorder(loop, (*_PORTS, *ports, *(("recovery_active",) if has_recovery else ())))
-    violations = ViolationCounter(loop)
-    margins_port = loop.GetOutputPort("margins")
-    fall_column = loop.constraint_names.index(require(loop, CanFall).fall_name)
-    fall_s = leave_s = math.inf
-    triggered_s = math.nan
-    for time in play_throws(
-        loop, simulator, throws, duration_s=duration_s, log_period_s=log_period_s
-    ):
-        recorder.record(context, time)
-        violations.count(context)
-        margins = margins_port.Eval(context)
-        if margins.min() < 0:
-            leave_s = min(leave_s, time)
-        if margins[fall_column] < 0:
-            fall_s = time
-            break
-        if probability is not None and time >= trigger_time_s - 1e-9:
+    is_triggered_here = loop.HasInputPort("safety_probability")
+    violations, rows = Violations(loop), []
+    has_triggered = False
+
+    def start(context: Context) -> None:
+        thrown.reset_calm(context, episode_rng(seed, index))
+        if is_triggered_here:
+            loop.GetInputPort("safety_probability").FixValue(context, [1.0])
+
+    def release(throw: Throw) -> tuple[float, Callable[[Context], object]]:
+        release_s = max(throw.time_s - _FLIGHT_S, 0.0)
+        lead_s = throw.time_s - release_s
+        return release_s, lambda context: thrown.throw_ball(context, throw, lead_s)
+
+    def each_row(context: Context, time_s: float) -> None:
+        nonlocal has_triggered
+        rows.append(violations(context))
+        if is_triggered_here and time_s >= trigger_time_s - 1e-9:
             # One low value suffices: the trigger latches.
-            probability.FixValue(context, [0.0 if math.isnan(triggered_s) else 1.0])
-            triggered_s = time if math.isnan(triggered_s) else triggered_s
-    arrays = recorder.arrays()
-    active = arrays.pop("recovery_active", np.zeros((len(arrays["time_s"]), 1)))[:, 0]
-    if has_recovery and probability is None and active.any():
-        triggered_s = float(arrays["time_s"][int(np.argmax(active > 0))])
-    extra = {name: arrays.pop(name) for name in ports}
-    return ThrowLog(
+            value = 1.0 if has_triggered else 0.0
+            loop.GetInputPort("safety_probability").FixValue(context, [value])
+            has_triggered = True
+
+    motion = simulate(
+        loop,
+        start,
+        (*_PORTS, *ports, *(["recovery_active"] if has_recovery else [])),
+        duration_s=impact_s + _AFTER_S if duration_s is None else duration_s,
+        events=map(release, throws),
+        each_row=each_row,
         index=index,
-        throw=first,
-        **arrays,
-        trigger_time_s=triggered_s,
-        fall_time_s=fall_s,
-        leave_time_s=leave_s,
-        recovery_active=active,
-        violations=violations.counts,
-        extra=extra,
+        who=f"throw {index} of '{loop.scenario.name}' (seed {seed})",
+        **options,
     )
+    motion.ports["violations"] = np.array(rows)
+    motion.push_time_s = impact_s
+    return motion
 
 
 def run_throws(
@@ -241,40 +172,35 @@ def run_throws(
     *,
     seed: int,
     variation: str = "actual",
-    trigger_times_s: dict[int, float] | None = None,
+    trigger_times_s: Sequence[float] | None = None,
     num_workers: int | None = None,
     progress: Progress | bool | None = None,
-) -> list[ThrowLog]:
+) -> list[Motion]:
     """Throws a set of balls, in worker processes.
 
     Args:
-        trigger_times_s: Time of the trigger by index [s]; by default there is no recovery.
+        trigger_times_s: Times of the triggers [s]; by default there is no recovery.
     """
-    options = {"ball": True, "recovery": trigger_times_s is not None}
-    times = trigger_times_s or {}
-    logs = run_batches(
-        partial(_throw_batch, scenario, variation, options, seed),
-        [(i, times.get(i, math.nan)) for i in indices],
+    times = [math.nan] * len(indices) if trigger_times_s is None else trigger_times_s
+    make = worker_loop(scenario, variation, ball=True, recovery=trigger_times_s is not None)
+    logs = map_items(
+        partial(make.run, _throw_at, seed=seed),
+        enumerate(zip(indices, times, strict=True)),
         num_workers=num_workers,
         progress=progress,
         stage="throws",
     )
-    by_index = {log.index: log for log in logs}
-    return [by_index[index] for index in indices]
+    return [log for _, log in sorted(logs, key=lambda found: found[0])]
 
 
-def _throw_batch(
-    scenario: Scenario,
-    variation: str,
-    options: dict[str, Any],
-    seed: int,
-    items: list[tuple[int, float]],
-) -> list[ThrowLog]:
-    loop = worker_loop(scenario, variation, options)
-    return [run_throw(loop, index, seed=seed, trigger_time_s=time) for index, time in items]
+def _throw_at(
+    loop: ClosedLoop, item: tuple[int, tuple[int, float]], *, seed: int
+) -> tuple[int, Motion]:
+    place, (index, trigger_time_s) = item
+    return place, run_throw(loop, index, seed=seed, trigger_time_s=trigger_time_s)
 
 
-def trigger_time(log: ThrowLog, probability: np.ndarray, threshold: float) -> float:
+def trigger_time(log: Motion, probability: np.ndarray, threshold: float) -> float:
     """Time at which a probability first falls below a threshold [s]; NaN if it never does.
 
     Args:

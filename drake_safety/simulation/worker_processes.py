@@ -10,11 +10,11 @@ import socket
 import threading
 import time
 import warnings
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Hashable, Iterable
 from contextlib import closing, nullcontext
 from functools import cache, partial
 from operator import attrgetter
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import LeafSystem
@@ -23,57 +23,30 @@ from drake_safety.files.progress import shown
 from drake_safety.learning.segments import installed_versions
 
 BATCH_SIZE = 4
-"""Episodes, or throws, per call of a worker."""
+"""Number of items that are sent to a worker at a time."""
 _WATCH_PERIOD_S = 1.0
 _LOCAL_BACKENDS = ("LokyBackend", "SequentialBackend")
 _DASKS = "KilledWorker"
 _TURN = threading.RLock()
 
 _Item = TypeVar("_Item")
+_Made = TypeVar("_Made")
 _Result = TypeVar("_Result")
 Progress = Callable[[int, int], None]
 """Called with the number done and in all."""
 
 
-def batches(items: list[_Item], size: int = BATCH_SIZE) -> list[list[_Item]]:
-    """Splits a list into batches, one for each call of a worker."""
-    return [items[i : i + size] for i in range(0, len(items), size)]
-
-
-def run_batches(
-    function: Callable[[list[_Item]], list[_Result]],
-    items: list[_Item],
+def map_items(
+    function: Callable[[_Item], _Result],
+    items: Iterable[_Item],
     *,
     num_workers: int | None = None,
+    batch_size: int = BATCH_SIZE,
     progress: Progress | bool | None = None,
     num_done: int = 0,
     stage: str = "simulations",
-    batch_size: int = BATCH_SIZE,
 ) -> Generator[_Result, None, None]:
-    """Calls a function for batches of items in worker processes; yields results as they finish.
-
-    Args:
-        function: A function at module level, or a partial of one; returns one result per item.
-        progress: Called with the number done and in all, at the start and after each batch; True
-            shows it.
-    """
-    num_wanted = num_done + len(items)
-    calls = [(batch,) for batch in batches(items, batch_size)]
-    results = parallel_map(function, calls, num_workers)
-    with shown(progress, lambda stages: partial(stages, stage)) as report, closing(results):
-        if report is not None:
-            report(num_done, num_wanted)
-        for batch in results:
-            yield from batch
-            num_done += len(batch)
-            if report is not None:
-                report(num_done, num_wanted)
-
-
-def parallel_map(
-    function: Callable[..., Any], arguments: list[tuple], num_workers: int | None = None
-) -> Generator[Any, None, None]:
-    """Calls ``function(*arguments[i])`` in worker processes; yields results as they finish.
+    """Calls ``function(item)`` in worker processes; yields results as batches finish.
 
     Within ``joblib.parallel_config`` of another backend than loky, or :func:`cluster.connected`,
     that backend's workers are used.
@@ -82,11 +55,36 @@ def parallel_map(
     Ctrl-C or any error the workers end; when this process is killed they end within a second or
     two.
 
+    Args:
+        num_workers: Number of processes; that of cores by default. 1 runs in this process.
+        batch_size: Number of items that are sent to a worker at a time.
+        progress: Called with the number done and in all, at the start and after each batch; True
+            shows it.
+        num_done: Number that had been done before.
+
     Raises:
         ChildProcessError: A worker was killed.
         ValueError: A number of processes is given, but another backend has its own, or a worker has
             other versions of Python, Drake, NumPy or this package.
     """
+    todo = list(items)
+    batches = [todo[i : i + batch_size] for i in range(0, len(todo), batch_size)]
+    results = _map_batches(partial(_called, _versions(), function), batches, num_workers)
+    with shown(progress, lambda stages: partial(stages, stage)) as report, closing(results):
+        report = report or (lambda done, wanted: None)
+        num_wanted = num_done + len(todo)
+        report(num_done, num_wanted)
+        for batch in results:
+            yield from batch
+            num_done += len(batch)
+            report(num_done, num_wanted)
+
+
+def _map_batches(
+    call: Callable[[list[_Item]], list[_Result]],
+    batches: list[list[_Item]],
+    num_workers: int | None,
+) -> Generator[list[_Result], None, None]:
     import joblib
     from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import BrokenProcessPool
@@ -99,9 +97,8 @@ def parallel_map(
             "on the command line --workers"
         )
     num_workers = num_workers or joblib.cpu_count()
-    call = partial(_called, _versions(), function)
-    if is_local and (num_workers == 1 or len(arguments) <= 1):
-        yield from (call(*args) for args in arguments)
+    if is_local and (num_workers == 1 or len(batches) <= 1):
+        yield from map(call, batches)
         return
     local = {"initializer": end_with_parent, "initargs": (os.getpid(),)}
     with (
@@ -110,7 +107,7 @@ def parallel_map(
         else nullcontext()
     ):
         results = joblib.Parallel(return_as="generator_unordered", batch_size=1)(
-            joblib.delayed(call)(*args) for args in arguments
+            joblib.delayed(call)(batch) for batch in batches
         )
         try:
             for result in results:  # noqa: UP028 (`yield from` would hand Ctrl-C to joblib)
@@ -134,7 +131,9 @@ def parallel_map(
             raise
 
 
-def _called(versions: dict[str, str], function: Callable[..., Any], *arguments: Any) -> Any:
+def _called(
+    versions: dict[str, str], function: Callable[[_Item], _Result], batch: list[_Item]
+) -> list[_Result]:
     from threadpoolctl import threadpool_limits
 
     here = _versions()
@@ -146,7 +145,7 @@ def _called(versions: dict[str, str], function: Callable[..., Any], *arguments: 
             )
     # Threads of one worker would share its loops.
     with _TURN, threadpool_limits(1):
-        return function(*arguments)
+        return [function(item) for item in batch]
 
 
 @cache
@@ -170,6 +169,33 @@ def end_with_parent(parent: int) -> None:
     if os.getppid() != parent:
         os._exit(1)
     threading.Thread(target=watch, name="end_with_parent", daemon=True).start()
+
+
+class MadeOnce(Generic[_Made]):
+    """A diagram that each process makes once, when it is first called.
+
+    It is sent to workers with all that ``make`` uses. pydrake never frees a system in Python: a
+    loop made for every call would cost 2.4 MB each. Only the last one is kept.
+
+    Args:
+        key: Tells diagrams apart.
+    """
+
+    _made: ClassVar[dict[Hashable, Any]] = {}
+
+    def __init__(self, key: Hashable, make: Callable[[], _Made]) -> None:
+        self._key, self._make = key, make
+
+    def __call__(self) -> _Made:
+        """The diagram."""
+        if self._key not in self._made:
+            self._made.clear()
+            self._made[self._key] = self._make()
+        return self._made[self._key]
+
+    def run(self, function: Callable[..., _Result], *arguments: Any, **options: Any) -> _Result:
+        """Calls a function of the diagram and of more arguments."""
+        return function(self(), *arguments, **options)
 
 
 class Sent:

@@ -1,0 +1,307 @@
+"""The one loop that simulates a diagram from a start to an end, and its log."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, Diagram, PortDataType
+
+from drake_safety.learning.segments import (
+    DIVERGED,
+    LARGEST,
+    RECORDED,
+    DivergenceError,
+    Episode,
+    EpisodeError,
+)
+from drake_safety.simulation.capabilities import CanFall
+from drake_safety.simulation.closed_loop import ClosedLoop, require_ports
+
+_LOGGER = logging.getLogger("drake_safety")
+
+
+@dataclass(kw_only=True, eq=False)
+class Motion:
+    """Log of a simulated motion.
+
+    Attributes:
+        time_s: Times of the rows [s], (N,).
+        ports: The logged output ports by name, (N, size) each; ``motion[name]`` is one of them.
+        leave_time_s: Time at which it left the safe set [s]; infinite if it did not.
+        cause: The constraint that was violated then; "" for none.
+        fall_time_s: Time of the fall [s]; infinite without one.
+        failure: Why the simulation ended early; "" if it did not.
+        first_row: First row with an undisturbed future.
+        index: Its number in a set.
+        push_time_s: Start of a push, or impact of the first ball [s]; infinite without one.
+    """
+
+    time_s: np.ndarray
+    ports: dict[str, np.ndarray]
+    leave_time_s: float = math.inf
+    cause: str = ""
+    fall_time_s: float = math.inf
+    failure: str = ""
+    first_row: int = 0
+    index: int = 0
+    push_time_s: float = math.inf
+
+    def __getitem__(self, port: str) -> np.ndarray:
+        return self.ports[port]
+
+    @property
+    def has_left(self) -> bool:
+        """Whether the state left the safe set."""
+        return math.isfinite(self.leave_time_s)
+
+    @property
+    def has_fallen(self) -> bool:
+        """Whether the robot fell."""
+        return math.isfinite(self.fall_time_s)
+
+    @property
+    def recovery_intervals_s(self) -> list[tuple[float, float]]:
+        """First and last time of each recovery [s]; one still active at the end ends there."""
+        active = self.ports.get("recovery_active", np.zeros((len(self.time_s), 1)))[:, 0]
+        is_first, is_last = np.diff(active, prepend=0.0) > 0, np.diff(active, append=0.0) < 0
+        pairs = zip(self.time_s[is_first].tolist(), self.time_s[is_last].tolist(), strict=True)
+        return list(pairs)
+
+    def episode(self, num_features: int = 0) -> Episode:
+        """The motion as an episode: ``diverged`` if the simulation failed.
+
+        What was not logged has its default: ``true_state`` is ``state``, ``desired_output`` the
+        first sample of the preview, and the ``num_features`` features are zero.
+        """
+        num_rows, cause = len(self.time_s), DIVERGED if self.failure else self.cause
+        defaults = {
+            "true_state": self["state"],
+            "desired_output": self["desired_preview"][:, : self["output"].shape[1]],
+            "features": np.zeros((num_rows, num_features)),
+        }
+        failures = self.ports.get("num_controller_failures", np.zeros((num_rows, 1)))
+        return Episode(
+            index=self.index,
+            time_s=self.time_s,
+            **{name: (defaults | self.ports)[name] for name in RECORDED},
+            is_safe=cause == "",
+            cause=cause,
+            first_step=min(self.first_row, num_rows - 1),
+            num_controller_failures=int(failures[-1, 0]),
+        )
+
+
+class Recorder:
+    """Records output ports of a diagram, row by row.
+
+    Args:
+        names: Ports to record; a mapping from recorded names to those of ports renames them.
+    """
+
+    def __init__(self, diagram: Diagram, names: Iterable[str] | Mapping[str, str] = RECORDED):
+        named = names if isinstance(names, Mapping) else {name: name for name in names}
+        self._ports = {name: diagram.GetOutputPort(port) for name, port in named.items()}
+        self._rows: list[dict[str, np.ndarray]] = []
+        self._times: list[float] = []
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def record(
+        self, context: Context, time_s: float | None = None, *, is_checked: bool = False
+    ) -> None:
+        """Appends a row, unless a port raises; a given time is without rounding errors [s].
+
+        Raises:
+            DivergenceError: A port of ``RECORDED`` is not finite, if that is checked.
+        """
+        row = {name: np.array(port.Eval(context)) for name, port in self._ports.items()}
+        time_s = context.get_time() if time_s is None else time_s
+        if is_checked:
+            wrong = [n for n in RECORDED if n in row and not (np.abs(row[n]) < LARGEST).all()]
+            if wrong:
+                raise DivergenceError(f"ports {wrong} are not finite at {time_s:g} s")
+        self._rows.append(row)
+        self._times.append(time_s)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns ``time_s`` (N,) [s] and, by name, (N, size) for a vector port, else (N,)."""
+        arrays = {}
+        for name, port in self._ports.items():
+            is_vector = port.get_data_type() == PortDataType.kVectorValued
+            shape = (len(self._rows), port.size()) if is_vector else len(self._rows)
+            arrays[name] = np.array([row[name] for row in self._rows]).reshape(shape)
+        return {"time_s": np.array(self._times), **arrays}
+
+
+def simulate(
+    diagram: Diagram,
+    start: Callable[[Context], int | None],
+    ports: Iterable[str] | Mapping[str, str],
+    *,
+    duration_s: float,
+    step_s: float = 0.02,
+    watch_period_s: float = math.inf,
+    after_leaving_s: float = math.inf,
+    after_fall_s: float = 0.0,
+    events: Iterable[tuple[float, Callable[[Context], object]]] = (),
+    each_row: Callable[[Context, float], None] = lambda context, time_s: None,
+    margins: str = "margins",
+    safe: str | None = "safe",
+    constraint_names: Sequence[str] | None = None,
+    may_fail: bool = False,
+    realtime_rate: float = 0.0,
+    index: int = 0,
+    who: str = "motion",
+) -> Motion:
+    """Simulates a diagram from a start to an end, and logs output ports.
+
+    A row shows the state at its time, before the updates that are due then. A motion that ends as
+    it leaves the safe set has its last row at that instant, between two others.
+
+    Args:
+        start: Sets state and plan of the root Context, which is the default one. It may return the
+            first row whose future is undisturbed, if that is not 0.
+        ports: Ports to log; a mapping from logged names to those of ports renames them.
+        duration_s: End time [s].
+        step_s: Time between two rows [s].
+        watch_period_s: Sampling period of the safe set, counted from each row [s]; by default it
+            is sampled at rows.
+        after_leaving_s: Time for which a motion goes on outside the safe set [s].
+        after_fall_s: Time for which it goes on after a fall [s]; only a :class:`CanFall` falls.
+        events: Times [s] and what is done then with the Context.
+        each_row: Called with Context and time [s] after each row.
+        margins: Name of the port of margins.
+        safe: Name of the port that is below 1 outside the safe set; None if that is where a margin
+            is negative.
+        constraint_names: Names of the margins; by default the diagram's.
+        may_fail: Whether a failure of the simulation is a result, ``Motion.failure``. The motion
+            then has the rows that are finite.
+        realtime_rate: Target real-time rate; 0 for as fast as possible.
+        who: What is simulated, for messages.
+
+    Raises:
+        ValueError: A closed loop has no such port.
+        EpisodeError: A system raised an error, which is its cause, or the simulation failed, before
+            the first row or where it may not.
+    """
+    logged = dict(ports) if isinstance(ports, Mapping) else {name: name for name in ports}
+    if isinstance(diagram, ClosedLoop):
+        require_ports(diagram, logged.values())
+        constraint_names = constraint_names or diagram.constraint_names
+    names = list(constraint_names or ())
+    recorder = Recorder(diagram, logged)
+    margins_port = diagram.GetOutputPort(margins)
+    safe_port = None if safe is None else diagram.GetOutputPort(safe)
+    fall = names.index(diagram.fall_name) if isinstance(diagram, CanFall) else None
+    simulator = Simulator(diagram)
+    simulator.set_target_realtime_rate(realtime_rate)
+    context = simulator.get_mutable_context()
+    if isinstance(diagram, ClosedLoop):
+        diagram.remove_visuals(context)
+    first_row = start(context)
+    is_finite_at_start = np.isfinite(_state(context))
+    waiting = sorted(events, key=lambda event: event[0])
+    is_last = False
+    leave_s = fall_s = math.inf
+    cause = failure = ""
+
+    def is_over(time_s: float) -> bool:
+        nonlocal leave_s, fall_s, cause
+        now = margins_port.Eval(context)
+        if not np.isfinite(now).all():
+            raise DivergenceError(f"a margin is not finite at {time_s:g} s")
+        is_safe = now.min() >= 0 if safe_port is None else safe_port.Eval(context)[0] >= 1
+        if not is_safe and not cause:
+            leave_s, cause = time_s, names[int(np.argmin(now))]
+        if fall is not None and now[fall] < 0:
+            fall_s = min(fall_s, time_s)
+        return time_s >= leave_s + after_leaving_s or time_s >= fall_s + after_fall_s
+
+    try:
+        simulator.Initialize()
+        for row in range(round(duration_s / step_s) + 1):
+            for time_s in _watch_times(row, step_s, watch_period_s):
+                while waiting and waiting[0][0] <= time_s:
+                    event_s, act = waiting.pop(0)
+                    advance_to(simulator, event_s)
+                    act(context)
+                advance_to(simulator, time_s)
+                if is_last := is_over(time_s):
+                    break
+            recorder.record(context, time_s, is_checked=True)
+            each_row(context, time_s)
+            if is_last:
+                break
+    except (Exception, SystemExit) as error:
+        if not (len(recorder) and _is_divergence(error, context, is_finite_at_start)):
+            raise EpisodeError(f"{who}: {type(error).__name__}: {error}") from error
+        if not may_fail:
+            raise EpisodeError(f"{who}: the simulation failed: {error}") from error
+        failure = str(error)
+        _LOGGER.info("%s diverged: %s", who, error)
+    arrays = recorder.arrays()
+    return Motion(
+        time_s=arrays.pop("time_s"),
+        ports=arrays,
+        leave_time_s=leave_s,
+        cause=cause,
+        fall_time_s=fall_s,
+        failure=failure,
+        first_row=first_row or 0,
+        index=index,
+    )
+
+
+def advance_to(simulator: Simulator, time_s: float) -> None:
+    """Advances a simulation to a time, before the updates due at that time.
+
+    The state of a discrete plant is then that of the given time. The update due then already
+    computes the next state, so a row recorded after it (``AdvancePendingEvents``, or a time rounded
+    upwards) would not belong to its time.
+    """
+    # Both this time and Drake's time of an update are products, rounded in the last bit or two.
+    before_s = time_s - 4.0 * math.ulp(time_s)
+    if before_s > simulator.get_context().get_time():
+        simulator.AdvanceTo(before_s)
+
+
+def _watch_times(row: int, step_s: float, period_s: float) -> list[float]:
+    """Times at which the safe set is sampled after the row before, its own time included."""
+    count = max(math.ceil(step_s / period_s - 1e-6), 1) if row else 1
+    begin_s = (row - 1) * step_s
+    return [*(begin_s + i * period_s for i in range(1, count)), row * step_s]
+
+
+_NUMERICAL_FAILURE = re.compile(
+    r"solver failed to converge|Detected NaN|is NaN\b|non-finite value|step smaller than minimum"
+    r"|Failure at .*(solver|multibody|integrator)"
+)
+"""Messages of numerical failures of Drake's contact solver, SceneGraph and integrators.
+
+Drake raises them as RuntimeError, like any other error, and failed assertions, such as TAMSI's on a
+huge force, as SystemExit."""
+
+
+def _is_divergence(error: BaseException, context: Context, is_finite_at_start: np.ndarray) -> bool:
+    """Whether an error is a numerical failure of the simulation, not a programming error."""
+    if isinstance(error, DivergenceError):
+        return True
+    if type(error) in (RuntimeError, SystemExit) and _NUMERICAL_FAILURE.search(str(error)):
+        return True
+    # Any error that follows a state that became non-finite.
+    state = _state(context)
+    return bool((is_finite_at_start & ~np.isfinite(state)).any())
+
+
+def _state(context: Context) -> np.ndarray:
+    """Continuous and discrete state of a Context."""
+    discrete = context.get_discrete_state()
+    groups = [discrete.value(i) for i in range(discrete.num_groups())]
+    return np.concatenate([context.get_continuous_state_vector().CopyToVector(), *groups])
