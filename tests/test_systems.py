@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import PortDataType
 
 from drake_safety import load_assessment
@@ -25,7 +24,7 @@ from drake_safety.systems.state_observer import StateObserver
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner
 from drake_safety.systems.whole_body_controller import WholeBodyController
 from legged_robots import ROBOT_NAMES, robot_kinematics
-from system_doubles import INFO, AssessmentDouble, SlowIsSafe, controller, guard
+from system_doubles import INFO, AssessmentDouble, Bench, SlowIsSafe, controller, guard
 
 PERIOD = {"period_s": 0.01}
 LATE = PERIOD | {"offset_s": 0.002}
@@ -134,9 +133,11 @@ def add_robot(name):
 for name in ROBOT_NAMES:
     add_robot(name)
 
+ONE_OF_EACH = [key for key in CASES if key.split()[1:] in ([], ["laikago"])]
 
-class Given:
-    """A system with the ports that it promises, and a simulator in which its inputs are given."""
+
+class Given(Bench):
+    """A system with the ports that it promises, whose inputs are given."""
 
     def __init__(self, key, without=(), **values):
         make, text = CASES[key]
@@ -144,18 +145,13 @@ class Given:
         pairs = [one.split() for one in inputs]
         self.inputs = {name.strip("?"): int(size) for name, size in pairs}
         self.optional = {name.strip("?") for name, _ in pairs if "?" in name}
-        self.outputs, self.through = {}, set()
+        self.promised, self.through = {}, set()
         for output in outputs:
             name, size, *sources = output.replace(" < ", " ").split()
-            self.outputs[name] = size
+            self.promised[name] = size
             self.through |= {(one, name) for one in self.inputs if one in sources or "*" in sources}
-        self.system = make()
-        self.simulator = Simulator(self.system)
-        self.context = self.simulator.get_mutable_context()
-        for port in self.inputs.keys() - set(without):
-            self.system.GetInputPort(port).FixValue(
-                self.context, values.get(port, self.value(key, port))
-            )
+        given = {port: self.value(key, port) for port in self.inputs.keys() - set(without)}
+        super().__init__(make(), **given | values)
 
     def value(self, key, port):
         if port == "plant_state" and len(key.split()) > 1:
@@ -170,24 +166,22 @@ class Given:
             "plant_state": np.eye(1, self.inputs[port]).ravel(),
         }.get(port, np.zeros(self.inputs[port]))
 
-    def ports(self):
-        ins = [self.system.get_input_port(i) for i in range(self.system.num_input_ports())]
-        return ins, [self.system.get_output_port(i) for i in range(self.system.num_output_ports())]
-
-    def advance(self, time_s):
+    def at(self, time_s):
         self.simulator.AdvanceTo(time_s)
-        return {port.get_name(): np.copy(port.Eval(self.context)) for port in self.ports()[1]}
+        return self.outputs()
 
 
 @pytest.mark.parametrize("key", CASES)
 def test_ports_have_the_promised_names_and_sizes_and_feed_through_what_they_say(key):
     given = Given(key)
-    ins, outs = given.ports()
+    system = given.system
+    ins = [system.get_input_port(i) for i in range(system.num_input_ports())]
+    outs = [system.get_output_port(i) for i in range(system.num_output_ports())]
     assert {port.get_name(): port.size() for port in ins} == given.inputs
     abstract = [port for port in outs if port.get_data_type() == PortDataType.kAbstractValued]
     found = {port.get_name(): "-" if port in abstract else str(port.size()) for port in outs}
-    assert found == given.outputs
-    is_direct = given.system.HasDirectFeedthrough
+    assert found == given.promised
+    is_direct = system.HasDirectFeedthrough
     pairs = [(one, other) for one in ins for other in outs]
     assert given.through == {
         (one.get_name(), other.get_name())
@@ -196,18 +190,34 @@ def test_ports_have_the_promised_names_and_sizes_and_feed_through_what_they_say(
     }
 
 
-@pytest.mark.parametrize("key", [key for key in CASES if key.split()[1:] in ([], ["laikago"])])
+@pytest.mark.parametrize("key", ONE_OF_EACH)
 def test_optional_ports_may_be_left_open_and_any_other_is_named(key):
     given = Given(key, Given(key).optional)
-    given.advance(0.0)
-    given.advance(0.3)
+    given.at(0.0)
+    given.at(0.3)
     for port in given.inputs.keys() - given.optional:
         # Within the switch it is that of one of Drake's.
         name = "nominal" if key.startswith("RecoverySwitch") and "nominal" in port else port
         without = Given(key, {port})
         with pytest.raises(RuntimeError, match=rf"required InputPort.*\({name}.*is not connected"):
-            without.advance(0.0)
-            without.advance(0.3)
+            without.at(0.0)
+            without.at(0.3)
+
+
+@pytest.mark.parametrize("key", ONE_OF_EACH)
+def test_all_memory_is_in_the_context_so_a_clone_goes_on_as_if_alone(key):
+    given, alone = Given(key), Given(key)
+    given.at(0.05), alone.at(0.05)
+    clone = Bench(given.system)
+    clone.simulator.reset_context(given.context.Clone())
+    clone.context = clone.simulator.get_mutable_context()
+    given.fix(**{port: given.value(key, port) + np.full(1, 0.1) for port in given.inputs})
+    given.at(0.3)
+    for bench in (clone, alone):
+        bench.simulator.AdvanceTo(0.3)
+    expected = alone.outputs()
+    for name, found in clone.outputs().items():
+        np.testing.assert_array_equal(found, expected[name])
 
 
 NOT_FINITE = {
@@ -223,12 +233,12 @@ NOT_FINITE = {
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_an_entry_that_is_not_finite_has_the_promised_answer(key, port, value):
     given = Given(key)
-    before, promised = given.advance(0.01), NOT_FINITE[key, port]
+    before, promised = given.at(0.01), NOT_FINITE[key, port]
     assert any(np.any(before[name] != np.array(promised[name])) for name in promised)
     for entry in range(given.inputs[port]):
         values = np.array(given.value(key, port))
         values[entry] = value
-        found = Given(key, **{port: values}).advance(0.01)
+        found = Given(key, **{port: values}).at(0.01)
         for name, expected in promised.items():
             np.testing.assert_array_equal(found[name], np.broadcast_to(expected, found[name].shape))
 
@@ -246,9 +256,9 @@ def test_an_entry_that_is_not_finite_has_the_promised_answer(key, port, value):
 )
 def test_outputs_are_held_until_the_next_tick(key, port, value, tick_s):
     given, same = Given(key), Given(key)
-    held = given.advance(0.0025)
-    given.system.GetInputPort(port).FixValue(given.context, value)
-    for name, later in given.advance(tick_s - 1e-4).items():
+    held = given.at(0.0025)
+    given.fix(**{port: value})
+    for name, later in given.at(tick_s - 1e-4).items():
         np.testing.assert_array_equal(later, held[name])
-    changed, expected = given.advance(tick_s + 1e-4), same.advance(tick_s + 1e-4)
+    changed, expected = given.at(tick_s + 1e-4), same.at(tick_s + 1e-4)
     assert any(not np.array_equal(changed[name], expected[name]) for name in held)
