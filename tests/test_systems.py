@@ -207,7 +207,8 @@ def test_optional_ports_may_be_left_open_and_any_other_is_named(key):
 @pytest.mark.parametrize("key", ONE_OF_EACH)
 def test_all_memory_is_in_the_context_so_a_clone_goes_on_as_if_alone(key):
     given, alone = Given(key), Given(key)
-    given.at(0.05), alone.at(0.05)
+    for bench in (given, alone):
+        bench.at(0.05)
     clone = Bench(given.system)
     clone.simulator.reset_context(given.context.Clone())
     clone.context = clone.simulator.get_mutable_context()
