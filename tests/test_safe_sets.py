@@ -21,7 +21,7 @@ SQUARE = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
 NAMES = list(BalanceSafeSet.names)
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(3, 12))
+@given(st.integers(0, 2**32 - 1), st.integers(3, 9))
 def test_a_hull_turns_left_holds_every_point_and_is_as_far_as_brute_force_says(seed, num_points):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(num_points, 2))
@@ -199,16 +199,6 @@ def test_height_and_tracking_features_are_the_hand_worked_differences():
     # The feet turn with the base.
     turned, _ = state(kinematics, rotation=(0, 0, 0.4))
     assert features(safe_set, turned, v, preview)["yaw_error"] == pytest.approx(0, abs=1e-9)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("where", ["position", "velocity", "preview"])
-def test_features_of_what_is_not_finite_are_not_a_number(value, where):
-    kinematics, safe_set = safe_set_of("laikago")
-    q, v = state(kinematics)
-    preview = np.zeros((3, 3))
-    {"position": q, "velocity": v, "preview": preview[1]}[where][1] = value
-    assert np.isnan(safe_set.features(q, v, preview)).all()
 
 
 @pytest.mark.parametrize(

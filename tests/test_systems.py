@@ -225,6 +225,7 @@ NOT_FINITE = {
     ("SafetyMonitor laikago", "plant_state"): {"safe": 0.0, "margins": -np.inf},
     ("StateObserver laikago", "plant_state"): {"state": np.nan},
     ("PlanFeatures laikago", "plant_state"): {"features": np.nan},
+    ("PlanFeatures laikago", "desired_preview"): {"features": np.nan},
     ("BeliefEvaluator", "state"): {"belief": [0.0, 0.0, 1.0], "safety_probability": 0.0},
     ("CommandGuard", "command"): {"desired_output": 0.0, "is_changed": 1.0},
 }
