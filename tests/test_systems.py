@@ -8,6 +8,7 @@ from drake_safety import load_assessment
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.diagrams.pendulum import PendulumController, PendulumObserver, PendulumParameters
+from drake_safety.robots.shift import Fault
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
 from drake_safety.systems.change_monitor import ChangeMonitor
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
@@ -29,6 +30,7 @@ from system_doubles import INFO, AssessmentDouble, Bench, SlowIsSafe, controller
 PERIOD = {"period_s": 0.01}
 LATE = PERIOD | {"offset_s": 0.002}
 ROWS = PERIOD | {"horizon": 4, "num_outlook": 3}
+FAULTS = [Fault(kind="delay", value=0.03), Fault(kind="half_rate")]
 STEPS = RecoveryStepParameters(min_steps=1, max_steps=1)
 LEARNED = load_assessment("laikago_balancing")
 N_S, N_F = len(LEARNED.info_.state_names), len(LEARNED.info_.feature_names)
@@ -40,7 +42,10 @@ BELIEF = "safety_probability 1, belief 3, embedding 2, novelty 1, "
 BELIEF += "cause_probability {0}, predicted_margins {0}"
 # Ports with their sizes; `?`: may be left open; `<`: of these inputs, or of all of them, at once.
 CASES = {
-    "SensorFaults": (lambda: SensorFaults(["a", "b"], **PERIOD), "input 2 -> output 2 < *"),
+    "SensorFaults": (
+        lambda: SensorFaults(["a", "b"], FAULTS, **PERIOD),
+        "input 2 -> output 2 < *",
+    ),
     "RecoveryTrigger": (
         lambda: RecoveryTrigger(**PERIOD),
         "safety_probability 1, belief? 3, recovery_done? 1 -> recovery_active 1, port_selector -",
