@@ -61,7 +61,7 @@ docs: $(DEVELOPED) ## Build the pages and the reference into build/site; a warni
 	$(BIN)/mkdocs build --strict
 
 clean: ## Remove the environments, the tools' caches and what was built (runs/ stays)
-	rm -rf .venv .pythons build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .benchmarks
+	rm -rf .venv .pythons build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .benchmarks .hypothesis
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/it" >&2; exit 1; }

@@ -3,6 +3,7 @@
 import sys
 
 import pytest
+from typer.testing import CliRunner
 
 from drake_safety import cli
 
@@ -13,6 +14,11 @@ def call(monkeypatch, *arguments, main=cli.main):
     with pytest.raises(SystemExit) as ended:
         main()
     return ended.value.code or 0
+
+
+def invoked(*arguments):
+    """The result of a command whose output is kept."""
+    return CliRunner().invoke(cli.make_app(), [*map(str, arguments)])
 
 
 def study(monkeypatch, *arguments):

@@ -6,10 +6,22 @@ workers would mostly start. Both cores are used by running two tests at a time (
 
 import os
 
+from hypothesis import Phase, settings
+
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 # What joblib counts where no number of workers is given; a number that is given stays as it is.
 os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
+# Laws are tried on the same few examples every time, and no example is slow by accident.
+settings.register_profile(
+    "few",
+    derandomize=True,
+    max_examples=20,
+    deadline=None,
+    database=None,
+    phases=(Phase.explicit, Phase.generate, Phase.shrink),
+)
+settings.load_profile("few")
 
 
 def pytest_collection_modifyitems(items):

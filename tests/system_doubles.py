@@ -1,9 +1,10 @@
-"""Doubles of what systems need: an assessment, a guard's assessment, a policy, a set's names."""
+"""A system alone in a simulator, and doubles of what systems need: assessments, a policy."""
 
 from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
+from pydrake.systems.analysis import Simulator
 
 from drake_safety.control.policy import (
     CommandLimits,
@@ -36,6 +37,35 @@ INFO = EpisodesInfo(
     feature_names=["f"],
     versions={},
 )
+
+
+class Bench:
+    """A system alone in a simulator; its inputs are given by name."""
+
+    def __init__(self, system, **inputs):
+        self.system = system
+        self.simulator = Simulator(system)
+        self.context = self.simulator.get_mutable_context()
+        self.fix(**inputs)
+
+    def fix(self, **inputs):
+        for name, value in inputs.items():
+            values = np.ravel(np.asarray(value, dtype=float))
+            self.system.GetInputPort(name).FixValue(self.context, values)
+
+    def get(self, name):
+        return np.copy(self.system.GetOutputPort(name).Eval(self.context))
+
+    def outputs(self):
+        ports = map(self.system.get_output_port, range(self.system.num_output_ports()))
+        return {port.get_name(): self.get(port.get_name()) for port in ports}
+
+    def advance(self, seconds):
+        self.simulator.AdvanceTo(self.context.get_time() + seconds)
+
+    def begin(self):
+        self.simulator.Initialize()
+        return self
 
 
 def correction(size):

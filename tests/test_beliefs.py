@@ -1,25 +1,22 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
+import naive
 from drake_safety.learning.beliefs import EMPTY, empty, from_scores, fuse, fuse_cells
 
 
-def printed_fusion(beliefs):
-    """F with the products as the paper prints them, for a handful of uncertain beliefs."""
-    mu = beliefs[:, 2]
-    others = np.array([np.prod(np.delete(mu, i)) for i in range(len(mu))])
-    divisor = others.sum() - len(mu) * mu.prod()
-    masses = (beliefs[:, :2] * ((1 - mu) * others)[:, None]).sum(axis=0) / divisor
-    return np.append(masses, (len(mu) - mu.sum()) * mu.prod() / divisor)
-
-
-def random_beliefs(rng, count, num_causes=0):
-    return from_scores(
-        rng.uniform(size=count),
-        rng.uniform(0.05, 0.95, size=count),
-        rng.integers(0, max(num_causes, 1), size=count),
-        num_causes,
+@st.composite
+def beliefs(draw, num_causes=0):
+    """Up to twenty uncertain beliefs."""
+    n = draw(st.integers(1, 20))
+    score, uncertainty = (
+        draw(arrays(float, n, elements=st.floats(*ends))) for ends in ((0.0, 1.0), (0.05, 0.95))
     )
+    cause = draw(arrays(int, n, elements=st.integers(0, max(num_causes, 1) - 1)))
+    return from_scores(score, uncertainty, cause, num_causes)
 
 
 def test_a_score_becomes_the_masses_of_the_papers_equation_the_unsafe_one_booked_on_its_cause():
@@ -28,67 +25,55 @@ def test_a_score_becomes_the_masses_of_the_papers_equation_the_unsafe_one_booked
     np.testing.assert_allclose(beliefs, [[0.4, 0.4, 0.2, 0, 0.4, 0], [0.8, 0, 0.2, 0, 0, 0]])
 
 
-def test_fusion_equals_the_printed_products():
-    rng = np.random.default_rng(0)
-    for count in (1, 2, 5, 20):
-        beliefs = random_beliefs(rng, count)
-        np.testing.assert_allclose(fuse(beliefs), printed_fusion(beliefs), rtol=1e-12)
-    # By hand: w = 1 and 1/4, b_safe = (0.5 + 0.05) / 1.25, mu = (0.5 + 0.2) / 1.25.
-    fused = fuse(np.array([[0.5, 0.0, 0.5], [0.2, 0.0, 0.8]]))
-    np.testing.assert_allclose(fused, [0.44, 0.0, 0.56])
+@given(beliefs(), st.integers(0, 3), st.randoms())
+def test_fusion_is_the_printed_products_and_ignores_empty_beliefs_and_the_order(
+    beliefs, num_empty, random
+):
+    expected = naive.fusion(beliefs)
+    np.testing.assert_allclose(fuse(beliefs), expected, rtol=1e-12, atol=1e-300)
+    shuffled = [*beliefs, *[EMPTY] * num_empty]
+    random.shuffle(shuffled)
+    np.testing.assert_allclose(fuse(np.array(shuffled)), expected, rtol=1e-12, atol=1e-300)
 
 
-def test_fusion_of_a_thousand_beliefs_is_finite_and_keeps_their_uncertainty():
-    fused = fuse(from_scores(np.linspace(0.0, 1.0, 1000), 0.3))
-    np.testing.assert_allclose(fused, [0.35, 0.35, 0.3])
+@pytest.mark.parametrize(
+    ("beliefs", "expected"),
+    [
+        # w = 1 and 1/4, b_safe = (0.5 + 0.05) / 1.25, mu = (0.5 + 0.2) / 1.25.
+        ([[0.5, 0.0, 0.5], [0.2, 0.0, 0.8]], [0.44, 0.0, 0.56]),
+        # A thousand keep their uncertainty.
+        (from_scores(np.linspace(0.0, 1.0, 1000), 0.3), [0.35, 0.35, 0.3]),
+        # Certain ones outweigh all others and are averaged.
+        ([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.0, 0.999, 0.001]], [0.75, 0.25, 0.0]),
+        # A nearly certain one does not overflow.
+        ([[1.0, 0.0, 1e-300], [0.0, 0.5, 0.5]], [1.0, 0.0, 0.0]),
+        (empty(0, 2), empty((), 2)),
+        (empty(4), EMPTY),
+    ],
+)
+def test_fused_beliefs_worked_by_hand(beliefs, expected):
+    np.testing.assert_allclose(fuse(np.array(beliefs)), expected, atol=1e-12)
 
 
-def test_fusion_ignores_empty_beliefs_and_the_order():
-    rng = np.random.default_rng(1)
-    beliefs = random_beliefs(rng, 6)
-    with_empty = rng.permutation(np.vstack([beliefs, EMPTY, EMPTY]))
-    np.testing.assert_allclose(fuse(with_empty), fuse(beliefs), rtol=1e-12)
-
-
-def test_certain_beliefs_outweigh_all_others_and_are_averaged():
-    fused = fuse(np.array([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.0, 0.999, 0.001]]))
-    np.testing.assert_allclose(fused, [0.75, 0.25, 0.0])
-
-
-def test_a_nearly_certain_belief_does_not_overflow():
-    fused = fuse(np.array([[1.0, 0.0, 1e-300], [0.0, 0.5, 0.5]]))
-    np.testing.assert_allclose(fused, [1.0, 0.0, 0.0], atol=1e-12)
-
-
-def test_nothing_and_only_empty_beliefs_fuse_to_the_empty_one():
-    np.testing.assert_array_equal(fuse(empty(0, 2)), empty((), 2))
-    np.testing.assert_array_equal(fuse(empty(4)), EMPTY)
-
-
-def test_cells_are_fused_each_for_itself_from_the_minimum_count_on():
-    rng = np.random.default_rng(3)
-    beliefs = random_beliefs(rng, 9, num_causes=2)
-    cells = np.array([0, 0, 0, 2, 2, -1, 3, 3, 3])
-    fused = fuse_cells(beliefs, cells, num_cells=5, min_count=3)
-    for cell in (0, 3):
-        np.testing.assert_allclose(fused[cell], fuse(beliefs[cells == cell]))
-        np.testing.assert_allclose(
-            [fused[cell, :3].sum(), fused[cell, 3:].sum()], [1, fused[cell, 1]]
-        )
-    for cell in (1, 2, 4):
-        np.testing.assert_array_equal(fused[cell], empty((), 2))
-
-
-def test_a_multiplicity_counts_as_so_many_equal_beliefs():
-    rng = np.random.default_rng(0)
-    beliefs = from_scores(rng.random(12), rng.uniform(0.0, 1.0, 12), np.zeros(12, dtype=int), 1)
-    times, cells = rng.integers(1, 5, 12), rng.integers(0, 3, 12)
-    options = {"num_cells": 3, "min_count": 1}
-    np.testing.assert_allclose(
-        fuse_cells(beliefs, cells, multiplicity=times, **options),
-        fuse_cells(np.repeat(beliefs, times, axis=0), np.repeat(cells, times), **options),
-        atol=1e-12,
+@given(beliefs(num_causes=2), st.integers(1, 4), st.data())
+def test_cells_are_fused_each_for_itself_from_the_minimum_count_on(beliefs, min_count, data):
+    n = len(beliefs)
+    cells, times = (
+        data.draw(arrays(int, n, elements=st.integers(*ends))) for ends in ((-1, 3), (1, 4))
     )
+    options = {"num_cells": 5, "min_count": min_count}
+    fused = fuse_cells(beliefs, cells, **options)
+    for cell in range(5):
+        own = beliefs[cells == cell]
+        expected = fuse(own) if len(own) >= min_count else empty((), 2)
+        np.testing.assert_allclose(fused[cell], expected, atol=1e-12)
+        sums = [fused[cell, :3].sum(), fused[cell, 3:].sum()]
+        np.testing.assert_allclose(sums, [1.0, fused[cell, 1]], atol=1e-12)
+    # A multiplicity counts as so many equal beliefs.
+    options["min_count"] = 1
+    repeated = fuse_cells(np.repeat(beliefs, times, axis=0), np.repeat(cells, times), **options)
+    counted = fuse_cells(beliefs, cells, multiplicity=times, **options)
+    np.testing.assert_allclose(counted, repeated, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import naive
 from drake_safety.learning.change_detector import (
     FALSE_ALARMS_PER_HOUR,
     LEAST_MOTION_S,
@@ -22,27 +23,6 @@ def worst(rows, detector=None):
     return (detector or learned()).levels_of([rows]).max(axis=1)
 
 
-def slowly(detector, motions):
-    """Levels and charts after each row of consecutive motions, one after another."""
-    charts, levels = np.zeros((6, len(detector.watched))), np.zeros(len(detector.watched))
-    seen = []
-    for one in motions:
-        x, state, repeats = one[:, detector.columns], one[:, detector.watched], 0
-        for k in range(len(one)):
-            repeats = repeats + 1 if k > 0 and np.array_equal(x[k], x[k - 1]) else 0
-            if k > 1:
-                z = detector.innovation(x[k - 1], x[k - 2], state[k] - state[k - 1])
-                charts = charts.copy()
-                for i, memory_s in enumerate(TIME_CONSTANTS_S):
-                    weight = min(STEP_S / memory_s, 1.0)
-                    charts[i] += weight * (z - charts[i])
-                    charts[i + 3] += weight * (z**2 - 1.0 - charts[i + 3])
-                of_charts = np.vstack([np.abs(charts[:3]), charts[3:]]) / detector.limits
-                levels = np.maximum(of_charts.max(axis=0), repeats / detector.longest_repeat)
-            seen.append((levels, charts))
-    return tuple(np.array(each) for each in zip(*seen, strict=True))
-
-
 @pytest.mark.parametrize("monitored", [None, ["knee_rate"]])
 def test_levels_are_those_of_the_recursion_over_consecutive_motions(monitored):
     detector = learned()
@@ -52,7 +32,7 @@ def test_levels_are_those_of_the_recursion_over_consecutive_motions(monitored):
     rows = [motion(2.0, seed, ALWAYS) for seed in range(4)]
     rows[1] = rows[1][:2]  # Too short for an innovation: the charts keep their values.
     rows[2][20:30] = rows[2][20]
-    levels, charts = slowly(detector, rows)
+    levels, charts = naive.charts(detector, rows)
     np.testing.assert_allclose(detector.levels_of(rows), levels, rtol=1e-4, atol=1e-4)
     assert levels.shape[1] == len(monitored or INFO.state_names)
     assert not levels[:2].any() and levels[2:].min() > 0.0
@@ -93,13 +73,13 @@ def test_a_frozen_input_is_noticed_after_few_repeats():
     (alarm,) = learned().watch([rows])[1]
     assert 215 < alarm.begin <= 215 + learned().longest_repeat + 1
     assert alarm.end == len(rows)
-    _, charts = slowly(learned(), [rows])
+    _, charts = naive.charts(learned(), [rows])
     repeats = learned().longest_repeat + 1
     assert learned().cause(charts[-1], repeats, INFO.state_names) == "inputs frozen"
 
 
 def test_the_cause_names_the_state_that_is_pushed():
-    _, charts = slowly(learned(), [motion(5.0, 6, ALWAYS, -0.03)])
+    _, charts = naive.charts(learned(), [motion(5.0, 6, ALWAYS, -0.03)])
     said = learned().cause(charts[-1], 0.0, INFO.state_names)
     assert said.startswith("joint knee answers unlike in training (knee_rate -")
 

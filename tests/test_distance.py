@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import naive
 from drake_safety.learning import distance
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
@@ -19,6 +20,11 @@ def segments():
     return split(make_episodes(30), stride=4, discount=0.99)
 
 
+@pytest.fixture(scope="module")
+def warping(segments):
+    return {cost: naive.dtw(segments.error, segments.length, cost) for _, cost in WAYS[:3]}
+
+
 def dtw_matrix(error, length, backend="dtaidistance"):
     """DTW of every pair, which a graph of neighbours never holds."""
     every = slice(0, len(error))
@@ -30,63 +36,41 @@ def graph_of(segments, **changes):
     return neighbour_graph(segments.error, segments.length, segments.score, **options)
 
 
-def test_dtw_of_two_short_sequences_is_the_value_worked_by_hand():
+def test_dtw_is_the_value_worked_by_hand_and_symmetric(segments):
     # (0, 1, 2) against (0, 2): 0-0, 1-0 or 1-2 at cost 1, 2-2
     error = np.array([[[0.0], [1.0], [2.0]], [[0.0], [2.0], [99.0]]])
     for backend in distance.BACKENDS:
         matrix = dtw_matrix(error, np.array([3, 2]), backend=backend)
         np.testing.assert_allclose(matrix, [[0.0, 1.0], [1.0, 0.0]])
-
-
-def test_dtw_is_symmetric_and_agrees_with_its_oracle(segments):
     assert np.any(segments.length < segments.error.shape[1])
     matrix = dtw_matrix(segments.error, segments.length)
     np.testing.assert_array_equal(matrix, matrix.T)
     np.testing.assert_array_equal(np.diag(matrix), 0.0)
-    oracle = dtw_matrix(segments.error, segments.length, backend="tslearn")
-    np.testing.assert_allclose(matrix, oracle, atol=1e-12)
+
+
+WAYS = [*(("dtaidistance", cost) for cost in distance.WARPING_COSTS), ("tslearn", "rooted")]
 
 
 @pytest.mark.parametrize("rows", [32, 7])
 @pytest.mark.parametrize("score_weight", [0.0, 0.01, 0.5])
 def test_among_all_segments_the_graph_holds_exactly_the_nearest_neighbours(
-    segments, rows, score_weight, monkeypatch
+    segments, warping, rows, score_weight, monkeypatch
 ):
     monkeypatch.setattr(distance, "_ROWS", rows)
     monkeypatch.setattr(distance, "_BLOCK", 4 * rows)
-    seen = []
-    graph = graph_of(segments, score_weight=score_weight, progress=seen.append)
-    assert seen == sorted(seen) and seen[-1] == 1.0
-    assert not np.any(graph.indices == np.arange(len(segments))[:, None])
-    assert all(len(set(row)) == 15 for row in graph.indices.tolist())
-    oracle = graph_of(segments, score_weight=score_weight, backend="tslearn")
-    assert graph.max_dtw == pytest.approx(oracle.max_dtw, rel=1e-12)
-    np.testing.assert_allclose(graph.distances, oracle.distances, atol=1e-12)
-    matrix = dtw_matrix(segments.error, segments.length)
-    score = segments.score
-    omega = matrix / matrix.max() + score_weight * np.abs(score[:, None] - score)
-    found = np.take_along_axis(omega, graph.indices, axis=1)
-    np.testing.assert_allclose(found, graph.distances, atol=1e-12)
-
-
-@pytest.mark.parametrize("cost", distance.WARPING_COSTS)
-def test_every_cost_of_a_warping_path_gives_its_exact_neighbours(segments, cost):
-    every = slice(0, len(segments))
-    matrix = distance._dtw_block(
-        distance._series(segments.error, segments.length),
-        every,
-        every,
-        is_absolute=cost == "absolute",
-    )
-    if cost == "squared":
-        matrix = matrix**2
-    graph = graph_of(segments, cost=cost)
-    assert graph.max_dtw == pytest.approx(matrix.max(), rel=1e-12)
-    score = segments.score
-    omega = matrix / matrix.max() + 0.05 * np.abs(score[:, None] - score)
-    np.fill_diagonal(omega, np.inf)
-    nearest = np.sort(omega, axis=1)[:, : graph.distances.shape[1]]
-    np.testing.assert_allclose(graph.distances, nearest, atol=1e-12)
+    unlike = np.abs(segments.score[:, None] - segments.score)
+    for backend, cost in WAYS:
+        seen, options = [], {"score_weight": score_weight, "cost": cost}
+        graph = graph_of(segments, **options, backend=backend, progress=seen.append)
+        assert seen == sorted(seen) and seen[-1] == 1.0
+        assert all(len(set(row)) == 15 for row in graph.indices.tolist())
+        assert graph.max_dtw == pytest.approx(warping[cost].max(), rel=1e-12)
+        omega = warping[cost] / warping[cost].max() + score_weight * unlike
+        np.fill_diagonal(omega, np.inf)
+        nearest = np.sort(omega, axis=1)[:, :15]
+        np.testing.assert_allclose(graph.distances, nearest, atol=1e-12)
+        found = np.take_along_axis(omega, graph.indices, axis=1)  # Infinite for itself.
+        np.testing.assert_allclose(found, nearest, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +131,7 @@ def test_the_largest_dtw_is_found_though_the_euclidean_bound_misleads():
     length = np.full(len(error), 12)
     score = np.zeros(len(error))
     graph = neighbour_graph(error, length, score, score_weight=0.0, num_neighbours=3, cost="rooted")
-    assert graph.max_dtw == pytest.approx(dtw_matrix(error, length).max(), rel=1e-12)
+    assert graph.max_dtw == pytest.approx(naive.dtw(error, length).max(), rel=1e-12)
 
 
 def test_identical_segments_are_at_distance_zero_of_each_other():

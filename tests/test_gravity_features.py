@@ -11,6 +11,7 @@ from drake_safety.control.observation import gravity_in_foot_plane
 from drake_safety.robots.shift import Shift
 from drake_safety.systems.gravity_features import GravityFeatures
 from legged_robots import ROBOT_NAMES, robot_kinematics
+from system_doubles import Bench
 
 DOWN = np.array([0.0, 0.0, -9.81])
 
@@ -64,13 +65,9 @@ def test_the_mirrored_robot_sees_the_mirrored_slope():
     seen = []
     for mirror in (None, Mirror(kinematics)):
         system = GravityFeatures(kinematics, mirror=mirror)
-        context = system.CreateDefaultContext()
-        state = np.concatenate(
-            [kinematics.standing_positions(), np.zeros(kinematics.num_velocities)]
-        )
-        system.GetInputPort("plant_state").FixValue(context, state)
-        system.GetInputPort("gravity").FixValue(context, downhill(0.1, 0.7))
-        seen.append(system.GetOutputPort("features").Eval(context))
+        q, v = kinematics.standing_positions(), np.zeros(kinematics.num_velocities)
+        bench = Bench(system, plant_state=np.append(q, v), gravity=downhill(0.1, 0.7))
+        seen.append(bench.get("features"))
     assert system.feature_names == ["gravity_x", "gravity_y"]
     np.testing.assert_allclose(seen[0], 0.1 * np.array([math.cos(0.7), math.sin(0.7)]), atol=1e-3)
     np.testing.assert_allclose(seen[1], seen[0] * (1.0, -1.0))

@@ -1,25 +1,29 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from drake_safety.learning.grid import OUTSIDE, Grid
 
 GRID = Grid(resolution=14, cell_length=10.0)
-
-
-def test_each_centre_lies_in_its_own_cell():
-    np.testing.assert_array_equal(GRID.locate(GRID.centres), np.arange(GRID.num_cells))
-
-
-def test_the_first_coordinate_counts_rows():
-    assert GRID.locate(np.array([-69.0, -69.0])) == 0
-    assert GRID.locate(np.array([-69.0, -59.0])) == 1
-    assert GRID.locate(np.array([-59.0, -69.0])) == 14
+GRIDS = st.builds(Grid, resolution=st.integers(1, 20), cell_length=st.floats(0.1, 100.0))
+SEEDS = st.integers(0, 2**32 - 1)
 
 
 def interpolated(grid, points, values):
     """One value a cell, at points of one map."""
     found, _ = grid.interpolate(np.asarray(points)[None], np.asarray(values)[None, :, None])
     return found[0, :, 0]
+
+
+@given(GRIDS)
+def test_each_centre_lies_in_its_own_cell(grid):
+    np.testing.assert_array_equal(grid.locate(grid.centres), np.arange(grid.num_cells))
+
+
+def test_the_first_coordinate_counts_rows():
+    corners = np.array([[-69.0, -69.0], [-69.0, -59.0], [-59.0, -69.0]])
+    np.testing.assert_array_equal(GRID.locate(corners), [0, 1, 14])
 
 
 @pytest.mark.parametrize("point", [(70.0, 0.0), (0.0, -70.1), (np.nan, 0.0), (np.inf, 0.0)])
@@ -31,32 +35,30 @@ def test_a_point_beyond_the_edge_is_outside_and_not_in_the_last_cell(point):
         assert not is_inside.any()
 
 
-def test_scaled_points_are_centred_and_fill_the_grid_but_for_a_tenth():
-    points = np.random.default_rng(0).normal(3.0, 20.0, size=(500, 2))
-    scaled = GRID.scale(points)
-    np.testing.assert_allclose(scaled.mean(axis=0), 0.0, atol=1e-9)
-    assert 1.1 * np.abs(scaled).max() == pytest.approx(70.0)
+@given(GRIDS, SEEDS)
+def test_scaled_points_are_centred_and_fill_the_grid_but_for_a_tenth(grid, seed):
+    half = 0.5 * grid.resolution * grid.cell_length
+    scaled = grid.scale(np.random.default_rng(seed).normal(3.0, 20.0, size=(500, 2)))
+    np.testing.assert_allclose(scaled.mean(axis=0), 0.0, atol=1e-9 * half)
+    assert 1.1 * np.abs(scaled).max() == pytest.approx(half)
 
 
-def test_interpolation_reproduces_a_linear_function_between_the_outermost_centres():
-    points = np.random.default_rng(1).uniform(-65.0, 65.0, size=(200, 2))
-    found = interpolated(GRID, points, GRID.centres @ [2.0, -3.0] + 5.0)
-    np.testing.assert_allclose(found, points @ [2.0, -3.0] + 5.0, atol=1e-9)
-    values = np.random.default_rng(2).uniform(size=GRID.num_cells)
-    np.testing.assert_allclose(interpolated(GRID, GRID.centres, values), values, atol=1e-12)
+@given(GRIDS, SEEDS)
+def test_interpolation_is_linear_between_the_centres_and_nearest_beyond_the_outermost(grid, seed):
+    rng, outermost = np.random.default_rng(seed), np.abs(grid.centres).max()
+    points = rng.uniform(-1.0, 1.0, size=(200, 2)) * (outermost + 0.49 * grid.cell_length)
+    found = interpolated(grid, points, grid.centres @ [2.0, -3.0] + 5.0)
+    expected = np.clip(points, -outermost, outermost) @ [2.0, -3.0] + 5.0
+    np.testing.assert_allclose(found, expected, atol=1e-9 * (1.0 + outermost))
+    values = rng.uniform(size=grid.num_cells)
+    np.testing.assert_allclose(interpolated(grid, grid.centres, values), values, atol=1e-12)
 
 
-def test_between_the_outermost_centres_and_the_edge_the_nearest_centres_count():
-    values = np.arange(GRID.num_cells, dtype=float)
-    found = interpolated(GRID, [[-69.9, -69.9], [69.9, -65.0], [-69.0, -60.0]], values)
-    np.testing.assert_allclose(found, [0.0, 13 * 14, 0.5])
-    one = Grid(resolution=1, cell_length=2.0)
-    np.testing.assert_allclose(interpolated(one, [[0.3, -0.7]], [4.0]), [4.0])
-
-
-def test_each_map_reads_its_own_cells():
-    values = np.random.default_rng(3).uniform(size=(3, GRID.num_cells, 2))
-    points = np.random.default_rng(4).uniform(-69.0, 69.0, size=(3, 50, 2))
+@given(SEEDS)
+def test_each_map_reads_its_own_cells(seed):
+    rng = np.random.default_rng(seed)
+    values = rng.uniform(size=(3, GRID.num_cells, 2))
+    points = rng.uniform(-69.0, 69.0, size=(3, 50, 2))
     found, is_inside = GRID.look_up(points, values)
     assert is_inside.all()
     for k in range(3):

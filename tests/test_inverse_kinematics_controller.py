@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.analysis import Simulator
 
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
 from drake_safety.systems.trajectory_planner import to_world
 from legged_robots import ROBOT_NAMES, robot_kinematics
+from system_doubles import Bench
 
 PERIOD_S = 0.01
 STIFFNESS = 250.0
@@ -21,34 +21,25 @@ def base_over(kinematics, stance_pose=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0)):
     return to_world(np.array(stance_pose), base + shift)
 
 
-class Bench:
-    """A controller alone, with its inputs fixed."""
+class Commanded(Bench):
+    """A controller alone, of a robot that stands."""
 
-    def __init__(self, name, stiffness=STIFFNESS, desired=None, **options):
-        self.kinematics = robot_kinematics(name)
-        n_j = self.kinematics.num_joints
-        self.controller = InverseKinematicsController(
-            self.kinematics, np.full(n_j, stiffness), **{"period_s": PERIOD_S} | options
-        )
-        self.simulator = Simulator(self.controller)
-        self.context = self.simulator.get_mutable_context()
-        X_WB = RigidTransform([0, 0, self.kinematics.standing_height])
-        q = self.kinematics.positions_at(X_WB, self.kinematics.posture)
-        self.fix("plant_state", np.concatenate([q, np.zeros(self.kinematics.num_velocities)]))
-        self.fix("desired_output", base_over(self.kinematics) if desired is None else desired)
-
-    def fix(self, name, value):
-        self.controller.GetInputPort(name).FixValue(self.context, np.ravel(value))
+    def __init__(self, name, stiffness=STIFFNESS, desired=None):
+        self.kinematics = k = robot_kinematics(name)
+        gains = np.full(k.num_joints, stiffness)
+        super().__init__(InverseKinematicsController(k, gains, period_s=PERIOD_S))
+        q = k.positions_at(RigidTransform([0, 0, k.standing_height]), k.posture)
+        self.fix(plant_state=np.append(q, np.zeros(k.num_velocities)))
+        self.fix(desired_output=base_over(k) if desired is None else desired)
 
     def command(self):
         """The commanded joint positions and rates."""
-        value = self.controller.GetOutputPort("desired_joint_state").Eval(self.context)
-        return np.split(value, 2)
+        return np.split(self.get("desired_joint_state"), 2)
 
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_the_command_of_standing_is_the_posture_and_the_static_offset(name):
-    bench = Bench(name)
+    bench = Commanded(name)
     kinematics = bench.kinematics
     bench.simulator.AdvanceTo(0.1)
     position, rate = bench.command()
@@ -64,9 +55,9 @@ def test_the_set_point_carries_the_base_over_the_feet_wherever_they_stand(name, 
     kinematics = robot_kinematics(name)
     shift = (0.01, -0.01, -0.02)
     desired = base_over(kinematics, stance_pose, shift)
-    bench = Bench(name, stiffness=1e9, desired=desired)  # So stiff that there is no offset.
+    bench = Commanded(name, stiffness=1e9, desired=desired)  # So stiff that there is no offset.
     feet = standing_feet(kinematics, stance_pose)
-    bench.controller.set_foot_positions(bench.context, feet)
+    bench.system.set_foot_positions(bench.context, feet)
     bench.simulator.Initialize()
     position, _ = bench.command()
     X_WB = RigidTransform(RotationMatrix.MakeZRotation(stance_pose[2]), desired)
@@ -76,13 +67,13 @@ def test_the_set_point_carries_the_base_over_the_feet_wherever_they_stand(name, 
 
 @pytest.mark.parametrize(("lift_m", "yaw"), [(0.04, 0.0), (0.0, 0.1)])
 def test_connected_feet_override_the_parameter_and_a_yaw_that_of_the_feet(lift_m, yaw):
-    bench = Bench("laikago", stiffness=1e9)
+    bench = Commanded("laikago", stiffness=1e9)
     kinematics = bench.kinematics
     feet = standing_feet(kinematics) + np.array([0.0, 0.0, lift_m])
     if lift_m:
-        bench.fix("desired_foot_positions", feet)
+        bench.fix(desired_foot_positions=feet)
     else:
-        bench.fix("desired_yaw", yaw)
+        bench.fix(desired_yaw=yaw)
     bench.simulator.Initialize()
     X_WB = RigidTransform(RotationMatrix.MakeZRotation(yaw), base_over(kinematics))
     q = kinematics.positions_at(X_WB, bench.command()[0])
@@ -90,12 +81,12 @@ def test_connected_feet_override_the_parameter_and_a_yaw_that_of_the_feet(lift_m
 
 
 def test_a_lifted_foot_gets_no_share_of_the_weight():
-    on_ground, lifted = Bench("hexapod"), Bench("hexapod")
+    on_ground, lifted = Commanded("hexapod"), Commanded("hexapod")
     feet = standing_feet(lifted.kinematics)
     feet[0, 2] += 0.02
-    lifted.fix("desired_foot_positions", feet)
-    stiff = Bench("hexapod", stiffness=1e9)
-    stiff.fix("desired_foot_positions", feet)
+    lifted.fix(desired_foot_positions=feet)
+    stiff = Commanded("hexapod", stiffness=1e9)
+    stiff.fix(desired_foot_positions=feet)
     for bench in (on_ground, lifted, stiff):
         bench.simulator.Initialize()
     leg = [lifted.kinematics.joint_names.index(f"{name}_0") for name in ("lift", "knee")]
@@ -105,10 +96,10 @@ def test_a_lifted_foot_gets_no_share_of_the_weight():
 
 
 def test_the_commanded_rate_is_the_set_points_change_over_a_period():
-    bench = Bench("laikago", stiffness=1e9)
+    bench = Commanded("laikago", stiffness=1e9)
     bench.simulator.Initialize()
     before, _ = bench.command()
-    bench.fix("desired_output", base_over(bench.kinematics, shift=(0.0, 0.0, -0.002)))
+    bench.fix(desired_output=base_over(bench.kinematics, shift=(0.0, 0.0, -0.002)))
     bench.simulator.AdvanceTo(0.001)
     after, rate = bench.command()
     np.testing.assert_allclose(rate, (after - before) / PERIOD_S, atol=1e-4)
@@ -120,7 +111,7 @@ def test_the_commanded_rate_is_the_set_points_change_over_a_period():
 def test_commands_stay_within_the_joints_limits(name, height):
     kinematics = robot_kinematics(name)
     desired = base_over(kinematics, shift=(0.3, 0.3, height))
-    bench = Bench(name, stiffness=20.0, desired=desired)
+    bench = Commanded(name, stiffness=20.0, desired=desired)
     bench.simulator.AdvanceTo(0.05)
     position, rate = bench.command()
     lowest, highest = kinematics.position_limits.T
@@ -136,6 +127,6 @@ def test_a_stiffness_that_is_not_positive_for_every_joint_is_refused(stiffness):
 
 
 def test_an_input_that_is_not_finite_is_an_error_not_a_crash():
-    bench = Bench("laikago", desired=np.array([np.nan, 0.0, 0.4]))
+    bench = Commanded("laikago", desired=np.array([np.nan, 0.0, 0.4]))
     with pytest.raises((ValueError, RuntimeError)):
         bench.simulator.Initialize()

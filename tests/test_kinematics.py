@@ -24,11 +24,6 @@ def random_positions(kinematics, rng):
     return kinematics.positions_at(X_WB, joints)
 
 
-def standing(kinematics):
-    X_WB = RigidTransform([0.0, 0.0, kinematics.standing_height])
-    return kinematics.positions_at(X_WB, kinematics.posture)
-
-
 def test_the_contact_jacobian_is_the_derivative_of_the_contact_positions(kinematics):
     rng = np.random.default_rng(1)
     q = random_positions(kinematics, rng)
@@ -44,7 +39,7 @@ def test_the_contact_jacobian_is_the_derivative_of_the_contact_positions(kinemat
 
 
 def test_standing_puts_every_sphere_on_the_ground(kinematics):
-    p_WC = kinematics.contact_positions(standing(kinematics))
+    p_WC = kinematics.contact_positions(kinematics.standing_positions())
     np.testing.assert_allclose(p_WC[:, 2], kinematics.foot_radii, atol=1e-9)
 
 
@@ -66,7 +61,7 @@ def test_no_answer_depends_on_an_earlier_call(kinematics):
 
 def test_the_gravity_torques_and_ground_forces_carry_the_weight(kinematics):
     # Inverse dynamics: zero acceleration needs exactly these torques and a total force m g.
-    q = standing(kinematics)
+    q = kinematics.standing_positions()
     is_stance = np.ones(kinematics.num_contacts, bool)
     torques = kinematics.gravity_torques(q, is_stance)
     J = kinematics.contact_jacobian(q)
@@ -82,7 +77,7 @@ def test_the_gravity_torques_and_ground_forces_carry_the_weight(kinematics):
 
 def test_gravity_torques_do_not_depend_on_place_or_heading(kinematics):
     is_stance = np.ones(kinematics.num_contacts, bool)
-    here = kinematics.gravity_torques(standing(kinematics), is_stance)
+    here = kinematics.gravity_torques(kinematics.standing_positions(), is_stance)
     X_WB = RigidTransform(RotationMatrix.MakeZRotation(1.0), [3, -1, kinematics.standing_height])
     q = kinematics.positions_at(X_WB, kinematics.posture)
     # The small regularisation sees the world's origin: some hundredths of a newton metre.
@@ -90,7 +85,7 @@ def test_gravity_torques_do_not_depend_on_place_or_heading(kinematics):
 
 
 def test_in_the_air_the_torques_hold_the_legs_only(kinematics):
-    q = standing(kinematics)
+    q = kinematics.standing_positions()
     torques = kinematics.gravity_torques(q, np.zeros(kinematics.num_contacts, bool))
     kinematics.plant.SetPositions(kinematics.context, q)
     gravity = kinematics.plant.CalcGravityGeneralizedForces(kinematics.context)
@@ -99,7 +94,7 @@ def test_in_the_air_the_torques_hold_the_legs_only(kinematics):
 
 def test_a_lifted_foot_pushes_nothing():
     kinematics = robot_kinematics("hexapod")
-    q = standing(kinematics)
+    q = kinematics.standing_positions()
     is_stance = np.ones(6, bool)
     is_stance[2] = False
     torques = kinematics.gravity_torques(q, is_stance)
@@ -113,7 +108,7 @@ def test_a_lighter_robot_needs_less_torque_in_proportion():
     robot = robot_model("biped")
     full, light = RobotKinematics(robot), RobotKinematics(robot, PlantVariation(mass_scale=0.8))
     assert light.total_mass == pytest.approx(0.8 * full.total_mass)
-    q, is_stance = standing(full), np.ones(full.num_contacts, bool)
+    q, is_stance = full.standing_positions(), np.ones(full.num_contacts, bool)
     torques = full.gravity_torques(q, is_stance)
     np.testing.assert_allclose(light.gravity_torques(q, is_stance), 0.8 * torques, atol=1e-9)
 
@@ -135,7 +130,7 @@ def test_the_centre_of_mass_is_the_mean_of_the_bodies(kinematics):
 @pytest.mark.parametrize("entry", [0, 4, 9])
 def test_positions_that_are_not_finite_are_refused_not_fatal(value, entry):
     kinematics = robot_kinematics("laikago")
-    q = standing(kinematics)
+    q = kinematics.standing_positions()
     q[entry] = value
     for call in (kinematics.contact_positions, kinematics.contact_jacobian):
         with pytest.raises(ValueError, match="robot 'laikago': positions must be finite"):

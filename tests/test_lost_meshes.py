@@ -6,10 +6,9 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 import urdf_files
-from drake_safety.cli import make_app
+from command_line import invoked
 from drake_safety.robots.robot_template import write_robot
 from drake_safety.robots.urdf_survey import Survey
 from drake_safety.simulation.rollouts import run_episode
@@ -95,9 +94,7 @@ def test_without_the_extra_its_command_is_told_and_the_meshes_are_left_out(tmp_p
     urdf = shaped(tmp_path, femur_0=bar())
     monkeypatch.setitem(sys.modules, "trimesh", None)
     out = tmp_path / "spider"
-    result = CliRunner().invoke(
-        make_app(), ["new", "spider", "--urdf", str(urdf), "--out", str(out)]
-    )
+    result = invoked("new", "spider", "--urdf", urdf, "--out", out)
     assert result.exit_code == 0
     assert "WARNING  1 links have lost their collision meshes" in result.output
     assert result.output.count("pip install 'drake_safety[robots]'") == 1
@@ -108,9 +105,7 @@ def test_without_the_extra_its_command_is_told_and_the_meshes_are_left_out(tmp_p
 def test_check_draws_the_standing_robot_beside_its_shapes(spider, tmp_path, is_legged):
     scenario = str(spider.folder / "balancing.yaml") if is_legged else "pendulum"
     picture = tmp_path / "shapes.png"
-    result = CliRunner().invoke(
-        make_app(), ["check", scenario, "--quick", "--picture", str(picture)]
-    )
+    result = invoked("check", scenario, "--quick", "--picture", picture)
     assert picture.is_file() == is_legged
     if is_legged:
         assert result.exit_code == 0

@@ -6,9 +6,8 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 import yaml
-from typer.testing import CliRunner
 
-from drake_safety.cli import make_app
+from command_line import invoked
 from drake_safety.robots.robot_template import write_robot
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.scenario_check import check_scenario
@@ -242,9 +241,7 @@ def bare(tmp_path):
 
 def test_links_that_lose_their_collision_meshes_are_told_loudly(bare, tmp_path):
     out = tmp_path / "spider"
-    result = CliRunner().invoke(
-        make_app(), ["new", "spider", "--urdf", str(bare), "--out", str(out)]
-    )
+    result = invoked("new", "spider", "--urdf", bare, "--out", out)
     assert result.exit_code == 0
     assert "WARNING  2 links have lost their collision meshes, which are missing" in result.output
     assert "everything passes through femur_0, femur_1. Add boxes" in result.output
@@ -255,7 +252,7 @@ def test_links_that_lose_their_collision_meshes_are_told_loudly(bare, tmp_path):
 def test_check_warns_of_links_without_a_shape_until_they_have_one(bare, tmp_path):
     written = write_robot("spider", bare, "balancing", tmp_path / "spider")
     file = written.folder / "balancing.yaml"
-    result = CliRunner().invoke(make_app(), ["check", str(file), "--quick"])
+    result = invoked("check", file, "--quick")
     assert result.exit_code == 0
     assert "warning  collision shapes: 2 links have none" in result.output
     assert "fix: add a <collision> with a box, sphere or capsule [m]" in result.output
@@ -271,7 +268,7 @@ def test_check_warns_of_links_without_a_shape_until_they_have_one(bare, tmp_path
 
 def test_a_quick_check_leaves_out_the_episodes_and_says_so(spider):
     file = spider.folder / "balancing.yaml"
-    result = CliRunner().invoke(make_app(), ["check", str(file), "--quick"])
+    result = invoked("check", file, "--quick")
     assert result.exit_code == 0
     assert "starts can be sampled" not in result.output
     assert "not checked: the share of unsafe episodes" in result.output
@@ -300,9 +297,7 @@ def test_new_says_which_visuals_it_left_out(tmp_path):
     gone = mesh("visual", "gone.stl")
     urdf = urdf_of_spider(tmp_path, lambda text: with_shape(text, "body", gone))
     out = tmp_path / "spider"
-    result = CliRunner().invoke(
-        make_app(), ["new", "spider", "--urdf", str(urdf), "--out", str(out)]
-    )
+    result = invoked("new", "spider", "--urdf", urdf, "--out", out)
     assert result.exit_code == 0
     assert "not where the URDF says are left out: gone.stl" in result.output
     assert "left out: gone.stl" in (out / "README.md").read_text()
@@ -341,8 +336,6 @@ def test_new_refuses_what_it_cannot_write(tmp_path, name, task, folder, message)
 
 def test_check_exits_with_1_when_there_is_a_problem_and_says_how_to_fix_it(own):
     edited(own / "robot.yaml", base="trunk")
-    result = CliRunner().invoke(
-        make_app(), ["check", str(own / "balancing.yaml"), "--episodes", "0"]
-    )
+    result = invoked("check", own / "balancing.yaml", "--episodes", "0")
     assert result.exit_code == 1
     assert "fix: correct what the message names" in result.output

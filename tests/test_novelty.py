@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import naive
 from drake_safety import SafetyAssessment, load_assessment, load_scenario
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.inputs import input_names
@@ -28,23 +29,6 @@ def novelty():
     return fitted(*redundant(np.random.default_rng(0)))
 
 
-def whitened_distances(known, x, plan):
-    """The same by whitening along every axis, the variance of each bounded from below."""
-    scale = np.maximum(np.sqrt(np.diag(known.covariance)), 1e-2)
-    found = []
-    for columns, least, most in (
-        (slice(None), 1e-2, np.inf),
-        (slice(None), 1e-8, 1e-7),
-        (plan, 1e-4, np.inf),
-    ):
-        unit = scale[columns]
-        variance, axes = np.linalg.eigh(known.covariance[columns, columns] / np.outer(unit, unit))
-        along = (x - known.mean)[:, columns] / unit @ axes
-        squares = (along**2 / np.maximum(variance, least))[:, variance < most]
-        found.append(np.sqrt(squares.sum(axis=1)))
-    return np.stack(found, axis=1)
-
-
 @pytest.mark.parametrize("name", ["atlas_reaching", "go2_walking"])
 def test_the_distances_are_those_of_whitened_inputs_with_bounded_variances(name):
     novelty = load_assessment(name).novelty_
@@ -52,7 +36,7 @@ def test_the_distances_are_those_of_whitened_inputs_with_bounded_variances(name)
     root = np.linalg.cholesky(known.covariance + 1e-12 * np.eye(len(known.mean)))
     x = known.mean + rng.normal(size=(200, len(root))) @ root.T
     x[100:] += rng.normal(size=(100, len(root))) * 10.0 ** rng.integers(-6, 6, size=(100, 1))
-    expected = whitened_distances(known, x, novelty.plan)
+    expected = naive.whitened_distances(known, x, novelty.plan)
     np.testing.assert_allclose(novelty.distances(x), expected, rtol=1e-6)
     np.testing.assert_allclose(novelty.of(x), (expected / novelty.limits).max(axis=1), rtol=1e-6)
 

@@ -2,7 +2,6 @@ import math
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
 
 from drake_safety.diagrams.pendulum import (
     PendulumController,
@@ -11,16 +10,15 @@ from drake_safety.diagrams.pendulum import (
     PendulumSafeSet,
     bob_position,
 )
+from system_doubles import Bench
 
 LENGTH_M = 0.5
 PERIOD_S = 0.01
 
 
 def observed(angle_from_hanging, rate):
-    observer = PendulumObserver(LENGTH_M)
-    context = observer.CreateDefaultContext()
-    observer.get_input_port().FixValue(context, [angle_from_hanging, rate])
-    return [observer.GetOutputPort(name).Eval(context) for name in ("plant_state", "output")]
+    bench = Bench(PendulumObserver(LENGTH_M), pendulum_state=[angle_from_hanging, rate])
+    return bench.get("plant_state"), bench.get("output")
 
 
 def test_the_observer_counts_from_upright_and_places_the_bob():
@@ -35,16 +33,12 @@ def test_the_observer_counts_from_upright_and_places_the_bob():
 
 def torque_of(parameters, state, angle=0.0, rate=0.0):
     """The torque that a controller holds after its update at time 0."""
-    controller = PendulumController(parameters, PERIOD_S)
-    simulator = Simulator(controller)
-    context = simulator.get_mutable_context()
     point = bob_position(angle, parameters.length_m)
     velocity = rate * parameters.length_m * np.array([math.cos(angle), 0.0, -math.sin(angle)])
-    ports = {"plant_state": state, "desired_output": point, "desired_output_rate": velocity}
-    for name, value in ports.items():
-        controller.GetInputPort(name).FixValue(context, value)
-    simulator.AdvanceTo(0.1 * PERIOD_S)
-    return controller.get_output_port().Eval(context)[0]
+    bench = Bench(PendulumController(parameters, PERIOD_S), plant_state=state)
+    bench.fix(desired_output=point, desired_output_rate=velocity)
+    bench.advance(0.1 * PERIOD_S)
+    return bench.get("torque")[0]
 
 
 def test_the_torque_is_that_of_both_errors_less_the_weights():

@@ -1,69 +1,43 @@
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
 
 from drake_safety.systems.policy_controller import ACTING, HELD
-from gliding_task import evaluated
-from system_doubles import controller
+from system_doubles import Bench, controller
 
 
-def started(system, command=(0.2, 0.4, 0.0), state=None):
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    state = np.eye(1, 17).ravel() if state is None else state
-    system.GetInputPort("plant_state").FixValue(context, state)
-    system.GetInputPort("command").FixValue(context, np.array(command))
-    return simulator, context
+def started(system):
+    bench = Bench(system, plant_state=np.eye(1, 17), command=[0.2, 0.4, 0.0])
+    bench.advance(0.01)
+    return bench
 
 
-def test_a_set_point_is_that_of_the_action_until_the_next_period():
-    system = controller()
-    simulator, context = started(system)
-    simulator.AdvanceTo(0.01)
+def test_a_set_point_is_that_of_the_action():
+    bench = started(controller())
     # Actions 1.2 and 1.4, half a radian each, of the joints b and a.
-    expected = np.float32([0.7, 0.6, 0, 0])
-    np.testing.assert_allclose(evaluated(system, context, "desired_joint_state"), expected)
-    simulator.AdvanceTo(0.0199)
-    np.testing.assert_allclose(evaluated(system, context, "desired_joint_state"), expected)
-    assert evaluated(system, context, "status")[0] == ACTING
-    assert len(evaluated(system, context, "action_state")) == len(system.action_names) == 10
+    np.testing.assert_allclose(bench.get("desired_joint_state"), np.float32([0.7, 0.6, 0, 0]))
+    assert bench.get("status")[0] == ACTING
+    assert len(bench.get("action_state")) == len(bench.system.action_names) == 10
 
 
-def test_a_cloned_context_goes_on_from_its_phase():
-    system = controller()
-    simulator, context = started(system)
-    simulator.AdvanceTo(0.05)
-    other = Simulator(system, context.Clone())
-    for one in (simulator, other):
-        one.AdvanceTo(0.13)
-    for name in ("desired_joint_state", "action_state"):
-        np.testing.assert_array_equal(
-            evaluated(system, context, name), evaluated(system, other.get_context(), name)
-        )
-    _, fresh_context = started(system)
-    system.set_state(fresh_context, system.state_of(context))
-    np.testing.assert_array_equal(
-        evaluated(system, fresh_context, "action_state"), evaluated(system, context, "action_state")
-    )
+def test_the_state_of_an_action_is_carried_to_another_context():
+    bench = started(controller())
+    bench.advance(0.12)
+    other = started(bench.system)
+    assert not np.array_equal(other.get("action_state"), bench.get("action_state"))
+    bench.system.set_state(other.context, bench.system.state_of(bench.context))
+    np.testing.assert_array_equal(other.get("action_state"), bench.get("action_state"))
 
 
-@pytest.mark.parametrize("what", ["command", "state", "action"])
+@pytest.mark.parametrize("what", ["command", "plant_state", "action"])
 def test_what_is_not_finite_leaves_the_last_action_and_a_status(what):
     broken = []
-
-    def evaluate(batch):
-        return batch[:, :2] * np.nan if broken else batch[:, :2] + 1.0
-
-    system = controller(evaluate)
-    simulator, context = started(system)
-    simulator.AdvanceTo(0.01)
-    good = evaluated(system, context, "desired_joint_state").copy()
-    if what == "command":
-        system.GetInputPort("command").FixValue(context, [np.inf, 0, 0])
-    elif what == "state":
-        system.GetInputPort("plant_state").FixValue(context, np.full(17, np.nan))
-    else:
+    system = controller(lambda batch: batch[:, :2] * np.nan if broken else batch[:, :2] + 1.0)
+    bench = started(system)
+    good = bench.get("desired_joint_state")
+    if what == "action":
         broken.append(True)
-    simulator.AdvanceTo(0.05)
-    np.testing.assert_array_equal(evaluated(system, context, "desired_joint_state"), good)
-    assert evaluated(system, context, "status")[0] == HELD
+    else:
+        bench.fix(**{what: {"command": [np.inf, 0, 0], "plant_state": np.full(17, np.nan)}[what]})
+    bench.advance(0.04)
+    np.testing.assert_array_equal(bench.get("desired_joint_state"), good)
+    assert bench.get("status")[0] == HELD

@@ -59,24 +59,18 @@ def test_a_push_on_a_floating_body_changes_its_velocity_by_impulse_over_mass(sta
     np.testing.assert_allclose(loop.velocity(context), expected, rtol=0.0, atol=1e-10)
 
 
-def test_a_push_that_was_cleared_never_comes():
+def test_contexts_of_one_source_are_pushed_each_by_its_own_and_a_cleared_push_never_comes():
     loop = FloatingBox()
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.set_push(context)
-    loop.source.clear_push(loop.source.GetMyMutableContextFromRoot(context))
-    simulator.AdvanceTo(0.5)
-    np.testing.assert_array_equal(loop.velocity(context), np.zeros(6))
-
-
-def test_contexts_of_one_source_are_pushed_each_by_its_own():
-    loop = FloatingBox()
-    pushed, left_alone = Simulator(loop), Simulator(loop)
-    loop.set_push(pushed.get_mutable_context())
-    for simulator in (pushed, left_alone):
+    pushed, cleared, left_alone = simulators = [Simulator(loop) for _ in range(3)]
+    for simulator in (pushed, cleared):
+        loop.set_push(simulator.get_mutable_context())
+    own = loop.source.GetMyMutableContextFromRoot(cleared.get_mutable_context())
+    loop.source.clear_push(own)
+    for simulator in simulators:
         simulator.AdvanceTo(0.5)
     assert np.abs(loop.velocity(pushed.get_context())).max() > 0.1
-    np.testing.assert_array_equal(loop.velocity(left_alone.get_context()), np.zeros(6))
+    for simulator in (cleared, left_alone):
+        np.testing.assert_array_equal(loop.velocity(simulator.get_context()), np.zeros(6))
 
 
 def test_a_body_that_the_robot_does_not_have_is_answered_with_those_it_has():

@@ -1,62 +1,42 @@
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.analysis import Simulator
 
 from drake_safety.control.kinematics import fit_stance
 from drake_safety.control.recovery_step import RecoveryStepParameters, capture_point, gait_groups
 from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
 from drake_safety.systems.trajectory_planner import to_world
 from legged_robots import ROBOT_NAMES, robot_kinematics
+from system_doubles import Bench
 
 PERIOD_S = 0.01
 HORIZON = 4
 NUM_OUTLOOK = 3
 
 
-class Bench:
+class Stepping(Bench):
     """A planner that sees a robot standing (or gliding) in its posture at a stance pose."""
 
     def __init__(
         self, name="laikago", stance_pose=(0.0, 0.0, 0.0), speed=(0.0, 0.0), active=1.0, **numbers
     ):
-        self.kinematics = robot_kinematics(name)
+        self.kinematics = k = robot_kinematics(name)
         self.parameters = RecoveryStepParameters(**numbers)
-        self.planner = RecoveryStepPlanner(
-            self.kinematics,
-            self.parameters,
-            period_s=PERIOD_S,
-            horizon=HORIZON,
-            num_outlook=NUM_OUTLOOK,
-        )
-        self.simulator = Simulator(self.planner)
-        self.context = self.simulator.get_mutable_context()
-        self.stance_pose = np.array(stance_pose)
-        feet = np.column_stack([self.kinematics.nominal_contacts, self.kinematics.foot_radii])
-        self.feet = to_world(self.stance_pose, feet)
-        base = np.append(self.kinematics.nominal_base_offset, self.kinematics.standing_height)
-        self.base = to_world(self.stance_pose, base)
-        self.planner.set_stance(self.context, self.feet, self.stance_pose)
-        self.speed = np.array([*speed, 0.0])
+        options = {"period_s": PERIOD_S, "horizon": HORIZON, "num_outlook": NUM_OUTLOOK}
+        super().__init__(RecoveryStepPlanner(k, self.parameters, **options))
+        self.stance_pose, self.speed = np.array(stance_pose), np.array([*speed, 0.0])
+        self.feet = to_world(self.stance_pose, np.c_[k.nominal_contacts, k.foot_radii])
+        self.base = to_world(self.stance_pose, np.r_[k.nominal_base_offset, k.standing_height])
+        self.system.set_stance(self.context, self.feet, self.stance_pose)
         self.see(self.base)
-        self.fix("recovery_active", [active])
-        self.fix("nominal_desired_output", self.base)
-
-    def fix(self, name, value):
-        self.planner.GetInputPort(name).FixValue(self.context, value)
+        self.fix(recovery_active=active, nominal_desired_output=self.base)
 
     def see(self, p_WB, turned=0.0, yaw_rate=0.0):
         X_WB = RigidTransform(RotationMatrix.MakeZRotation(self.stance_pose[2] + turned), p_WB)
         v = np.zeros(self.kinematics.num_velocities)
         v[2], v[3:6] = yaw_rate, self.speed
         q = self.kinematics.positions_at(X_WB, self.kinematics.posture)
-        self.fix("plant_state", np.concatenate([q, v]))
-
-    def get(self, name):
-        return self.planner.GetOutputPort(name).Eval(self.context).copy()
-
-    def advance(self, seconds):
-        self.simulator.AdvanceTo(self.context.get_time() + seconds)
+        self.fix(plant_state=np.concatenate([q, v]))
 
     def feet_now(self):
         return self.get("desired_foot_positions").reshape(-1, 3)
@@ -74,7 +54,7 @@ class Bench:
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_at_rest_the_feet_stay_where_they_were_set(name):
-    bench = Bench(name, stance_pose=(1.0, 2.0, 0.5), active=0.0)
+    bench = Stepping(name, stance_pose=(1.0, 2.0, 0.5), active=0.0)
     bench.advance(0.3)
     np.testing.assert_array_equal(bench.feet_now(), bench.feet)
     np.testing.assert_array_equal(bench.get("stance_pose"), [1.0, 2.0, 0.5])
@@ -83,7 +63,7 @@ def test_at_rest_the_feet_stay_where_they_were_set(name):
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_one_group_swings_at_a_time_and_the_groups_alternate(name):
-    bench = Bench(name, speed=(0.5, 0.0), min_steps=4)
+    bench = Stepping(name, speed=(0.5, 0.0), min_steps=4)
     swung = []
     for _ in range(4):
         bench.advance(0.5 * bench.parameters.step_duration_s)
@@ -96,7 +76,7 @@ def test_one_group_swings_at_a_time_and_the_groups_alternate(name):
 
 
 def test_a_swing_rises_by_its_lift():
-    bench = Bench(speed=(0.5, 0.0))
+    bench = Stepping(speed=(0.5, 0.0))
     heights = []
     for _ in range(round(bench.parameters.step_duration_s / PERIOD_S)):
         bench.advance(PERIOD_S)
@@ -106,7 +86,7 @@ def test_a_swing_rises_by_its_lift():
 
 @pytest.mark.parametrize("speed", [(0.6, 0.0), (0.0, 0.6), (-0.4, 0.4)])
 def test_feet_step_in_the_direction_of_the_fall(speed):
-    bench = Bench(speed=speed)
+    bench = Stepping(speed=speed)
     bench.advance(0.9 * bench.parameters.step_duration_s)
     moved = (bench.feet_now() - bench.feet)[:, :2]
     swung = np.concatenate([np.r_[bench.kinematics.foot_slices[i]] for i in bench.lifted()])
@@ -114,7 +94,7 @@ def test_feet_step_in_the_direction_of_the_fall(speed):
 
 
 def test_the_base_set_point_follows_the_measured_base_at_the_standing_height():
-    bench = Bench(speed=(0.5, 0.0))
+    bench = Stepping(speed=(0.5, 0.0))
     bench.advance(2 * PERIOD_S)
     bench.see(bench.base + [0.05, -0.02, -0.03])
     bench.advance(2 * PERIOD_S)
@@ -123,7 +103,7 @@ def test_the_base_set_point_follows_the_measured_base_at_the_standing_height():
 
 
 def test_the_preview_is_the_set_point_held_in_the_stance_frame():
-    bench = Bench(stance_pose=(2.0, -1.0, 1.2), speed=(0.5, 0.0))
+    bench = Stepping(stance_pose=(2.0, -1.0, 1.2), speed=(0.5, 0.0))
     bench.advance(5 * PERIOD_S)
     preview = bench.get("desired_preview").reshape(HORIZON, 3)
     assert np.all(preview == preview[0])
@@ -134,7 +114,7 @@ def test_the_preview_is_the_set_point_held_in_the_stance_frame():
 
 
 def test_at_rest_the_base_is_told_the_yaw_of_its_stance():
-    bench = Bench(stance_pose=(1.0, 2.0, 0.5), active=0.0)
+    bench = Stepping(stance_pose=(1.0, 2.0, 0.5), active=0.0)
     bench.see(bench.base, turned=0.2)
     bench.advance(0.1)
     assert bench.get("desired_yaw")[0] == 0.5
@@ -143,7 +123,7 @@ def test_at_rest_the_base_is_told_the_yaw_of_its_stance():
 @pytest.mark.parametrize("heading", [0.0, 0.5, 3.1, -3.1])
 @pytest.mark.parametrize("turned", [0.1, -0.2])
 def test_a_base_that_has_turned_is_told_the_heading_in_which_the_recovery_began(heading, turned):
-    bench = Bench(stance_pose=(0.0, 0.0, heading), speed=(1.0, 0.0), max_twist_rad=0.3)
+    bench = Stepping(stance_pose=(0.0, 0.0, heading), speed=(1.0, 0.0), max_twist_rad=0.3)
     for _ in range(3):  # Footholds turn with the base; the heading does not.
         bench.see(bench.base, turned=turned)
         bench.advance(bench.parameters.step_duration_s)
@@ -162,14 +142,14 @@ def test_a_base_that_has_turned_is_told_the_heading_in_which_the_recovery_began(
 )
 def test_a_turning_base_is_told_a_yaw_against_it(damping_s, twist, turned, rate, told):
     options = {} if damping_s is None else {"yaw_damping_s": damping_s}
-    bench = Bench(speed=(1.0, 0.0), max_twist_rad=twist, **options)
+    bench = Stepping(speed=(1.0, 0.0), max_twist_rad=twist, **options)
     bench.see(bench.base, turned=turned, yaw_rate=rate)
     bench.advance(2 * PERIOD_S)
     assert bench.get("desired_yaw")[0] == pytest.approx(told, abs=1e-9 if twist else 0.1)
 
 
 def test_a_robot_that_holds_no_heading_stops_wherever_it_has_turned_to():
-    bench = Bench(max_twist_rad=0.0)
+    bench = Stepping(max_twist_rad=0.0)
     bench.see(bench.base, turned=1.5)
     settled(bench)
     assert bench.get("recovery_done")[0] == 1
@@ -177,7 +157,7 @@ def test_a_robot_that_holds_no_heading_stops_wherever_it_has_turned_to():
 
 
 def test_a_robot_far_from_its_heading_steps_on():
-    bench = Bench(settle_heading_rad=0.35, max_steps=20)
+    bench = Stepping(settle_heading_rad=0.35, max_steps=20)
     bench.see(bench.base, turned=0.5)
     bench.advance(10.5 * bench.parameters.step_duration_s)
     assert bench.lifted()
@@ -188,7 +168,7 @@ def test_a_robot_far_from_its_heading_steps_on():
 
 @pytest.mark.parametrize("max_steps", [RecoveryStepParameters().max_steps, 2])
 def test_a_robot_that_cannot_stand_after_all_steps_on_up_to_its_last_step(max_steps):
-    bench = Bench(min_steps=2, max_steps=max_steps)
+    bench = Stepping(min_steps=2, max_steps=max_steps)
     bench.advance(2 * bench.parameters.step_duration_s + 3 * PERIOD_S)
     assert not bench.lifted()
     assert bench.get("recovery_done")[0] == 0
@@ -203,14 +183,14 @@ def test_a_robot_that_cannot_stand_after_all_steps_on_up_to_its_last_step(max_st
 
 
 def test_the_base_comes_to_rest_over_its_capture_point_before_it_returns():
-    bench = Bench(speed=(0.2, 0.1), min_steps=2, return_duration_s=50.0)
+    bench = Stepping(speed=(0.2, 0.1), min_steps=2, return_duration_s=50.0)
     bench.advance(2 * bench.parameters.step_duration_s + 2.0)
     point = capture_point(bench.base, bench.speed)
     np.testing.assert_allclose(bench.get("desired_output")[:2], point, atol=2e-3)
 
 
 def test_a_fast_robot_goes_on_stepping_until_its_last_step():
-    bench = Bench(speed=(1.0, 0.0), max_steps=6)
+    bench = Stepping(speed=(1.0, 0.0), max_steps=6)
     bench.advance(5.5 * bench.parameters.step_duration_s)
     assert bench.lifted()
     bench.advance(1.0 * bench.parameters.step_duration_s)
@@ -219,7 +199,7 @@ def test_a_fast_robot_goes_on_stepping_until_its_last_step():
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_a_robot_at_rest_settles_after_the_fewest_steps_and_hands_over(name):
-    bench = Bench(name, min_steps=2, settle_margin_m=0.01, resume_margin_m=0.0)
+    bench = Stepping(name, min_steps=2, settle_margin_m=0.01, resume_margin_m=0.0)
     bench.advance(2 * bench.parameters.step_duration_s + 2 * PERIOD_S)
     assert not bench.lifted()
     assert bench.get("recovery_done")[0] == 0
@@ -234,16 +214,16 @@ def settled(bench):
 
 
 def test_the_return_ends_at_the_nominal_set_point():
-    bench = Bench(stance_pose=(1.0, 1.0, -0.7))
+    bench = Stepping(stance_pose=(1.0, 1.0, -0.7))
     goal = bench.base + [0.03, 0.02, 0.01]
-    bench.fix("nominal_desired_output", goal)
+    bench.fix(nominal_desired_output=goal)
     settled(bench)
     np.testing.assert_allclose(bench.get("desired_output"), goal, atol=1e-9)
 
 
 def test_the_base_set_point_never_jumps_during_the_return():
-    bench = Bench()
-    bench.fix("nominal_desired_output", bench.base + [0.05, 0.0, 0.0])
+    bench = Stepping()
+    bench.fix(nominal_desired_output=bench.base + [0.05, 0.0, 0.0])
     previous, largest = bench.base, 0.0
     for _ in range(100):
         bench.advance(PERIOD_S)
@@ -257,7 +237,7 @@ def test_the_base_set_point_never_jumps_during_the_return():
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_the_stance_pose_becomes_that_of_the_new_footholds(name):
-    bench = Bench(
+    bench = Stepping(
         name, stance_pose=(0.5, 0.0, 0.3), min_steps=2, settle_margin_m=0.01, resume_margin_m=0.0
     )
     bench.advance(PERIOD_S)
@@ -270,36 +250,27 @@ def test_the_stance_pose_becomes_that_of_the_new_footholds(name):
 
 
 def test_feet_stand_on_the_ground_after_recovery():
-    bench = settled(Bench(speed=(0.1, 0.0)))
+    bench = settled(Stepping(speed=(0.1, 0.0)))
     np.testing.assert_allclose(bench.feet_now()[:, 2], bench.kinematics.foot_radii, atol=1e-9)
 
 
 def test_done_lasts_until_the_trigger_lets_go_and_then_it_can_step_again():
-    bench = settled(Bench())
+    bench = settled(Stepping())
     assert bench.get("recovery_done")[0] == 1
-    bench.fix("recovery_active", [0.0])
+    bench.fix(recovery_active=0.0)
     bench.advance(2 * PERIOD_S)
     assert bench.get("recovery_done")[0] == 0
     assert not bench.lifted()
-    bench.fix("recovery_active", [1.0])
+    bench.fix(recovery_active=1.0)
     bench.advance(0.5 * bench.parameters.step_duration_s)
     assert bench.lifted()
 
 
 def test_setting_the_stance_puts_it_to_rest():
-    bench = Bench(speed=(1.0, 0.0))
+    bench = Stepping(speed=(1.0, 0.0))
     bench.advance(0.5 * bench.parameters.step_duration_s)
-    bench.fix("recovery_active", [0.0])
-    bench.planner.set_stance(bench.context, bench.feet, bench.stance_pose)
+    bench.fix(recovery_active=0.0)
+    bench.system.set_stance(bench.context, bench.feet, bench.stance_pose)
     bench.advance(0.2)
     assert not bench.lifted()
     np.testing.assert_array_equal(bench.feet_now(), bench.feet)
-
-
-def test_nothing_is_kept_in_the_planner_itself():
-    bench = Bench(speed=(0.5, 0.0))
-    bench.advance(0.5 * bench.parameters.step_duration_s)
-    fresh = bench.planner.CreateDefaultContext()
-    bench.planner.set_stance(fresh, bench.feet, bench.stance_pose)
-    feet = bench.planner.GetOutputPort("desired_foot_positions").Eval(fresh)
-    np.testing.assert_array_equal(feet, bench.feet.ravel())

@@ -10,50 +10,41 @@ from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.simulation.legged_loop import UPDATE_TICK
 from drake_safety.systems.recovery_switch import RecoverySwitch
 from legged_robots import ROBOT_NAMES, robot_kinematics
+from system_doubles import Bench
 
 PERIOD_S, OFFSET_S, HORIZON = 0.01, 0.0005, 3
 PREVIEW = np.arange(9.0)
 OUTLOOK = np.arange(6.0)
 
 
-class Bench:
+class Standing(Bench):
     """The block alone, seeing a robot that stands still."""
 
     def __init__(self, name="laikago"):
-        self.kinematics = robot_kinematics(name)
+        self.kinematics = k = robot_kinematics(name)
         self.parameters = RecoveryStepParameters(settle_margin_m=0.01, resume_margin_m=0.0)
-        self.switch = RecoverySwitch(
-            self.kinematics,
-            self.parameters,
-            threshold=0.6,
-            period_s=PERIOD_S,
-            offset_s=OFFSET_S,
-            horizon=HORIZON,
-            num_outlook=2,
-        )
-        self.simulator = Simulator(self.switch)
-        self.context = self.simulator.get_mutable_context()
-        base = np.append(self.kinematics.nominal_base_offset, self.kinematics.standing_height)
-        q = self.kinematics.positions_at(RigidTransform(base), self.kinematics.posture)
+        options = {"period_s": PERIOD_S, "offset_s": OFFSET_S, "horizon": HORIZON, "num_outlook": 2}
+        super().__init__(RecoverySwitch(k, self.parameters, threshold=0.6, **options))
+        base = np.append(k.nominal_base_offset, k.standing_height)
         self.nominal = base + [0.02, 0.01, 0.0]
-        self.feet = np.column_stack([self.kinematics.nominal_contacts, self.kinematics.foot_radii])
-        planner = self.switch.step_planner
+        self.feet = np.column_stack([k.nominal_contacts, k.foot_radii])
+        planner = self.system.step_planner
         planner_context = planner.GetMyMutableContextFromRoot(self.context)
         planner.set_stance(planner_context, self.feet, np.zeros(3))
-        self.fix("plant_state", np.concatenate([q, np.zeros(self.kinematics.num_velocities)]))
-        self.fix("nominal_desired_output", self.nominal)
-        self.fix("nominal_desired_preview", PREVIEW)
-        self.fix("nominal_desired_outlook", OUTLOOK)
-        self.fix("safety_probability", [1.0])
+        q = k.positions_at(RigidTransform(base), k.posture)
+        self.fix(
+            plant_state=np.append(q, np.zeros(k.num_velocities)),
+            nominal_desired_output=self.nominal,
+            nominal_desired_preview=PREVIEW,
+            nominal_desired_outlook=OUTLOOK,
+            safety_probability=1.0,
+        )
 
-    def fix(self, name, value):
-        self.switch.GetInputPort(name).FixValue(self.context, value)
-
-    def get(self, name):
-        return self.switch.GetOutputPort(name).Eval(self.context).copy()
-
-    def advance(self, seconds):
-        self.simulator.AdvanceTo(self.context.get_time() + seconds)
+    def assert_nominal(self):
+        assert self.get("recovery_active")[0] == 0
+        nominal = {"output": self.nominal, "preview": PREVIEW, "outlook": OUTLOOK}
+        for name, expected in nominal.items():
+            np.testing.assert_array_equal(self.get(f"desired_{name}"), expected)
 
     def recovery_duration_s(self):
         steps = self.parameters.max_steps * self.parameters.step_duration_s
@@ -62,22 +53,19 @@ class Bench:
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_while_safe_the_nominal_plan_passes_through_at_once(name):
-    bench = Bench(name)
+    bench = Standing(name)
     bench.advance(0.1)
-    assert bench.get("recovery_active")[0] == 0
-    np.testing.assert_array_equal(bench.get("desired_output"), bench.nominal)
-    np.testing.assert_array_equal(bench.get("desired_preview"), PREVIEW)
-    np.testing.assert_array_equal(bench.get("desired_outlook"), OUTLOOK)
+    bench.assert_nominal()
     np.testing.assert_array_equal(bench.get("desired_foot_positions"), bench.feet.ravel())
-    bench.fix("nominal_desired_output", bench.nominal + 1.0)
+    bench.fix(nominal_desired_output=bench.nominal + 1.0)
     np.testing.assert_array_equal(bench.get("desired_output"), bench.nominal + 1.0)
 
 
 @pytest.mark.parametrize("probability", [0.3, np.nan])
 def test_a_low_probability_makes_feet_leave_the_ground_within_two_ticks(probability):
-    bench = Bench()
+    bench = Standing()
     bench.advance(0.1)
-    bench.fix("safety_probability", [probability])
+    bench.fix(safety_probability=probability)
     bench.advance(2 * PERIOD_S)
     assert bench.get("recovery_active")[0] == 1
     height = bench.get("desired_foot_positions").reshape(-1, 3)[:, 2] - bench.kinematics.foot_radii
@@ -85,9 +73,9 @@ def test_a_low_probability_makes_feet_leave_the_ground_within_two_ticks(probabil
 
 
 def test_the_step_planner_ticks_behind_the_trigger_in_the_same_period():
-    bench = Bench()
+    bench = Standing()
     bench.advance(0.1 + 0.5 * PERIOD_S)
-    bench.fix("safety_probability", [0.3])
+    bench.fix(safety_probability=0.3)
     bench.simulator.AdvanceTo(0.11 + OFFSET_S + 1e-6)
     assert bench.get("recovery_active")[0] == 1
     before = bench.get("desired_output")
@@ -113,18 +101,15 @@ def test_only_a_system_that_updates_a_tick_later_sees_what_another_has_updated(o
 
 
 def test_each_recovery_ends_with_the_nominal_plan_passing_through_again():
-    bench = Bench()
+    bench = Standing()
     for _ in range(2):
-        bench.fix("safety_probability", [0.3])
+        bench.fix(safety_probability=0.3)
         bench.advance(3 * PERIOD_S)
-        bench.fix("safety_probability", [1.0])
+        bench.fix(safety_probability=1.0)
         bench.advance(3 * PERIOD_S)
         assert bench.get("recovery_active")[0] == 1  # It latches.
         outlook, preview = bench.get("desired_outlook"), bench.get("desired_preview")
         np.testing.assert_array_equal(outlook, preview[:6])
         assert not np.array_equal(outlook, OUTLOOK)
         bench.advance(bench.recovery_duration_s())
-        assert bench.get("recovery_active")[0] == 0
-        np.testing.assert_array_equal(bench.get("desired_output"), bench.nominal)
-        np.testing.assert_array_equal(bench.get("desired_preview"), PREVIEW)
-        np.testing.assert_array_equal(bench.get("desired_outlook"), OUTLOOK)
+        bench.assert_nominal()

@@ -4,10 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.geometry import Role
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
 
 import drake_safety.models
 from drake_safety.robots.model_files import model_file
@@ -165,22 +163,6 @@ def test_joint_damping_is_added_to_the_models_own():
     for name in servo_joints(published, robot):
         before = published.GetJointByName(name).default_damping()
         assert damped.GetJointByName(name).default_damping() == pytest.approx(before + 0.7)
-
-
-def test_the_feet_and_only_the_feet_take_the_variations_friction():
-    robot = robot_model("laikago")
-    builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
-    add_robot(plant, robot, PlantVariation(foot_friction=0.123), scene_graph=scene_graph)
-    plant.Finalize()
-    inspector = scene_graph.model_inspector()
-    feet = 0
-    for geometry in inspector.GetAllGeometryIds(Role.kProximity):
-        friction = inspector.GetProximityProperties(geometry).GetProperty(
-            "material", "coulomb_friction"
-        )
-        feet += friction.static_friction() == 0.123
-    assert feet == len(robot.feet)
 
 
 FRICTION_NM = 0.4

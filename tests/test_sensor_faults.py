@@ -134,19 +134,6 @@ def test_noise_is_normal_is_held_for_a_period_and_follows_from_the_seed():
     assert np.mean(held[:, 0]) == pytest.approx(0.0, abs=0.15)
 
 
-def test_all_memory_is_in_the_context():
-    bench = Bench(Fault(kind="delay", value=0.3), Fault(kind="half_rate"))
-    bench.at(1.0)
-    copied = bench.context.Clone()
-    first = [bench.at(t)[1] for t in (1.1, 1.2, 1.3)]
-    bench.simulator.reset_context(copied)
-    again = []
-    for time_s in (1.1, 1.2, 1.3):
-        bench.simulator.AdvanceTo(time_s)
-        again.append(bench.system.get_output_port().Eval(bench.system.GetMyContextFromRoot(copied)))
-    np.testing.assert_array_equal(again, first)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [

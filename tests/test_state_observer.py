@@ -7,9 +7,9 @@ from drake_safety.control.observation import add_noise, stance_state
 from drake_safety.robots.robot import ObservationNoise
 from drake_safety.systems.state_observer import StateObserver
 from legged_robots import robot_kinematics
+from system_doubles import Bench
 
 NOISE = ObservationNoise(position=0.01, velocity=0.05)
-OUTPUTS = ("measured_plant_state", "state", "output")
 
 
 def plant_state(kinematics):
@@ -19,13 +19,9 @@ def plant_state(kinematics):
 
 
 def observed(kinematics, noise=None, draws=None, x=None, **options):
-    observer = StateObserver(kinematics, noise, **options)
-    context = observer.CreateDefaultContext()
     x = plant_state(kinematics) if x is None else x
-    observer.GetInputPort("plant_state").FixValue(context, x)
-    if draws is not None:
-        observer.GetInputPort("noise").FixValue(context, draws)
-    return {name: observer.GetOutputPort(name).Eval(context) for name in OUTPUTS}
+    inputs = {"plant_state": x} if draws is None else {"plant_state": x, "noise": draws}
+    return Bench(StateObserver(kinematics, noise, **options), **inputs).outputs()
 
 
 def test_without_noise_the_measurement_is_the_truth():

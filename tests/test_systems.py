@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import PortDataType
 
 from drake_safety import load_assessment
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.diagrams.pendulum import PendulumController, PendulumObserver, PendulumParameters
+from drake_safety.robots.shift import Fault
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
 from drake_safety.systems.change_monitor import ChangeMonitor
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
@@ -25,11 +25,12 @@ from drake_safety.systems.state_observer import StateObserver
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner
 from drake_safety.systems.whole_body_controller import WholeBodyController
 from legged_robots import ROBOT_NAMES, robot_kinematics
-from system_doubles import INFO, AssessmentDouble, SlowIsSafe, controller, guard
+from system_doubles import INFO, AssessmentDouble, Bench, SlowIsSafe, controller, guard
 
 PERIOD = {"period_s": 0.01}
 LATE = PERIOD | {"offset_s": 0.002}
 ROWS = PERIOD | {"horizon": 4, "num_outlook": 3}
+FAULTS = [Fault(kind="delay", value=0.03), Fault(kind="half_rate")]
 STEPS = RecoveryStepParameters(min_steps=1, max_steps=1)
 LEARNED = load_assessment("laikago_balancing")
 N_S, N_F = len(LEARNED.info_.state_names), len(LEARNED.info_.feature_names)
@@ -41,7 +42,10 @@ BELIEF = "safety_probability 1, belief 3, embedding 2, novelty 1, "
 BELIEF += "cause_probability {0}, predicted_margins {0}"
 # Ports with their sizes; `?`: may be left open; `<`: of these inputs, or of all of them, at once.
 CASES = {
-    "SensorFaults": (lambda: SensorFaults(["a", "b"], **PERIOD), "input 2 -> output 2 < *"),
+    "SensorFaults": (
+        lambda: SensorFaults(["a", "b"], FAULTS, **PERIOD),
+        "input 2 -> output 2 < *",
+    ),
     "RecoveryTrigger": (
         lambda: RecoveryTrigger(**PERIOD),
         "safety_probability 1, belief? 3, recovery_done? 1 -> recovery_active 1, port_selector -",
@@ -134,9 +138,11 @@ def add_robot(name):
 for name in ROBOT_NAMES:
     add_robot(name)
 
+ONE_OF_EACH = [key for key in CASES if key.split()[1:] in ([], ["laikago"])]
 
-class Given:
-    """A system with the ports that it promises, and a simulator in which its inputs are given."""
+
+class Given(Bench):
+    """A system with the ports that it promises, whose inputs are given."""
 
     def __init__(self, key, without=(), **values):
         make, text = CASES[key]
@@ -144,18 +150,13 @@ class Given:
         pairs = [one.split() for one in inputs]
         self.inputs = {name.strip("?"): int(size) for name, size in pairs}
         self.optional = {name.strip("?") for name, _ in pairs if "?" in name}
-        self.outputs, self.through = {}, set()
+        self.promised, self.through = {}, set()
         for output in outputs:
             name, size, *sources = output.replace(" < ", " ").split()
-            self.outputs[name] = size
+            self.promised[name] = size
             self.through |= {(one, name) for one in self.inputs if one in sources or "*" in sources}
-        self.system = make()
-        self.simulator = Simulator(self.system)
-        self.context = self.simulator.get_mutable_context()
-        for port in self.inputs.keys() - set(without):
-            self.system.GetInputPort(port).FixValue(
-                self.context, values.get(port, self.value(key, port))
-            )
+        given = {port: self.value(key, port) for port in self.inputs.keys() - set(without)}
+        super().__init__(make(), **given | values)
 
     def value(self, key, port):
         if port == "plant_state" and len(key.split()) > 1:
@@ -170,24 +171,22 @@ class Given:
             "plant_state": np.eye(1, self.inputs[port]).ravel(),
         }.get(port, np.zeros(self.inputs[port]))
 
-    def ports(self):
-        ins = [self.system.get_input_port(i) for i in range(self.system.num_input_ports())]
-        return ins, [self.system.get_output_port(i) for i in range(self.system.num_output_ports())]
-
-    def advance(self, time_s):
+    def at(self, time_s):
         self.simulator.AdvanceTo(time_s)
-        return {port.get_name(): np.copy(port.Eval(self.context)) for port in self.ports()[1]}
+        return self.outputs()
 
 
 @pytest.mark.parametrize("key", CASES)
 def test_ports_have_the_promised_names_and_sizes_and_feed_through_what_they_say(key):
     given = Given(key)
-    ins, outs = given.ports()
+    system = given.system
+    ins = [system.get_input_port(i) for i in range(system.num_input_ports())]
+    outs = [system.get_output_port(i) for i in range(system.num_output_ports())]
     assert {port.get_name(): port.size() for port in ins} == given.inputs
     abstract = [port for port in outs if port.get_data_type() == PortDataType.kAbstractValued]
     found = {port.get_name(): "-" if port in abstract else str(port.size()) for port in outs}
-    assert found == given.outputs
-    is_direct = given.system.HasDirectFeedthrough
+    assert found == given.promised
+    is_direct = system.HasDirectFeedthrough
     pairs = [(one, other) for one in ins for other in outs]
     assert given.through == {
         (one.get_name(), other.get_name())
@@ -196,24 +195,42 @@ def test_ports_have_the_promised_names_and_sizes_and_feed_through_what_they_say(
     }
 
 
-@pytest.mark.parametrize("key", [key for key in CASES if key.split()[1:] in ([], ["laikago"])])
+@pytest.mark.parametrize("key", ONE_OF_EACH)
 def test_optional_ports_may_be_left_open_and_any_other_is_named(key):
     given = Given(key, Given(key).optional)
-    given.advance(0.0)
-    given.advance(0.3)
+    given.at(0.0)
+    given.at(0.3)
     for port in given.inputs.keys() - given.optional:
         # Within the switch it is that of one of Drake's.
         name = "nominal" if key.startswith("RecoverySwitch") and "nominal" in port else port
         without = Given(key, {port})
         with pytest.raises(RuntimeError, match=rf"required InputPort.*\({name}.*is not connected"):
-            without.advance(0.0)
-            without.advance(0.3)
+            without.at(0.0)
+            without.at(0.3)
+
+
+@pytest.mark.parametrize("key", ONE_OF_EACH)
+def test_all_memory_is_in_the_context_so_a_clone_goes_on_as_if_alone(key):
+    given, alone = Given(key), Given(key)
+    for bench in (given, alone):
+        bench.at(0.05)
+    clone = Bench(given.system)
+    clone.simulator.reset_context(given.context.Clone())
+    clone.context = clone.simulator.get_mutable_context()
+    given.fix(**{port: given.value(key, port) + np.full(1, 0.1) for port in given.inputs})
+    given.at(0.3)
+    for bench in (clone, alone):
+        bench.simulator.AdvanceTo(0.3)
+    expected = alone.outputs()
+    for name, found in clone.outputs().items():
+        np.testing.assert_array_equal(found, expected[name])
 
 
 NOT_FINITE = {
     ("SafetyMonitor laikago", "plant_state"): {"safe": 0.0, "margins": -np.inf},
     ("StateObserver laikago", "plant_state"): {"state": np.nan},
     ("PlanFeatures laikago", "plant_state"): {"features": np.nan},
+    ("PlanFeatures laikago", "desired_preview"): {"features": np.nan},
     ("BeliefEvaluator", "state"): {"belief": [0.0, 0.0, 1.0], "safety_probability": 0.0},
     ("CommandGuard", "command"): {"desired_output": 0.0, "is_changed": 1.0},
 }
@@ -223,12 +240,12 @@ NOT_FINITE = {
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_an_entry_that_is_not_finite_has_the_promised_answer(key, port, value):
     given = Given(key)
-    before, promised = given.advance(0.01), NOT_FINITE[key, port]
+    before, promised = given.at(0.01), NOT_FINITE[key, port]
     assert any(np.any(before[name] != np.array(promised[name])) for name in promised)
     for entry in range(given.inputs[port]):
         values = np.array(given.value(key, port))
         values[entry] = value
-        found = Given(key, **{port: values}).advance(0.01)
+        found = Given(key, **{port: values}).at(0.01)
         for name, expected in promised.items():
             np.testing.assert_array_equal(found[name], np.broadcast_to(expected, found[name].shape))
 
@@ -246,9 +263,9 @@ def test_an_entry_that_is_not_finite_has_the_promised_answer(key, port, value):
 )
 def test_outputs_are_held_until_the_next_tick(key, port, value, tick_s):
     given, same = Given(key), Given(key)
-    held = given.advance(0.0025)
-    given.system.GetInputPort(port).FixValue(given.context, value)
-    for name, later in given.advance(tick_s - 1e-4).items():
+    held = given.at(0.0025)
+    given.fix(**{port: value})
+    for name, later in given.at(tick_s - 1e-4).items():
         np.testing.assert_array_equal(later, held[name])
-    changed, expected = given.advance(tick_s + 1e-4), same.advance(tick_s + 1e-4)
+    changed, expected = given.at(tick_s + 1e-4), same.at(tick_s + 1e-4)
     assert any(not np.array_equal(changed[name], expected[name]) for name in held)

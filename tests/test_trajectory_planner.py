@@ -1,13 +1,21 @@
+import itertools
 import math
 
 import numpy as np
 import pytest
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
+from drake_safety.systems.trajectory_planner import (
+    TrajectoryPlanner,
+    interpolate,
+    plan_shape,
+    points_of_plan,
+)
 from gliding_task import evaluated
 
 START, GOAL = np.array([0.0, 0.1, 0.4]), np.array([0.2, -0.1, 0.5])
+DETOUR = np.array([-0.1, 0.15, 0.05])
+STEP_S, DURATION_S = 0.1, 3.0
 
 
 def planner_at(time, plan, stance_pose=None, **options):
@@ -23,30 +31,19 @@ def ramp(rate=(1.0, 2.0, 0.0), duration_s=1.0):
     return PiecewisePolynomial.FirstOrderHold([0.0, duration_s], knots)
 
 
-@pytest.mark.parametrize("detour", [None, np.zeros(3)])
-def test_the_interpolation_starts_and_ends_at_rest(detour):
+@pytest.mark.parametrize("detour", [None, np.zeros(3), np.array([-0.5, 0.25, 0.1])])
+def test_the_interpolation_starts_and_ends_at_rest_and_a_detour_moves_its_middle_alone(detour):
     plan = interpolate(START, GOAL, 0.8, start_time_s=0.3, detour=detour)
-    for time, position in ((0.3, START), (1.1, GOAL)):
+    middle = 0.5 * (START + GOAL) + (0.0 if detour is None else detour)
+    for time, position in ((0.3, START), (0.7, middle), (1.1, GOAL)):
         np.testing.assert_allclose(plan.value(time)[:, 0], position, atol=1e-12)
-        for order in (1, 2):
+    for time, order in itertools.product((0.3, 1.1), (1, 2)):
+        if order == 1 or detour is None or not detour.any():
             derivative = plan.MakeDerivative(order).value(time)
             np.testing.assert_allclose(derivative, 0.0, atol=1e-9)
-    np.testing.assert_allclose(plan.value(0.7)[:, 0], 0.5 * (START + GOAL), atol=1e-12)
-
-
-def test_the_peak_speed_of_a_minimum_jerk_motion_is_fifteen_eighths_of_the_mean():
+    # The peak speed is fifteen eighths of the mean.
     plan = interpolate(np.zeros(1), np.ones(1), 2.0)
     assert plan.MakeDerivative().value(1.0)[0, 0] == pytest.approx(15 / 8 / 2.0)
-
-
-def test_a_detour_moves_the_middle_and_neither_end():
-    start, goal, detour = np.array([[0.0, 1.0], [2.0, 1.0], [-0.5, 0.25]])
-    plan = interpolate(start, goal, 2.0, 1.0, detour=detour)
-    for time, expected in ((1.0, start), (2.0, (start + goal) / 2 + detour), (3.0, goal)):
-        np.testing.assert_allclose(plan.value(time).ravel(), expected, atol=1e-12)
-    rate = plan.MakeDerivative()
-    for time in (1.0, 3.0):
-        np.testing.assert_allclose(rate.value(time).ravel(), np.zeros(2), atol=1e-12)
 
 
 @pytest.mark.parametrize("duration_s", [0.0, -1.0, math.nan])
@@ -150,3 +147,34 @@ def test_a_plan_of_another_size_is_refused():
 def test_impossible_sizes_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         TrajectoryPlanner(**options)
+
+
+def preview_of(num_samples, detour=None):
+    plan = interpolate(START, GOAL, DURATION_S, detour=detour)
+    return plan.vector_values(STEP_S * np.arange(num_samples)).T
+
+
+@pytest.mark.parametrize("num_samples", [12, 31, 40])
+@pytest.mark.parametrize("detour", [None, DETOUR], ids=["straight", "detour"])
+def test_start_goal_and_detour_are_found_though_the_preview_ends_before_or_after_the_plan(
+    num_samples, detour
+):
+    found = plan_shape(preview_of(num_samples, detour), STEP_S, DURATION_S)
+    expected = [START, GOAL, np.zeros(3) if detour is None else detour]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_preview_of_another_frame_is_the_shape_of_that_frame():
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    shape = plan_shape(preview_of(20, DETOUR), STEP_S, DURATION_S)
+    turned = plan_shape(preview_of(20, DETOUR) @ turn.T + [1, 2, 3], STEP_S, DURATION_S)
+    np.testing.assert_allclose(turned[:2], shape[:2] @ turn.T + [1, 2, 3], atol=1e-9)
+    # A detour is a direction: it turns and does not move.
+    np.testing.assert_allclose(turned[2], shape[2] @ turn.T, atol=1e-9)
+
+
+def test_points_of_a_shape_begin_at_its_start_pass_by_its_detour_and_end_at_its_goal():
+    points = points_of_plan(np.array([START, GOAL, DETOUR]), 5)
+    np.testing.assert_allclose(points[[0, -1]], [START, GOAL], atol=1e-12)
+    np.testing.assert_allclose(points[2], 0.5 * (START + GOAL) + DETOUR, atol=1e-12)
+    np.testing.assert_allclose(points[1], 0.75 * START + 0.25 * GOAL + 0.75 * DETOUR, atol=1e-12)

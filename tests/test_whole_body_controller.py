@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.whole_body_model import PointReference
@@ -9,6 +8,7 @@ from drake_safety.models import load_robot, robot_names
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.systems.whole_body_controller import NOT_FINITE, WholeBodyController
 from legged_robots import ROBOT_NAMES, robot_kinematics, robot_model
+from system_doubles import Bench
 from whole_body_loop import PERIOD_S, WholeBodyLoop
 
 NAMES = sorted({*ROBOT_NAMES, *robot_names()})
@@ -16,98 +16,81 @@ STANDS_S = {"atlas": 10.0}  # Every other robot: 2 s.
 HANDS = [(name, hand) for name in robot_names() for hand in load_robot(name).reaching_frames]
 
 
-class Bench:
-    """A controller alone, with its inputs fixed; the biped reaches with its head."""
+class Alone(Bench):
+    """A controller alone, of a robot that stands; the biped reaches with its head."""
 
     def __init__(self, name="biped", hand="head", **options):
         self.kinematics = robot_kinematics(name)
-        self.controller = WholeBodyController(
-            self.kinematics, hand=hand, **{"period_s": PERIOD_S} | options
+        super().__init__(
+            WholeBodyController(self.kinematics, hand=hand, period_s=PERIOD_S, **options)
         )
-        self.simulator = Simulator(self.controller)
-        self.context = self.simulator.get_mutable_context()
         self.q = self.kinematics.standing_positions()
         self.set_state(self.q)
 
     def set_state(self, q, v=None):
         v = np.zeros(self.kinematics.num_velocities) if v is None else v
-        self.fix("plant_state", np.concatenate([q, v]))
+        self.fix(plant_state=np.concatenate([q, v]))
 
-    def fix(self, name, value):
-        self.controller.GetInputPort(name).FixValue(self.context, value)
-
-    def actuation(self):
-        return self.controller.GetOutputPort("actuation").Eval(self.context)
-
-    def status(self):
-        return self.controller.GetOutputPort("solver_status").Eval(self.context)[0]
-
-    def advance(self, num_ticks=1):
-        time = self.simulator.get_context().get_time()
-        self.simulator.AdvanceTo(time + num_ticks * PERIOD_S)
+    def ticks(self, number=1):
+        self.advance(number * PERIOD_S)
+        return self.get("solver_status")[0], self.get("num_failures")[0]
 
     def torques(self, reference, q=None):
         """What the program itself gives, at rest."""
         q = self.q if q is None else q
         v = np.zeros(self.kinematics.num_velocities)
-        return solve_qp(build_qp(self.controller.model, q, v, reference)).torques
+        return solve_qp(build_qp(self.system.model, q, v, reference)).torques
 
 
 def test_the_actuation_is_the_solution_of_the_program():
-    bench = Bench()
-    reference = bench.controller.model.reference(bench.q)
-    bench.simulator.Initialize()
-    np.testing.assert_array_equal(bench.actuation(), bench.torques(reference))
-    assert bench.status() == 0
+    bench = Alone()
+    reference = bench.system.model.reference(bench.q)
+    bench.begin()
+    np.testing.assert_array_equal(bench.get("actuation"), bench.torques(reference))
+    assert bench.get("solver_status")[0] == 0
     goal = reference.reaching.position + [0.02, 0.01, -0.01]
     reference.reaching = PointReference(position=goal, rate=np.array([0.1, 0.0, 0.0]))
-    bench.fix("desired_output", goal)
-    bench.fix("desired_output_rate", [0.1, 0.0, 0.0])
-    bench.simulator.Initialize()
-    np.testing.assert_array_equal(bench.actuation(), bench.torques(reference))
+    bench.fix(desired_output=goal, desired_output_rate=[0.1, 0.0, 0.0])
+    bench.begin()
+    np.testing.assert_array_equal(bench.get("actuation"), bench.torques(reference))
 
 
 def test_a_reference_holds_for_the_context_it_was_set_in():
-    bench = Bench()
-    other = bench.controller.CreateDefaultContext()
-    reference = bench.controller.model.reference(bench.q)
+    bench = Alone()
+    other = Bench(bench.system, plant_state=np.append(bench.q, np.zeros(len(bench.q) - 1)))
+    reference = bench.system.model.reference(bench.q)
     reference.center_of_mass.position += [0.0, 0.0, -0.02]
     expected = bench.torques(reference)
-    bench.controller.set_reference(bench.context, reference)
+    bench.system.set_reference(bench.context, reference)
     reference.center_of_mass.position[:] = 0.0  # The Context keeps a copy.
-    bench.simulator.Initialize()
-    np.testing.assert_array_equal(bench.actuation(), expected)
-    elsewhere = Simulator(bench.controller, other)
-    bench.controller.GetInputPort("plant_state").FixValue(
-        other, np.concatenate([bench.q, np.zeros(bench.kinematics.num_velocities)])
-    )
-    elsewhere.Initialize()
-    standing = bench.torques(bench.controller.model.reference(bench.q))
-    np.testing.assert_array_equal(bench.controller.GetOutputPort("actuation").Eval(other), standing)
+    bench.begin()
+    np.testing.assert_array_equal(bench.get("actuation"), expected)
+    standing = bench.torques(bench.system.model.reference(bench.q))
+    np.testing.assert_array_equal(other.begin().get("actuation"), standing)
 
 
 def test_a_reference_of_another_robot_is_refused():
-    reference = Bench("hexapod", hand=None).controller.model.reference(
+    reference = Alone("hexapod", hand=None).system.model.reference(
         robot_kinematics("hexapod").standing_positions()
     )
-    bench = Bench()
+    bench = Alone()
     with pytest.raises(ValueError, match="robot 'biped': the whole-body reference must have"):
-        bench.controller.set_reference(bench.context, reference)
+        bench.system.set_reference(bench.context, reference)
 
 
 def test_torques_go_to_the_actuators_that_the_matrix_names():
     n_j = robot_kinematics("biped").num_joints
     rng = np.random.default_rng(0)
     matrix = np.vstack([np.eye(n_j)[rng.permutation(n_j)], np.zeros((2, n_j))])
-    plain, mapped = Bench(), Bench(actuation_matrix=matrix)
-    plain.simulator.Initialize()
-    mapped.simulator.Initialize()
-    np.testing.assert_array_equal(mapped.actuation(), matrix @ plain.actuation())
+    plain, mapped = Alone(), Alone(actuation_matrix=matrix)
+    plain.begin()
+    mapped.begin()
+    np.testing.assert_array_equal(mapped.get("actuation"), matrix @ plain.get("actuation"))
 
 
 def test_a_matrix_for_other_joints_is_refused():
     with pytest.raises(ValueError, match=r"must have 12 columns.*left_knee.*shape \(3, 5\)"):
-        Bench(actuation_matrix=np.zeros((3, 5)))
+        Alone(actuation_matrix=np.zeros((3, 5)))
 
 
 def spoilt(bench, how):
@@ -121,58 +104,53 @@ def spoilt(bench, how):
     elif how == "velocity":
         bench.set_state(bench.q, np.full(bench.kinematics.num_velocities, 1e100))
     else:
-        bench.fix(how, [0.0, np.inf, 1.0])
+        bench.fix(**{how: [0.0, np.inf, 1.0]})
 
 
 @pytest.mark.parametrize(
     "how", ["state", "orientation", "velocity", "desired_output", "desired_output_rate"]
 )
 def test_an_input_that_is_not_finite_keeps_the_last_good_command(how):
-    bench = Bench()
-    reaching = bench.controller.model.reference(bench.q).reaching.position
-    bench.fix("desired_output", reaching)
-    bench.fix("desired_output_rate", np.zeros(3))
-    bench.simulator.Initialize()
-    good = bench.actuation()
+    bench = Alone()
+    at_rest = {"desired_output_rate": np.zeros(3)}
+    at_rest["desired_output"] = bench.system.model.reference(bench.q).reaching.position
+    bench.fix(**at_rest)
+    bench.begin()
+    good = bench.get("actuation")
     spoilt(bench, how)
-    bench.advance(3)
-    assert bench.status() == NOT_FINITE
-    np.testing.assert_array_equal(bench.actuation(), good)
-    num_failures = bench.controller.GetOutputPort("num_failures").Eval(bench.context)[0]
-    assert num_failures >= 3
+    status, num_failures = bench.ticks(3)
+    assert status == NOT_FINITE and num_failures >= 3
+    np.testing.assert_array_equal(bench.get("actuation"), good)
     bench.set_state(bench.q)
-    bench.fix("desired_output", reaching)
-    bench.fix("desired_output_rate", np.zeros(3))
-    bench.advance()
-    assert bench.status() == 0
-    assert bench.controller.GetOutputPort("num_failures").Eval(bench.context)[0] == num_failures
+    bench.fix(**at_rest)
+    assert bench.ticks() == (0, num_failures)
 
 
 def test_a_program_without_solution_keeps_the_last_good_command():
-    bench = Bench()
-    bench.simulator.Initialize()
-    good = bench.actuation()
+    bench = Alone()
+    bench.begin()
+    good = bench.get("actuation")
     v = np.zeros(bench.kinematics.num_velocities)
     v[6:] = 200.0  # No ankle can stop a foot that spins so fast.
     bench.set_state(bench.q, v)
-    bench.advance()
-    assert bench.status() < 0
-    assert bench.controller.GetOutputPort("num_failures").Eval(bench.context)[0] >= 1
-    np.testing.assert_array_equal(bench.actuation(), good)
+    status, num_failures = bench.ticks()
+    assert status < 0 and num_failures >= 1
+    np.testing.assert_array_equal(bench.get("actuation"), good)
 
 
 def test_nothing_of_an_earlier_episode_is_left_after_the_initialisation():
-    bench = Bench()
-    bench.simulator.Initialize()
+    bench = Alone()
+    bench.begin()
     spoilt(bench, "state")
-    bench.advance(2)
-    bench.simulator.Initialize()
-    np.testing.assert_array_equal(bench.actuation(), 0.0)  # No command of this episode is good.
-    assert bench.controller.GetOutputPort("num_failures").Eval(bench.context)[0] == 1
+    bench.ticks(2)
+    bench.begin()
+    np.testing.assert_array_equal(
+        bench.get("actuation"), 0.0
+    )  # No command of this episode is good.
+    assert bench.get("num_failures")[0] == 1
     bench.set_state(bench.q)
-    bench.simulator.Initialize()
-    assert bench.status() == 0
-    assert bench.controller.GetOutputPort("num_failures").Eval(bench.context)[0] == 0
+    bench.begin()
+    assert (bench.get("solver_status")[0], bench.get("num_failures")[0]) == (0, 0)
 
 
 @pytest.mark.parametrize("name", NAMES)

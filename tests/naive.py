@@ -1,0 +1,102 @@
+"""The obvious slow way of what the package computes fast."""
+
+import itertools
+import math
+
+import numpy as np
+
+from drake_safety.learning.change_detector import TIME_CONSTANTS_S
+
+
+def fusion(beliefs):
+    """F with the products as the paper prints them, for a handful of uncertain beliefs."""
+    mu = beliefs[:, 2]
+    others = np.array([np.prod(np.delete(mu, i)) for i in range(len(mu))])
+    divisor = others.sum() - len(mu) * mu.prod()
+    masses = (beliefs[:, :2] * ((1 - mu) * others)[:, None]).sum(axis=0) / divisor
+    return np.append(masses, (len(mu) - mu.sum()) * mu.prod() / divisor)
+
+
+def dtw(error, length, cost="rooted"):
+    """Dynamic time warping of all pairs of sequences, cell by cell, (n, n)."""
+    n, m = error.shape[:2]
+    total, beyond = {(0, 0): np.zeros((n, n))}, np.full((n, n), np.inf)
+    for i, j in itertools.product(range(m), repeat=2):
+        apart = np.linalg.norm(error[:, None, i] - error[:, j], axis=-1)
+        before = [total.get(cell, beyond) for cell in ((i, j), (i, j + 1), (i + 1, j))]
+        step = apart if cost == "absolute" else apart**2
+        total[i + 1, j + 1] = step + np.minimum.reduce(before)
+    rows = range(n)
+    found = np.array([[total[length[a], length[b]][a, b] for b in rows] for a in rows])
+    return np.sqrt(found) if cost == "rooted" else found
+
+
+def charts(detector, motions):
+    """Levels and charts after each row of consecutive motions, one after another."""
+    charts, levels = np.zeros((6, len(detector.watched))), np.zeros(len(detector.watched))
+    seen = []
+    for one in motions:
+        x, state, repeats = one[:, detector.columns], one[:, detector.watched], 0
+        for k in range(len(one)):
+            repeats = repeats + 1 if k > 0 and np.array_equal(x[k], x[k - 1]) else 0
+            if k > 1:
+                z = detector.innovation(x[k - 1], x[k - 2], state[k] - state[k - 1])
+                charts = charts.copy()
+                for i, memory_s in enumerate(TIME_CONSTANTS_S):
+                    weight = min(detector.step_s / memory_s, 1.0)
+                    charts[i] += weight * (z - charts[i])
+                    charts[i + 3] += weight * (z**2 - 1.0 - charts[i + 3])
+                of_charts = np.vstack([np.abs(charts[:3]), charts[3:]]) / detector.limits
+                levels = np.maximum(of_charts.max(axis=0), repeats / detector.longest_repeat)
+            seen.append((levels, charts))
+    return tuple(np.array(each) for each in zip(*seen, strict=True))
+
+
+def whitened_distances(known, x, plan):
+    """The same by whitening along every axis, the variance of each bounded from below."""
+    scale = np.maximum(np.sqrt(np.diag(known.covariance)), 1e-2)
+    found = []
+    for columns, least, most in (
+        (slice(None), 1e-2, np.inf),
+        (slice(None), 1e-8, 1e-7),
+        (plan, 1e-4, np.inf),
+    ):
+        unit = scale[columns]
+        variance, axes = np.linalg.eigh(known.covariance[columns, columns] / np.outer(unit, unit))
+        along = (x - known.mean)[:, columns] / unit @ axes
+        squares = (along**2 / np.maximum(variance, least))[:, variance < most]
+        found.append(np.sqrt(squares.sum(axis=1)))
+    return np.stack(found, axis=1)
+
+
+def in_triangle(p, a, b, c):
+    def side(u, w):
+        return (w[0] - u[0]) * (p[1] - u[1]) - (w[1] - u[1]) * (p[0] - u[0])
+
+    signs = [side(a, b), side(b, c), side(c, a)]
+    return all(s >= 0 for s in signs) or all(s <= 0 for s in signs)
+
+
+def hull_distance(point, points, samples=2001):
+    """Signed distance to a hull without any hull.
+
+    A point is inside when some triangle of the points holds it; the hull's edges are the pairs
+    that have all other points on one side.
+    """
+    n = len(points)
+    inside = any(
+        in_triangle(point, points[i], points[j], points[k])
+        for i in range(n)
+        for j in range(i)
+        for k in range(j)
+    )
+    s = np.linspace(0, 1, samples)[:, None]
+    nearest = math.inf
+    for i in range(n):
+        for j in range(n):
+            a, b = points[i], points[j]
+            cross = (b - a)[0] * (points - a)[:, 1] - (b - a)[1] * (points - a)[:, 0]
+            if i != j and np.all(cross >= -1e-12):
+                edge = a + s * (b - a)
+                nearest = min(nearest, np.linalg.norm(edge - point, axis=1).min())
+    return nearest if inside else -nearest
