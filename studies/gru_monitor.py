@@ -88,11 +88,13 @@ class GruMonitor:
         """Trains the network on random windows."""
         import torch
 
+        from drake_safety.learning.embedding import one_torch_thread
+
         pairs = [tuple(map(torch.tensor, self._pairs(one))) for one in motions]
         rows = np.array([len(z) for z, _ in pairs])
         num_steps = _EPOCHS * max(1, round(int(rows.sum()) / (_WINDOW * _BATCH)))
         rng = np.random.default_rng(0)
-        with torch.random.fork_rng(devices=[]):
+        with one_torch_thread(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             network = _network(len(self._mean), self._num_states)
             optimiser = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_DECAY)

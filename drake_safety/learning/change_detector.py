@@ -95,7 +95,7 @@ class ChangeDetector:
         motion = f"monitor: {self.motion_s / 60.0:.0f} min of motion for its limits"
         if self.has_limits:
             hours = f"{1 / FALSE_ALARMS_PER_HOUR:.0f} h"
-            return f"{motion}, for at most one false alarm in {hours}"
+            return f"{motion}, extrapolated to one false alarm in {hours}"
         needed = f"{LEAST_MOTION_S / 60.0:.0f} are needed"
         return f"{motion}, {needed}: it reports levels and never alarms"
 
