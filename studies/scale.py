@@ -64,7 +64,7 @@ def scale(
         workers=workers,
         plotted=lambda row: row.metric in ("ms a segment", "peak GB", "auc"),
     ) as study:
-        parameters = replace(study.scenario.assessment, mode=mode)
+        parameters = replace(study.scenario.assessment, mode=mode)  # type: ignore[arg-type]
         path = episodes_folder(assessment, mode)
         training = load_episodes(path)
         methods = {"": parameters, " exact": replace(parameters, candidates_per_neighbour=0)}

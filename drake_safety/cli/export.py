@@ -43,7 +43,7 @@ def export(
     print_shipped(folder)
     out.parent.mkdir(parents=True, exist_ok=True)
     gamma.to_onnx(out)
-    lines = {
+    lines: dict[str, str] = {
         one.kind: f"safe from {one.threshold:.4f}, unsafe below {one.unsafe_below:.4f}: "
         f"{one.promise}"
         for one in gamma.calibrations_.values()

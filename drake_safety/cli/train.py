@@ -173,7 +173,7 @@ def _learn(
             stages(f"{mode}: {stage}", done, wanted)
 
     started = time.process_time()
-    scenario.assessment.mode = mode
+    scenario.assessment.mode = mode  # type: ignore[assignment]  # Checked before.
     data = load_episodes(episodes_folder(out, mode))
     # Γ is that of the scenario's diagram, whatever the options of its training episodes.
     data.info = replace(data.info, scenario_hash=scenario.simulation_hash())

@@ -73,7 +73,8 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
     """
     try:
         text = json.dumps({"value": _completed(schema, raw)}, default=_plain)
-        document: Any = _document(schema).model_validate_json(text, strict=True)
+        known: Any = schema
+        document: Any = _document(known).model_validate_json(text, strict=True)
     except TypeError as error:  # A key that is no text.
         raise ValueError(f"{who}: {error}") from None
     except pydantic.ValidationError as error:
@@ -92,7 +93,7 @@ def load_typed_file(schema: type[_Value], path: Path, who: str) -> _Value:
 
 
 @functools.cache
-def _document(schema: type) -> type[pydantic.BaseModel]:
+def _document(schema: Any) -> type[pydantic.BaseModel]:
     # Inside it, dataclasses of the standard library, such as a user's task has, are strict too.
     return pydantic.create_model("Document", __config__=_STRICT, value=(schema, ...))
 
@@ -142,5 +143,5 @@ def _keys(schema: Any, place: tuple[str | int, ...]) -> list[str]:
         schema = get_args(schema)[0]
     if not place:
         return [one.name for one in fields(schema)]
-    inner = get_type_hints(schema)[place[0]] if is_dataclass(schema) else get_args(schema)[-1]
+    inner = get_type_hints(schema)[str(place[0])] if is_dataclass(schema) else get_args(schema)[-1]
     return _keys(inner, place[1:])

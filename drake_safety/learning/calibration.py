@@ -132,7 +132,7 @@ def calibrate(
     # The same rule for the safe class, with the order of the scores reversed.
     below = -score_threshold(-score, ~label, false_alarm_rate, confidence=confidence, whose="safe")
     return Calibration(
-        kind=kind,
+        kind=kind,  # type: ignore[arg-type]  # The schema refuses others.
         miss_rate=miss_rate,
         false_alarm_rate=false_alarm_rate,
         confidence=confidence,

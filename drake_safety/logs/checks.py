@@ -147,7 +147,8 @@ def check_stillness(
     but the feet seem to slip twice as far as the base moves.
     """
     other = copy.deepcopy(log_map)
-    (other.base_orientation.order,) = set(ORDERS) - {log_map.base_orientation.order}
+    is_first = log_map.base_orientation.order == "wxyz"
+    other.base_orientation.order = "xyzw" if is_first else "wxyz"
     slips = []
     for read_by in (log_map, other):
         feet = np.array([kinematics.contact_positions(q) for q in positions(read_by)])

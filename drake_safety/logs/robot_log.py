@@ -316,18 +316,16 @@ def _velocities(
     joint_columns = [joint_map.column(joint) for joint in kinematics.joint_names]
     checks.check_limits(kinematics, joints, channels[joint_map.topic], joint_columns)
     parts = []
-    for velocity, time, derived, unit in (
+    for velocity, time, derived in (
         (
             log_map.base_angular_velocity,
             rotation_time,
             angular_velocities(rotation_time, rotations),
-            "rad",
         ),
         (
             log_map.base_linear_velocity,
             base_time,
             rates(base_time, points(log_map.base_position, channels)),
-            "m",
         ),
     ):
         if velocity.columns:
@@ -337,7 +335,7 @@ def _velocities(
             )
             channel = channels[velocity.topic]
             if is_checked:
-                checks.check_rates(table, derived, channel, velocity.columns, velocity.unit or unit)
+                checks.check_rates(table, derived, channel, velocity.columns, velocity.unit)
             parts.append(values_at(own_time, table, at_s))
         else:
             parts.append(values_at(time, derived, at_s))
