@@ -67,12 +67,12 @@ def map_items(
         ValueError: A number of processes is given, but another backend has its own, or a worker has
             other versions of Python, Drake, NumPy or this package.
     """
-    todo = list(items)
-    batches = [todo[i : i + batch_size] for i in range(0, len(todo), batch_size)]
+    pending = list(items)
+    batches = [pending[i : i + batch_size] for i in range(0, len(pending), batch_size)]
     results = _map_batches(partial(_called, _versions(), function), batches, num_workers)
     with shown(progress, lambda stages: partial(stages, stage)) as report, closing(results):
         report = report or (lambda done, wanted: None)
-        num_wanted = num_done + len(todo)
+        num_wanted = num_done + len(pending)
         report(num_done, num_wanted)
         for batch in results:
             yield from batch
