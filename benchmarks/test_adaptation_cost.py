@@ -11,7 +11,7 @@ from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
 
 from drake_safety import Scenario, load_assessment
-from drake_safety.learning.feedback import FeedbackSet
+from drake_safety.learning.feedback import EpisodePair
 from drake_safety.simulation.feedback import run_pairs
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
@@ -21,7 +21,7 @@ NUM_ADOPTIONS = 100  # In a round.
 
 
 @pytest.fixture(scope="module")
-def feedback(scenario: Scenario) -> list[FeedbackSet]:
+def feedback(scenario: Scenario) -> list[EpisodePair]:
     return run_pairs(scenario, NUM_PAIRS).feedback()
 
 
@@ -31,16 +31,15 @@ def test_one_update(
     benchmark: Any,
     report: Callable[..., None],
     scenario: Scenario,
-    feedback: list[FeedbackSet],
+    feedback: list[EpisodePair],
     mode: str,
     method: str,
 ) -> None:
     assessment = load_assessment(scenario.name, mode)
     assert any(one.differs for one in feedback)
-    x = np.concatenate(
-        [assessment.inputs_of(one.state, one.desired_preview, one.features) for one in feedback]
-    )
-    label = np.concatenate([np.full(len(one), one.is_unsafe) for one in feedback])
+    rows = [pair.rows for pair in feedback]
+    x = np.concatenate([assessment.columns_.of_rows(one, "actual") for one in rows])
+    label = np.concatenate([one.is_unsafe for one in rows])
     standardised = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), 1e-6)
     with threadpool_limits(1):
         cost_s, peers_s = alternate(

@@ -224,7 +224,7 @@ def test_one_prediction_beside_gradient_boosting(
     benchmark: Any, report: Callable[..., None], scenario: Scenario, episodes: Episodes
 ) -> None:
     gamma = SafetyAssessment(copy.deepcopy(scenario.assessment)).fit(episodes[:NUM_EPISODES])
-    boosting = DirectClassifier("gradient_boosting", shortest=gamma.parameters.shortest)
+    boosting = DirectClassifier("gradient_boosting", shortest=gamma.settings.shortest)
     boosting.fit(episodes)  # All: the cost grows with the number of trees.
     inputs = [getattr(episodes[0], name)[0] for name in INPUT_NAMES]
     x = np.concatenate(inputs)[None].astype(np.float32)

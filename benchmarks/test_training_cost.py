@@ -84,7 +84,7 @@ def classifier_cost(folder: Path, num_episodes: int) -> float:
 def our_cost(folder: Path, num_episodes: int, num_segments: int) -> dict[str, float]:
     """CPU time of DTW, Ω and t-SNE by this library."""
     from drake_safety.learning.distance import neighbour_graph
-    from drake_safety.learning.embedding import tsne
+    from drake_safety.learning.points import tsne
 
     segments, parameters = some_segments(folder, num_episodes, num_segments)
 

@@ -25,6 +25,7 @@ from drake_safety.evaluation.metrics import (
 )
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
+from drake_safety.learning.mode_settings import mode_settings
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.dataset import load_episodes
@@ -196,7 +197,7 @@ def list_variants(
         found.append(Variant(name="state_without_velocities", without=rates))
         if len(rates) < len(rate_names):
             found.append(Variant(name="without_velocities", without=list(rate_names)))
-    if base.is_sharpened:
+    if base.mode == "sharpened":
         found.append(Variant(name="paper", changes={"mode": "paper"}))
         # The paper's mode depends strongly on its score weight.
         changes = {"mode": "paper", "score_weight": 0.1}
@@ -230,11 +231,11 @@ def unsafe_scores(
         info = episodes.info
         states = _kept_columns(info.state_names, variant.without)
         features = _kept_columns(info.feature_names, variant.without)
-        state = segments.state if parameters.is_sharpened else segments.true_state
+        state = segments.true_state if assessment.settings.uses_true_state else segments.state
         result = assessment.predict(
             state[:, states],
             segments.desired_preview[:, : parameters.horizon * len(info.output_names)],
-            segments.features[:, features] if assessment.uses_features else None,
+            segments.features[:, features],
         )
         found.append(result)
     seen, judged = found
@@ -247,7 +248,7 @@ def unsafe_scores(
 
 def judged_segments(episodes: Episodes, base: AssessmentParameters) -> Segments:
     """The segments of fresh episodes at which all variants are evaluated."""
-    return split(episodes, stride=1, discount=1.0, shortest=base.shortest)
+    return split(episodes, stride=1, discount=1.0, shortest=mode_settings(base).shortest)
 
 
 def variant_estimates(

@@ -24,9 +24,9 @@ from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_f
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
 from drake_safety.files.progress import StageProgress
-from drake_safety.learning.assessment import Assessments, SafetyAssessment
+from drake_safety.learning.assessment import Prediction, SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
-from drake_safety.learning.feedback import FeedbackSet
+from drake_safety.learning.feedback import EpisodePair
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import ADAPTATION
 from drake_safety.learning.segments import Episodes, Segments, split
@@ -37,10 +37,10 @@ from studies.baselines import DirectClassifier
 from studies.harness import open_study
 
 SIZES = (40, 80, 120, 160, 400)
-"""Numbers of feedback sets after which an assessment is evaluated."""
+"""Numbers of pairs of episodes after which an assessment is evaluated."""
 THRESHOLD = 0.5
 """Γ below which a segment is classified unsafe."""
-PUBLISHED: dict[str, Callable[[Assessments], np.ndarray]] = {
+PUBLISHED: dict[str, Callable[[Prediction], np.ndarray]] = {
     "calibrated": lambda result: result.probability,
     "grid": lambda result: safe_share(result.belief),
 }
@@ -125,7 +125,7 @@ def adaptation(
         for mode, prior in priors.items():
             baselines = train_baselines(prior, learned_from, num_workers=workers, progress=stages)
             judged = [
-                Pool(feedback=one, test=TestSet.of(episodes, prior.parameters.shortest))
+                Pool(feedback=one, test=TestSet.of(episodes, prior.settings.shortest))
                 for one, episodes in zip(sets, fresh, strict=True)
             ]
             study.add(mode, pool_estimates(prior, judged, baselines=baselines, progress=stages))
@@ -174,8 +174,7 @@ class TestSet:
     def unsafe_score(self, assessment: SafetyAssessment) -> np.ndarray:
         """1 - the safe share of each segment's belief, (N,)."""
         segments = self.segments
-        features = segments.features if assessment.uses_features else None
-        found = assessment.predict(segments.state, segments.desired_preview, features)
+        found = assessment.predict(segments.state, segments.desired_preview, segments.features)
         return 1.0 - safe_share(found.belief)
 
 
@@ -189,12 +188,7 @@ def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, f
         test: The test set.
     """
     segments = test.segments
-    is_plain = not assessment.parameters.is_sharpened and test.episodes.info.variation == "nominal"
-    result = assessment.predict(
-        segments.true_state if is_plain else segments.state,
-        segments.desired_preview,
-        segments.features if assessment.uses_features else None,
-    )
+    result = assessment.predict_rows(segments, test.episodes.info.variation)
     unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
     found = {}
     for name, published in PUBLISHED.items():
@@ -225,7 +219,7 @@ class Pool:
         test: Fresh actual episodes.
     """
 
-    feedback: Sequence[FeedbackSet]
+    feedback: Sequence[EpisodePair]
     test: TestSet
 
 
@@ -260,7 +254,7 @@ def pool_estimates(
     least = min(len(pool.feedback) for pool in pools)
     sizes = [size for size in sizes if size <= least]
     if not sizes:
-        raise ValueError(f"adaptation study: there are only {least} feedback sets")
+        raise ValueError(f"adaptation study: there are only {least} pairs of episodes")
     found: dict[str, list[dict[str, dict[str, float]]]] = {}
     stage = f"{assessment.parameters.mode}: pools of feedback"
     for i, pool in enumerate(pools):
@@ -336,7 +330,7 @@ def _learned(
 
 
 def losses(
-    prior: SafetyAssessment, feedback: Sequence[FeedbackSet], learned: Episodes, test: TestSet
+    prior: SafetyAssessment, feedback: Sequence[EpisodePair], learned: Episodes, test: TestSet
 ) -> dict[str, Estimate]:
     """Brier scores of the steps from x to an adapted grid, each on the fresh episodes.
 
@@ -360,18 +354,16 @@ def losses(
     """
     from sklearn.neighbors import KNeighborsClassifier
 
-    parameters = prior.parameters
-    known = split(learned, stride=1, discount=1.0, shortest=parameters.shortest)
+    shortest = prior.settings.shortest
+    known = split(learned, stride=1, discount=1.0, shortest=shortest)
     if np.ptp(known.is_unsafe.astype(int)) == 0:
         raise ValueError("losses: all actual episodes end alike; expected safe and unsafe ones")
     judged = test.segments
     boosting = DirectClassifier(
-        "gradient_boosting", uses_features=prior.uses_features, shortest=parameters.shortest
+        "gradient_boosting", uses_features=prior.uses_features, shortest=shortest
     ).fit(learned)
     here, there = (
-        prior.predict(
-            one.state, one.desired_preview, one.features if prior.uses_features else None
-        ).embedding
+        prior.predict(one.state, one.desired_preview, one.features).embedding
         for one in (judged, known)
     )
     neighbours = KNeighborsClassifier(min(NUM_NEIGHBOURS, len(known)))
@@ -384,7 +376,7 @@ def losses(
     overall = known.is_unsafe.mean()
     by_cell = np.divide(unsafe, count, out=np.full(len(count), overall), where=count > 0)
     without_gpr = copy.copy(prior)
-    without_gpr.parameters = copy.deepcopy(parameters)
+    without_gpr.parameters = copy.deepcopy(prior.parameters)
     without_gpr.parameters.adaptation.gate = 0.0
     probability = {
         "x": boosting.predict_unsafe(judged.state, judged.desired_preview, judged.features),

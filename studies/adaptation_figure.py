@@ -27,13 +27,13 @@ from drake_safety.evaluation.figure_style import (
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, UNSAFE
 from drake_safety.learning.discrepancy import DiscrepancyFunction
-from drake_safety.learning.feedback import FeedbackSegments, FeedbackSet
+from drake_safety.learning.feedback import EpisodePair, FeedbackSegments, feedback_segments
 
 _NUM_MARKED = 3
 
 
 def adaptation_figure(
-    prior: SafetyAssessment, feedback: Sequence[FeedbackSet], *, updates: Sequence[int] = (1, 4)
+    prior: SafetyAssessment, feedback: Sequence[EpisodePair], *, updates: Sequence[int] = (1, 4)
 ) -> Figure:
     """Plots the map before feedback and after some updates: feedback, discrepancy, beliefs.
 
@@ -55,7 +55,7 @@ def adaptation_figure(
     stages = [update * interval for update in updates if update * interval <= len(feedback)]
     if not stages:
         raise ValueError(
-            f"adaptation_figure: {len(feedback)} feedback sets are fewer than the "
+            f"adaptation_figure: {len(feedback)} pairs of episodes are fewer than the "
             f"{updates[0] * interval} of update {updates[0]}"
         )
     ramp = LinearSegmentedColormap.from_list("discrepancy", ["#fbfbfc", "#e0a3b8", "#7a1742"])
@@ -80,8 +80,8 @@ def adaptation_figure(
         _draw_feedback(panels[1, 0], prior, feedback[: stages[-1]])
         for (upper, lower), update, size in zip(panels.T[1:], updates, stages, strict=False):
             adapted = prior.adapt(feedback[:size])
-            after = draw_beliefs(upper, adapted, f"After update {update}: {size} feedback sets")
-            segments = prior.feedback_segments(feedback[:size])
+            after = draw_beliefs(upper, adapted, f"After update {update}: {size} pairs of episodes")
+            segments = feedback_segments(feedback[:size], prior.parameters)
             points = _points(prior, segments)
             _mark_changes(upper, prior, after - before, before, segments, points)
             difference = np.abs(segments.score - segments.nominal_score)
@@ -100,8 +100,8 @@ def _points(prior: SafetyAssessment, segments: FeedbackSegments) -> np.ndarray:
     return prior.predict(segments.state, segments.desired_preview, segments.features).embedding
 
 
-def _draw_feedback(axes: Axes, prior: SafetyAssessment, feedback: Sequence[FeedbackSet]) -> None:
-    segments = prior.feedback_segments(feedback)
+def _draw_feedback(axes: Axes, prior: SafetyAssessment, feedback: Sequence[EpisodePair]) -> None:
+    segments = feedback_segments(feedback, prior.parameters)
     points = _points(prior, segments)
     difference = segments.score - segments.nominal_score
     draw_grid(axes, prior.grid_)

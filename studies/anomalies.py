@@ -113,7 +113,7 @@ def anomalies(
             one[:, detector.columns] for one in usual_rows(drawn("training", 60.0 * motion))
         ]
         monitors = [
-            Monitor("monitor", names, lambda x: detector.levels_of([x]), detector.alarm_level),
+            Monitor("monitor", names, lambda x: detector.watch([x])[0], detector.alarm_level),
             *learned_monitors(training, detector.columns, names, partial(study.stages, "GRU")),
         ]
         calibration = [rows_of(one) for one in other if one.is_safe]

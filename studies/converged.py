@@ -18,7 +18,7 @@ from drake_safety.evaluation.throw_study import PAPER_THRESHOLD, TriggerRule, ev
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.calibration import score_threshold
-from drake_safety.learning.feedback import FeedbackSet, feedback_sets
+from drake_safety.learning.feedback import EpisodePair, pair_episodes
 from drake_safety.learning.seeds import ADAPTATION, EVALUATION
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.capabilities import HasGoals, is_fair
@@ -80,11 +80,11 @@ def converged(
             study.add("converged", thrown)
 
 
-def nominal_feedback(assessment: SafetyAssessment, episodes: Episodes) -> list[FeedbackSet]:
+def nominal_feedback(assessment: SafetyAssessment, episodes: Episodes) -> list[EpisodePair]:
     """Feedback of a robot without a reality gap: nominal episodes are their own twins."""
     info = replace(episodes.info, scenario_hash=assessment.info_.scenario_hash)
     twins = Episodes(info, list(episodes))
-    return feedback_sets(twins, twins)
+    return pair_episodes(twins, twins)
 
 
 def without_feedback_beliefs(prior: SafetyAssessment) -> SafetyAssessment:

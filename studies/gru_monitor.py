@@ -88,7 +88,7 @@ class GruMonitor:
         """Trains the network on random windows."""
         import torch
 
-        from drake_safety.learning.embedding import one_torch_thread
+        from drake_safety.learning.maps import one_torch_thread
 
         pairs = [tuple(map(torch.tensor, self._pairs(one))) for one in motions]
         rows = np.array([len(z) for z, _ in pairs])

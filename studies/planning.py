@@ -198,8 +198,8 @@ def planning_estimates(
         raise ValueError("planning study: there is no start to plan from")
     outcomes, gamma = [], []
     for trial in trials.values():
-        features = trial.features if assessment.uses_features else None
-        gamma.append(assessment.predict(trial.state, trial.desired_preview, features).probability)
+        found = assessment.predict(trial.state, trial.desired_preview, trial.features)
+        gamma.append(found.probability)
         outcomes.append(trial.is_safe)
     best = [int(np.argmax(values)) for values in gamma]
     default = np.array([is_safe[0] for is_safe in outcomes])

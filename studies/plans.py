@@ -176,11 +176,7 @@ def named_causes(assessment: SafetyAssessment, plans: Plans) -> dict[str, np.nda
         "by_cause_probability", the constraint with the largest unsafe mass.
     """
     first = plans.first
-    result = assessment.predict(
-        first.state if assessment.parameters.is_sharpened else first.true_state,
-        first.desired_preview,
-        first.features if assessment.uses_features else None,
-    )
+    result = assessment.predict_rows(first)
     no_margins = np.full_like(result.predicted_margins, np.nan)
     return {
         "right_cause": likely_causes(

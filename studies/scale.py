@@ -19,8 +19,7 @@ from drake_safety.evaluation.metrics import Estimate, auc
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.seeds import EVALUATION
-from drake_safety.learning.segments import Episodes, Segments, split
-from drake_safety.learning.training import segments_for
+from drake_safety.learning.segments import Episodes, Segments, split, training_segments
 from drake_safety.simulation.dataset import load_episodes
 from studies.baselines import auc_difference
 from studies.harness import (
@@ -123,7 +122,7 @@ def counts_for(
     Raises:
         ValueError: There are fewer segments.
     """
-    per_episode = np.bincount(segments_for(episodes, parameters)[0].episode)
+    per_episode = np.bincount(training_segments(episodes, parameters).episode)
     total = np.cumsum(per_episode)
     misfits = sorted(size for size in sizes if not 1 <= size <= total[-1])
     if misfits:
@@ -178,7 +177,7 @@ def learned_row(
     )
     scorer = assessment_scorer(parameters.mode, learned)
     row = {
-        "segments": len(segments_for(training, parameters)[0]),
+        "segments": len(training_segments(training, parameters)),
         "episodes": count,
         "cpu_s": list(cpu_s.values()),
         "peak_gb": int(peak) / 1024**2,

@@ -238,8 +238,7 @@ def random_plan_estimates(assessment: SafetyAssessment, episodes: Episodes) -> d
     """
     segments = split(episodes, stride=episodes.info.horizon, discount=1.0, shortest=1)
     first = segments.take(segments.is_first)
-    state = first.state if assessment.uses_features else first.true_state
-    found = assessment.predict(state, first.desired_preview, first.features)
+    found = assessment.predict_rows(first)
     probability = safe_share(found.belief)
     is_safe, says_safe = ~first.is_unsafe, probability >= THRESHOLD
     wrong = is_confidently_wrong(is_safe, probability)

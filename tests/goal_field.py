@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from drake_safety.learning.assessment import Assessments
+from drake_safety.learning.assessment import Prediction
 
 BOX = np.array([[0.0, -1.0, 0.0], [1.0, 1.0, 2.0]])
 
@@ -41,7 +41,8 @@ class GoalTask:
 class FieldAssessment:
     """Γ of a goal is a given function of it: `gamma(goals (N, 3)) -> (N,)`."""
 
-    parameters = SimpleNamespace(initial_uncertainty=0.3, margin_unit=0.02, is_sharpened=True)
+    parameters = SimpleNamespace(initial_uncertainty=0.3, margin_unit=0.02)
+    base_logit_ = object()
 
     def __init__(self, gamma, unknown=0.3):
         self._gamma = gamma
@@ -52,7 +53,7 @@ class FieldAssessment:
         gamma = np.asarray(self._gamma(state), dtype=float)
         known = 1.0 - self._unknown
         unsafe = known * (1.0 - gamma)
-        return Assessments(
+        return Prediction(
             belief=np.column_stack([known * gamma, unsafe, np.full(n, self._unknown)]),
             embedding=np.zeros((n, 2)),
             cause_probability=np.column_stack([0.2 * unsafe, 0.8 * unsafe]),

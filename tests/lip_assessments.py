@@ -7,8 +7,8 @@ import numpy as np
 
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.calibration import PLAN, Calibration
-from drake_safety.learning.embedding import MapData
-from drake_safety.learning.feedback import feedback_sets
+from drake_safety.learning.feedback import pair_episodes
+from drake_safety.learning.maps import MapData
 from drake_safety.learning.segments import Episodes, split
 from lip_episodes import make_episodes
 
@@ -62,7 +62,7 @@ def pairs_with(flip, num=NUM_PAIRS, seed=3):
             episode = dataclasses.replace(episode, is_safe=is_safe, cause=cause)
         actual.append(episode)
     info = dataclasses.replace(nominal.info, variation="actual")
-    return feedback_sets(Episodes(info, actual), nominal)
+    return pair_episodes(Episodes(info, actual), nominal)
 
 
 def worse(num=NUM_PAIRS):

@@ -15,7 +15,7 @@ from drake_safety.control.policy import (
 )
 from drake_safety.control.policy_network import PolicyNetwork
 from drake_safety.learning.novelty import Moments, Novelty
-from drake_safety.learning.prediction import Assessment, Assessments, Correction
+from drake_safety.learning.prediction import Correction, Prediction
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.robots.robot_model import JointGains
 from drake_safety.systems.command_guard import CommandGuard
@@ -106,7 +106,7 @@ class AssessmentDouble:
             safe = state[0] * beliefs[0, 0, 0]
             belief = [safe, 0.9 - safe, 0.1]
         probability = safe + correction.hidden[0, 3] * correction.guard[0, 5]
-        return Assessment(
+        return Prediction(
             belief=np.array(belief),
             probability=probability,
             cause_probability=np.array([0.2, 0.3]),
@@ -133,7 +133,7 @@ class SlowIsSafe:
         n = len(gamma)
         if self.novelty > 1.0:
             gamma = np.zeros(n)
-        return Assessments(
+        return Prediction(
             belief=np.column_stack([0.7 * gamma, 0.7 * (1 - gamma), np.full(n, 0.3)]),
             embedding=np.zeros((n, 2)),
             cause_probability=np.zeros((n, 1)),

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from drake_safety.learning import adaptation
-from drake_safety.learning.adaptation import TrainingScores, prior_beliefs
 from drake_safety.learning.assessment import (
     AdaptationParameters,
     AssessmentParameters,
@@ -21,9 +20,10 @@ from drake_safety.learning.beliefs import (
 )
 from drake_safety.learning.change_detector import usual_rows
 from drake_safety.learning.discrepancy import DiscrepancyFunction, updated_uncertainty
-from drake_safety.learning.feedback import feedback_sets, segments_of
+from drake_safety.learning.feedback import feedback_segments, pair_episodes
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import Episodes
+from drake_safety.learning.training_scores import TrainingScores, prior_beliefs
 from lip_assessments import NUM_PAIRS, QUICK, better, inputs, pairs_with, worse
 from lip_episodes import make_episodes
 
@@ -50,10 +50,14 @@ def paper(fitted):
 
 def feedback_cells(assessment, feedback, is_wanted):
     """Cells of each map that hold feedback segments which `is_wanted(segments)` chooses."""
-    segments = assessment.feedback_segments(feedback)
+    segments = feedback_segments(feedback, assessment.parameters)
     x = assessment.inputs_of(segments.state, segments.desired_preview, segments.features)
     points = assessment.embedding_.embed(x)
     return [assessment.grid_.locate(p[is_wanted(segments)]) for p in points]
+
+
+def prior_of(assessment):
+    return prior_beliefs(assessment.training_, assessment.grid_, assessment.parameters, 2)
 
 
 @pytest.mark.train
@@ -84,7 +88,7 @@ def test_cells_that_training_leaves_empty_are_filled_by_what_the_actual_robot_di
         for name in ("heads", "score", "cause", "nearest", "multiplicity")
     }
     assessment.training_ = replace(known, points=known.points[:, is_far], **rows)
-    assessment.beliefs_ = assessment.prior_beliefs()
+    assessment.beliefs_ = prior_of(assessment)
     assert np.all(assessment.beliefs_[0, cells, UNCERTAINTY] == 1.0)
     adapted = assessment.adapt(feedback).beliefs_[0]
     count = np.bincount(cells, minlength=len(adapted))
@@ -133,7 +137,7 @@ def test_gamma_never_rises_in_a_learned_cell_whose_feedback_was_unsafe(sharpened
         np.testing.assert_array_equal(guard, is_held)
     assert num_held > 5
     # What is published rises nowhere either where all that is read are such cells.
-    x = [getattr(feedback[0], name) for name in ("state", "desired_preview", "features")]
+    x = inputs(feedback[0].rows)
     all_guarded = replace(adapted.correction_, guard=np.ones_like(adapted.correction_.guard))
     held = sharpened.predict(*x, correction=all_guarded).probability
     assert np.all(held <= sharpened.predict(*x).probability + 1e-12)
@@ -144,8 +148,7 @@ def test_far_from_all_feedback_the_hidden_layer_adds_no_more_than_it_did_there(s
     correction = sharpened.adapt(worse()).correction_
     least, most = correction.hidden_range
     assert least < 0.0 < most
-    one = worse()[0]
-    x = sharpened.inputs_of(one.state, one.desired_preview, one.features)
+    x = sharpened.inputs_of(*inputs(worse()[0].rows))
     for factor in (1.0, -30.0, 30.0):
         added = correction.residual(sharpened.embedding_, factor * x)
         assert np.all((added >= least) & (added <= most))
@@ -157,8 +160,7 @@ def test_far_from_all_feedback_the_hidden_layer_adds_no_more_than_it_did_there(s
 def test_a_gap_of_any_size_gives_a_probability_online_and_offline(sharpened, offset, expected):
     own = sharpened.correction_
     extreme = replace(own, change=np.array([offset, 0.0, 0.0]))
-    one = worse()[0]
-    x = one.state, one.desired_preview, one.features
+    x = inputs(worse()[0].rows)
     many = sharpened.predict(*x, correction=extreme).probability
     single = sharpened.predict_one(*(part[0] for part in x), correction=extreme).probability
     assert many[0] == pytest.approx(expected, abs=1e-9)
@@ -194,7 +196,7 @@ def test_the_earlier_assessment_stays_as_it_was_and_adapting_again_starts_from_i
     np.testing.assert_array_equal(sharpened.correction_.change, 0.0)
     again = adapted.adapt(worse())
     np.testing.assert_array_equal(again.beliefs_, adapted.beliefs_)
-    np.testing.assert_array_equal(adapted.prior_beliefs(), before)
+    np.testing.assert_array_equal(prior_of(adapted), before)
 
 
 @pytest.mark.train
@@ -205,8 +207,8 @@ def test_every_way_to_ask_an_adapted_assessment_gives_the_same(fitted, tmp_path)
         adapted.save(tmp_path / mode)
         loaded = SafetyAssessment.load(tmp_path / mode)
         assert loaded.adaptation_ == adapted.adaptation_
-        segments = segments_of(held_out, stride=5, shortest=10, discount=0.99, plain=False)
-        given = inputs(segments)
+        segments = feedback_segments(held_out, assessment.parameters)
+        given = inputs(segments, slice(None, None, 5))
         results = [
             adapted.predict(*given),
             loaded.predict(*given),
@@ -222,8 +224,8 @@ def test_every_way_to_ask_an_adapted_assessment_gives_the_same(fitted, tmp_path)
                 np.testing.assert_array_equal(
                     getattr(other, field.name), getattr(results[0], field.name)
                 )
-        for row in range(0, len(segments), 7):
-            one = adapted.predict_one(*inputs(segments, row))
+        for row in range(0, len(given[0]), 7):
+            one = adapted.predict_one(*(part[row] for part in given))
             assert one.probability == pytest.approx(results[0].probability[row], abs=1e-3)
             np.testing.assert_allclose(one.belief, results[0].belief[row], atol=1e-3)
         unmoved = assessment.predict(*given)
@@ -232,10 +234,10 @@ def test_every_way_to_ask_an_adapted_assessment_gives_the_same(fitted, tmp_path)
 
 @pytest.mark.train
 def test_grid_and_published_probability_move_the_same_way(sharpened):
-    segments = segments_of(worse(), stride=3, shortest=10, discount=0.99, plain=False)
-    before = sharpened.predict(*inputs(segments))
+    given = inputs(feedback_segments(worse(), sharpened.parameters), slice(None, None, 3))
+    before = sharpened.predict(*given)
     adapted = sharpened.adapt(worse())
-    after = adapted.predict(*inputs(segments))
+    after = adapted.predict(*given)
     # Rows that were unknown have no probability to move.
     was_known = before.probability > 0.0
     published = (after.probability - before.probability)[was_known]
@@ -252,7 +254,7 @@ def test_grid_and_published_probability_move_the_same_way(sharpened):
 @pytest.mark.parametrize("num_sets", [1, NUM_PAIRS])
 def test_in_the_papers_mode_a_cell_without_feedback_has_its_refused_prior(paper, num_sets):
     feedback = worse()[:num_sets]
-    segments = paper.feedback_segments(feedback)
+    segments = feedback_segments(feedback, paper.parameters)
     x = paper.inputs_of(segments.state, segments.desired_preview, None)
     points = paper.embedding_.embed(x)[0]
     discrepancy = DiscrepancyFunction().fit(points, np.abs(segments.score - segments.nominal_score))
@@ -339,20 +341,15 @@ def test_the_papers_update_can_be_asked_for_in_the_sharpened_mode(sharpened):
 def test_a_pair_that_diverged_says_nothing():
     episodes = make_episodes(4, noise=0.002)
     broken = [replace(e, is_safe=False, cause="diverged") if e.index == 1 else e for e in episodes]
-    feedback = feedback_sets(Episodes(episodes.info, broken), episodes)
-    assert [one.index for one in feedback] == [0, 2, 3]
+    feedback = pair_episodes(Episodes(episodes.info, broken), episodes)
+    assert [one.actual.index for one in feedback] == [0, 2, 3]
 
 
 def test_a_twin_that_has_ended_scores_one():
-    one = max(pairs_with(lambda episode: False), key=len)
-    ended = replace(
-        one,
-        nominal_is_unsafe=True,
-        nominal_remaining_steps=np.maximum(3 - one.steps_since_start, 0),
-        is_unsafe=False,
-        cause=-1,
-    )
-    segments = segments_of([ended], stride=1, shortest=10, discount=0.9, plain=False)
+    one = next(pair for pair in pairs_with(lambda episode: False) if pair.actual.is_safe)
+    twin = replace(one.twin, time_s=one.twin.time_s[:4], is_safe=False, cause="height")
+    parameters = AssessmentParameters(discount=0.9)
+    segments = feedback_segments([replace(one, twin=twin)], parameters)
     np.testing.assert_allclose(segments.nominal_score[:5], [0.9**3, 0.9**2, 0.9, 1.0, 1.0])
     np.testing.assert_array_equal(segments.score, 0.0)
 
@@ -403,7 +400,7 @@ def of_another(feedback, **changes):
         (lambda sets: of_another(sets, step_s=0.05), {}, "differ in step_s"),
         (lambda sets: of_another(sets, constraint_names=["a", "b"]), {}, "differ in constraint_na"),
         (lambda sets: [replace(one, nominal_hash="x") for one in sets], {}, "twin's scenario hash"),
-        (lambda sets: [], {}, "got none, expected at least one set"),
+        (lambda sets: [], {}, "got none, expected at least one pair"),
         (lambda sets: sets, {"method": "luck"}, "cannot adapt by 'luck'"),
         (lambda sets: sets, {"method": "recalibration"}, "'recalibration' needs maps with heads"),
     ],
@@ -418,9 +415,9 @@ def test_feedback_and_methods_that_do_not_fit_are_refused(
 def test_a_twin_is_missing_or_begins_elsewhere():
     episodes = make_episodes(3, noise=0.002)
     with pytest.raises(ValueError, match=r"episode 2 .* has no nominal twin"):
-        feedback_sets(episodes, episodes[:2])
+        pair_episodes(episodes, episodes[:2])
     shifted = [replace(e, true_state=e.true_state + 0.1 * (e.index == 1)) for e in episodes]
     with pytest.raises(ValueError, match="twin of episode 1 starts in another state"):
-        feedback_sets(episodes, Episodes(episodes.info, shifted))
+        pair_episodes(episodes, Episodes(episodes.info, shifted))
     with pytest.raises(ValueError, match="average_cells"):
         average_cells(np.zeros((3, 3)), np.zeros(2, dtype=int), np.zeros(4))

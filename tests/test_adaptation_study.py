@@ -65,7 +65,7 @@ def test_pools_differ_and_the_oracle_bounds_the_gap(assessment, judged):
     assert closed == pytest.approx(expected, nan_ok=True)
     differing = sum(one.differs for pool in pools for one in pool.feedback)
     assert found["gap"].value == pytest.approx(differing / 70)
-    with pytest.raises(ValueError, match="only 30 feedback sets"):
+    with pytest.raises(ValueError, match="only 30 pairs of episodes"):
         pool_estimates(assessment, pools, sizes=(41,))
 
 

@@ -12,8 +12,7 @@ from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessm
 from drake_safety.learning.assessment_file import SCHEMA, SCHEMA_VERSION
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.prediction import is_unknown
-from drake_safety.learning.segments import split
-from drake_safety.learning.training import segments_for
+from drake_safety.learning.segments import split, training_segments
 from lip_assessments import (
     QUICK,
     calibration,
@@ -47,7 +46,7 @@ def test_parameters_that_change_afterwards_change_nothing_that_was_learned():
 def test_held_out_episodes_are_told_apart(assessment, held_out):
     result = assessment.predict(*inputs(held_out))
     area = area_under_curve(-result.belief[:, 0], held_out.is_unsafe)
-    assert area > (0.88 if assessment.parameters.is_sharpened else 0.75)
+    assert area > (0.88 if assessment.uses_features else 0.75)
 
 
 def test_the_probability_is_b_safe_without_heads_and_zero_where_it_is_dont_know(
@@ -62,7 +61,7 @@ def test_the_probability_is_b_safe_without_heads_and_zero_where_it_is_dont_know(
     unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
     assert unknown.any() and not unknown.all()
     np.testing.assert_array_equal(result.probability[unknown], 0.0)
-    if not assessment.parameters.is_sharpened:
+    if not assessment.uses_features:
         np.testing.assert_array_equal(result.probability, result.belief[:, 0])
 
 
@@ -135,7 +134,7 @@ def test_a_cell_holds_the_fusion_of_the_scores_that_the_map_sends_there(assessme
 
 def test_predicted_margins_and_causes_name_what_will_be_violated(assessment, held_out):
     result = assessment.predict(*inputs(held_out))
-    if not assessment.parameters.is_sharpened:
+    if not assessment.uses_features:
         assert np.all(np.isnan(result.predicted_margins))
         return
     assert np.all(np.isfinite(result.predicted_margins))
@@ -195,7 +194,7 @@ def test_short_segments_of_safe_episodes_are_learned_from_where_they_are_asked_f
         parameters = AssessmentParameters(mode=mode, shortest_segment=shortest)
         is_asked = shortest and mode == "sharpened"  # The paper's mode knows none.
         expected = split(few, stride=1, discount=0.99, shortest=shortest if is_asked else None)
-        sizes[shortest] = len(segments_for(few, parameters)[0])
+        sizes[shortest] = len(training_segments(few, parameters))
         assert sizes[shortest] == len(expected)
     assert sizes[0] == sizes[10]  # The horizon.
     assert (sizes[3] > sizes[0]) == (mode == "sharpened")
@@ -234,7 +233,7 @@ def test_inputs_that_do_not_fit_are_refused_by_name(assessment, held_out, ask, m
 
 def test_features_that_do_not_fit_are_refused_where_they_are_used(assessment, held_out):
     state, preview, features = inputs(held_out)
-    if assessment.parameters.is_sharpened:
+    if assessment.uses_features:
         with pytest.raises(ValueError, match=r"features has the shape"):
             assessment.predict(state, preview, features[:, :-1])
         with pytest.raises(ValueError, match=r"features are missing, expected \d+ columns: \["):
@@ -279,7 +278,7 @@ def test_learning_gives_the_same_bits_for_any_number_of_threads():
         np.testing.assert_array_equal(*pair)
     np.testing.assert_array_equal(one.novelty_.limits, other.novelty_.limits)
     assert_same_detector(one, other)
-    stages = ["distances", "t-SNE", "training", "monitor", "beliefs"]
+    stages = ["distances", "t-SNE", "training", "beliefs", "monitor"]
     assert list(dict.fromkeys(stage for stage, *_ in seen)) == stages
     assert all(0 <= done <= total == 100 for _, done, total in seen)
 
@@ -296,7 +295,7 @@ def test_what_is_saved_is_loaded_to_the_bit(assessment, held_out, tmp_path):
     np.testing.assert_array_equal(loaded.training_.points, assessment.training_.points)
     assert loaded.embedding_.is_same(assessment.embedding_)
     assert_same_detector(loaded, assessment)
-    assert np.isfinite(loaded.embedding_.input_range).all() == assessment.parameters.is_sharpened
+    assert np.isfinite(loaded.embedding_.input_range).all() == assessment.uses_features
     assert list(tmp_path.iterdir()) == [path]
 
 

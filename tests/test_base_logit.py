@@ -3,12 +3,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drake_safety.learning import training
+from drake_safety.learning import maps
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_parameters import AssessmentParameters
+from drake_safety.learning.maps import fitted_base_logit, held_out_segments
 from drake_safety.learning.prediction import BaseLogit, sigmoid
+from drake_safety.learning.segments import training_segments
 from drake_safety.learning.trained_maps import EmbeddingOutput
-from drake_safety.learning.training import fitted_base_logit, held_out_segments, segments_for
 from lip_episodes import make_episodes
 
 
@@ -18,7 +19,7 @@ def parameters(**changed):
 
 @pytest.fixture(scope="module")
 def segments():
-    return segments_for(make_episodes(200), parameters())[0]
+    return training_segments(make_episodes(200), parameters())
 
 
 def test_all_maps_leave_out_the_same_episodes_and_whole_ones(segments):
@@ -39,18 +40,18 @@ def test_the_logit_is_fitted_on_an_ensemble_that_knows_none_of_the_episodes(monk
     episodes = make_episodes(120, noise=0.002)
     settings = parameters(epochs=2, hidden_sizes=[24, 24], held_out=0.3)
     tried = []
-    fit = training.fitted_base_logit
-    monkeypatch.setattr(training, "fitted_base_logit", lambda *of: tried.append(of) or fit(*of))
+    fit = maps.fitted_base_logit
+    monkeypatch.setattr(maps, "fitted_base_logit", lambda *of: tried.append(of) or fit(*of))
     sizes = []
-    train = training.train_map
+    train = maps.train_map
 
     def train_map(data, *arguments, **options):
         sizes.append(len(data.x))
         return train(data, *arguments, **options)
 
-    monkeypatch.setattr(training, "train_map", train_map)
+    monkeypatch.setattr(maps, "train_map", train_map)
     learned = SafetyAssessment(settings).fit(episodes)
-    segments = segments_for(episodes, settings)[0]
+    segments = training_segments(episodes, settings)
     held_out = held_out_segments(segments, settings)
     # Three maps are tried on what they have not learned; three others learn from all.
     assert sizes == [np.sum(~held_out)] * 3 + [len(segments)] * 3

@@ -66,7 +66,7 @@ def test_a_diagram_and_rows_have_the_same_levels_and_alarms():
     np.testing.assert_array_equal(alarm, expected)
     frozen = np.tile(rows[0], (6, 1))
     levels, _, _ = Played(frozen).history()
-    np.testing.assert_allclose(levels, learned().levels_of([frozen]), atol=1e-5)
+    np.testing.assert_allclose(levels, learned().watch([frozen])[0], atol=1e-5)
 
 
 def test_it_waits_while_it_is_held():
@@ -106,7 +106,7 @@ def test_it_adopts_the_detector_of_an_adapted_assessment():
     played = Played(rows)
     played.monitor.adopt(played.context, SimpleNamespace(detector_=adapted))
     levels, alarm, _ = played.history()
-    np.testing.assert_allclose(levels, adapted.levels_of([rows]), atol=1e-5)
+    np.testing.assert_allclose(levels, adapted.watch([rows])[0], atol=1e-5)
     assert not alarm.any() and Played(rows).history()[1].any()
 
 

@@ -8,8 +8,10 @@ from drake_safety.learning import distance
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.segments import split
-from drake_safety.learning.training import learned_maps, segments_for
+from drake_safety.learning.inputs import InputColumns
+from drake_safety.learning.maps import learned_maps
+from drake_safety.learning.points import embedded_points
+from drake_safety.learning.segments import split, training_segments
 from lip_episodes import make_episodes
 
 pytestmark = pytest.mark.train
@@ -25,10 +27,10 @@ def warping(segments):
     return {cost: naive.dtw(segments.error, segments.length, cost) for _, cost in WAYS[:3]}
 
 
-def dtw_matrix(error, length, backend="dtaidistance"):
+def dtw_matrix(error, length, **options):
     """DTW of every pair, which a graph of neighbours never holds."""
-    every = slice(0, len(error))
-    return distance._dtw_block(distance._series(error, length), every, every, backend=backend)
+    series = [one[:count] for one, count in zip(error, length, strict=True)]
+    return distance._dtw(series, range(len(error)), range(len(error)), **options)
 
 
 def graph_of(segments, **changes):
@@ -116,10 +118,10 @@ def test_a_user_chooses_what_computes_dtw_and_learns_the_same(monkeypatch):
         parameters = AssessmentParameters(
             distance_backend=backend, mode="paper", perplexity=5.0, epochs=1
         )
-        segments, has_target = segments_for(episodes, parameters)
-        x = segments.state
-        grid = Grid(resolution=14, cell_length=10.0)
-        learned[backend], _ = learned_maps(segments, has_target, x, grid, parameters, None)
+        segments = training_segments(episodes, parameters)
+        points = embedded_points(segments, Grid(resolution=14, cell_length=10.0), parameters)
+        columns = InputColumns(episodes.info, parameters)
+        learned[backend], _ = learned_maps(segments, points, columns, parameters)
         assert bool(asked) == (backend == "tslearn")
     assert learned["tslearn"].is_same(learned["dtaidistance"])
 

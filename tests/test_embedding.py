@@ -5,7 +5,8 @@ import pytest
 
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.distance import neighbour_graph
-from drake_safety.learning.embedding import stack_members, train_map, tsne
+from drake_safety.learning.maps import stack_members, train_map
+from drake_safety.learning.points import tsne
 from drake_safety.learning.segments import split
 from drake_safety.learning.trained_maps import Embedding
 from lip_assessments import map_data

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from drake_safety.evaluation.embedding_figure import embedding_figure
-from drake_safety.learning.adaptation import TrainingScores
 from drake_safety.learning.beliefs import from_scores, fuse_cells
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import split
+from drake_safety.learning.training_scores import TrainingScores
 from lip_episodes import make_episodes
 
 

@@ -61,7 +61,7 @@ EXTRAS = {
 ONLY_IN = {
     "cloudpickle": ("drake_safety/simulation/worker_processes.py",),
     "torch": (
-        "drake_safety/learning/embedding.py",
+        "drake_safety/learning/maps.py",
         "drake_safety/learning/state_predictor.py",
         "drake_safety/control/policy_network.py",
     ),
@@ -356,7 +356,7 @@ IN_FUNCTIONS = "if TYPE_CHECKING:\n    import torch\ndef f():\n    import torch"
         (upward_imports, ROOM("systems"), "from . import b\nfrom ..control import c", None),
         (upward_imports, "models/__init__.py", "from drake_safety.robots.robot import x", None),
         (upward_imports, ROOM("cli"), "from drake_safety import __version__", None),
-        (forbidden_imports, "drake_safety/learning/embedding.py", IN_FUNCTIONS, None),
+        (forbidden_imports, "drake_safety/learning/maps.py", IN_FUNCTIONS, None),
         (forbidden_anywhere, "tests/a.py", "np.load(path, allow_pickle=False)", None),
         (forbidden_anywhere, "tests/a.py", "import drake_safety.models", None),
         (borrowed_tests, "tests/test_a.py", "from lip_episodes import make_episodes", None),

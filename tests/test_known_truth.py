@@ -34,10 +34,8 @@ def test_a_grid_reaches_to_its_corners_with_the_first_variable_first():
 class SaysTheState:
     """An assessment that takes the first number of a state for the probability of safety."""
 
-    uses_features = True
-
-    def predict(self, state, desired_preview, features):
-        return SimpleNamespace(belief=np.stack([state[:, 0], 1.0 - state[:, 0]], axis=1))
+    def predict_rows(self, rows):
+        return SimpleNamespace(belief=np.stack([rows.state[:, 0], 1.0 - rows.state[:, 0]], axis=1))
 
 
 def test_random_plans_are_judged_by_their_first_rows_alone():

@@ -177,7 +177,7 @@ def test_a_log_is_judged_as_its_motions_are_with_its_own_times(monkeypatch, caps
     for begin_s, motion_ in zip((0.0, 321 * scenario.time_step_s), motions, strict=True):
         expected = begin_s + scenario.monitor_step_s * np.arange(len(motion_.time_s))
         np.testing.assert_allclose(motion_.time_s, expected, atol=1e-6)
-    levels = assessment.detector_.levels_of([rows_of(motion_) for motion_ in motions])
+    levels = assessment.detector_.watch([rows_of(motion_) for motion_ in motions])[0]
     assert one["level"] == pytest.approx(levels.max())
     assert one["end_s"] == pytest.approx(motions[1].time_s[-1])
     assert one["left_safe_set"] == ""

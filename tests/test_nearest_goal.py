@@ -1,7 +1,5 @@
 """The gradient leads to the nearest accepted goal, with far fewer goals judged than by search."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -123,7 +121,7 @@ def test_the_reserve_of_the_papers_mode_ends_at_its_largest_probability():
     paper = PlaneAssessment()
     shape = paper._gamma
     paper._gamma = lambda goals: 0.7 * shape(goals)
-    paper.parameters = SimpleNamespace(**vars(paper.parameters) | {"is_sharpened": False})
+    paper.base_logit_ = None
     assert 0.66 <= search(GoalTask(), paper).probability <= 0.7
 
 

@@ -6,7 +6,6 @@ import pytest
 import naive
 from drake_safety import SafetyAssessment, load_assessment, load_scenario
 from drake_safety.learning.beliefs import EMPTY
-from drake_safety.learning.inputs import input_names
 from drake_safety.learning.novelty import Moments, Novelty
 
 ROWS, EPISODES = 20, 200
@@ -164,7 +163,7 @@ def test_the_strangest_input_of_a_robot_is_called_by_its_name(robot):
     name, parts = robot
     assessment = load_assessment(name, "sharpened")
     state, *others = (part[0] for part in parts)
-    names = input_names(assessment.info_, assessment.parameters)
+    names = assessment.columns_.names
     assert len(names) == len(assessment.novelty_.training.mean)
     column = assessment.info_.state_names.index(assessment.info_.state_names[-1])
     found, deviation = assessment.strangest_input(

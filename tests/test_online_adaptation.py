@@ -35,7 +35,7 @@ PORTS = {"state": 1, "output": 1, "desired_output": 1, "desired_preview": 2, "pl
 
 
 class Prior:
-    """An assessment whose adaptations say how many feedback sets they are of."""
+    """An assessment whose adaptations say how many pairs of episodes they are of."""
 
     detector_ = SimpleNamespace(step_s=0.05)
 
@@ -46,9 +46,6 @@ class Prior:
     def adapt(self, feedback, *, method=None, motions=None):
         self.motions.append(motions)
         return (method, len(feedback))
-
-    def feedback_segments(self, feedback):
-        return [row for one in feedback for row in range(NUM_STEPS)]
 
 
 class Watching:
@@ -127,7 +124,7 @@ def test_the_newest_feedback_is_kept_so_that_a_long_simulation_needs_no_more_mem
     adaptation, adopted = run(4.05, capacity=3, update_interval=1)
     # Ten windows, the last three of which are kept.
     assert len(adopted) == 10
-    assert [one.index for one in adaptation.feedback] == [7, 8, 9]
+    assert [one.actual.index for one in adaptation.feedback] == [7, 8, 9]
     assert [number for _, number in adaptation.adapted] == [3] * 8  # Of the newest updates.
     assert adaptation.num_updates == 10
 
@@ -174,10 +171,12 @@ def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterw
         # the safe set, where another window begins.
         episode = run_episode(alone, index, seed=7)
         start = episode.true_state[0]
-        (same,) = (one for one in online.feedback if np.allclose(one.true_state[0], start))
-        rows = len(same.true_state)
-        np.testing.assert_allclose(same.true_state, episode.true_state[:rows], atol=1e-9)
-        assert same.is_unsafe != episode.is_safe
+        (same,) = (
+            one.actual for one in online.feedback if np.allclose(one.actual.true_state[0], start)
+        )
+        rows = len(same.true_state) - 1
+        np.testing.assert_allclose(same.true_state[:-1], episode.true_state[:rows], atol=1e-9)
+        assert same.is_safe == episode.is_safe
         if index < len(motions[-1]):
             # Some of the monitor's rows are those of an episode, which may end between two.
             every = round(scenario.step_s / prior.detector_.step_s)

@@ -12,7 +12,7 @@ from packaging.version import Version
 from command_line import call
 from drake_safety.assessments import assessed_scenarios, load_assessment
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.inputs import input_names, plan_columns, used_states
+from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Correction, is_unknown
 from drake_safety.learning.trained_maps import Embedding
@@ -29,7 +29,7 @@ FIELDS = {
     "novelty": "novelty",
     "embedding": "embedding",
 }
-"""Output port and field of `Assessments`."""
+"""Output port and field of `Prediction`."""
 NUM_INPUTS = 1000
 TAKES_NO_ROWS = Version("1.32")
 """The first onnxruntime that takes an empty batch through the graph's search of the grid."""
@@ -64,7 +64,7 @@ def exported(assessment, folder):
 def ports_of(assessment, x):
     """The arguments of `predict` for inputs x (N, n_x), random where a state is not used."""
     info = assessment.info_
-    is_used = used_states(info, assessment.parameters)
+    is_used = assessment.columns_.is_used
     state = np.random.default_rng(9).normal(size=(len(x), len(is_used)))
     ends = np.cumsum([is_used.sum(), info.widths["desired_preview"], info.widths["features"]])
     state[:, is_used], preview, features, _ = np.split(x, ends, axis=1)
@@ -164,6 +164,7 @@ def with_whole_numbers(assessment):
     changed.base_logit_ = dataclasses.replace(changed.base_logit_, **whole, margin_slope=2)
     changed.grid_ = dataclasses.replace(changed.grid_, cell_length=10)
     changed.parameters = dataclasses.replace(changed.parameters, feature_unit=1)
+    changed.columns_ = InputColumns(changed.info_, changed.parameters)
     return changed
 
 
@@ -172,8 +173,9 @@ def without_velocities(assessment):
     changed, parameters, known = copy.copy(assessment), assessment.parameters, assessment.novelty_
     reading = dataclasses.replace(parameters.paper, velocities=False)
     changed.parameters = dataclasses.replace(parameters, paper=reading)
+    changed.columns_ = InputColumns(assessment.info_, changed.parameters)
     is_kept = np.ones(len(known.training.mean), dtype=bool)
-    is_kept[: known.plan.start] = used_states(assessment.info_, changed.parameters)
+    is_kept[: known.plan.start] = changed.columns_.is_used
     maps = assessment.embedding_
     weights = dict(maps.weights)
     weights["trunk.0.weight"] = weights["trunk.0.weight"][:, is_kept]
@@ -182,7 +184,7 @@ def without_velocities(assessment):
     changed.novelty_ = Novelty(
         training=dataclasses.replace(known.training, mean=mean, covariance=covariance),
         limits=known.limits,
-        plan=plan_columns(assessment.info_, changed.parameters),
+        plan=changed.columns_.plan,
     )
     return changed
 
@@ -275,7 +277,7 @@ def test_the_metadata_are_the_contract(tmp_path):
     ports = contract["inputs"]
     preview = [f"desired {name}" for name in ports["desired_preview"]]
     names = [*ports["state"], *preview, *ports["features"]]
-    assert names == input_names(info, assessment.parameters)
+    assert names == assessment.columns_.names
     widths = {port.name: port.shape[1] for port in runtime.session.get_inputs()}
     assert widths == {name: len(columns) for name, columns in ports.items()}
     ahead_s = contract["horizon"] * contract["preview_step_s"]

@@ -9,10 +9,9 @@ from drake_safety.learning.assessment import (
     SafetyAssessment,
 )
 from drake_safety.learning.assessment_parameters import PaperReading
-from drake_safety.learning.embedding import stack_members, train_map
-from drake_safety.learning.inputs import inputs, is_rate, num_inputs
-from drake_safety.learning.segments import Episodes
-from drake_safety.learning.training import segments_for
+from drake_safety.learning.inputs import InputColumns, is_rate
+from drake_safety.learning.maps import stack_members, train_map
+from drake_safety.learning.segments import Episodes, training_segments
 from lip_assessments import QUICK, map_data
 from lip_episodes import make_episodes
 
@@ -23,7 +22,7 @@ def paper(**changes):
 
 
 def trained(data, reading, held_out=None):
-    parameters = paper(paper=reading, batch_size=64).of_maps()
+    parameters = paper(paper=reading, batch_size=64)
     return stack_members([train_map(data, parameters, seed=0, held_out=held_out)], num_margins=0)
 
 
@@ -35,8 +34,7 @@ def episodes():
 def test_segments_overlap_by_all_but_one_sample_or_not_at_all(episodes):
     horizon = episodes.info.horizon
     for stride, expected in ((1, 1), (0, horizon)):
-        segments, has_target = segments_for(episodes, paper(paper=PaperReading(stride=stride)))
-        assert has_target.all()
+        segments = training_segments(episodes, paper(paper=PaperReading(stride=stride)))
         first = segments.start_row[segments.episode == segments.episode[0]]
         assert set(np.diff(first)) <= {expected}
         assert not np.any(segments.start_row % expected)
@@ -51,15 +49,15 @@ def test_without_velocities_gamma_depends_on_configurations_alone(episodes):
     assessment = SafetyAssessment(paper(paper=reading)).fit(episodes)
     rates = np.array([is_rate(name) for name in episodes.info.state_names])
     assert rates.any() and not rates.all()
-    whole = num_inputs(episodes.info, paper())
-    assert num_inputs(episodes.info, assessment.parameters) == whole - rates.sum()
+    whole = InputColumns(episodes.info, paper())
+    assert len(assessment.columns_.names) == len(whole.names) - rates.sum()
     one = episodes[0]
     state = one.true_state.copy()
     before = assessment.predict(state, one.desired_preview)
     state[:, rates] += 3.0
     after = assessment.predict(state, one.desired_preview)
     np.testing.assert_array_equal(after.embedding, before.embedding)
-    x = inputs(state, one.desired_preview, None, episodes.info, assessment.parameters)
+    x = assessment.inputs_of(state, one.desired_preview, None)
     np.testing.assert_array_equal(x[:, : (~rates).sum()], state[:, ~rates])
 
 

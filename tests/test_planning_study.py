@@ -15,8 +15,6 @@ from studies.planning import planning_estimates, run_trials
 class Knowing(FieldAssessment):
     """Γ by the speeds along x and y, in a task in which slower is safer."""
 
-    uses_features = True
-
     def __init__(self, sign=1.0):
         super().__init__(lambda state: 0.5 - sign * 0.1 * np.clip(state[:, 3:5].sum(axis=1), -4, 4))
 

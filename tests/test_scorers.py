@@ -16,13 +16,14 @@ def episodes():
 class StandIn:
     """An assessment that takes the first column of what it sees for its belief of safe."""
 
-    def __init__(self, uses_features):
-        self.uses_features = uses_features
-        self.used_ = []
-        self.parameters = SimpleNamespace(is_sharpened=uses_features, initial_uncertainty=0.3)
+    used_ = ()
+    parameters = SimpleNamespace(initial_uncertainty=0.3)
+
+    def __init__(self, uses_true_state):
+        self.settings = SimpleNamespace(uses_true_state=uses_true_state)
 
     def predict(self, state, desired_preview, features):
-        assert (features is not None) == self.uses_features
+        assert features is not None
         return SimpleNamespace(
             probability=state[:, 0],
             # More than half of the belief about every third input is of empty cells.
@@ -42,12 +43,11 @@ def test_the_unsafe_score_is_what_the_probability_of_safety_leaves(episodes):
     np.testing.assert_array_equal(clear.unsafe_score(segments), 1.0 - segments.true_state[:, 0])
 
 
-@pytest.mark.parametrize("uses_features", [True, False])
-def test_an_assessment_scores_by_its_probability_on_what_its_mode_sees(episodes, uses_features):
+@pytest.mark.parametrize("uses_true_state", [True, False])
+def test_an_assessment_scores_by_its_probability_on_what_its_mode_sees(episodes, uses_true_state):
     segments = split(episodes, stride=1, discount=1.0)
-    scorer = assessment_scorer("gamma", StandIn(uses_features))
-    # The paper's mode has no noise in its data.
-    assert scorer.uses_true_state is not uses_features
+    scorer = assessment_scorer("gamma", StandIn(uses_true_state))
+    assert scorer.uses_true_state is uses_true_state
     probability = scorer.probability(segments.state, segments.desired_preview, segments.features)
     is_unknown = np.arange(len(segments)) % 3 == 2
     np.testing.assert_array_equal(np.isnan(probability), is_unknown)

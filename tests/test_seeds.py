@@ -9,7 +9,7 @@ from drake_safety.evaluation.episode_study import evaluate_episodes
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.calibration import calibrate as choose
-from drake_safety.learning.feedback import feedback_sets
+from drake_safety.learning.feedback import pair_episodes
 from drake_safety.learning.seeds import (
     ADAPTATION,
     BLOCKS,
@@ -42,7 +42,7 @@ def used(seed, purpose="training", num_episodes=7):
 def paired(seed, num=12):
     nominal = make_episodes(num, seed=seed)
     actual = Episodes(dataclasses.replace(nominal.info, variation="actual"), list(nominal))
-    return feedback_sets(actual, nominal)
+    return pair_episodes(actual, nominal)
 
 
 def calibrated(assessment, seed):
@@ -77,11 +77,11 @@ def test_every_command_takes_its_default_seed_from_the_table():
 
 
 def test_a_used_seed_is_refused_with_what_it_was_used_for_and_one_that_is_free():
-    spent = [used(3), used(5, "calibration", None), used(NOT_DRAWN, "adaptation")]
+    spent = [used(3), used(5, "calibration", 9), used(NOT_DRAWN, "adaptation")]
     check_unused(spent, (0, 1, 2, 4, NOT_DRAWN), "who")
     with pytest.raises(ValueError, match=r"^who: seed 3 .* the 7 'nominal' episodes of its train"):
         check_unused(spent, (3,), "who")
-    with pytest.raises(ValueError, match=r"seed 5 .* the 'nominal' .* calibration; .* such as 6$"):
+    with pytest.raises(ValueError, match=r"seed 5 .* 9 'nominal' .* calibration; .* such as 6$"):
         check_unused(spent, (4, 5), "who")
 
 

@@ -305,13 +305,8 @@ def _print_cuts(log: Path, found: LogPieces) -> None:
 
 def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Estimate]:
     """Estimates of the probability on every segment of fresh episodes."""
-    segments = split(fresh, stride=1, discount=1.0, shortest=assessment.parameters.shortest)
-    is_plain = not assessment.parameters.is_sharpened and fresh.info.variation == "nominal"
-    result = assessment.predict(
-        segments.true_state if is_plain else segments.state,
-        segments.desired_preview,
-        segments.features if assessment.uses_features else None,
-    )
+    segments = split(fresh, stride=1, discount=1.0, shortest=assessment.settings.shortest)
+    result = assessment.predict_rows(segments, fresh.info.variation)
     return segment_estimates(segments, 1.0 - result.probability, threshold=1.0 - _THRESHOLD)
 
 

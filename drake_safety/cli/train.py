@@ -37,7 +37,7 @@ from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.seeds import TRAINING
-from drake_safety.learning.training import segments_for
+from drake_safety.learning.segments import training_segments
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
@@ -180,5 +180,5 @@ def _learn(
     assessment = SafetyAssessment(scenario.assessment).fit(data, report, detector=detector)
     assessment.save(assessment_file(out, mode))
     unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
-    num_segments = len(segments_for(data, scenario.assessment)[0])
+    num_segments = len(training_segments(data, scenario.assessment))
     return num_segments, unsafe, time.process_time() - started

@@ -42,15 +42,13 @@ def assessment_scorer(name: str, assessment: SafetyAssessment) -> Scorer:
     def probability(
         state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray
     ) -> np.ndarray:
-        result = assessment.predict(
-            state, desired_preview, features if assessment.uses_features else None
-        )
+        result = assessment.predict(state, desired_preview, features)
         unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
         return np.where(unknown, np.nan, result.probability)
 
     return Scorer(
         name=name,
         probability=probability,
-        uses_true_state=not assessment.parameters.is_sharpened,
+        uses_true_state=assessment.settings.uses_true_state,
         used=assessment.used_,
     )

@@ -117,7 +117,7 @@ def assessment_judge(assessment: SafetyAssessment) -> Judge:
     def judge(
         state: np.ndarray, preview: np.ndarray, features: np.ndarray, is_outside: np.ndarray
     ) -> Verdicts:
-        found = assessment.predict(state, preview, features if assessment.uses_features else None)
+        found = assessment.predict(state, preview, features)
         unknown = is_unknown(found.belief, assessment.parameters.initial_uncertainty)
         return Verdicts(
             probability=np.where(is_outside, 0.0, found.probability), is_unknown=unknown

@@ -65,7 +65,7 @@ def truth_figure(
         return np.array([getattr(episode, array)[episode.first_step] for episode in starts])
 
     parameters = assessment.parameters
-    state = first("state" if parameters.is_sharpened else "true_state")
+    state = first("true_state" if assessment.settings.uses_true_state else "state")
     features = first("features")
     found = assessment.predict(state, first("desired_preview"), features)
     is_known = ~is_unknown(found.belief, parameters.initial_uncertainty)

@@ -107,3 +107,14 @@ def shown(
     else:
         with open_stages() as stages:
             yield of_stages(stages)
+
+
+def ignore(*done: object) -> None:
+    """A callback for a progress that nobody watches."""
+
+
+def stage_of(progress: StageProgress | None, name: str) -> Callable[[float], None]:
+    """Returns the callback of one stage, which takes the fraction done."""
+    if progress is None:
+        return ignore
+    return lambda done: progress(name, round(100 * done), 100)

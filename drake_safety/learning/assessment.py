@@ -7,37 +7,48 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from drake_safety.extras import require_extra
-from drake_safety.files.progress import StageProgress, shown
-from drake_safety.learning import adaptation, assessment_file, prediction, recalibration
-from drake_safety.learning.adaptation import Adaptation, TrainingScores
+from drake_safety.files.progress import StageProgress, shown, stage_of
+from drake_safety.learning import adaptation, assessment_file, prediction
+from drake_safety.learning.adaptation import Adaptation
 from drake_safety.learning.assessment_parameters import AdaptationParameters, AssessmentParameters
 from drake_safety.learning.blas_threads import one_blas_thread
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector, usual_rows
 from drake_safety.learning.feedback import (
-    FeedbackSegments,
-    FeedbackSet,
+    EpisodePair,
     check_feedback,
-    segments_of,
+    feedback_segments,
     used_episodes,
 )
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.inputs import input_names, inputs, plan_columns, used_states
+from drake_safety.learning.inputs import InputColumns
+from drake_safety.learning.maps import learned_maps
+from drake_safety.learning.mode_settings import ModeSettings, mode_settings
 from drake_safety.learning.novelty import Novelty
-from drake_safety.learning.prediction import Assessment, Assessments, BaseLogit, Correction
+from drake_safety.learning.points import embedded_points
+from drake_safety.learning.prediction import BaseLogit, Correction, Prediction
+from drake_safety.learning.recalibration import recalibrated
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
-from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo, split
-from drake_safety.learning.training import check_preview, known_range, learned_maps, segments_for
+from drake_safety.learning.segments import (
+    Episode,
+    Episodes,
+    EpisodesInfo,
+    Segments,
+    split,
+    training_segments,
+)
+from drake_safety.learning.trained_maps import Embedding
+from drake_safety.learning.training_scores import TrainingScores, prior_beliefs
 
 __all__ = [
     "AdaptationParameters",
-    "Assessment",
     "AssessmentParameters",
-    "Assessments",
+    "Prediction",
     "SafetyAssessment",
 ]
 
@@ -49,6 +60,7 @@ class SafetyAssessment:
 
     - `info_`: the `EpisodesInfo` of the training episodes.
     - `grid_`: the `Grid` of the embedding space.
+    - `columns_`: the `InputColumns` of x.
     - `embedding_`: the maps Psi, an immutable `Embedding`.
     - `detector_`: the `ChangeDetector`, which sees a changed plant or sensor, for a monitor.
     - `beliefs_`: the beliefs of every map's cells, (K, R*R, 3 + n_c). They may be replaced, and
@@ -70,6 +82,20 @@ class SafetyAssessment:
     reading, for comparison.
     """
 
+    info_: EpisodesInfo
+    grid_: Grid
+    columns_: InputColumns
+    embedding_: Embedding
+    detector_: ChangeDetector
+    beliefs_: np.ndarray
+    training_: TrainingScores
+    novelty_: Novelty
+    base_logit_: BaseLogit | None
+    correction_: Correction
+    adaptation_: Adaptation | None
+    used_: list[UsedEpisodes]
+    calibrations_: dict[str, Calibration]
+
     def __init__(self, parameters: AssessmentParameters | None = None):
         # A copy, so that later changes of a scenario do not change a trained assessment.
         self.parameters = copy.deepcopy(parameters or AssessmentParameters())
@@ -80,19 +106,18 @@ class SafetyAssessment:
             return f"SafetyAssessment({mode}, not fitted)"
         words = [f"'{self.info_.scenario}'", mode, f"{len(self.beliefs_)} maps"]
         for one in self.used_:
-            count = "" if one.num_episodes is None else f"{one.num_episodes} "
-            words.append(f"{one.purpose} on {count}episodes of '{one.variation}'")
+            words.append(f"{one.purpose} on {one.num_episodes} episodes of '{one.variation}'")
         return f"SafetyAssessment({', '.join(words)})"
+
+    @property
+    def settings(self) -> ModeSettings:
+        """What the stages of learning read of the parameters in this mode."""
+        return mode_settings(self.parameters)
 
     @property
     def uses_features(self) -> bool:
         """Whether x contains the features, as in the sharpened mode."""
-        return self.parameters.is_sharpened
-
-    @property
-    def num_causes(self) -> int:
-        """n_c, the number of constraints."""
-        return len(self.info_.constraint_names)
+        return self.settings.uses_features
 
     def fit(
         self,
@@ -104,8 +129,8 @@ class SafetyAssessment:
         """Learns embedding and beliefs from nominal episodes.
 
         Args:
-            progress: Called with a stage ("distances", "t-SNE", "training", "monitor",
-                "beliefs"), the percentage done and 100; True shows it.
+            progress: Called with a stage ("distances", "t-SNE", "training", "beliefs", "monitor"),
+                the percentage done and 100; True shows it.
             detector: That of undisturbed motion. By default it is learned from the episodes, whose
                 motion rarely suffices for its limits.
 
@@ -122,68 +147,57 @@ class SafetyAssessment:
             threadpool_limits(1, user_api="blas"),
             shown(progress, lambda stages: stages) as report,
         ):
-            self._learn(episodes, report, detector)
+            vars(self).update(self._learned(episodes, report, detector))
         return self
 
-    def _learn(
+    def _learned(
         self,
         episodes: Episodes,
         progress: StageProgress | None,
         detector: ChangeDetector | None,
-    ) -> None:
-        parameters = self.parameters
-        info = episodes.info
-        check_preview(info, parameters)
-        segments, has_target = segments_for(episodes, parameters)
-        self.info_ = info
-        self.grid_ = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
-        x = self.inputs_of(
-            segments.state if parameters.is_sharpened else segments.true_state,
-            segments.desired_preview,
-            segments.features if parameters.is_sharpened else None,
+    ) -> dict[str, Any]:
+        """The learned attributes, stage by stage."""
+        parameters, info = self.parameters, episodes.info
+        segments = training_segments(episodes, parameters)
+        grid, columns = Grid.of(parameters), InputColumns(info, parameters)
+        points = embedded_points(segments, grid, parameters, progress)
+        embedding, base_logit = learned_maps(
+            segments, points, columns, parameters, stage_of(progress, "training")
         )
-        self.embedding_, base_logit = learned_maps(
-            segments, has_target, x, self.grid_, parameters, progress
-        )
-        if parameters.is_sharpened:
-            self.embedding_ = self.embedding_.clipping(known_range(x))
+        output = embedding.evaluate(columns.of_rows(segments))
+        training = TrainingScores.of(segments, output, base_logit).thinned(grid, parameters.seed)
+        beliefs = prior_beliefs(training, grid, parameters, len(info.constraint_names))
+        stage_of(progress, "beliefs")(1.0)
         every = split(episodes, stride=1, discount=1.0, shortest=1)
-        self.novelty_ = Novelty.fit(
+        novelty = Novelty.fit(
             # With noise in either mode, as on a robot.
-            self.inputs_of(every.state, every.desired_preview, every.features),
+            columns.of(every.state, every.desired_preview, every.features),
             every.episode,
             every.is_unsafe,
             parameters.novelty_rate,
-            plan=plan_columns(info, parameters),
+            plan=columns.plan,
         )
-        self.detector_ = ChangeDetector.fit(episodes) if detector is None else detector
-        if progress is not None:
-            progress("monitor", 100, 100)
-        output = self.embedding_.evaluate(x)
-        self.base_logit_: BaseLogit | None = base_logit
-        self.training_ = TrainingScores.of(segments, output, base_logit).thinned(
-            self.grid_, parameters.seed
-        )
-        self.adaptation_: Adaptation | None = None
-        self.calibrations_: dict[str, Calibration] = {}
-        self.used_ = [UsedEpisodes.of("training", info, len(episodes))]
-        self.correction_ = Correction.none(self.embedding_, self.grid_)
-        self.beliefs_ = adaptation.prior_beliefs(
-            self.training_, self.grid_, parameters, self.num_causes
-        )
-        if progress is not None:
-            progress("beliefs", 100, 100)
-
-    def prior_beliefs(self) -> np.ndarray:
-        """Computes the beliefs of every map's cells before any feedback, (K, R*R, 3 + n_c)."""
-        self._check_fitted()
-        return adaptation.prior_beliefs(
-            self.training_, self.grid_, self.parameters, self.num_causes
-        )
+        detector = ChangeDetector.fit(episodes) if detector is None else detector
+        stage_of(progress, "monitor")(1.0)
+        return {
+            "info_": info,
+            "grid_": grid,
+            "columns_": columns,
+            "embedding_": embedding,
+            "base_logit_": base_logit,
+            "training_": training,
+            "beliefs_": beliefs,
+            "novelty_": novelty,
+            "detector_": detector,
+            "correction_": Correction.none(embedding, grid),
+            "adaptation_": None,
+            "calibrations_": {},
+            "used_": [UsedEpisodes.of("training", info, len(episodes))],
+        }
 
     def adapt(
         self,
-        feedback: Sequence[FeedbackSet],
+        feedback: Sequence[EpisodePair],
         *,
         method: str | None = None,
         motions: Episodes | Sequence[np.ndarray] | None = None,
@@ -191,7 +205,7 @@ class SafetyAssessment:
         """Returns a copy adapted to feedback from the actual robot.
 
         Every adaptation starts from the nominal episodes, as F is not associative: pass all
-        feedback, not only the new sets.
+        feedback, not only the new pairs.
 
         Departure ("recalibration"): see `recalibration.recalibrated_beliefs`.
 
@@ -210,50 +224,60 @@ class SafetyAssessment:
         """
         require_extra("train", "SafetyAssessment.adapt", "sklearn")
         self._check_fitted()
-        self.parameters.check()
-        who = f"SafetyAssessment of '{self.info_.scenario}'"
-        method = adaptation.chosen_method(method, has_heads=self.base_logit_ is not None, who=who)
+        parameters, columns = self.parameters, self.columns_
+        parameters.check()
+        methods = ("paper",) if self.base_logit_ is None else ("recalibration", "paper")
+        method = method or methods[0]
+        if method not in methods:
+            raise ValueError(
+                f"{self._who}: cannot adapt by '{method}'; the methods are {list(methods)}, and "
+                "'recalibration' needs maps with heads"
+            )
         check_feedback(feedback, self.info_)
         drawn = used_episodes(feedback)
         self.check_unused(*{one.seed for one in drawn}, purpose="adaptation")
-        segments = self.feedback_segments(feedback)
-        x = self.inputs_of(segments.state, segments.desired_preview, segments.features)
-        points = self.embedding_.embed(x)
+        segments = feedback_segments(feedback, parameters)
         adapted = copy.copy(self)
-        rows = [self._rows(one) for one in feedback]
+        adapted.parameters = copy.deepcopy(parameters)
+        rows = [pair.rows for pair in feedback]
+        seen = [columns.of(one.state, one.desired_preview, one.features) for one in rows]
         adapted.novelty_ = self.novelty_.with_feedback(
-            np.concatenate(rows), self.parameters.novelty_rate
+            np.concatenate(seen), parameters.novelty_rate
         )
         if motions is not None:
             adapted.detector_ = self._detector_with(motions)
-        adapted.parameters = copy.deepcopy(self.parameters)
         # The thresholds' promises hold for the old beliefs only.
         adapted.calibrations_ = {}
         adapted.used_ = [*(one for one in self.used_ if one.purpose != "adaptation"), *drawn]
-        adapted.correction_ = Correction.none(self.embedding_, self.grid_)
-        if method == "paper":
+        num_causes = len(self.info_.constraint_names)
+        if method == "paper" or self.base_logit_ is None:
+            x = columns.of(segments.state, segments.desired_preview, segments.features)
+            adapted.correction_ = Correction.none(self.embedding_, self.grid_)
             adapted.beliefs_ = adaptation.paper_beliefs(
-                self.training_, segments, points, self.grid_, self.parameters, self.num_causes
+                self.training_,
+                segments,
+                self.embedding_.embed(x),
+                self.grid_,
+                parameters,
+                num_causes,
             )
-        elif self.base_logit_ is not None:
-            adapted.correction_, adapted.beliefs_ = recalibration.recalibrated(
+        else:
+            adapted.correction_, adapted.beliefs_ = recalibrated(
                 feedback,
                 segments,
-                x,
-                points,
-                inputs=self.inputs_of,
+                columns=columns,
                 embedding=self.embedding_,
                 base_logit=self.base_logit_,
                 training=self.training_,
                 grid=self.grid_,
-                parameters=self.parameters,
-                num_causes=self.num_causes,
+                parameters=parameters,
+                num_causes=num_causes,
             )
         adapted.adaptation_ = Adaptation(
             method=method,
             variation=feedback[0].info.variation,
             num_sets=len(feedback),
-            num_differing=sum(one.differs for one in feedback),
+            num_differing=sum(pair.differs for pair in feedback),
         )
         return adapted
 
@@ -264,8 +288,8 @@ class SafetyAssessment:
         every = round(wanted / found)
         if not math.isclose(every * found, wanted):
             raise ValueError(
-                f"SafetyAssessment of '{self.info_.scenario}': rows of the motions are {found} s "
-                f"apart, which does not divide the {wanted} s of the monitor's training"
+                f"{self._who}: rows of the motions are {found} s apart, which does not divide the "
+                f"{wanted} s of the monitor's training"
             )
         return self.detector_.with_motions([rows[::every] for rows in usual_rows(motions)])
 
@@ -281,7 +305,7 @@ class SafetyAssessment:
         """
         self._check_fitted()
         used = [one for one in self.used_ if one.purpose != purpose]
-        check_unused(used, seeds, f"SafetyAssessment of '{self.info_.scenario}'")
+        check_unused(used, seeds, self._who)
 
     def adopt_calibrations(
         self, calibrations: Sequence[Calibration], info: EpisodesInfo, num_episodes: int
@@ -296,45 +320,19 @@ class SafetyAssessment:
         self.calibrations_ = {one.kind: one for one in calibrations}
         self.used_ = [*kept, UsedEpisodes.of("calibration", info, num_episodes)]
 
-    def feedback_segments(self, feedback: Sequence[FeedbackSet]) -> FeedbackSegments:
-        """Splits feedback sets into segments as the training episodes were split."""
-        parameters = self.parameters
-        return segments_of(
-            feedback,
-            stride=parameters.stride,
-            shortest=parameters.shortest,
-            discount=parameters.discount,
-            plain=not parameters.is_sharpened,
-        )
-
-    def _rows(self, motion: Episode | FeedbackSet) -> np.ndarray:
-        return self.inputs_of(motion.state, motion.desired_preview, motion.features)
-
-    @property
-    def state_names(self) -> list[str]:
-        """Names of the states in x, which are its first columns."""
-        is_used = used_states(self.info_, self.parameters)
-        return [n for n, used in zip(self.info_.state_names, is_used, strict=True) if used]
-
     def inputs_of(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
         """Returns x, (..., n_x); the arguments are those of `predict`."""
-        return inputs(state, desired_preview, features, self.info_, self.parameters)
+        return self.columns_.of(state, desired_preview, features)
+
+    @property
+    def _who(self) -> str:
+        return f"SafetyAssessment of '{self.info_.scenario}'"
 
     def _check_fitted(self) -> None:
         if not hasattr(self, "beliefs_"):
             raise ValueError("SafetyAssessment: not fitted or loaded yet")
-
-    def _or_own(
-        self, beliefs: np.ndarray | None, correction: Correction | None
-    ) -> tuple[np.ndarray, Correction]:
-        if beliefs is None and correction is None:
-            return self.beliefs_, self.correction_
-        beliefs = self.beliefs_ if beliefs is None else beliefs
-        correction = self.correction_ if correction is None else correction
-        prediction.check_shapes((beliefs, correction), (self.beliefs_, self.correction_))
-        return beliefs, correction
 
     def predict(
         self,
@@ -345,7 +343,7 @@ class SafetyAssessment:
         beliefs: np.ndarray | None = None,
         correction: Correction | None = None,
         novelty: Novelty | None = None,
-    ) -> Assessments:
+    ) -> Prediction:
         """Assesses N inputs.
 
         Args:
@@ -367,30 +365,40 @@ class SafetyAssessment:
         x = self.inputs_of(state, desired_preview, features)
         if x.ndim != 2:
             raise ValueError(
-                f"SafetyAssessment of '{self.info_.scenario}': state has the shape "
-                f"{np.shape(state)}, expected (N, n_s); predict_one assesses a single input"
+                f"{self._who}: state has the shape {np.shape(state)}, expected (N, n_s); "
+                "predict_one assesses a single input"
             )
         return self._predict(x, beliefs, correction, novelty)
+
+    def predict_rows(self, rows: Episode | Segments, variation: str = "nominal") -> Prediction:
+        """Assesses recorded rows of a plant.
+
+        In the paper's mode, the states of the nominal plant are without noise.
+        """
+        self._check_fitted()
+        return self._predict(self.columns_.of_rows(rows, variation))
 
     @one_blas_thread
     def _predict(
         self,
         x: np.ndarray,
-        beliefs: np.ndarray | None,
-        correction: Correction | None,
-        novelty: Novelty | None,
-    ) -> Assessments:
-        beliefs, correction = self._or_own(beliefs, correction)
+        beliefs: np.ndarray | None = None,
+        correction: Correction | None = None,
+        novelty: Novelty | None = None,
+    ) -> Prediction:
+        if beliefs is not None or correction is not None:
+            beliefs = self.beliefs_ if beliefs is None else beliefs
+            correction = self.correction_ if correction is None else correction
+            prediction.check_shapes((beliefs, correction), (self.beliefs_, self.correction_))
         return prediction.predict(
             x,
             embedding=self.embedding_,
             grid=self.grid_,
-            beliefs=beliefs,
-            correction=correction,
+            beliefs=self.beliefs_ if beliefs is None else beliefs,
+            correction=self.correction_ if correction is None else correction,
             base_logit=self.base_logit_,
             novelty=self.novelty_ if novelty is None else novelty,
             initial_uncertainty=self.parameters.initial_uncertainty,
-            is_sharpened=self.parameters.is_sharpened,
         )
 
     def predict_one(
@@ -402,7 +410,7 @@ class SafetyAssessment:
         beliefs: np.ndarray | None = None,
         correction: Correction | None = None,
         novelty: Novelty | None = None,
-    ) -> Assessment:
+    ) -> Prediction:
         """Assesses one input; the arguments are those of `predict` without the axis N.
 
         The result has the same bits as that of `predict` in a row.
@@ -411,8 +419,8 @@ class SafetyAssessment:
         x = self.inputs_of(state, desired_preview, features)
         if x.ndim != 1:
             raise ValueError(
-                f"SafetyAssessment of '{self.info_.scenario}': state has the shape "
-                f"{np.shape(state)}, expected (n_s,); predict assesses many inputs"
+                f"{self._who}: state has the shape {np.shape(state)}, expected (n_s,); "
+                "predict assesses many inputs"
             )
         return self._predict(x[None], beliefs, correction, novelty).one(0)
 
@@ -424,13 +432,13 @@ class SafetyAssessment:
         The arguments are those of `predict_one`.
 
         Returns:
-            Its name, as in `inputs.input_names`, and the difference from what the other entries
+            Its name, one of `columns_.names`, and the difference from what the other entries
             say, in standard deviations of training.
         """
         self._check_fitted()
         found = self.novelty_.contradictions(self.inputs_of(state, desired_preview, features))
         column = int(np.argmax(np.abs(found)))
-        return input_names(self.info_, self.parameters)[column], float(found[column])
+        return self.columns_.names[column], float(found[column])
 
     def unsafe_logits(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None

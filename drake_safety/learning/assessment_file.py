@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
 from drake_safety.files.atomic import replacing
-from drake_safety.learning.adaptation import Adaptation, TrainingScores
+from drake_safety.learning.adaptation import Adaptation
 from drake_safety.learning.assessment_parameters import (
     AdaptationParameters,
     AssessmentParameters,
@@ -21,20 +21,17 @@ from drake_safety.learning.assessment_parameters import (
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.inputs import plan_columns
+from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.novelty import Moments, Novelty
 from drake_safety.learning.prediction import BaseLogit, Correction
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
+from drake_safety.learning.training_scores import TrainingScores
 
 SCHEMA = "drake_safety.assessment"
 SCHEMA_VERSION = 10
 
-_MAPS, _CORRECTION = "embedding.", "correction."
-_INPUT_RANGE = "input_range"
-_DETECTOR = "detector."
-_NOVELTY, _FEEDBACK_NOVELTY = "novelty.", "feedback_novelty."
 _TRAINING: dict[str, tuple[type, type]] = {
     "points": (np.float32, np.float32),
     "score": (np.float32, float),
@@ -45,7 +42,6 @@ _TRAINING: dict[str, tuple[type, type]] = {
     "count": (np.int32, np.int64),
 }
 """Arrays of `TrainingScores`: the type on disk and in memory."""
-_OPTIONAL = ("heads", "nearest", "multiplicity", "count")
 _T = TypeVar("_T")
 
 
@@ -58,21 +54,24 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
     from safetensors.numpy import save
 
     embedding, correction = learned["embedding_"], learned["correction_"]
-    tensors = {f"{_MAPS}{name}": w for name, w in embedding.weights.items()}
-    tensors |= {f"{_CORRECTION}{name}": value for name, value in asdict(correction).items()}
+    novelty, training = learned["novelty_"], learned["training_"]
+    moments = {"novelty.": novelty.training, "feedback_novelty.": novelty.feedback}
+    groups = {
+        "": {"beliefs": learned["beliefs_"]},
+        "embedding.": embedding.weights,
+        "correction.": asdict(correction) | {"guard": correction.guard.astype(np.uint8)},
+        "detector.": learned["detector_"].arrays(),
+        "training_": {
+            name: values.astype(stored)
+            for name, (stored, _) in _TRAINING.items()
+            if (values := getattr(training, name)) is not None
+        },
+    }
     if np.isfinite(embedding.input_range).all():
-        tensors[_INPUT_RANGE] = embedding.input_range
-    tensors["correction.guard"] = correction.guard.astype(np.uint8)
-    tensors["beliefs"] = learned["beliefs_"]
-    novelty = learned["novelty_"]
-    moments = {_NOVELTY: novelty.training, _FEEDBACK_NOVELTY: novelty.feedback}
+        groups[""]["input_range"] = embedding.input_range
     for prefix, one in moments.items():
         if one is not None:
-            tensors[f"{prefix}mean"], tensors[f"{prefix}covariance"] = one.mean, one.covariance
-    tensors |= {f"{_DETECTOR}{k}": v for k, v in learned["detector_"].arrays().items()}
-    for name, (stored, _) in _TRAINING.items():
-        if (values := getattr(learned["training_"], name)) is not None:
-            tensors[f"training_{name}"] = values.astype(stored)
+            groups[prefix] = {"mean": one.mean, "covariance": one.covariance}
     adaptation, base_logit = learned["adaptation_"], learned["base_logit_"]
     numbers = {
         "num_margins": embedding.num_margins,
@@ -89,7 +88,11 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
         "adaptation": None if adaptation is None else asdict(adaptation),
         "numbers": numbers,
     }
-    arrays = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+    arrays = {
+        f"{prefix}{name}": np.ascontiguousarray(value)
+        for prefix, group in groups.items()
+        for name, value in group.items()
+    }
     # safetensors stores several entries of metadata in any order.
     text = _to_json(entries | {"sha256": _digest(entries, arrays)})
     content = save(arrays, {SCHEMA: text})
@@ -112,7 +115,7 @@ def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
             entries = json.loads(metadata[SCHEMA])
             version = str(entries["schema_version"])
         if version == str(SCHEMA_VERSION):
-            return _checked(entries, tensors)
+            return _learned(entries, tensors)
     except KeyError as error:
         raise ValueError(f"'{path}' is a damaged safety assessment: it has no {error}") from error
     except (AttributeError, RecursionError, TypeError, ValueError) as error:
@@ -121,20 +124,6 @@ def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
         f"'{path}' has the schema version {version}, this version reads {SCHEMA_VERSION}: train "
         "the assessment again (episodes are kept: `--resume`)"
     )
-
-
-def _checked(
-    entries: dict[str, Any], tensors: dict[str, np.ndarray]
-) -> tuple[AssessmentParameters, dict[str, Any]]:
-    stored = entries.pop("sha256")
-    if stored != _digest(entries, tensors):
-        raise ValueError("its contents do not have the SHA-256 that it was written with")
-    nested = {"paper": PaperReading, "adaptation": AdaptationParameters}
-    # Files from before this parameter are of exact neighbours.
-    own = {"candidates_per_neighbour": 0} | entries["parameters"]
-    own |= {name: _made(made, own[name]) for name, made in nested.items()}
-    parameters = _made(AssessmentParameters, own)
-    return parameters, _learned(parameters, entries, tensors)
 
 
 def _to_json(entries: Mapping[str, Any]) -> str:
@@ -158,65 +147,54 @@ def _made(made: type[_T], entries: Mapping[str, Any]) -> _T:
 
 
 def _learned(
-    parameters: AssessmentParameters, entries: dict[str, Any], tensors: dict[str, np.ndarray]
-) -> dict[str, Any]:
-    info, numbers = _made(EpisodesInfo, entries["info"]), entries["numbers"]
-    grid = Grid(resolution=parameters.resolution, cell_length=parameters.cell_length)
-    weights = {k.removeprefix(_MAPS): v for k, v in tensors.items() if k.startswith(_MAPS)}
-    # Files from before the range was stored have none: their maps extrapolate.
-    embedding = Embedding(
-        weights, num_margins=numbers["num_margins"], input_range=tensors.get(_INPUT_RANGE)
-    )
-    base_logit = numbers["base_logit"]
+    entries: dict[str, Any], tensors: dict[str, np.ndarray]
+) -> tuple[AssessmentParameters, dict[str, Any]]:
+    stored = entries.pop("sha256")
+    if stored != _digest(entries, tensors):
+        raise ValueError("its contents do not have the SHA-256 that it was written with")
+    # Files from before this parameter are of exact neighbours.
+    own: dict[str, Any] = {"candidates_per_neighbour": 0} | entries["parameters"]
+    own["paper"] = _made(PaperReading, own["paper"])
+    own["adaptation"] = _made(AdaptationParameters, own["adaptation"])
+    parameters, info = _made(AssessmentParameters, own), _made(EpisodesInfo, entries["info"])
+
+    def group(prefix: str) -> dict[str, Any]:
+        return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+
+    numbers, columns = entries["numbers"], InputColumns(info, parameters)
+    base_logit, adaptation = numbers["base_logit"], entries["adaptation"]
     if base_logit is not None:
-        low, high = base_logit["margin_range"]
-        base_logit = base_logit | {"margin_range": (low, high)}
-        base_logit = _made(BaseLogit, base_logit)
-    correction = {field.name: tensors[f"{_CORRECTION}{field.name}"] for field in fields(Correction)}
-    correction["guard"] = correction["guard"].astype(float)
-    calibrations = [_made(Calibration, one) for one in numbers["calibrations"]]
-    adaptation = entries["adaptation"]
-    learned: dict[str, Any] = {
+        base_logit["margin_range"] = tuple(base_logit["margin_range"])
+    correction = Correction(**group("correction."))
+    correction.guard = correction.guard.astype(float)
+    training = group("training_")
+    counts = numbers["novelty_counts"]
+    feedback = Moments(count=counts[1], **group("feedback_novelty.")) if counts[1] else None
+    return parameters, {
         "info_": info,
-        "grid_": grid,
-        "embedding_": embedding,
-        "base_logit_": base_logit,
-        "beliefs_": tensors["beliefs"],
-        "correction_": Correction(**correction),
-        "novelty_": _novelty(numbers, tensors, plan_columns(info, parameters)),
-        "detector_": ChangeDetector.from_arrays(
-            {k.removeprefix(_DETECTOR): v for k, v in tensors.items() if k.startswith(_DETECTOR)}
+        "grid_": Grid.of(parameters),
+        "columns_": columns,
+        # Files from before the range was stored have none: their maps extrapolate.
+        "embedding_": Embedding(
+            group("embedding."),
+            num_margins=numbers["num_margins"],
+            input_range=tensors.get("input_range"),
         ),
-        "calibrations_": {one.kind: one for one in calibrations},
+        "base_logit_": None if base_logit is None else _made(BaseLogit, base_logit),
+        "beliefs_": tensors["beliefs"],
+        "correction_": correction,
+        "training_": TrainingScores(**{k: v.astype(_TRAINING[k][1]) for k, v in training.items()}),
+        "novelty_": Novelty(
+            training=Moments(count=counts[0], **group("novelty.")),
+            feedback=feedback,
+            limits=np.array(numbers["novelty_limits"], dtype=float),
+            plan=columns.plan,
+        ),
+        "detector_": ChangeDetector.from_arrays(group("detector.")),
+        "calibrations_": {one["kind"]: _made(Calibration, one) for one in numbers["calibrations"]},
         "used_": [_made(UsedEpisodes, one) for one in numbers["used"]],
         "adaptation_": None if adaptation is None else _made(Adaptation, adaptation),
     }
-    stored: dict[str, Any] = {
-        name: tensors[f"training_{name}"].astype(used)
-        for name, (_, used) in _TRAINING.items()
-        if name not in _OPTIONAL or f"training_{name}" in tensors
-    }
-    learned["training_"] = TrainingScores(**stored)
-    return learned
-
-
-def _novelty(numbers: dict[str, Any], tensors: dict[str, np.ndarray], plan: slice) -> Novelty:
-    training, feedback = (
-        Moments(
-            count=int(count),
-            mean=tensors[f"{prefix}mean"],
-            covariance=tensors[f"{prefix}covariance"],
-        )
-        if count
-        else None
-        for prefix, count in zip(
-            (_NOVELTY, _FEEDBACK_NOVELTY), numbers["novelty_counts"], strict=True
-        )
-    )
-    if training is None:
-        raise ValueError("it has no moments of the training inputs")
-    limits = np.array(numbers["novelty_limits"], dtype=float)
-    return Novelty(training=training, feedback=feedback, limits=limits, plan=plan)
 
 
 def file_hash(path: Path) -> str:

@@ -1,7 +1,7 @@
 """The schema of a scenario's `assessment`: parameters of training and adaptation."""
 
 from dataclasses import field, replace
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -204,37 +204,3 @@ class AssessmentParameters:
     def check(self) -> None:
         """Checks all values, which may have been set since the construction."""
         replace(self, paper=replace(self.paper), adaptation=replace(self.adaptation))
-
-    @property
-    def is_sharpened(self) -> bool:
-        """Whether the mode is "sharpened"."""
-        return self.mode == "sharpened"
-
-    @property
-    def num_members(self) -> int:
-        """K, the number of maps: one in the paper's mode."""
-        return self.ensemble_size if self.is_sharpened else 1
-
-    @property
-    def stride(self) -> int:
-        """Rows between the starts of segments: one when sharpened."""
-        return 1 if self.is_sharpened else self.preview_stride * (self.paper.stride or self.horizon)
-
-    def of_maps(self) -> Self:
-        """The parameters with which the maps are trained: in the paper's mode, those of `paper`."""
-        if self.is_sharpened:
-            return self
-        return replace(
-            self,
-            hidden_sizes=self.paper.hidden_sizes,
-            dropout=self.paper.dropout,
-            epochs=self.paper.epochs,
-            target_weight=1.0,
-            safety_weight=0.0,
-            margin_weight=0.0,
-        )
-
-    @property
-    def shortest(self) -> int:
-        """Least number of samples of a safe episode's segment."""
-        return (self.shortest_segment or self.horizon) if self.is_sharpened else self.horizon

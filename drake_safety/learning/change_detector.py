@@ -12,6 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from drake_safety.extras import require_extra
+from drake_safety.files.progress import ignore
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.learning.state_predictor import StatePredictor
 
@@ -81,11 +82,6 @@ class ChangeDetector:
         return self
 
     @property
-    def has_limits(self) -> bool:
-        """Whether there was enough motion for limits; otherwise it never alarms."""
-        return math.isfinite(self.alarm_level)
-
-    @property
     def rates(self) -> np.ndarray:
         """Weight of the newest innovation in the charts of each memory, (3,)."""
         return np.minimum(1.0, self.step_s / np.array(TIME_CONSTANTS_S))
@@ -93,16 +89,14 @@ class ChangeDetector:
     def describe(self) -> str:
         """What the limits were learned from, and what they promise."""
         motion = f"monitor: {self.motion_s / 60.0:.0f} min of motion for its limits"
-        if self.has_limits:
+        if math.isfinite(self.alarm_level):
             hours = f"{1 / FALSE_ALARMS_PER_HOUR:.0f} h"
             return f"{motion}, extrapolated to one false alarm in {hours}"
         needed = f"{LEAST_MOTION_S / 60.0:.0f} are needed"
         return f"{motion}, {needed}: it reports levels and never alarms"
 
     @classmethod
-    def fit(
-        cls, motions: Episodes, progress: Callable[[float], None] | None = None
-    ) -> ChangeDetector:
+    def fit(cls, motions: Episodes, progress: Callable[[float], object] = ignore) -> ChangeDetector:
         """Learns the prediction from one half of the motions, and the limits from the other.
 
         Limits from the errors of other predictions, as in cross-validation, do not see what this
@@ -213,10 +207,6 @@ class ChangeDetector:
         levels: np.ndarray = (_sizes(charts) / self.limits).max(axis=-2)
         return np.maximum(levels, repeats / self.longest_repeat)
 
-    def levels_of(self, motions: Sequence[np.ndarray]) -> np.ndarray:
-        """Levels at each row of consecutive motions; see `watch`."""
-        return self.watch(motions)[0]
-
     def watch(
         self, motions: Sequence[np.ndarray], state_names: Sequence[str] | None = None
     ) -> tuple[np.ndarray, list[Alarm]]:
@@ -310,23 +300,7 @@ class ChangeDetector:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ChangeDetector:
-        """Makes the detector of arrays written by `arrays`.
-
-        Raises:
-            ValueError: Their shapes do not fit each other.
-        """
-        n_u, n_w = len(arrays["columns"]), len(arrays["watched"])
-        shapes: dict[str, tuple[int, ...]] = {
-            "deviation": (n_w,),
-            "limits": (2 * len(TIME_CONSTANTS_S), n_w),
-            "settings": (len(_SETTINGS),),
-            **{f"predictor.{k}": v for k, v in StatePredictor.shapes(n_u, n_w).items()},
-        }
-        for name, shape in shapes.items():
-            if arrays[name].shape != shape:
-                raise ValueError(
-                    f"the shape of its detector.{name} is {arrays[name].shape}, expected {shape}"
-                )
+        """Makes the detector of arrays written by `arrays`."""
         alarm_level, longest_repeat, step_s, motion_s = arrays["settings"].tolist()
         prefix = "predictor."
         of_predictor = {k.removeprefix(prefix): v for k, v in arrays.items() if prefix in k}

@@ -14,14 +14,14 @@ matters.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
 
-from drake_safety.extras import require_extra
+from drake_safety.files.progress import ignore
 
 Backend = Literal["dtaidistance", "tslearn"]
 BACKENDS = get_args(Backend)
@@ -62,7 +62,7 @@ def neighbour_graph(
     num_candidates: int | None = None,
     cost: str = "squared",
     backend: str = "dtaidistance",
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], object] = ignore,
 ) -> NeighbourGraph:
     """Finds the nearest neighbours under the safety distance Omega.
 
@@ -87,7 +87,6 @@ def neighbour_graph(
             raise ValueError(f"distance: unknown {name} '{value}'; it is one of {list(known)}")
     if backend == "tslearn" and cost == "absolute":
         raise ValueError("distance: the backend 'tslearn' has no cost 'absolute'")
-    require_extra("train", "neighbour_graph", backend)
     error = np.asarray(error, dtype=float)
     score = np.asarray(score, dtype=float)
     num_segments = len(error)
@@ -105,14 +104,14 @@ def neighbour_graph(
         raise ValueError("neighbour_graph: the errors contain values that are not finite")
     from scipy.spatial import cKDTree
 
-    series = _series(error, length)
+    series = [np.ascontiguousarray(one[:n]) for one, n in zip(error, length, strict=True)]
     held = _hold_last(error, length)
     # Omega is 1 / w_max * DTW ** power; bounds and DTW itself are those without the power.
     power = 2.0 if cost == "squared" else 1.0
     # sum ||.|| over H pairs is at most sqrt(H) times the root of sum ||.||^2.
     looseness = np.sqrt(error.shape[1]) if cost == "absolute" else 1.0
-    dtw = partial(_dtw_block, backend=backend, is_absolute=cost == "absolute")
-    largest = _max_dtw(series, held, dtw, looseness)
+    dtw = partial(_dtw, series, backend=backend, is_absolute=cost == "absolute")
+    largest = _max_dtw(held, dtw, looseness)
     scale = largest**-power if largest > 0.0 else 0.0
 
     def omega(rows: np.ndarray, columns: np.ndarray, warping: np.ndarray) -> np.ndarray:
@@ -136,18 +135,13 @@ def neighbour_graph(
         bound = omega(rows, columns, looseness * _euclidean(held[rows], held[columns]))
         radius = np.partition(bound, num_neighbours - 1, axis=1)[:, num_neighbours - 1].max()
         limit = (radius * (1.0 + _SLACK)) ** (1.0 / power) * largest * (1.0 + _SLACK)
-        pool = [series[i] for i in (*rows, *columns)]
-        split = len(rows)
-        found = omega(
-            rows, columns, dtw(pool, slice(0, split), slice(split, len(pool)), limit=limit)
-        )
+        found = omega(rows, columns, dtw(rows, columns, limit=limit))
         nearest = np.argpartition(found, num_neighbours - 1, axis=1)[:, :num_neighbours]
         found = np.take_along_axis(found, nearest, axis=1)
         order = np.lexsort((columns[nearest], found), axis=1)
         distances[rows] = np.take_along_axis(found, order, axis=1)
         indices[rows] = np.take_along_axis(columns[nearest], order, axis=1)
-        if progress is not None:
-            progress(min(start + _ROWS, num_segments) / num_segments)
+        progress(min(start + _ROWS, num_segments) / num_segments)
     return NeighbourGraph(indices=indices, distances=distances, max_dtw=largest**power)
 
 
@@ -171,51 +165,41 @@ def _places(held: np.ndarray, score: np.ndarray, power: float) -> np.ndarray:
     return points @ axes[:, ::-1][:, :num_kept]
 
 
-def _series(error: np.ndarray, length: np.ndarray) -> list[np.ndarray]:
-    return [
-        np.ascontiguousarray(sequence[:count], dtype=float)
-        for sequence, count in zip(error, length, strict=True)
-    ]
-
-
 def _hold_last(error: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Each sequence with its last counted sample repeated, flattened, (N, H*n_z)."""
     steps = np.minimum(np.arange(error.shape[1]), np.asarray(length)[:, None] - 1)
     return np.take_along_axis(error, steps[:, :, None], axis=1).reshape(len(error), -1)
 
 
-def _dtw_block(
-    series: list[np.ndarray],
-    rows: slice,
-    columns: slice,
+def _dtw(
+    series: Sequence[np.ndarray],
+    rows: Iterable[int],
+    columns: Iterable[int],
     *,
     backend: str = BACKENDS[0],
     is_absolute: bool = False,
     limit: float = np.inf,
 ) -> np.ndarray:
-    """DTW of `rows` against `columns`, sqrt(sum ||.||^2) or, if absolute, sum ||.||.
-
-    Values above `limit` may be infinite.
-    """
+    """DTW, sqrt(sum ||.||^2) or, if absolute, sum ||.||; above `limit` it may be infinite."""
+    sides = [series[i] for i in rows], [series[i] for i in columns]
     if backend == "tslearn":
         from tslearn.metrics import cdist_dtw
         from tslearn.utils import to_time_series_dataset
 
-        sides = (to_time_series_dataset(series[part]) for part in (rows, columns))
-        return np.asarray(cdist_dtw(*sides))
+        return np.asarray(cdist_dtw(*map(to_time_series_dataset, sides)))
     from dtaidistance import dtw_ndim
 
+    num_rows, num_columns = map(len, sides)
     distances = dtw_ndim.distance_matrix_fast(
-        series,
+        sides[0] + sides[1],
         ndim=series[0].shape[1],
-        block=((rows.start, rows.stop), (columns.start, columns.stop), False),
+        block=((0, num_rows), (num_rows, num_rows + num_columns), False),
         max_dist=max(limit, np.finfo(float).tiny) if np.isfinite(limit) else None,
         compact=True,
         parallel=False,
         inner_dist="euclidean" if is_absolute else "squared euclidean",
     )
-    shape = (rows.stop - rows.start, columns.stop - columns.start)
-    return np.frombuffer(distances, dtype=float).reshape(shape).copy()
+    return np.frombuffer(distances, dtype=float).reshape(num_rows, num_columns).copy()
 
 
 def _euclidean(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -228,16 +212,13 @@ def _euclidean(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return np.sqrt(block, out=block)
 
 
-def _max_dtw(
-    series: list[np.ndarray], held: np.ndarray, dtw: Callable[..., np.ndarray], looseness: float
-) -> float:
+def _max_dtw(held: np.ndarray, dtw: Callable[..., np.ndarray], looseness: float) -> float:
     """Largest DTW over all pairs, with DTW only where its bound exceeds the largest yet."""
     held = held - held.mean(axis=0)
     size = np.linalg.norm(held, axis=1)
     by_size = np.argsort(-size, kind="stable")
     held, size = held[by_size], size[by_size]
-    first = [series[i] for i in by_size[:64]]
-    largest = float(dtw(first, slice(0, len(first)), slice(0, len(first))).max())
+    largest = float(dtw(by_size[:64], by_size[:64]).max())
     for start in range(0, len(held), _BLOCK):
         # Two segments are no further apart than their distances from the mean together.
         reach = largest / looseness * (1.0 - _SLACK) - size[start]
@@ -246,12 +227,9 @@ def _max_dtw(
             break
         bound = _euclidean(held[start : start + _BLOCK], held[start:end])
         is_open = looseness * bound > largest
-        open_rows = start + np.flatnonzero(is_open.any(axis=1))
-        open_columns = start + np.flatnonzero(is_open.any(axis=0))
-        for first_column in range(0, len(open_columns), 8 * _BLOCK):
-            chosen = open_columns[first_column : first_column + 8 * _BLOCK]
-            pool = [series[by_size[i]] for i in (*open_rows, *chosen)]
-            split = len(open_rows)
-            block = dtw(pool, slice(0, split), slice(split, len(pool)))
-            largest = max(largest, float(block.max()))
+        rows = by_size[start + np.flatnonzero(is_open.any(axis=1))]
+        columns = by_size[start + np.flatnonzero(is_open.any(axis=0))]
+        for first in range(0, len(columns), 8 * _BLOCK):
+            found = dtw(rows, columns[first : first + 8 * _BLOCK])
+            largest = max(largest, float(found.max()))
     return largest

@@ -5,167 +5,131 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 
+from drake_safety.learning.assessment_parameters import AssessmentParameters
+from drake_safety.learning.mode_settings import mode_settings
 from drake_safety.learning.seeds import UsedEpisodes
-from drake_safety.learning.segments import DIVERGED, Episodes, EpisodesInfo, split, unsafety_score
+from drake_safety.learning.segments import (
+    DIVERGED,
+    Episode,
+    Episodes,
+    EpisodesInfo,
+    Segments,
+    split,
+    unsafety_score,
+)
 
 START_TOLERANCE = 1e-2
 """Tolerance of a twin's first true state: logged positions are not exact."""
+_SAME_TASK = (
+    *("scenario", "step_s", "horizon", "preview_stride"),
+    *("state_names", "output_names", "feature_names"),
+)
 _logger = logging.getLogger("drake_safety")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FeedbackSet:
-    """An actual episode and its nominal twin from the same state along the same plan.
-
-    Holds what adaptation needs: the inputs x at every start row of the actual episode and at the
-    twin's first row, and the end of both.
+class EpisodePair:
+    """An actual episode and its nominal twin, from the same state along the same plan.
 
     Attributes:
-        state: Measured state, (N, n_s).
-        true_state: State without observation noise, (N, n_s).
-        desired_preview: Desired outputs over the horizon, (N, H*n_z).
-        features: Features, (N, n_f).
-        steps_since_start: Rows from the episode's `first_step` to each start, (N,).
-        remaining_steps: Rows until the actual episode ends, (N,).
-        nominal_remaining_steps: Rows until the twin ends, (N,); 0 after its end.
-        twin_state: Measured state at the twin's first row, (n_s,).
-        twin_desired_preview: Desired preview at the twin's first row, (H*n_z,).
-        twin_features: Features at the twin's first row, (n_f,).
-        cause: Column of the constraint that ended the actual episode, -1 when safe.
+        info: That of the actual episode.
+        actual: The actual episode.
+        twin: The nominal one.
+        nominal_hash: Scenario hash of the nominal plant.
+        twin_seed: Seed of the twin's set.
     """
 
     info: EpisodesInfo
+    actual: Episode
+    twin: Episode
     nominal_hash: str
     twin_seed: int
-    index: int
-    state: np.ndarray
-    true_state: np.ndarray
-    desired_preview: np.ndarray
-    features: np.ndarray
-    steps_since_start: np.ndarray
-    remaining_steps: np.ndarray
-    nominal_remaining_steps: np.ndarray
-    twin_state: np.ndarray
-    twin_desired_preview: np.ndarray
-    twin_features: np.ndarray
-    is_unsafe: bool
-    nominal_is_unsafe: bool
-    cause: int
-
-    def __len__(self) -> int:
-        return len(self.remaining_steps)
 
     @property
     def differs(self) -> bool:
         """Whether exactly one of the two episodes is safe."""
-        return self.is_unsafe != self.nominal_is_unsafe
+        return self.actual.is_safe != self.twin.is_safe
+
+    @cached_property
+    def rows(self) -> Segments:
+        """Segments from every row of the actual episode but those at its end."""
+        return split(Episodes(self.info, [self.actual]), stride=1, discount=1.0, shortest=1)
 
 
-def feedback_sets(
+def pair_episodes(
     actual: Episodes, nominal: Episodes, *, nominal_hash: str | None = None
-) -> list[FeedbackSet]:
+) -> list[EpisodePair]:
     """Pairs actual episodes with their nominal twins by index, without diverged pairs.
 
     Args:
         nominal: The twins; further episodes are ignored.
         nominal_hash: Scenario hash of the nominal plant, if the twins' hash also covers the options
             of the pairs; the twins' hash by default.
+
+    Raises:
+        ValueError: A twin is missing or starts in another state, or the sets are of other tasks.
     """
-    _check_same_task(actual.info, nominal.info)
-    twins = {episode.index: episode for episode in nominal}
-    sets = []
-    for episode in actual:
-        twin = twins.get(episode.index)
-        if twin is None:
-            raise ValueError(
-                f"feedback of '{actual.info.scenario}': episode {episode.index} of the variation "
-                f"'{actual.info.variation}' has no nominal twin; there are {len(twins)} twins"
-            )
-        apart = np.abs(episode.true_state[0] - twin.true_state[0]).max(initial=0.0)
-        if not apart <= START_TOLERANCE:
-            raise ValueError(
-                f"feedback of '{actual.info.scenario}': the twin of episode {episode.index} starts "
-                f"in another state; their first states differ by {apart:.3g}"
-            )
-        if DIVERGED in (episode.cause, twin.cause):
-            _logger.info("pair %d of '%s' diverged", episode.index, actual.info.scenario)
-            continue
-        if any(one.num_steps == one.first_step for one in (episode, twin)):
-            continue
-        segments = split(Episodes(actual.info, [episode]), stride=1, discount=1.0, shortest=1)
-        sets.append(
-            FeedbackSet(
-                info=actual.info,
-                nominal_hash=nominal_hash or nominal.info.scenario_hash,
-                twin_seed=nominal.info.seed,
-                index=episode.index,
-                state=segments.state,
-                true_state=segments.true_state,
-                desired_preview=segments.desired_preview,
-                features=segments.features,
-                steps_since_start=segments.start_row - episode.first_step,
-                remaining_steps=segments.remaining_steps,
-                nominal_remaining_steps=np.maximum(twin.num_steps - segments.start_row, 0),
-                twin_state=twin.state[twin.first_step],
-                twin_desired_preview=twin.desired_preview[twin.first_step],
-                twin_features=twin.features[twin.first_step],
-                is_unsafe=not episode.is_safe,
-                nominal_is_unsafe=not twin.is_safe,
-                cause=int(segments.cause[0]),
-            )
-        )
-    return sets
-
-
-def _check_same_task(actual: EpisodesInfo, nominal: EpisodesInfo) -> None:
-    for name in (
-        "scenario",
-        "step_s",
-        "horizon",
-        "preview_stride",
-        "state_names",
-        "output_names",
-        "feature_names",
-    ):
-        here, there = getattr(actual, name), getattr(nominal, name)
+    who = f"feedback of '{actual.info.scenario}'"
+    for name in _SAME_TASK:
+        here, there = getattr(actual.info, name), getattr(nominal.info, name)
         if here != there:
             raise ValueError(
                 f"feedback: actual and nominal episodes differ in {name}: {here} and {there}"
             )
+    twins = {episode.index: episode for episode in nominal}
+    pairs = []
+    for episode in actual:
+        twin = twins.get(episode.index)
+        if twin is None:
+            raise ValueError(
+                f"{who}: episode {episode.index} of the variation '{actual.info.variation}' has no "
+                f"nominal twin; there are {len(twins)} twins"
+            )
+        apart = np.abs(episode.true_state[0] - twin.true_state[0]).max(initial=0.0)
+        if not apart <= START_TOLERANCE:
+            raise ValueError(
+                f"{who}: the twin of episode {episode.index} starts in another state; their first "
+                f"states differ by {apart:.3g}"
+            )
+        if DIVERGED in (episode.cause, twin.cause):
+            _logger.info("pair %d of '%s' diverged", episode.index, actual.info.scenario)
+        elif all(one.num_steps > one.first_step for one in (episode, twin)):
+            pairs.append(
+                EpisodePair(
+                    info=actual.info,
+                    actual=episode,
+                    twin=twin,
+                    nominal_hash=nominal_hash or nominal.info.scenario_hash,
+                    twin_seed=nominal.info.seed,
+                )
+            )
+    return pairs
 
 
-def check_feedback(feedback: Sequence[FeedbackSet], learned: EpisodesInfo) -> None:
+def check_feedback(feedback: Sequence[EpisodePair], learned: EpisodesInfo) -> None:
     """Checks that feedback is of the scenario that an assessment was trained on."""
     if not feedback:
-        raise ValueError(f"feedback of '{learned.scenario}': got none, expected at least one set")
-    for one in feedback:
+        raise ValueError(f"feedback of '{learned.scenario}': got none, expected at least one pair")
+    for pair in feedback:
         sides = {
-            name: (getattr(one.info, name), getattr(learned, name))
-            for name in (
-                "scenario",
-                "step_s",
-                "horizon",
-                "preview_stride",
-                "constraint_names",
-                "state_names",
-                "output_names",
-                "feature_names",
-            )
+            name: (getattr(pair.info, name), getattr(learned, name))
+            for name in (*_SAME_TASK, "constraint_names")
         }
-        sides["the nominal twin's scenario hash"] = (one.nominal_hash, learned.scenario_hash)
+        sides["the nominal twin's scenario hash"] = (pair.nominal_hash, learned.scenario_hash)
         for what, (got, expected) in sides.items():
             if got != expected:
                 raise ValueError(
-                    f"feedback set {one.index} and the assessment differ in {what}: the feedback "
+                    f"pair {pair.actual.index} and the assessment differ in {what}: the feedback "
                     f"has {got}, the assessment was trained with {expected}"
                 )
 
 
-def used_episodes(feedback: Sequence[FeedbackSet]) -> list[UsedEpisodes]:
+def used_episodes(feedback: Sequence[EpisodePair]) -> list[UsedEpisodes]:
     """Returns the sets of actual and twin episodes in feedback."""
     sides = [(one.info.variation, one.info.scenario_hash, one.info.seed) for one in feedback]
     sides += [("nominal", one.nominal_hash, one.twin_seed) for one in feedback]
@@ -181,77 +145,63 @@ def used_episodes(feedback: Sequence[FeedbackSet]) -> list[UsedEpisodes]:
     ]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FeedbackSegments:
-    """Segments of several feedback sets.
+@dataclass(kw_only=True, eq=False)
+class FeedbackSegments(Segments):
+    """Segments of actual episodes, beside what became of their twins.
 
     Attributes:
-        state: State in x, (N, n_s).
-        desired_preview: Desired outputs over the horizon, (N, H*n_z).
-        features: Features, (N, n_f).
-        score: lambda of the actual episode, (N,).
         nominal_score: lambda of the twin, (N,).
-        is_unsafe: Whether the actual episode ended unsafely, (N,).
         nominal_is_unsafe: Whether the twin ended unsafely, (N,).
-        cause: Column of the constraint that ended the actual episode, -1 when safe, (N,).
     """
 
-    state: np.ndarray
-    desired_preview: np.ndarray
-    features: np.ndarray
-    score: np.ndarray
     nominal_score: np.ndarray
-    is_unsafe: np.ndarray
     nominal_is_unsafe: np.ndarray
-    cause: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.score)
 
 
-def segments_of(
-    feedback: Sequence[FeedbackSet], *, stride: int, shortest: int, discount: float, plain: bool
+def feedback_segments(
+    feedback: Sequence[EpisodePair], parameters: AssessmentParameters
 ) -> FeedbackSegments:
-    """Splits feedback sets into segments as training episodes are split.
+    """Splits actual episodes into segments as training episodes are split.
 
-    A twin that has left the safe set before a segment starts scores 1 there.
+    A twin that has left the safe set before a segment starts scores 1 there. As in training, an
+    unsafe episode has segments only where a complete one has them.
 
-    Args:
-        shortest: Least number of samples of a safe episode's segment.
-        plain: Whether to use the state without noise for "actual" episodes of the nominal plant, as
-            in training in the paper's mode.
+    Raises:
+        ValueError: There is no segment.
     """
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in FeedbackSegments.__annotations__}
-    for one in feedback:
-        sample = one.info.preview_stride
-        is_taken = one.steps_since_start % stride == 0
-        left = one.remaining_steps
-        if one.is_unsafe:
-            # As in training, an unsafe episode has segments only where a complete one has them.
-            left = np.maximum(left, one.info.num_steps - one.steps_since_start)
-        is_taken &= left >= shortest * sample
-        rows = np.flatnonzero(is_taken)
-        is_unsafe = np.full(rows.size, one.is_unsafe)
-        nominal_is_unsafe = np.full(rows.size, one.nominal_is_unsafe)
-        state = one.true_state if plain and one.info.variation == "nominal" else one.state
-        piece = {
-            "state": state[rows],
-            "desired_preview": one.desired_preview[rows],
-            "features": one.features[rows],
-            "score": unsafety_score(one.remaining_steps[rows] / sample, is_unsafe, discount),
-            "nominal_score": unsafety_score(
-                one.nominal_remaining_steps[rows] / sample, nominal_is_unsafe, discount
-            ),
-            "is_unsafe": is_unsafe,
-            "nominal_is_unsafe": nominal_is_unsafe,
-            "cause": np.full(rows.size, one.cause),
-        }
-        for name, values in piece.items():
-            parts[name].append(values)
-    segments = FeedbackSegments(**{name: np.concatenate(values) for name, values in parts.items()})
+    settings, discount = mode_settings(parameters), parameters.discount
+    parts = []
+    for position, pair in enumerate(feedback):
+        rows, sample = pair.rows, pair.info.preview_stride
+        since_start = rows.start_row - pair.actual.first_step
+        left = rows.remaining_steps
+        if not pair.actual.is_safe:
+            left = np.maximum(left, pair.info.num_steps - since_start)
+        is_taken = (since_start % settings.stride == 0) & (left >= settings.shortest * sample)
+        taken = rows.take(is_taken)
+        is_unsafe = np.full(len(taken), not pair.twin.is_safe)
+        remaining = np.maximum(pair.twin.num_steps - taken.start_row, 0)
+        taken = replace(
+            taken,
+            episode=np.full(len(taken), position),
+            score=unsafety_score(taken.remaining_steps / sample, taken.is_unsafe, discount),
+        )
+        if settings.uses_true_state and pair.info.variation == "nominal":
+            taken = replace(taken, state=taken.true_state)
+        parts.append(
+            FeedbackSegments(
+                **vars(taken),
+                nominal_score=unsafety_score(remaining / sample, is_unsafe, discount),
+                nominal_is_unsafe=is_unsafe,
+            )
+        )
+    names = [field.name for field in fields(FeedbackSegments)]
+    segments = FeedbackSegments(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    )
     if not len(segments):
         raise ValueError(
-            f"feedback of '{feedback[0].info.scenario}': none of {len(feedback)} sets has a "
-            f"segment of {shortest} samples"
+            f"feedback of '{feedback[0].info.scenario}': none of {len(feedback)} pairs has a "
+            f"segment of {settings.shortest} samples"
         )
     return segments

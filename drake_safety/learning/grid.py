@@ -8,6 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
+from drake_safety.learning.assessment_parameters import AssessmentParameters
+from drake_safety.learning.mode_settings import mode_settings
+
 OUTSIDE = -1
 """Cell of a point outside the grid, and of NaN."""
 
@@ -25,10 +28,22 @@ class Grid:
     Attributes:
         resolution: Number of cells a side, R.
         cell_length: Side of a cell, in units of the embedding.
+        interpolates: Whether `read` interpolates between the cells' centres. Departure
+            ("sharpened" only): the paper reads the cell that contains Psi(x).
     """
 
     resolution: int
     cell_length: float
+    interpolates: bool = True
+
+    @classmethod
+    def of(cls, parameters: AssessmentParameters) -> Grid:
+        """Makes the grid of an assessment."""
+        return cls(
+            resolution=parameters.resolution,
+            cell_length=parameters.cell_length,
+            interpolates=mode_settings(parameters).interpolates,
+        )
 
     def __post_init__(self) -> None:
         if self.resolution < 1:
@@ -75,10 +90,14 @@ class Grid:
     def locate(self, points: np.ndarray) -> np.ndarray:
         """Returns L, the cell of each point (..., 2), or `OUTSIDE`."""
         position = (np.asarray(points, dtype=float) + self.half_width) / self.cell_length
-        is_inside = _is_within(position, self.resolution)
-        index = np.where(is_inside, position, 0.0).astype(int)
+        is_inside = np.all((position >= 0.0) & (position < self.resolution), axis=-1)
+        index = np.where(is_inside[..., None], position, 0.0).astype(int)
         cells = index[..., 0] * self.resolution + index[..., 1]
-        return np.where(is_inside[..., 0], cells, OUTSIDE)
+        return np.where(is_inside, cells, OUTSIDE)
+
+    def read(self, points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Reads values of the cells at points; see `interpolate`."""
+        return (self.interpolate if self.interpolates else self.look_up)(points, values)
 
     def interpolate(self, points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Interpolates values of the cells bilinearly between the cells' centres.
@@ -117,8 +136,3 @@ class Grid:
         is_inside = cells != OUTSIDE
         found = np.take_along_axis(values, np.maximum(cells, 0)[..., None], axis=1)
         return found * is_inside[..., None], is_inside
-
-
-def _is_within(position: np.ndarray, resolution: int) -> np.ndarray:
-    """Whether positions (..., 2) in units of cells lie in the grid, (..., 1); false for NaN."""
-    return np.all((position >= 0.0) & (position < resolution), axis=-1, keepdims=True)

@@ -14,9 +14,7 @@ import numpy as np
 from drake_safety.extras import require_extra
 from drake_safety.files.atomic import replacing
 from drake_safety.learning import beliefs as belief_masses
-from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.inputs import used_states
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import (
     LOGIT_LIMIT,
@@ -25,7 +23,7 @@ from drake_safety.learning.prediction import (
     Correction,
     unknown_above,
 )
-from drake_safety.learning.segments import EpisodesInfo, installed_versions
+from drake_safety.learning.segments import installed_versions
 from drake_safety.learning.trained_maps import INPUT_LIMIT, Embedding
 
 if TYPE_CHECKING:
@@ -67,13 +65,13 @@ def write(path: Path, assessment: Any) -> None:
     base_logit = assessment.base_logit_
     nodes = _Nodes()
     inputs = {name: info.widths[name] for name in ("state", "desired_preview")}
-    if parameters.is_sharpened and info.feature_names:
+    if assessment.columns_.has_features:
         inputs["features"] = info.widths["features"]
-    x, is_usable = _inputs(nodes, inputs, info, parameters)
+    x, is_usable = _inputs(nodes, inputs, assessment.columns_.is_used, parameters.feature_unit)
     y, logit, margins, activations = _maps(nodes, nodes("Where", is_usable, x, 0.0), embedding)
     share = _novelty(nodes, x, assessment.novelty_)
     is_known = nodes("And", is_usable, nodes("LessOrEqual", share, 1.0))
-    weights, inside = _cell_weights(nodes, y, grid, parameters.is_sharpened)
+    weights, inside = _cell_weights(nodes, y, grid)
     num_causes = len(info.constraint_names)
     empty = np.zeros(3 + num_causes)
     empty[belief_masses.UNCERTAINTY] = 1.0
@@ -220,16 +218,15 @@ def _port(name: str, width: int | None) -> onnx.ValueInfoProto:
 
 
 def _inputs(
-    nodes: _Nodes, ports: Iterable[str], info: EpisodesInfo, parameters: AssessmentParameters
+    nodes: _Nodes, ports: Iterable[str], is_used: np.ndarray, feature_unit: float
 ) -> tuple[str, str]:
     """x, (N, n_x), and which rows the maps can take, (N, 1)."""
     parts = list(ports)
-    is_used = used_states(info, parameters)
     if not is_used.all():
         parts[0] = nodes("Gather", "state", np.flatnonzero(is_used), axis=1)
-    if "features" in ports and parameters.feature_unit:
+    if "features" in ports and feature_unit:
         # Runtimes have no asinh of double precision.
-        u = nodes("Div", "features", parameters.feature_unit)
+        u = nodes("Div", "features", feature_unit)
         root = nodes("Sqrt", nodes("Add", nodes("Mul", u, u), 1.0))
         size = nodes("Log", nodes("Add", nodes("Abs", u), root))
         parts.append(nodes("Mul", nodes("Sign", u), size))
@@ -280,7 +277,7 @@ def _novelty(nodes: _Nodes, x: str, novelty: Novelty) -> str:
     return nodes("Sqrt", nodes("Where", is_finite, nodes("Max", largest, 0.0), np.inf))
 
 
-def _cell_weights(nodes: _Nodes, y: str, grid: Grid, is_sharpened: bool) -> tuple[str, str]:
+def _cell_weights(nodes: _Nodes, y: str, grid: Grid) -> tuple[str, str]:
     """Weights of the R cells along each axis at y, (K, N, 2, R); 1 inside the grid, (K, N, 1).
 
     One or two weights of an axis are not zero; all of them are outside the grid.
@@ -294,7 +291,7 @@ def _cell_weights(nodes: _Nodes, y: str, grid: Grid, is_sharpened: bool) -> tupl
     inside = nodes("ReduceMin", nodes.double(is_within), axes=[2], keepdims=1)
     position = nodes("Where", nodes("Greater", inside, 0.0), position, 0.0)
     cells = np.arange(resolution, dtype=float)
-    if is_sharpened:
+    if grid.interpolates:
         position = nodes.clip(nodes("Sub", position, 0.5), float(last), 0.0)
         distance = nodes("Abs", nodes("Sub", nodes("Unsqueeze", position, [3]), cells))
         weights = nodes("Max", nodes("Sub", 1.0, distance), 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +19,8 @@ SHIFT_LIMIT = 100.0
 
 
 @dataclass(kw_only=True, eq=False)
-class Assessments:
-    """Assessments of N inputs.
+class Prediction:
+    """What an assessment says of N inputs, or of one, for which the axis N is missing.
 
     Attributes:
         belief: (b_safe, b_unsafe, mu), (N, 3); empty for novel inputs. Its first entry is the
@@ -27,8 +28,8 @@ class Assessments:
         probability: Probability of staying safe, (N,), from the base logit with the correction by
             feedback; b_safe without heads, as in the paper's mode. 0 where the belief is "don't
             know", see `is_unknown`.
-        embedding: y of the first map, (N, 2); NaN for inputs that are not finite.
         cause_probability: b_unsafe split by the violated constraint, (N, n_c).
+        embedding: y of the first map, (N, 2); NaN for inputs that are not finite.
         predicted_margins: Smallest margin of each constraint until the episode's end [unit of the
             margins], (N, n_c); NaN for inputs that are not finite or without a margin head.
         novelty: Distance of x from the training inputs in units of the largest known one, (N,);
@@ -36,46 +37,27 @@ class Assessments:
     """
 
     belief: np.ndarray
-    probability: np.ndarray
-    embedding: np.ndarray
-    cause_probability: np.ndarray
-    predicted_margins: np.ndarray
-    novelty: np.ndarray
-
-    def one(self, row: int) -> Assessment:
-        """Returns the assessment in one row."""
-        return Assessment(
-            belief=self.belief[row],
-            probability=float(self.probability[row]),
-            cause_probability=self.cause_probability[row],
-            embedding=self.embedding[row],
-            predicted_margins=self.predicted_margins[row],
-            novelty=float(self.novelty[row]),
-        )
-
-
-@dataclass(kw_only=True, eq=False, slots=True)
-class Assessment:
-    """Assessment of one input; the fields of `Assessments` without the axis N."""
-
-    belief: np.ndarray
-    probability: float
+    probability: Any
     cause_probability: np.ndarray
     embedding: np.ndarray
     predicted_margins: np.ndarray
-    novelty: float
+    novelty: Any
 
-    def unknown(self) -> Assessment:
-        """The assessment with the empty belief."""
+    def one(self, row: int) -> Prediction:
+        """Returns the prediction for one of the inputs."""
+        return Prediction(**{name: values[row] for name, values in vars(self).items()})
+
+    def unknown(self) -> Prediction:
+        """The prediction for one input with the empty belief."""
         return replace(
             self,
             probability=0.0,
-            belief=np.array([0.0, 0.0, 1.0]),
+            belief=belief_masses.EMPTY,
             cause_probability=np.zeros_like(self.cause_probability),
         )
 
-    def outside(self, cause: int) -> Assessment:
-        """The assessment of a state outside the safe set: what was safe is unsafe."""
+    def outside(self, cause: int) -> Prediction:
+        """The prediction for a state outside the safe set: what was safe is unsafe."""
         safe, unsafe, uncertainty = self.belief
         cause_probability = self.cause_probability.copy()
         cause_probability[cause] += safe
@@ -175,20 +157,19 @@ class Correction:
         return np.where(shift < 0.0, (1.0 - guard) * shift, shift)
 
 
+_CORRECTION = tuple(field.name for field in fields(Correction))
+
+
 def check_shapes(given: tuple[np.ndarray, Correction], own: tuple[np.ndarray, Correction]) -> None:
     """Checks that beliefs and a correction are shaped as those of an assessment."""
     pairs = [("beliefs", given[0], own[0])]
-    for name in _CORRECTION:
-        pairs.append((name, getattr(given[1], name), getattr(own[1], name)))
+    pairs += [(name, getattr(given[1], name), getattr(own[1], name)) for name in _CORRECTION]
     for name, one, expected in pairs:
         if one.shape != expected.shape:
             what = name if name == "beliefs" else f"the correction's {name}"
             raise ValueError(
                 f"SafetyAssessment: the shape of {what} is {one.shape}, expected {expected.shape}"
             )
-
-
-_CORRECTION = tuple(field.name for field in fields(Correction))
 
 
 def hidden_sum(activations: np.ndarray, hidden: np.ndarray) -> np.ndarray:
@@ -232,24 +213,20 @@ def predict(
     base_logit: BaseLogit | None,
     novelty: Novelty,
     initial_uncertainty: float,
-    is_sharpened: bool,
-) -> Assessments:
+) -> Prediction:
     """Assesses inputs; novel ones and those that are not finite get the empty belief.
 
     Args:
         beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
         initial_uncertainty: mu_ini, the uncertainty of a filled cell.
-        is_sharpened: Whether beliefs are interpolated between cell centres.
     """
     output = embedding.evaluate(x)
-    # Departure ("sharpened" only): the paper reads the cell that contains Psi(x).
-    read = grid.interpolate if is_sharpened else grid.look_up
     num_members, _, num_columns = beliefs.shape
     has_correction = base_logit is not None and correction.is_any
     table = beliefs
     if has_correction:
         table = np.concatenate([beliefs, correction.guard[..., None]], axis=2)
-    found, is_inside = read(output.embedding, table)
+    found, is_inside = grid.read(output.embedding, table)
     summed = np.add.reduce(found, axis=0)
     masses = summed[:, :num_columns] / num_members
     if np.count_nonzero(is_inside) < is_inside.size:
@@ -279,7 +256,7 @@ def predict(
             logit += correction.shift(heads, residual, guard)
         probability = 1.0 / (1.0 + np.exp(logit))
     probability[is_unknown(masses, initial_uncertainty)] = 0.0
-    return Assessments(
+    return Prediction(
         belief=masses[:, :3],
         probability=probability,
         embedding=output.embedding[0],

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from drake_safety.learning import beliefs as belief_masses
-from drake_safety.learning.adaptation import TrainingScores
 from drake_safety.learning.assessment_parameters import AdaptationParameters, AssessmentParameters
-from drake_safety.learning.feedback import FeedbackSegments, FeedbackSet
+from drake_safety.learning.feedback import EpisodePair, FeedbackSegments
 from drake_safety.learning.grid import Grid
+from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.prediction import BaseLogit, Correction, hidden_sum, sigmoid
 from drake_safety.learning.trained_maps import Embedding
+from drake_safety.learning.training_scores import TrainingScores
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,39 +47,29 @@ def row_weights(num_rows: np.ndarray) -> np.ndarray:
 
 
 def outcomes(
-    feedback: Sequence[FeedbackSet],
-    inputs: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    feedback: Sequence[EpisodePair],
+    columns: InputColumns,
     embedding: Embedding,
     base_logit: BaseLogit,
 ) -> tuple[Outcomes, Outcomes]:
     """Outcomes of all rows of the actual episodes, and of the twins' first rows."""
-    num_rows = np.array([len(one) for one in feedback])
-    sides = (
+    num_rows = np.array([len(pair.rows) for pair in feedback])
+    actual = [(one.rows.state, one.rows.desired_preview, one.rows.features) for one in feedback]
+    first = [(one.twin, slice(one.twin.first_step, one.twin.first_step + 1)) for one in feedback]
+    twins = [(one.state[k], one.desired_preview[k], one.features[k]) for one, k in first]
+    found = []
+    for rows, is_unsafe, weight in (
         (
-            [one.state for one in feedback],
-            [one.desired_preview for one in feedback],
-            [one.features for one in feedback],
-            np.repeat([one.is_unsafe for one in feedback], num_rows),
+            actual,
+            np.repeat([not one.actual.is_safe for one in feedback], num_rows),
             row_weights(num_rows),
         ),
-        (
-            [one.twin_state[None] for one in feedback],
-            [one.twin_desired_preview[None] for one in feedback],
-            [one.twin_features[None] for one in feedback],
-            np.array([one.nominal_is_unsafe for one in feedback]),
-            np.ones(len(feedback)),
-        ),
-    )
-    found = []
-    for state, preview, features, is_unsafe, weight in sides:
-        x = inputs(np.concatenate(state), np.concatenate(preview), np.concatenate(features))
+        (twins, np.array([not one.twin.is_safe for one in feedback]), np.ones(len(feedback))),
+    ):
+        x = columns.of(*map(np.concatenate, zip(*rows, strict=True)))
+        heads, activations = base_logit.heads(embedding.evaluate(x)), embedding.activations(x)
         found.append(
-            Outcomes(
-                heads=base_logit.heads(embedding.evaluate(x)),
-                activations=embedding.activations(x),
-                is_unsafe=is_unsafe,
-                weight=weight,
-            )
+            Outcomes(heads=heads, activations=activations, is_unsafe=is_unsafe, weight=weight)
         )
     return found[0], found[1]
 
@@ -138,37 +129,11 @@ def fitted_change(
     return found[:3], hidden, np.array([added.min(), added.max()])
 
 
-def fitted_correction(
-    feedback: Sequence[FeedbackSet],
-    segments: FeedbackSegments,
-    points: np.ndarray,
-    *,
-    inputs: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
-    embedding: Embedding,
-    base_logit: BaseLogit,
-    grid: Grid,
-    parameters: AdaptationParameters,
-) -> Correction:
-    """Fits the correction to segments at Psi(x) (K, N, 2); zero without a pair that differs.
-
-    Only pairs with different outcomes are evidence of a reality gap.
-    """
-    if not any(one.differs for one in feedback):
-        return Correction.none(embedding, grid)
-    change, hidden, hidden_range = fitted_change(
-        *outcomes(feedback, inputs, embedding, base_logit), base_logit, parameters
-    )
-    guard = guarded_cells(segments, points, grid)
-    return Correction(change=change, hidden=hidden, hidden_range=hidden_range, guard=guard)
-
-
 def recalibrated(
-    feedback: Sequence[FeedbackSet],
+    feedback: Sequence[EpisodePair],
     segments: FeedbackSegments,
-    x: np.ndarray,
-    points: np.ndarray,
     *,
-    inputs: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    columns: InputColumns,
     embedding: Embedding,
     base_logit: BaseLogit,
     training: TrainingScores,
@@ -176,17 +141,24 @@ def recalibrated(
     parameters: AssessmentParameters,
     num_causes: int,
 ) -> tuple[Correction, np.ndarray]:
-    """Corrects base logit and beliefs, (K, R*R, 3 + n_c), by segments at Psi(x) (K, M, 2)."""
-    correction = fitted_correction(
-        feedback,
-        segments,
-        points,
-        inputs=inputs,
-        embedding=embedding,
-        base_logit=base_logit,
-        grid=grid,
-        parameters=parameters.adaptation,
-    )
+    """Corrects base logit and beliefs, (K, R*R, 3 + n_c), by feedback and its segments.
+
+    Only pairs with different outcomes are evidence of a reality gap; without any, the correction is
+    zero.
+    """
+    x = columns.of(segments.state, segments.desired_preview, segments.features)
+    points = embedding.embed(x)
+    correction = Correction.none(embedding, grid)
+    if any(pair.differs for pair in feedback):
+        change, hidden, hidden_range = fitted_change(
+            *outcomes(feedback, columns, embedding, base_logit), base_logit, parameters.adaptation
+        )
+        # Where most feedback was unsafe, the base logit must not fall.
+        vote = np.where(segments.is_unsafe, 1.0, -1.0)
+        guard = (cell_means(vote, points, grid) > 0.0).astype(float)
+        correction = Correction(
+            change=change, hidden=hidden, hidden_range=hidden_range, guard=guard
+        )
     residual = correction.residual(embedding, x)
     return correction, recalibrated_beliefs(
         training, base_logit, correction, segments, points, residual, grid, parameters, num_causes
@@ -203,12 +175,6 @@ def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray
         total = np.bincount(cells[inside], values[inside], minlength=grid.num_cells)
         means.append(total / np.maximum(count, 1))
     return np.array(means)
-
-
-def guarded_cells(feedback: FeedbackSegments, points: np.ndarray, grid: Grid) -> np.ndarray:
-    """Returns 1 in every map's cells where most feedback was unsafe, else 0, (K, R*R)."""
-    vote = np.where(feedback.is_unsafe, 1.0, -1.0)
-    return (cell_means(vote, points, grid) > 0.0).astype(float)
 
 
 def recalibrated_beliefs(
@@ -260,9 +226,7 @@ def recalibrated_beliefs(
         # Newly unsafe segments get the constraint with the smallest margin.
         cause = np.where(cause >= 0, cause, training.nearest[inside])
         masses = belief_masses.from_scores(score, parameters.initial_uncertainty, cause, num_causes)
-        times = (
-            np.ones(len(here)) if training.multiplicity is None else training.multiplicity[inside]
-        )
+        times = training.times[inside]
         learned = fuse(masses, here, multiplicity=times)
         both = fuse(
             np.concatenate([masses, actual]),

@@ -64,17 +64,17 @@ class UsedEpisodes:
     Attributes:
         purpose: "training", "calibration" or "adaptation".
         seed: Seed of the set, or `NOT_DRAWN`.
-        num_episodes: Number of episodes; None if unknown, as in files of earlier versions.
+        num_episodes: Number of episodes.
     """
 
     purpose: str
     variation: str
     scenario_hash: str
     seed: int
-    num_episodes: int | None
+    num_episodes: int
 
     @classmethod
-    def of(cls, purpose: str, info: EpisodesInfo, num_episodes: int | None) -> UsedEpisodes:
+    def of(cls, purpose: str, info: EpisodesInfo, num_episodes: int) -> UsedEpisodes:
         """Returns the entry of a set with this `EpisodesInfo`."""
         return cls(
             purpose=purpose,
@@ -85,8 +85,7 @@ class UsedEpisodes:
         )
 
     def __str__(self) -> str:
-        count = "" if self.num_episodes is None else f"{self.num_episodes} "
-        return f"the {count}'{self.variation}' episodes of its {self.purpose}"
+        return f"the {self.num_episodes} '{self.variation}' episodes of its {self.purpose}"
 
 
 def check_unused(used: Sequence[UsedEpisodes], seeds: Iterable[int], who: str) -> None:

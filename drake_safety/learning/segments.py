@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, overload
 
 import numpy as np
 
 from drake_safety.extras import require_extra
+from drake_safety.learning.assessment_parameters import AssessmentParameters
+from drake_safety.learning.mode_settings import mode_settings
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -321,7 +323,7 @@ class Segments:
 
     def take(self, rows: np.ndarray) -> Segments:
         """Selects segments by a mask or by indices, (M,)."""
-        return Segments(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+        return replace(self, **{name: values[rows] for name, values in vars(self).items()})
 
 
 def split(
@@ -392,3 +394,26 @@ def split(
             f"a segment of {shortest} samples ({episodes.num_diverged} diverged)"
         )
     return Segments(**{name: np.concatenate(values) for name, values in pieces.items()})
+
+
+def training_segments(episodes: Episodes, parameters: AssessmentParameters) -> Segments:
+    """Splits training episodes into segments according to the mode.
+
+    Raises:
+        ValueError: Horizon or preview stride are not those of the episodes, or they give no
+            segment.
+    """
+    for name in ("horizon", "preview_stride"):
+        here, there = getattr(parameters, name), getattr(episodes.info, name)
+        if here != there:
+            raise ValueError(
+                f"SafetyAssessment: {name} is {here}, but that of the episodes of "
+                f"'{episodes.info.scenario}' is {there}"
+            )
+    settings = mode_settings(parameters)
+    return split(
+        episodes,
+        stride=settings.stride,
+        discount=parameters.discount,
+        shortest=settings.shortest,
+    )

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drake_safety.files.progress import ignore
+
 HIDDEN_SIZES = (256, 256)
 """Units of the hidden layers."""
 _SMALLEST_SPREAD = 1e-4  # Of a column [unit of the column]; constant ones would be divided by zero.
@@ -37,12 +39,12 @@ class StatePredictor:
         cls,
         inputs: Sequence[np.ndarray],
         states: Sequence[np.ndarray],
-        progress: Callable[[float], None] | None = None,
+        progress: Callable[[float], object] = ignore,
     ) -> StatePredictor:
         """Learns from inputs (K, n_u) and states (K, n_w) of motions of at least three rows."""
         import torch
 
-        from drake_safety.learning.embedding import one_torch_thread
+        from drake_safety.learning.maps import one_torch_thread
 
         every = np.concatenate(inputs)
         mean, scale = every.mean(axis=0), np.maximum(every.std(axis=0), _SMALLEST_SPREAD)
@@ -51,7 +53,7 @@ class StatePredictor:
         start = cls(mean=mean, scale=scale, unit=unit, weights={})
         x = torch.tensor(np.concatenate([start._pairs(one) for one in inputs]))
         y = torch.tensor((change / unit).astype(np.float32))
-        with one_torch_thread(), torch.random.fork_rng(devices=[]):
+        with one_torch_thread():
             torch.manual_seed(0)
             network = _network(x.shape[1], y.shape[1])
             per_epoch = max(1, len(x) // _BATCH)
@@ -70,7 +72,7 @@ class StatePredictor:
                 loss.backward()
                 optimiser.step()
                 schedule.step()
-                if progress is not None and step % 50 == 0:
+                if step % 50 == 0:
                     progress(step / num_steps)
         weights = {k: v.detach().numpy().T.copy() for k, v in network.state_dict().items()}
         return replace(start, weights=weights)
@@ -131,22 +133,6 @@ class StatePredictor:
         own = {name: arrays[name].astype(float) for name in ("mean", "scale", "unit")}
         weights = {k: v.astype(np.float32) for k, v in arrays.items() if k not in own}
         return cls(**own, weights=weights)
-
-    @staticmethod
-    def shapes(num_inputs: int, num_states: int) -> dict[str, tuple[int, ...]]:
-        """Shapes of the arrays."""
-        widths = (2 * num_inputs, *HIDDEN_SIZES)
-        shapes: dict[str, tuple[int, ...]] = {
-            "mean": (num_inputs,),
-            "scale": (num_inputs,),
-            "unit": (num_states,),
-            "linear.weight": (widths[0], num_states),
-            "linear.bias": (num_states,),
-            "output.weight": (widths[-1], num_states),
-        }
-        for i, pair in enumerate(itertools.pairwise(widths)):
-            shapes |= {f"hidden.{i}.weight": pair, f"hidden.{i}.bias": pair[1:]}
-        return shapes
 
 
 def _network(num_inputs: int, num_outputs: int):  # type: ignore[no-untyped-def]

@@ -76,11 +76,6 @@ class Embedding:
                 f"{sorted(expected)}; missing {sorted(missing)}, unexpected {sorted(surplus)}"
             )
         self._layers = [self._layer(name) for name in names]
-        for (w, _), (next_w, _) in zip(self._layers, self._layers[1:], strict=False):
-            if w.shape[0] != next_w.shape[0] or w.shape[2] != next_w.shape[1]:
-                raise ValueError(
-                    f"Embedding: a layer of shape {w.shape} is followed by one of {next_w.shape}"
-                )
         self.num_members, self.num_inputs, _ = self._layers[0][0].shape
         self.num_activations = self._layers[-1][0].shape[1]
         if self._layers[-1][0].shape[2] != 2 + num_margins:

@@ -85,8 +85,9 @@ def nearest_accepted_goal(
         raise ValueError(f"nearest accepted goal: method must be one of {METHODS}; got '{method}'")
     if not 0.0 <= reserve <= 1.0:
         raise ValueError(f"nearest accepted goal: reserve is {reserve}, expected a value in [0, 1]")
-    parameters = assessment.parameters
-    highest = 1.0 if parameters.is_sharpened else 1.0 - parameters.initial_uncertainty
+    # Without a logit the probability is b_safe.
+    has_logit = assessment.base_logit_ is not None
+    highest = 1.0 if has_logit else 1.0 - assessment.parameters.initial_uncertainty
     stricter = threshold + reserve * max(highest - threshold, 0.0)
     goal = checked_goal(goal)
     if not np.isfinite(goal).all():

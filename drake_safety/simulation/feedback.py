@@ -14,7 +14,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.files.progress import shown
-from drake_safety.learning.feedback import FeedbackSet, feedback_sets
+from drake_safety.learning.feedback import EpisodePair, pair_episodes
 from drake_safety.learning.seeds import ADAPTATION, NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.simulation.capabilities import CanStartAnywhere, require
@@ -36,15 +36,15 @@ class EpisodePairs:
     nominal: Episodes
     nominal_hash: str
 
-    def feedback(self) -> list[FeedbackSet]:
-        """One feedback set per pair, in the order of the episodes, without diverged ones."""
-        return feedback_sets(self.actual, self.nominal, nominal_hash=self.nominal_hash)
+    def feedback(self) -> list[EpisodePair]:
+        """The pairs in the order of the episodes, without diverged ones."""
+        return pair_episodes(self.actual, self.nominal, nominal_hash=self.nominal_hash)
 
     @property
     def gap(self) -> tuple[int, int]:
         """Number of pairs that end differently, and number of pairs."""
-        sets = self.feedback()
-        return sum(feedback_set.differs for feedback_set in sets), len(sets)
+        pairs = self.feedback()
+        return sum(pair.differs for pair in pairs), len(pairs)
 
 
 def run_pairs(
@@ -193,7 +193,7 @@ def feedback_of_windows(
     *,
     run: Callable[..., Episodes] = run_twins,
     **options: Any,
-) -> list[FeedbackSet]:
-    """Feedback sets of recorded windows, whose nominal twins are simulated."""
+) -> list[EpisodePair]:
+    """Pairs of recorded windows, whose nominal twins are simulated."""
     actual = Episodes(recorder.info, [window.episode for window in windows])
-    return feedback_sets(actual, run(scenario, windows, **options))
+    return pair_episodes(actual, run(scenario, windows, **options))

@@ -1,4 +1,4 @@
-"""Adaptation during a simulation: an update of Γ after every k_u feedback sets."""
+"""Adaptation during a simulation: an update of Γ after every k_u pairs of episodes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 
 from drake_safety.extras import require_extra
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.feedback import FeedbackSet
+from drake_safety.learning.feedback import EpisodePair
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.feedback import feedback_of_windows, run_twins
 from drake_safety.simulation.scenario import Scenario
@@ -41,7 +41,7 @@ class OnlineAdaptation:
     Args:
         prior: The assessment before feedback.
         run: Function that simulates the twins; see `feedback_of_windows`.
-        capacity: Largest number of feedback sets kept; the oldest are dropped.
+        capacity: Largest number of pairs of episodes kept; the oldest are dropped.
 
     Attributes:
         feedback: All feedback so far, up to the capacity.
@@ -69,7 +69,7 @@ class OnlineAdaptation:
         num_rows = round(_KEPT_MOTION_S / prior.detector_.step_s)
         self._motion: deque[np.ndarray | None] = deque(maxlen=num_rows)
         self._seen_s = -math.inf  # Time of the newest row.
-        self.feedback: list[FeedbackSet] = []
+        self.feedback: list[EpisodePair] = []
         self.adapted: list[SafetyAssessment] = []
         self.num_updates = 0
 

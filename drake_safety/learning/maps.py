@@ -1,0 +1,385 @@
+"""Training of the maps Psi, and of the logit of their heads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from drake_safety.files.progress import ignore
+from drake_safety.learning.assessment_parameters import AssessmentParameters
+from drake_safety.learning.inputs import InputColumns
+from drake_safety.learning.mode_settings import ModeSettings, mode_settings
+from drake_safety.learning.points import Points
+from drake_safety.learning.prediction import LOGIT_LIMIT, BaseLogit
+from drake_safety.learning.segments import Segments
+from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
+
+_INSIDE_SHARE = 0.995
+"""Quantile of the inputs whose outputs are scaled to the extent of t-SNE's points."""
+_CLIPPED_SHARE = 1e-3
+"""Share of the training inputs that is clipped at either end of a column of x."""
+_SMALLEST_SPREAD = 1e-3
+_SAFETY_HIDDEN = 32
+_Report = Callable[[float], object]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MapData(Points):
+    """Training data of a map Psi.
+
+    Attributes:
+        x: Inputs, (N, n_x).
+        is_unsafe: Whether the input's episode ended unsafely, (N,).
+        margins: Smallest future margins, (N, n_c).
+        sample_weight: Weight of each input in all losses, (N,).
+        input_scale: Spread of each column of x after standardisation, (n_x,).
+    """
+
+    x: np.ndarray
+    is_unsafe: np.ndarray
+    margins: np.ndarray
+    sample_weight: np.ndarray
+    input_scale: np.ndarray
+
+    def take(self, rows: np.ndarray) -> MapData:
+        """Selects inputs by a mask (N,)."""
+        # The last entry is that of no neighbour.
+        position = np.append(np.where(rows, np.cumsum(rows) - 1, -1), -1)
+        names = ("x", "has_target", "is_unsafe", "margins", "sample_weight")
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in names},
+            target=self.target[rows[self.has_target]],
+            neighbours=position[self.neighbours[rows]],
+        )
+
+
+def learned_maps(
+    segments: Segments,
+    points: Points,
+    columns: InputColumns,
+    parameters: AssessmentParameters,
+    progress: _Report = ignore,
+) -> tuple[Embedding, BaseLogit | None]:
+    """Trains the maps Psi to reproduce t-SNE's points and, when sharpened, to predict safety.
+
+    Departure ("sharpened" only): maps of rectifiers extrapolate linearly, off the grid or into
+    cells of others, so the 0.1 and 99.9 % quantiles of training clip every column of x; of a
+    clipped input a map knows at least the other columns, as a decision tree does.
+
+    Args:
+        points: Those of the segments.
+        columns: The columns of x.
+
+    Returns:
+        The maps, and the base logit of their heads; None without heads.
+    """
+    settings, x = mode_settings(parameters), columns.of_rows(segments)
+    is_raw = np.arange(x.shape[1]) < columns.plan.stop
+    data = MapData(
+        **vars(points),
+        x=x,
+        is_unsafe=segments.is_unsafe,
+        margins=segments.future_margins,
+        sample_weight=_sample_weight(segments, settings),
+        input_scale=np.where(is_raw, settings.raw_input_scale, 1.0),
+    )
+    is_held_out = held_out_segments(segments, parameters)
+    if settings.is_regression:
+        held_out = data.take(is_held_out) if is_held_out.any() else None
+        return _train(data.take(~is_held_out), parameters, progress, held_out), None
+    label = segments.is_unsafe[is_held_out]
+    if not 0 < label.sum() < len(label):
+        # No held-out episodes of both labels.
+        tried = embedding = _train(data, parameters, progress)
+        is_held_out = np.ones(len(segments), dtype=bool)
+    else:
+        # As scikit-learn's CalibratedClassifierCV(ensemble=False): a first ensemble is evaluated
+        # on the held-out episodes, and the final one is trained on all episodes.
+        tried = _train(data.take(~is_held_out), parameters, lambda done: progress(0.5 * done))
+        embedding = _train(data, parameters, lambda done: progress(0.5 * (1 + done)))
+    base_logit = None
+    if embedding.has_heads:
+        judged = segments.take(is_held_out)
+        base_logit = fitted_base_logit(tried.evaluate(x[is_held_out]), judged, parameters)
+    known = np.quantile(x, [_CLIPPED_SHARE, 1.0 - _CLIPPED_SHARE], axis=0)
+    return embedding.clipping(known), base_logit
+
+
+def held_out_segments(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
+    """Returns which segments are held out, (N,), by whole episodes.
+
+    They are held out for the base logit, a function of the ensemble's mean, so all maps hold out
+    the same episodes; in the paper's mode for early stopping.
+    """
+    settings, episodes = mode_settings(parameters), np.unique(segments.episode)
+    seed = np.random.SeedSequence(parameters.seed, spawn_key=(settings.num_maps,))
+    drawn = np.random.default_rng(seed).permutation(episodes)
+    return np.isin(segments.episode, drawn[: int(min(settings.held_out, 0.5) * len(episodes))])
+
+
+def _sample_weight(segments: Segments, settings: ModeSettings) -> np.ndarray:
+    weight = np.where(segments.is_first, settings.first_row_weight, 1.0)
+    return weight / weight.mean()
+
+
+def _train(
+    data: MapData,
+    parameters: AssessmentParameters,
+    progress: _Report,
+    held_out: MapData | None = None,
+) -> Embedding:
+    settings, members = mode_settings(parameters), []
+    num_maps = settings.num_maps
+    for k in range(num_maps):
+
+        def report(fraction: float, k: int = k) -> None:
+            progress((k + fraction) / num_maps)
+
+        seed = int(np.random.SeedSequence(parameters.seed, spawn_key=(k,)).generate_state(1)[0])
+        members.append(train_map(data, parameters, seed=seed, held_out=held_out, progress=report))
+    num_margins = data.margins.shape[1] if settings.margin_weight > 0.0 else 0
+    embedding = stack_members(members, num_margins=num_margins)
+    if settings.is_regression:
+        return embedding
+    # Departure: a small weight of the distance to t-SNE's points leaves the maps' scale open;
+    # outputs would fall outside the grid, or into few of its cells. They become as wide as the
+    # points.
+    reach = np.abs(embedding.embed(data.x)).max(axis=2)
+    extent = np.quantile(reach, _INSIDE_SHARE, axis=1)
+    return embedding.scaled((np.abs(data.target).max() / extent).astype(np.float32))
+
+
+def stack_members(members: list[dict[str, np.ndarray]], *, num_margins: int) -> Embedding:
+    """Stacks members returned by `train_map` into one `Embedding`."""
+    weights = {name: np.stack([member[name] for member in members]) for name in members[0]}
+    return Embedding(weights, num_margins=num_margins)
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Training in one thread, fastest for small layers, with the same bits on any machine.
+
+    The state of torch's generator is restored after it.
+    """
+    import torch
+
+    number = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            yield
+    finally:
+        torch.set_num_threads(number)
+
+
+def train_map(
+    data: MapData,
+    parameters: AssessmentParameters,
+    *,
+    seed: int,
+    held_out: MapData | None = None,
+    progress: _Report = ignore,
+) -> dict[str, np.ndarray]:
+    """Trains one map Psi, deterministically for a seed and a machine.
+
+    Departure: the paper trains Psi on ||y - Psi(x)|| alone. With a safety head on y and a margin
+    head on the trunk, the map separates neighbours in t-SNE that end differently; held-out accuracy
+    on the robots rises to that of a direct classifier.
+
+    Args:
+        data: Inputs and targets; x is standardised here, with a lower bound on the spread so that
+            nearly constant columns are not amplified.
+        held_out: If given, the weights of the epoch with the smallest distance to t-SNE's points of
+            these inputs are kept instead of the last epoch's.
+
+    Returns:
+        The weights of one member, named as in `Embedding`, without the leading member axis.
+    """
+    import torch
+
+    settings = mode_settings(parameters)
+    has_safety, has_margins = settings.safety_weight > 0.0, settings.margin_weight > 0.0
+    mean = data.x.mean(axis=0)
+    spread = np.ones(len(mean))
+    if settings.standardized:
+        spread = np.maximum(data.x.std(axis=0), _SMALLEST_SPREAD) / data.input_scale
+    target_scale = float(data.target.std())
+    num_margins = data.margins.shape[1] if has_margins else 0
+
+    def single(values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.asarray(values, dtype=np.float32))
+
+    with one_torch_thread():
+        torch.manual_seed(seed)
+        net = _network(data.x.shape[1], num_margins, has_safety, settings)
+        x = single((data.x - mean) / spread)
+        target = torch.zeros(len(x), 2)
+        has_target = torch.from_numpy(np.asarray(data.has_target, dtype=bool))
+        target[has_target] = single(data.target / target_scale)
+        weight = single(data.sample_weight)
+        target_weight = weight * has_target
+        neighbours = torch.from_numpy(np.asarray(data.neighbours, dtype=np.int64))
+        is_unsafe = single(data.is_unsafe)
+        low, high = parameters.margin_range
+        margins = single(np.clip(data.margins, low, high) / parameters.margin_unit)
+        optimiser = torch.optim.AdamW(
+            net.parameters(),
+            lr=parameters.learning_rate,
+            weight_decay=settings.weight_decay,
+            fused=True,
+        )
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimiser,
+            max_lr=parameters.learning_rate,
+            total_steps=settings.epochs * -(-len(x) // parameters.batch_size) + 1,
+        )
+        functional = torch.nn.functional
+        # The share of targets varies between batches, so the mean over the whole set normalises.
+        mean_target_weight = float(target_weight.mean())
+        best: dict[str, Any] = {}
+        least = np.inf
+        if held_out is not None:
+            unseen = single((held_out.x[held_out.has_target] - mean) / spread)
+            wanted = single(held_out.target / target_scale)
+        for epoch in range(settings.epochs):
+            for batch in torch.randperm(len(x)).split(parameters.batch_size):
+                output = net["output"](net["trunk"](x[batch]))
+                y, w = output[:, :2], weight[batch]
+                distance = ((y - target[batch]) ** 2).sum(dim=1)
+                if settings.loss == "norm":
+                    # The offset keeps the gradient finite at distance zero.
+                    distance = torch.sqrt(distance + _SMALLEST_SPREAD**2)
+                loss = (
+                    settings.target_weight
+                    * (target_weight[batch] * distance).mean()
+                    / mean_target_weight
+                )
+                if settings.neighbour_weight > 0.0:
+                    chosen = torch.randint(neighbours.shape[1], (len(batch),))
+                    neighbour = neighbours[batch, chosen]
+                    other = net["output"](net["trunk"](x[neighbour.clamp(min=0)]))[:, :2]
+                    contrast = _neighbour_loss(y, other, target_scale / data.tsne_unit)
+                    contrast = (contrast * (neighbour >= 0)).mean()
+                    share = settings.neighbour_weight
+                    loss = (1.0 - share) * loss + share * contrast
+                if has_safety:
+                    logit = net["safety"](y)[:, 0]
+                    entropy = functional.binary_cross_entropy_with_logits(
+                        logit, is_unsafe[batch], weight=w
+                    )
+                    loss = loss + settings.safety_weight * entropy
+                if has_margins:
+                    huber = functional.huber_loss(output[:, 2:], margins[batch], reduction="none")
+                    loss = loss + settings.margin_weight * (w * huber.mean(dim=1)).mean()
+                optimiser.zero_grad(set_to_none=True)
+                loss.backward()
+                optimiser.step()
+                schedule.step()
+            if held_out is not None:
+                net.eval()
+                with torch.no_grad():
+                    y = net["output"](net["trunk"](unseen))[:, :2]
+                    error = float((y - wanted).norm(dim=1).mean())
+                net.train()
+                if error < least:
+                    least = error
+                    best = {name: value.clone() for name, value in net.state_dict().items()}
+            progress((epoch + 1) / settings.epochs)
+        if best:
+            net.load_state_dict(best)
+    return _folded_weights(net, mean, spread, target_scale, parameters.margin_unit)
+
+
+def _neighbour_loss(y: Any, neighbour: Any, unit: float) -> Any:
+    """The loss of parametric t-SNE for inputs and one neighbour of each, (N,).
+
+    InfoNC-t-SNE (Damrich et al., 2023), the contrastive form of t-SNE's loss: -log(q / (q + sum of
+    those of the other inputs)), q = 1 / (1 + ||y - y'||^2).
+    """
+    near = 1.0 / (1.0 + (unit * (y - neighbour)).square().sum(dim=1))
+    others = 1.0 / (1.0 + (unit * (y[:, None] - y[None])).square().sum(dim=2))
+    return ((others.sum(dim=1) - 1.0) / near).log1p()
+
+
+def _network(num_inputs: int, num_margins: int, has_safety: bool, settings: ModeSettings) -> Any:
+    from torch import nn
+
+    trunk, width = [], num_inputs
+    for size in settings.hidden_sizes:
+        trunk += [nn.Linear(width, size), nn.ReLU()]
+        if settings.dropout > 0.0:
+            trunk.append(nn.Dropout(settings.dropout))
+        width = size
+    net = nn.ModuleDict(
+        {"trunk": nn.Sequential(*trunk), "output": nn.Linear(width, 2 + num_margins)}
+    )
+    if has_safety:
+        net["safety"] = nn.Sequential(
+            nn.Linear(2, _SAFETY_HIDDEN), nn.ReLU(), nn.Linear(_SAFETY_HIDDEN, 1)
+        )
+    return net
+
+
+def _folded_weights(
+    net: Any, mean: np.ndarray, spread: np.ndarray, target_scale: float, margin_unit: float
+) -> dict[str, np.ndarray]:
+    """The trained layers with the standardisation of x, y and the margins folded in."""
+    weights: dict[str, np.ndarray] = {}
+    for part in net:
+        layers = [layer for layer in net[part].modules() if hasattr(layer, "weight")]
+        for i, layer in enumerate(layers):
+            name = "output" if part == "output" else f"{part}.{i}"
+            weights[f"{name}.weight"] = layer.weight.detach().numpy().astype(float).T
+            weights[f"{name}.bias"] = layer.bias.detach().numpy().astype(float)
+    weight = weights["trunk.0.weight"]
+    weights["trunk.0.bias"] = weights["trunk.0.bias"] - (mean / spread) @ weight
+    weights["trunk.0.weight"] = weight / spread[:, None]
+    scale = np.full(len(weights["output.bias"]), margin_unit)
+    scale[:2] = target_scale
+    weights["output.weight"] = weights["output.weight"] * scale
+    weights["output.bias"] = weights["output.bias"] * scale
+    if "safety" in net:
+        weights["safety.0.weight"] = weights["safety.0.weight"] / target_scale
+    return weights
+
+
+def fitted_base_logit(
+    output: EmbeddingOutput, segments: Segments, parameters: AssessmentParameters
+) -> BaseLogit:
+    """Fits the base logit to the ensemble's heads by logistic regression.
+
+    Args:
+        output: The maps' outputs for held-out segments; on training segments they are
+            overconfident.
+    """
+    low, high = parameters.margin_range
+    logit = BaseLogit(margin_unit=parameters.margin_unit, margin_range=(low, high))
+    weight = _sample_weight(segments, mode_settings(parameters))
+    offset, safety_slope, margin_slope = _logistic(logit.heads(output), segments.is_unsafe, weight)
+    return replace(logit, offset=offset, safety_slope=safety_slope, margin_slope=margin_slope)
+
+
+def _logistic(z: np.ndarray, label: np.ndarray, weight: np.ndarray) -> list[float]:
+    """Intercept and slopes, none of them negative, of a logistic regression on z (N, m)."""
+    from scipy.optimize import minimize
+
+    share = weight / weight.sum()
+    y = label.astype(float)
+    columns = np.column_stack([np.ones(len(z)), z])
+
+    def loss(values: np.ndarray) -> tuple[float, np.ndarray]:
+        logit = columns @ values
+        # The weight of a hundredth of a sample keeps the slopes finite for separable classes.
+        penalty = 0.01 / len(z) * values
+        residual = share * (1.0 / (1.0 + np.exp(-np.clip(logit, -500.0, 500.0))) - y)
+        cost = share @ (np.logaddexp(0.0, logit) - y * logit) + 0.5 * penalty @ values
+        return float(cost), residual @ columns + penalty
+
+    bounds = [(-LOGIT_LIMIT, LOGIT_LIMIT), *((0.0, 50.0) for _ in range(z.shape[1]))]
+    start = np.r_[0.0, np.ones(z.shape[1])]
+    return minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x.tolist()

@@ -1,0 +1,153 @@
+"""The points of segments in the plane: t-SNE under the safety distance Omega."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_safety.files.progress import StageProgress, ignore, stage_of
+from drake_safety.learning.assessment_parameters import AssessmentParameters
+from drake_safety.learning.distance import NeighbourGraph, neighbour_graph
+from drake_safety.learning.grid import Grid
+from drake_safety.learning.mode_settings import mode_settings
+from drake_safety.learning.segments import Segments
+
+_NUM_NEIGHBOURS = 15
+"""Nearest neighbours of a segment in the loss of parametric t-SNE, as in its publication."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Points:
+    """t-SNE's points of segments.
+
+    Attributes:
+        has_target: Whether the segment has a point, (N,).
+        target: The points of these segments, scaled to the grid, (M, 2).
+        neighbours: Nearest neighbours under Omega of each segment, as rows, (N, k); -1 for a
+            segment without a point or a neighbour that was not selected.
+        tsne_unit: Length of t-SNE's unit in that of the target.
+    """
+
+    has_target: np.ndarray
+    target: np.ndarray
+    neighbours: np.ndarray
+    tsne_unit: float
+
+
+def embedded_points(
+    segments: Segments,
+    grid: Grid,
+    parameters: AssessmentParameters,
+    progress: StageProgress | None = None,
+) -> Points:
+    """Embeds segments by t-SNE.
+
+    When sharpened, it embeds a segment every H/2 samples.
+
+    Args:
+        grid: The grid that the points are scaled to.
+        progress: Called with "distances" or "t-SNE", the percentage done and 100.
+
+    Raises:
+        ValueError: There are too few segments for the perplexity.
+    """
+    _, first, episode = np.unique(segments.episode, return_index=True, return_inverse=True)
+    since_start = segments.start_row - segments.start_row[first][episode]
+    has_target = since_start % mode_settings(parameters).target_stride == 0
+    num_targeted, num_neighbours = int(has_target.sum()), int(3 * parameters.perplexity)
+    if num_targeted <= num_neighbours:
+        raise ValueError(
+            f"SafetyAssessment: perplexity {parameters.perplexity} needs more than "
+            f"{num_neighbours} segments, the {len(first)} episodes give {num_targeted}: record "
+            "more episodes, or lower the perplexity"
+        )
+    targeted = segments.take(has_target)
+    graph = neighbour_graph(
+        targeted.error,
+        targeted.length,
+        targeted.score,
+        score_weight=parameters.score_weight,
+        cost=parameters.warping_cost,
+        num_neighbours=num_neighbours,
+        num_candidates=parameters.candidates_per_neighbour * num_neighbours or None,
+        backend=parameters.distance_backend,
+        progress=stage_of(progress, "distances"),
+    )
+    points = tsne(
+        graph,
+        perplexity=parameters.perplexity,
+        exaggeration=parameters.exaggeration,
+        initialization=parameters.initialization,
+        seed=parameters.seed,
+        progress=stage_of(progress, "t-SNE"),
+    )
+    target = grid.scale(points)
+    nearest = graph.indices[:, :_NUM_NEIGHBOURS]
+    neighbours = np.full((len(segments), nearest.shape[1]), -1)
+    neighbours[has_target] = np.flatnonzero(has_target)[nearest]
+    return Points(
+        has_target=has_target,
+        target=target,
+        neighbours=neighbours,
+        tsne_unit=float(target.std() / points.std()),
+    )
+
+
+def tsne(
+    graph: NeighbourGraph,
+    *,
+    perplexity: float,
+    exaggeration: float,
+    initialization: str,
+    seed: int,
+    progress: Callable[[float], object] = ignore,
+) -> np.ndarray:
+    """Computes the t-SNE embedding of a neighbour graph, (N, 2), deterministically for a seed.
+
+    Distances are not squared here: openTSNE squares them. It runs on one thread, as more threads
+    do not speed up the FFT of large sets.
+
+    Args:
+        perplexity: Effective number of neighbours.
+        exaggeration: Factor of the attraction after the early phase, 1 for plain t-SNE.
+    """
+    num_neighbours = graph.indices.shape[1]
+    if num_neighbours < int(3 * perplexity):
+        raise ValueError(
+            f"tsne: perplexity {perplexity} needs {int(3 * perplexity)} neighbours per segment, "
+            f"the graph has {num_neighbours}"
+        )
+    import openTSNE
+    from openTSNE.affinity import PerplexityBasedNN
+    from openTSNE.initialization import spectral
+    from openTSNE.nearest_neighbors import PrecomputedNeighbors
+
+    done = 0
+
+    def report(*state: object) -> bool:
+        nonlocal done
+        done += 50
+        progress(min(done / 750, 1.0))
+        return False
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        affinities = PerplexityBasedNN(
+            knn_index=PrecomputedNeighbors(graph.indices, graph.distances),
+            perplexity=perplexity,
+            random_state=seed,
+            n_jobs=1,
+        )
+        is_random = initialization == "random"
+        embedding = openTSNE.TSNE(
+            initialization="random" if is_random else spectral(affinities.P, random_state=seed),
+            exaggeration=exaggeration,
+            random_state=seed,
+            n_jobs=1,
+            callbacks=report,
+            callbacks_every_iters=50,
+        ).fit(affinities=affinities)
+    return np.asarray(embedding, dtype=float).copy()

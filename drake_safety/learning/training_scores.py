@@ -1,0 +1,134 @@
+"""The beliefs of the grid's cells, from the unsafety scores of the training segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_safety.learning import beliefs as belief_masses
+from drake_safety.learning.assessment_parameters import AssessmentParameters
+from drake_safety.learning.grid import Grid
+from drake_safety.learning.prediction import BaseLogit
+from drake_safety.learning.segments import Segments
+from drake_safety.learning.trained_maps import EmbeddingOutput
+
+_KEPT_IN_CELL = 500
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrainingScores:
+    """Embedded training segments, from which the cells' beliefs are computed.
+
+    Attributes:
+        points: Psi(x), (K, N, 2).
+        score: lambda, (N,).
+        cause: Column of the constraint that ended the episode, -1 when safe, (N,).
+        heads: Inputs of the base logit, see `BaseLogit.heads`, (N, 2); None for maps without heads.
+        nearest: Column of the constraint with the smallest predicted margin, (N,).
+        multiplicity: Number of segments that each stands for, (N,); None for one each.
+        count: Number of all training segments in every map's cells, (K, R*R); None if none of them
+            was left out.
+    """
+
+    points: np.ndarray
+    score: np.ndarray
+    cause: np.ndarray
+    heads: np.ndarray | None = None
+    nearest: np.ndarray | None = None
+    multiplicity: np.ndarray | None = None
+    count: np.ndarray | None = None
+
+    @classmethod
+    def of(
+        cls, segments: Segments, output: EmbeddingOutput, base_logit: BaseLogit | None
+    ) -> TrainingScores:
+        """Those of training segments, in the precision in which files store them."""
+        heads = nearest = None
+        if base_logit is not None:
+            margins = output.margins.mean(axis=0)
+            heads = _single(base_logit.heads(output))
+            nearest = (
+                margins.argmin(axis=1)
+                if margins.shape[1]
+                else np.zeros(len(segments), dtype=np.int64)
+            )
+        return cls(
+            points=output.embedding.astype(np.float32),
+            score=_single(segments.score),
+            cause=segments.cause,
+            heads=heads,
+            nearest=nearest,
+        )
+
+    @property
+    def times(self) -> np.ndarray:
+        """Number of segments that each stands for, (N,)."""
+        return np.ones(len(self.score)) if self.multiplicity is None else self.multiplicity
+
+    def counts(self, grid: Grid) -> np.ndarray:
+        """Counts all training segments in every map's cells, (K, R*R)."""
+        if self.count is not None:
+            return self.count
+        located = [grid.locate(points) for points in self.points]
+        return np.stack(
+            [np.bincount(cells[cells >= 0], minlength=grid.num_cells) for cells in located]
+        )
+
+    def thinned(self, grid: Grid, seed: int) -> TrainingScores:
+        """Draws segments of crowded cells, so that a file does not grow with the number of all.
+
+        A segment is kept with probability p = min(1, c / n), n the number of segments in its cell
+        and c = 500; with several maps, the largest p. It then stands for 1 / p segments, so that
+        sums over cells keep their expectations (Horvitz and Thompson, 1952).
+        """
+        probability, count = np.zeros(len(self.score)), self.counts(grid)
+        for points, member_count in zip(self.points, count, strict=True):
+            cells = grid.locate(points)
+            # A point outside the grid is in no cell.
+            own = np.where(cells >= 0, _KEPT_IN_CELL / np.maximum(member_count[cells], 1), 0.0)
+            probability = np.maximum(probability, np.minimum(own, 1.0))
+        kept = np.random.default_rng(seed).random(len(self.score)) < probability
+
+        def rows(values: np.ndarray | None) -> np.ndarray | None:
+            return None if values is None else values[kept]
+
+        return TrainingScores(
+            points=self.points[:, kept],
+            score=self.score[kept],
+            cause=self.cause[kept],
+            heads=rows(self.heads),
+            nearest=rows(self.nearest),
+            multiplicity=_single(1.0 / probability[kept]),
+            count=count,
+        )
+
+
+def _single(values: np.ndarray) -> np.ndarray:
+    """Rounds values to single precision, in which files store one number for every segment."""
+    return values.astype(np.float32).astype(float)
+
+
+def prior_beliefs(
+    training: TrainingScores,
+    grid: Grid,
+    parameters: AssessmentParameters,
+    num_causes: int,
+    uncertainty: np.ndarray | None = None,
+) -> np.ndarray:
+    """Beliefs of every map's cells, (K, R*R, 3 + n_c); `uncertainty` is mu, (K, N)."""
+    if uncertainty is None:
+        uncertainty = np.full(training.points.shape[:2], parameters.initial_uncertainty)
+    return np.stack(
+        [
+            belief_masses.fuse_cells(
+                belief_masses.from_scores(training.score, mu, training.cause, num_causes),
+                # L(x) is the cell of Psi(x), not of the segment's point in t-SNE.
+                grid.locate(points),
+                num_cells=grid.num_cells,
+                min_count=parameters.min_count,
+                multiplicity=training.times,
+            )
+            for points, mu in zip(training.points, uncertainty, strict=True)
+        ]
+    )
