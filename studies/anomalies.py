@@ -31,7 +31,7 @@ from drake_safety.cli.console import (
 from drake_safety.cli.training_folder import MODES, assessment_folder
 from drake_safety.evaluation.metrics import Estimate, auc, median, share
 from drake_safety.learning.change_detector import ChangeDetector, rows_of, usual_rows
-from drake_safety.learning.seeds import ANOMALIES
+from drake_safety.learning.seeds import ANOMALIES, MOTION
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.capabilities import FollowsCommands, require
 from drake_safety.simulation.rollouts import run_motions
@@ -68,8 +68,8 @@ def anomalies(
     ] = 280,
     calibration_episodes: CalibrationOption = 400,
     motion: Annotated[
-        float, typer.Option(help="Motion from which the others learn [min].", min=2.0)
-    ] = 24.0,
+        float, typer.Option(help="Motion of `train`, from which the others learn [min].", min=2.0)
+    ] = 120.0,
     seed: Annotated[int, typer.Option(help="First of the seeds of motion.")] = ANOMALIES.first,
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results; that of ASSESSMENT by default.")
@@ -88,6 +88,7 @@ def anomalies(
         "anomalies", scenario, learned.path, seed=seed, workers=workers, out=out
     ) as study:
         detector = study.load(MODES[0], seeds.values()).detector_
+        seeds["training"] = MOTION.first
         loop: Any = study.scenario.make_loop()
         require(loop, FollowsCommands, "anomalies")  # Its controller's memory can be handed over.
         drawn = partial(_motion, study, out / "anomalies", seeds)

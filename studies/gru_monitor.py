@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_safety.simulation.worker_processes import Progress
 
-_HIDDEN, _WINDOW, _BATCH, _EPOCHS = 256, 50, 64, 120
+_HIDDEN, _WINDOW, _BATCH, _EPOCHS, _MOST_STEPS = 256, 50, 64, 120, 6000
 _RATE, _DECAY, _LARGEST_GRADIENT, _INPUT_NOISE = 2e-3, 1e-2, 1.0, 0.01
 _LARGEST_LOG = 6.0  # Of a variance.
 _LEAST_SPREAD, _LARGEST_INPUT = 1e-4, 10.0  # [unit of the column], in standard deviations.
@@ -92,7 +92,8 @@ class GruMonitor:
 
         pairs = [tuple(map(torch.tensor, self._pairs(one))) for one in motions]
         rows = np.array([len(z) for z, _ in pairs])
-        num_steps = _EPOCHS * max(1, round(int(rows.sum()) / (_WINDOW * _BATCH)))
+        per_epoch = max(1, round(int(rows.sum()) / (_WINDOW * _BATCH)))
+        num_steps = min(_EPOCHS * per_epoch, _MOST_STEPS)
         rng = np.random.default_rng(0)
         with one_torch_thread(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)

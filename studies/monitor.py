@@ -19,7 +19,7 @@ from drake_safety.evaluation.shift_study import assessment_judge
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
 from drake_safety.learning import calibration
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.seeds import MOTION, SHIFTS
+from drake_safety.learning.seeds import FRESH_MOTION, SHIFTS
 from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import Scenario
 from studies.harness import Arrays, fingerprint, kept, open_study
@@ -64,9 +64,9 @@ def monitor(
             usual = run_motions(
                 loaded,
                 3600.0 * hours,
-                seed=MOTION.seeds()["other motion"],
+                seed=FRESH_MOTION.first,
                 num_workers=workers,
-                path=fresh_episodes_folder(study.folder, "motion", MOTION.first, {}),
+                path=fresh_episodes_folder(study.folder, "motion", FRESH_MOTION.first, {}),
                 progress=partial(study.stages, "hours of nominal motion"),
             )
             alarms = {"false_alarms_per_hour": false_alarms(usual, gamma.detector_)}

@@ -57,7 +57,7 @@ from drake_safety.learning import calibration
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import PLAN, episode_scores
-from drake_safety.learning.seeds import EVALUATION, MOTION, SHIFTS, SeedBlock
+from drake_safety.learning.seeds import EVALUATION, FRESH_MOTION, SHIFTS, SeedBlock
 from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.simulation.capabilities import HasBall, HasGoals, require
 from drake_safety.simulation.motion import Motion
@@ -324,7 +324,7 @@ def add_shifts(
     usual = run_motions(
         scenario,
         num_nominal * scenario.episode_duration_s,
-        seed=MOTION.seeds()["other motion"],
+        seed=FRESH_MOTION.first,
         num_workers=evaluation.workers,
         path=evaluation.run_folder / "fresh" / "motion",
         progress=partial(stages, "undisturbed nominal motion"),

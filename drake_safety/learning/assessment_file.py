@@ -30,7 +30,7 @@ from drake_safety.learning.trained_maps import Embedding
 from drake_safety.learning.training_scores import TrainingScores
 
 SCHEMA = "drake_safety.assessment"
-SCHEMA_VERSION = 10
+SCHEMA_VERSION = 11
 
 _TRAINING: dict[str, tuple[type, type]] = {
     "points": (np.float32, np.float32),

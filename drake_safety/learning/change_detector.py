@@ -22,6 +22,8 @@ FALSE_ALARMS_PER_HOUR = 0.1
 """For which the limits are made: at most one in ten hours of nominal motion."""
 LEAST_MOTION_S = 360.0
 """Motion for the limits, below which there is no alarm."""
+MOST_PREDICTOR_S = 3600.0
+"""Motion for the prediction, beyond which all is for the limits."""
 RECOVERED_LEVEL, RECOVERY_S = 0.7, 5.0
 """Every level must be below the first for a time before an alarm ends [s]."""
 NUM_PREVIEWED = 2
@@ -30,6 +32,7 @@ _CLIP = 6.0  # Of an innovation, in standard deviations, so that one impact is n
 _BEFORE_LEAVING_S = 0.5  # Left out of a motion that leaves the safe set.
 _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
 _TAIL_SHARE = 0.1  # Of the blocks.
+_NUM_FOLDS = 12  # Of motions, whose levels are those by limits of the others.
 _LEAST_LIMIT = 0.3  # Of a chart, in standard deviations of its value for white innovations.
 _FREE_REPEATS = 3  # Beyond the longest run of repeated inputs in training.
 _SETTINGS = ("alarm_level", "longest_repeat", "step_s", "motion_s")
@@ -50,11 +53,11 @@ class ChangeDetector:
     A plant or a sensor that changed cannot be seen in one input: it lies among those of training.
     It is seen in how the state follows from the last two inputs. Each state's innovation, in its
     standard deviations and clipped, has exponentially weighted means of itself and of its square,
-    with three memories. The largest of the six, in units of what undisturbed motion of the nominal
-    plant reached, is the state's level; an alarm is a level above 1. The limits are those of motion
-    that the predictor did not see, extrapolated to a rate of false alarms by the exponential tail
-    of the maxima of blocks (peaks over threshold; Coles 2001, section 4). Nothing is learned from
-    failures.
+    with three memories. The largest of the six, each in units of its limit, is the state's level;
+    an alarm is a level above 1. The limits are those of motion that the predictor did not see,
+    extrapolated to a rate of false alarms by the exponential tail of the maxima of blocks (peaks
+    over threshold; Coles 2001, section 4), first of each chart and then of the levels. Nothing is
+    learned from failures.
 
     Attributes:
         predictor: The prediction.
@@ -97,7 +100,9 @@ class ChangeDetector:
 
     @classmethod
     def fit(cls, motions: Episodes, progress: Callable[[float], object] = ignore) -> ChangeDetector:
-        """Learns the prediction from one half of the motions, and the limits from the other.
+        """Learns the prediction from one half of the motions, and the limits from the others.
+
+        Of more than two hours, the prediction learns from one.
 
         Limits from the errors of other predictions, as in cross-validation, do not see what this
         one gets wrong: on a mass on a spring they gave 16 to 71 false alarms in four hours.
@@ -127,8 +132,10 @@ class ChangeDetector:
                 "prediction and one for the limits"
             )
         with threadpool_limits(1, user_api="blas"):
-            # Motions alternate, so that both halves are alike.
-            predictor = StatePredictor.fit(seen[::2], states[::2], progress)
+            # Motions alternate, so that both parts are alike.
+            every = max(2, math.ceil(info.step_s * sum(map(len, seen)) / MOST_PREDICTOR_S))
+            of_limits = [i for i in range(len(seen)) if i % every]
+            predictor = StatePredictor.fit(seen[::every], states[::every], progress)
             unlimited = cls(
                 predictor=predictor,
                 columns=columns,
@@ -140,7 +147,7 @@ class ChangeDetector:
                 step_s=float(info.step_s),
                 motion_s=0.0,
             )
-            return unlimited._limited(seen[1::2], states[1::2])
+            return unlimited._limited([seen[i] for i in of_limits], [states[i] for i in of_limits])
 
     def _limited(self, seen: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> ChangeDetector:
         """Chooses deviations and limits from inputs (K, n_u) and states (K, n_w) of motions."""
@@ -153,22 +160,23 @@ class ChangeDetector:
         motion_s = self.step_s * sum(map(len, errors))
         least = _LEAST_LIMIT * np.sqrt(self.rates / (2.0 - self.rates))
         least = np.concatenate([least, math.sqrt(2.0) * least])[:, None]
+        probability = FALSE_ALARMS_PER_HOUR * _BLOCK_S / 3600.0
 
-        def scales(known: Sequence[np.ndarray]) -> np.ndarray:
-            maxima = np.concatenate(known)
-            return np.maximum(maxima.mean(axis=0) + 4.0 * maxima.std(axis=0), least)
+        def tails(known: Sequence[np.ndarray]) -> np.ndarray:
+            threshold, excess = _exponential_tail(np.concatenate(known))
+            return np.maximum(threshold + excess * math.log(_TAIL_SHARE / probability), least)
 
-        # Each motion in units of the others: the limits must hold for motion that they do not know.
-        levels = [
-            (own / scales(blocks[:i] + blocks[i + 1 :] or [own])).max(axis=(1, 2))
-            for i, own in enumerate(blocks)
-        ]
-        per_hour = 3600.0 / _BLOCK_S
-        limit = _tail_limit(np.concatenate(levels), FALSE_ALARMS_PER_HOUR / per_hour)
+        # Each fold in units of the others: the limits must hold for motion that they do not know.
+        folds = [blocks[i::_NUM_FOLDS] for i in range(min(_NUM_FOLDS, len(blocks)))]
+        levels = []
+        for i, fold in enumerate(folds):
+            others = [one for other in folds[:i] + folds[i + 1 :] for one in other]
+            levels.append((np.concatenate(fold) / tails(others or fold)).max(axis=(1, 2)))
+        limit = _tail_limit(np.concatenate(levels), probability)
         return replace(
             self,
             deviation=deviation,
-            limits=limit * scales(blocks),
+            limits=limit * tails(blocks),
             alarm_level=1.0 if motion_s >= LEAST_MOTION_S else math.inf,
             motion_s=motion_s,
         )
@@ -352,19 +360,27 @@ def _block_maxima(charts: np.ndarray, step_s: float) -> np.ndarray:
     return np.stack([charts[i : i + size].max(axis=0) for i in starts])
 
 
-def _tail_limit(maxima: np.ndarray, probability: float) -> float:
+def _exponential_tail(maxima: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Thresholds exceeded by a share of the blocks (B, ...), and the mean excesses, (...)."""
+    threshold = np.quantile(maxima, 1.0 - _TAIL_SHARE, axis=0)
+    excess = np.maximum(maxima - threshold, 0.0)
+    return threshold, excess.sum(axis=0) / np.maximum((excess > 0.0).sum(axis=0), 1)
+
+
+def _tail_limit(levels: np.ndarray, probability: float) -> float:
     """The level that a block exceeds with a small probability, by an exponential tail.
 
     The mean excess is its upper bound of 95 %: the less motion, the wider the limit.
     """
     from scipy.stats import chi2
 
-    threshold = float(np.quantile(maxima, 1.0 - _TAIL_SHARE))
-    excess = maxima[maxima > threshold] - threshold
-    if not len(excess):
-        return 2.0 * float(maxima.max())
-    mean = 2.0 * excess.sum() / chi2.ppf(0.05, 2 * len(excess))
-    return float(max(threshold + mean * math.log(_TAIL_SHARE / probability), maxima.max()))
+    threshold, excess = _exponential_tail(levels)
+    num = int((levels > threshold).sum())
+    if not num:
+        return 2.0 * float(levels.max())
+    bound = excess * 2.0 * num / chi2.ppf(0.05, 2 * num)
+    limit = threshold + bound * math.log(_TAIL_SHARE / probability)
+    return float(max(limit, levels.max()))
 
 
 def _repeats(x: np.ndarray) -> np.ndarray:

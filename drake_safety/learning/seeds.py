@@ -21,7 +21,7 @@ class SeedBlock(NamedTuple):
     """Consecutive seeds, one for each set of episodes that a command draws.
 
     Attributes:
-        first: Default of the first seed; the blocks are a million apart.
+        first: Default of the first seed; the blocks are 100 000 apart.
         purposes: Purposes of the sets, in the order of their seeds.
     """
 
@@ -47,13 +47,15 @@ DEMONSTRATION = SeedBlock(7_000_000, ("demonstration",))
 """For `run`, `play` and `check`."""
 SHIFTS = SeedBlock(8_000_000, ("shifts",))
 """Conditions that training does not have."""
-MOTION = SeedBlock(9_000_000, ("motion", "motion of the actual robot", "other motion"))
-"""Undisturbed motion, of which a monitor learns what is usual, and other motion to judge it."""
-ANOMALIES = SeedBlock(10_000_000, ("unperturbed", "perturbed", "thresholds", "training"))
-"""Motion with and without an anomaly, and that for thresholds and training of other monitors."""
+MOTION = SeedBlock(9_000_000, ("motion", "motion of the actual robot"))
+"""Undisturbed motion, of which a monitor learns what is usual."""
+FRESH_MOTION = SeedBlock(9_100_000, ("fresh motion",))
+"""Undisturbed motion that shows how often it alarms."""
+ANOMALIES = SeedBlock(10_000_000, ("unperturbed", "perturbed", "thresholds"))
+"""Motion with and without an anomaly, and that for thresholds."""
 BLOCKS = (
     *(TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION),
-    *(DEMONSTRATION, SHIFTS, MOTION, ANOMALIES),
+    *(DEMONSTRATION, SHIFTS, MOTION, FRESH_MOTION, ANOMALIES),
 )
 
 

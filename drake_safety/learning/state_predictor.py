@@ -13,7 +13,9 @@ from drake_safety.files.progress import ignore
 HIDDEN_SIZES = (256, 256)
 """Units of the hidden layers."""
 _SMALLEST_SPREAD = 1e-4  # Of a column [unit of the column]; constant ones would be divided by zero.
-_LARGEST_INPUT = 10.0  # In standard deviations; beyond, the network extrapolates.
+_LARGEST_INPUT = 10.0  # In standard deviations.
+_OUTSIDE = 0.005  # Share of training below and above the usual range of an input.
+_VECTORS = ("mean", "scale", "low", "high", "unit")
 _EPOCHS, _MOST_STEPS, _BATCH, _RATE, _DECAY = 25, 6000, 512, 2e-3, 1e-3
 
 
@@ -21,16 +23,22 @@ _EPOCHS, _MOST_STEPS, _BATCH, _RATE, _DECAY = 25, 6000, 512, 2e-3, 1e-3
 class StatePredictor:
     """Predicts the change of the measured state in one step.
 
-    A network of two hidden layers beside a linear map, both of the last two inputs.
+    A network of two hidden layers beside a linear map, both of the last two inputs. Outside the
+    usual range of an input it extrapolates and its errors say less: they are divided by the square
+    root of one plus the largest distance from that range, in standard deviations. Without it a
+    rare stumble of a walking robot looks like a changed plant.
 
     Attributes:
         mean, scale: Standardisation of an input, (n_u,).
+        low, high: Usual range of a standardised input, (n_u,).
         unit: Standard deviations of the change, (n_w,).
         weights: The linear map's and the layers' weights and biases, by name.
     """
 
     mean: np.ndarray
     scale: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
     unit: np.ndarray
     weights: Mapping[str, np.ndarray]
 
@@ -50,7 +58,8 @@ class StatePredictor:
         mean, scale = every.mean(axis=0), np.maximum(every.std(axis=0), _SMALLEST_SPREAD)
         change = np.concatenate([np.diff(one, axis=0)[1:] for one in states])
         unit = np.maximum(change.std(axis=0), 1e-9)
-        start = cls(mean=mean, scale=scale, unit=unit, weights={})
+        low, high = np.quantile((every - mean) / scale, [_OUTSIDE, 1.0 - _OUTSIDE], axis=0)
+        start = cls(mean=mean, scale=scale, low=low, high=high, unit=unit, weights={})
         x = torch.tensor(np.concatenate([start._pairs(one) for one in inputs]))
         y = torch.tensor((change / unit).astype(np.float32))
         with one_torch_thread():
@@ -77,10 +86,19 @@ class StatePredictor:
         weights = {k: v.detach().numpy().T.copy() for k, v in network.state_dict().items()}
         return replace(start, weights=weights)
 
+    def _standardised(self, inputs: np.ndarray) -> np.ndarray:
+        return np.clip((inputs - self.mean) / self.scale, -_LARGEST_INPUT, _LARGEST_INPUT)
+
     def _pairs(self, inputs: np.ndarray) -> np.ndarray:
         """Standardised inputs (K, n_u) beside the ones before them, (K - 2, 2 n_u)."""
-        z = np.clip((inputs - self.mean) / self.scale, -_LARGEST_INPUT, _LARGEST_INPUT)
+        z = self._standardised(inputs)
         return np.concatenate([z[1:-1], z[:-2]], axis=1).astype(np.float32)
+
+    def _divisor(self, z: np.ndarray) -> np.ndarray:
+        """Of errors after standardised inputs (..., n_u)."""
+        beyond = np.maximum(z - self.high, self.low - z).max(axis=-1)
+        divisor: np.ndarray = np.sqrt(1.0 + np.maximum(beyond, 0.0))
+        return divisor
 
     def _evaluated(self, z: np.ndarray) -> np.ndarray:
         """Predicted changes in their units of standardised pairs, (..., n_w)."""
@@ -94,9 +112,13 @@ class StatePredictor:
 
     def errors(self, inputs: np.ndarray, states: np.ndarray) -> np.ndarray:
         """Errors of the predicted states of a motion from the third row on, (K - 2, n_w)."""
+        divisor = self._divisor(self._standardised(inputs[1:-1]))
+        return self._residuals(inputs, states) / divisor[:, None]
+
+    def _residuals(self, inputs: np.ndarray, states: np.ndarray) -> np.ndarray:
         predicted = self.unit * self._evaluated(self._pairs(inputs))
-        errors: np.ndarray = np.diff(states, axis=0)[1:] - predicted
-        return errors
+        residuals: np.ndarray = np.diff(states, axis=0)[1:] - predicted
+        return residuals
 
     def error(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
         """The error (n_w,) of a change (n_w,) after an input and the one before, (n_u,) each."""
@@ -106,6 +128,7 @@ class StatePredictor:
         np.maximum(z, -_LARGEST_INPUT, out=z)  # Twice as fast as `np.clip`.
         np.minimum(z, _LARGEST_INPUT, out=z)
         error: np.ndarray = change - self.unit * self._evaluated(z.ravel().astype(np.float32))
+        error /= self._divisor(z[0])
         return error
 
     def corrected(
@@ -115,7 +138,7 @@ class StatePredictor:
         from sklearn.linear_model import Ridge
 
         z = np.concatenate([self._pairs(one) for one in inputs])
-        errors = np.concatenate([self.errors(*one) for one in zip(inputs, states, strict=True)])
+        errors = np.concatenate([self._residuals(*one) for one in zip(inputs, states, strict=True)])
         # Few rows: what they do not determine stays as it was.
         ridge = Ridge(alpha=len(z) / 10.0).fit(z, errors / self.unit)
         weights = dict(self.weights)
@@ -125,12 +148,12 @@ class StatePredictor:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns all that `from_arrays` needs, by name."""
-        return {"mean": self.mean, "scale": self.scale, "unit": self.unit, **self.weights}
+        return {name: getattr(self, name) for name in _VECTORS} | dict(self.weights)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> StatePredictor:
         """Makes the predictor of arrays written by `arrays`."""
-        own = {name: arrays[name].astype(float) for name in ("mean", "scale", "unit")}
+        own = {name: arrays[name].astype(float) for name in _VECTORS}
         weights = {k: v.astype(np.float32) for k, v in arrays.items() if k not in own}
         return cls(**own, weights=weights)
 
