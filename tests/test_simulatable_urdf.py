@@ -9,6 +9,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_safety.robots.meshes import mesh_points
 from drake_safety.robots.simulatable_urdf import simulatable_copy
 from urdf_files import GOOD, LINK, mesh, stl, written
 
@@ -67,8 +68,8 @@ def test_visuals_without_a_converter_are_left_out_and_the_extra_is_named(tmp_pat
     stl(tmp_path / "skin.stl", TRIANGLE)
     copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, mesh("visual", "skin.stl"))))
     (note,) = copy.left_out
-    assert "left out: skin.stl; install their converter by `pip install" in note
-    assert "'drake_safety[robots]'" in note
+    assert "left out, until you `pip install 'drake_safety[robots]'` and" in note
+    assert note.endswith(": skin.stl")
     assert list(copy.root.iter("visual")) == [] and copy.meshes == {}
 
 
@@ -104,7 +105,7 @@ def test_a_mesh_of_an_installed_package_is_found(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["stl", "ply"])
-def test_a_lost_collision_mesh_leaves_its_points_behind_turned_and_scaled(tmp_path, kind):
+def test_a_collision_mesh_becomes_its_hull_turned_and_scaled(tmp_path, kind):
     trimesh = pytest.importorskip("trimesh")
     trimesh.creation.box(bounds=[[0, 0, 0], [2, 1, 4]]).export(tmp_path / f"foot.{kind}")
     shape = (
@@ -113,11 +114,13 @@ def test_a_lost_collision_mesh_leaves_its_points_behind_turned_and_scaled(tmp_pa
         .replace("/></geo", ' scale="1 1 2"/></geo')
     )
     copy = simulatable_copy(written(tmp_path, LINK.format("foot", GOOD, shape)))
-    (points,) = copy.lost_meshes["foot"]
+    (hull,) = copy.hulls["foot"]
     # A quarter turn about z: x becomes y, and y becomes -x.
-    box = [points.min(axis=0), points.max(axis=0)]
-    np.testing.assert_allclose(box, [[-1, 0, 1], [0, 2, 9]], atol=1e-6)
-    assert list(copy.root.iter("collision")) == [] and copy.bare_links() == ["foot"]
+    np.testing.assert_allclose(hull.bounds, [[-1, 0, 1], [0, 2, 9]], atol=1e-6)
+    (name,) = (element.get("filename") for element in copy.root.iter("mesh"))
+    copy.write(tmp_path / "copy.urdf")
+    np.testing.assert_allclose(mesh_points(tmp_path / name).max(axis=0), [0, 2, 9], atol=1e-6)
+    assert copy.bare_links() == [] and len(copy.notes) == 1
 
 
 def test_friction_and_impossible_inertias_are_corrected_and_told(tmp_path):

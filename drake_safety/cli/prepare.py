@@ -101,12 +101,10 @@ def new(
     _say(f"{name}: {mass_kg:.1f} kg, its base '{written.sizes.base}' stands {height_m:.3f} m high")
     for path in files:
         print_path("wrote", path)
-    if written.fitted:
-        kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(written.fitted.items()))
+    if written.num_hulls:
         _say(
-            f"fitted {sum(written.fitted.values())} shapes in place of collision meshes that Drake "
-            f"does not read: {kinds}. Look at them: drake-safety check {written.files[-1]} "
-            "--picture FILE"
+            f"{written.num_hulls} convex hulls replace collision meshes that Drake does not read. "
+            f"Look at them: drake-safety check {written.files[-1]} --picture FILE"
         )
     for what in written.copy.left_out:
         _say(f"note  {what}", "yellow")

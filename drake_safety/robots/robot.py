@@ -7,7 +7,7 @@ from dataclasses import field
 from typing import Generic, Literal, TypeVar
 
 import numpy as np
-from pydrake.geometry import AddContactMaterial, ProximityProperties, RoleAssign, SceneGraph, Sphere
+from pydrake.geometry import ProximityProperties, RoleAssign, SceneGraph, Sphere
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
     JointActuator,
@@ -121,14 +121,11 @@ def _set_friction(
             is_contact = np.linalg.norm(points - centre, axis=1).min() < 1e-3
             if not is_contact or not isinstance(inspector.GetShape(geometry_id), Sphere):
                 continue
-            old = inspector.GetProximityProperties(geometry_id)
-            new = ProximityProperties()
-            AddContactMaterial(friction=CoulombFriction(mu, mu), properties=new)
-            for group in old.GetGroupNames():
-                for key, value in old.GetPropertiesInGroup(group).items():
-                    if not new.HasProperty(group, key):
-                        new.AddProperty(group, key, value.get_value())
-            scene_graph.AssignRole(plant.get_source_id(), geometry_id, new, RoleAssign.kReplace)
+            properties = ProximityProperties(inspector.GetProximityProperties(geometry_id))
+            properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(mu, mu))
+            scene_graph.AssignRole(
+                plant.get_source_id(), geometry_id, properties, RoleAssign.kReplace
+            )
 
 
 def add_robot(

@@ -6,14 +6,13 @@ import math
 import re
 import shutil
 import tempfile
-from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from drake_safety.robots.lost_meshes import replace_lost_meshes
+from drake_safety.robots.meshes import above
 from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.robots.scenario_template import TASKS, Sizes, scenario_yaml
 from drake_safety.robots.simulatable_urdf import simulatable_copy
@@ -59,9 +58,9 @@ class NewRobot:
         return [joint.name() for joint in self.survey.joints]
 
     @property
-    def fitted(self) -> dict[str, int]:
-        """Number of shapes by kind that replace collision meshes."""
-        return dict(Counter(one.kind for shapes in self.copy.fitted.values() for one in shapes))
+    def num_hulls(self) -> int:
+        """Number of convex hulls that replace collision meshes."""
+        return sum(map(len, self.copy.hulls.values()))
 
     @property
     def bare(self) -> list[str]:
@@ -122,7 +121,7 @@ def _survey(
 ) -> NewRobot:
     copy = simulatable_copy(urdf)
     copy.write(scratch)
-    survey = Survey(scratch, copy.lost_meshes)
+    survey = Survey(scratch)
     legs = survey.legs(feet)
     arms = survey.arms(legs)
     if task == "reaching" and not arms:
@@ -136,12 +135,17 @@ def _survey(
     for limb in legs:
         if not limb.is_own_shape:
             copy.replace_collisions(limb.body, limb.points, limb.radius_m)
-    if idle or not all(limb.is_own_shape for limb in legs):
-        copy.fix_joints(idle)
-        copy.write(scratch)
-        survey = Survey(scratch)
+        elif limb.body in copy.hulls:
+            copy.set_hulls(limb.body, [])
+            copy.notes.append(f"foot '{limb.body}' has no hull: its spheres alone touch")
+    copy.fix_joints(idle)
+    copy.write(scratch)
+    survey = Survey(scratch)
     posture = solve_standing_posture(survey, legs)
-    survey = replace_lost_meshes(copy, survey, legs, posture, scratch)
+    _lift_hulls(copy, survey, legs)
+    copy.write(scratch)
+    survey = Survey(scratch)
+    survey.set_joints(posture)
     # Balls are thrown at the base.
     is_base_bare = not survey.collides(survey.base)
     copy.ignore_collisions(survey.overlaps())
@@ -157,7 +161,7 @@ def _survey(
         sizes=_sizes(survey, legs, arms, copy),
     )
     found.asked += [
-        f"where foot '{limb.name}' touches: the URDF has no shape there [m]"
+        f"where foot '{limb.body}' touches: the URDF has no shape there [m]"
         for limb in legs
         if limb.is_guess
     ]
@@ -167,6 +171,18 @@ def _survey(
             "ball can hit it"
         )
     return found
+
+
+def _lift_hulls(copy: UrdfCopy, survey: Survey, legs: list[Limb]) -> None:
+    """Cuts hulls welded to a foot at the height of its contact points, which alone touch."""
+    for limb in legs:
+        lowest = float(survey.positions(limb)[:, 2].min())
+        for link in set(survey.welded(limb.body)) & set(copy.hulls):
+            X_LW = survey.pose(link).inverse()
+            up = X_LW.rotation().col(2)
+            height = lowest + float(X_LW.translation() @ up)
+            parts = [above(hull, up, height) for hull in copy.hulls[link]]
+            copy.set_hulls(link, [part for part in parts if part is not None])
 
 
 def _sizes(survey: Survey, legs: list[Limb], arms: list[Limb], copy: UrdfCopy) -> Sizes:
@@ -216,7 +232,7 @@ def _robot_yaml(found: NewRobot) -> str:
         points = [[round(float(value), 5) for value in point] for point in limb.points]
         ask = "  # ASK its contact points [m]" if limb.is_guess else ""
         lines += [
-            f"  {limb.name}:{ask}",
+            f"  {limb.body}:{ask}",
             f"    body: {limb.body}",
             f"    contact_points: {points}",
             f"    radius_m: {float(f'{limb.radius_m:.5g}')}",
@@ -226,13 +242,13 @@ def _robot_yaml(found: NewRobot) -> str:
         lines.append("reaching_frames:")
     for limb in found.arms:
         lines += [
-            f"  {limb.name}:",
+            f"  {limb.body}:",
             f"    body: {limb.body}",
             "    point: [0.0, 0.0, 0.0]  # ASK the point that reaches, in the body's frame [m]",
             "    radius_m: 0.05  # ASK the radius of the hand's collision sphere [m]",
             f"    joints: [{', '.join(limb.joints)}]",
         ]
-        found.asked.append(f"the point of hand '{limb.name}' that reaches, and its size [m]")
+        found.asked.append(f"the point of hand '{limb.body}' that reaches, and its size [m]")
     lines.append(
         "joint_gains:  # ASK the maker's; these grow with mass times height [N·m/rad, N·m·s/rad]"
     )

@@ -4,28 +4,34 @@ from __future__ import annotations
 
 import contextlib
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.extras import MissingExtraError
-from drake_safety.robots.mesh_cache import SHOWN_FORMATS, mesh_points, shown_mesh
+from drake_safety.robots.meshes import SHOWN_FORMATS, convex_hull, mesh_points, shown_mesh
 from drake_safety.robots.model_files import model_file
-from drake_safety.robots.urdf_copy import UrdfCopy, number, origin_of, read_urdf
+from drake_safety.robots.urdf_copy import UrdfCopy, number, read_urdf
 
+if TYPE_CHECKING:
+    import trimesh
+
+_Mesh = TypeVar("_Mesh")
 _IGNORED = ("calibration", "safety_controller")
 """Elements of a joint that Drake ignores with a warning."""
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_ROWS, _COLUMNS = np.triu_indices(3)
 
 
 def simulatable_copy(path: Path) -> UrdfCopy:
     """Reads a URDF, replaces what Drake rejects, and collects its meshes.
 
-    Visual meshes that Drake does not render are converted, see
-    :func:`~drake_safety.robots.mesh_cache.shown_mesh`, or left out if that fails. Collision meshes
-    that Drake does not read are left out.
+    Of meshes that Drake does not read, visual ones are converted to glTF and collision ones become
+    convex hulls, see :mod:`~drake_safety.robots.meshes`; what cannot be read is left out.
 
     Raises:
         ValueError: The file does not exist or is not a URDF.
@@ -41,14 +47,19 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     _drop_friction(copy)
     _fix_inertias(copy)
     _tell_materials_apart(copy)
-    _gather_visual_meshes(copy)
-    _gather_collision_meshes(copy)
+    lost: dict[str, list[str]] = {}  # Names by the reason.
+    _gather_visual_meshes(copy, lost)
+    hulls = _gather_collision_meshes(copy, lost)
+    copy.left_out = [f"{reason}: {_listed(names)}" for reason, names in lost.items()]
+    copy.notes += copy.left_out
     for link in copy.root.findall("link"):
         if link.find("visual") is None:
             # Links without visuals show their collision shapes.
             for shape in link.findall("collision"):
                 visual = ET.SubElement(link, "visual")
                 visual.extend(part for part in shape if part.tag in ("origin", "geometry"))
+    for name, of_link in hulls.items():
+        copy.set_hulls(name, of_link)
     return copy
 
 
@@ -92,54 +103,46 @@ def _fix_inertias(copy: UrdfCopy) -> None:
         if number(inertial.find("mass"), "value") == 0:
             link.remove(inertial)
             continue
-        xx, yy, zz, xy, xz, yz = (
-            number(inertia, key) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-        )
-        moments = np.nan_to_num([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        moments = np.zeros((3, 3))
+        moments[_ROWS, _COLUMNS] = np.nan_to_num([number(inertia, key) for key in _MOMENTS])
+        moments[_COLUMNS, _ROWS] = moments[_ROWS, _COLUMNS]
         principal = np.linalg.eigvalsh(moments)
         # Flat and thin bodies are allowed.
-        if principal[0] < 1e-6 * principal[2] and np.any([xy, xz, yz]):
-            for key in ("ixy", "ixz", "iyz"):
-                inertia.set(key, "0")
-            copy.notes.append(
-                f"link '{link.get('name')}' has an impossible inertia; its products of inertia are "
-                "set to zero"
-            )
+        if principal[0] < 1e-6 * principal[2] and np.triu(moments, 1).any():
+            changed, how = np.diag(np.diag(moments)), "its products of inertia are set to zero"
         elif 0 < principal[0] and principal[2] > (1 + 1e-6) * (principal[0] + principal[1]):
             # The moments of any body satisfy the triangle inequality.
             values, axes = np.linalg.eigh(moments)
             values[2] = 0.999 * (values[0] + values[1])  # Digits are rounded.
             changed = axes @ np.diag(values) @ axes.T
-            rows, columns = np.triu_indices(3)
-            for key, value in zip(_MOMENTS, changed[rows, columns], strict=True):
-                inertia.set(key, f"{value:.9g}")
-            copy.notes.append(
-                f"link '{link.get('name')}' has an impossible inertia; its largest moment is "
-                "reduced to the sum of the others"
-            )
+            how = "its largest moment is reduced to the sum of the others"
+        else:
+            continue
+        for key, row, column in zip(_MOMENTS, _ROWS, _COLUMNS, strict=True):
+            if changed[row, column] != moments[row, column]:
+                inertia.set(key, f"{changed[row, column]:.9g}")
+        copy.notes.append(f"link '{link.get('name')}' has an impossible inertia; {how}")
 
 
 def _tell_materials_apart(copy: UrdfCopy) -> None:
     """Renames materials that share a name but not a colour."""
-    seen: dict[str, list[tuple[str, ...]]] = {}
+    seen: dict[str, list[list[str]]] = {}
     for material in copy.root.iter("material"):
-        content = tuple(
-            _plain(value) for part in material for value in " ".join(part.attrib.values()).split()
-        )
-        if not content:
+        values = " ".join(value for part in material for value in part.attrib.values())
+        if not values:
             continue  # A reference to a material.
+        content = [_plain(value) for value in values.split()]
         name = material.get("name", "")
         known = seen.setdefault(name, [])
         if content not in known:
             known.append(content)
-        index = known.index(content)
-        if index:
+        if index := known.index(content):
             material.set("name", f"{name}_{index}")
-    for name, contents in seen.items():
-        if len(contents) > 1:
-            copy.notes.append(
-                f"the material '{name}' has {len(contents)} colours; now each has its own name"
-            )
+    copy.notes += [
+        f"the material '{name}' has {len(contents)} colours; now each has its own name"
+        for name, contents in seen.items()
+        if len(contents) > 1
+    ]
 
 
 def _plain(value: str) -> str:
@@ -150,28 +153,13 @@ def _plain(value: str) -> str:
         return value
 
 
-def _gather_visual_meshes(copy: UrdfCopy) -> None:
+def _gather_visual_meshes(copy: UrdfCopy, lost: dict[str, list[str]]) -> None:
     converted: list[str] = []
-    lost: dict[str, list[str]] = {}  # By the reason.
 
     def shown(url: str, rgba: str) -> str:
         file = _mesh_file(url, copy.source)
-        if file is None:
-            lost.setdefault(
-                "visual meshes that are not where the URDF says are left out: {}", []
-            ).append(url)
-            return ""
-        try:
-            mesh = shown_mesh(file, rgba)
-        except MissingExtraError:
-            lost.setdefault(
-                "visual meshes that Drake does not render are left out: {}; install their "
-                "converter by `pip install 'drake_safety[robots]'` and write the folder again",
-                [],
-            ).append(file.name)
-            return ""
-        except ValueError as error:
-            lost.setdefault("a visual is left out: {}", []).append(str(error))
+        mesh = _converted("visual", url, file, lambda file: shown_mesh(file, rgba), lost)
+        if file is None or mesh is None:
             return ""
         if mesh != file:
             converted.append(file.name)
@@ -180,13 +168,16 @@ def _gather_visual_meshes(copy: UrdfCopy) -> None:
     copy.replace_visual_meshes(shown)
     if converted:
         copy.notes.append(f"visual meshes are converted to glTF: {_listed(converted)}")
-    copy.left_out += [reason.format(_listed(names)) for reason, names in lost.items()]
-    copy.notes += copy.left_out
 
 
-def _gather_collision_meshes(copy: UrdfCopy) -> None:
-    lost: list[str] = []
+def _gather_collision_meshes(
+    copy: UrdfCopy, lost: dict[str, list[str]]
+) -> dict[str, list[trimesh.Trimesh]]:
+    """Convex hulls by link, in its frame, of the meshes that Drake does not read."""
+    replaced: list[str] = []
+    hulls: dict[str, list[trimesh.Trimesh]] = {}
     for link in copy.root.findall("link"):
+        name = link.get("name", "")
         for shape in link.findall("collision"):
             mesh = shape.find("geometry/mesh")
             if mesh is None:
@@ -197,15 +188,56 @@ def _gather_collision_meshes(copy: UrdfCopy) -> None:
                 mesh.set("filename", _gather(copy, file, file.name))
                 continue
             link.remove(shape)
-            lost.append(url if file is None else file.name)
-            points = copy.lost_meshes.setdefault(link.get("name", ""), [])
-            if file is not None:
-                points += _points(copy, file, shape, mesh)
-    if lost:
+            hull = _converted("collision", url, file, partial(_hull, shape, mesh), lost)
+            if file is None or hull is None:
+                copy.lost_links.add(name)
+            else:
+                hulls.setdefault(name, []).append(hull)
+                replaced.append(file.name)
+    if replaced:
         copy.notes.append(
-            f"collision meshes that Drake cannot read, or that do not exist, are left out: "
-            f"{_listed(lost)}"
+            "collision meshes that Drake does not read are replaced by convex hulls: "
+            f"{_listed(replaced)}"
         )
+    return hulls
+
+
+def _hull(shape: ET.Element, mesh: ET.Element, file: Path) -> trimesh.Trimesh:
+    """The convex hull of a collision mesh in the link's frame."""
+    origin = shape.find("origin")
+    xyz, rpy = (
+        [float(word) for word in ("" if origin is None else origin.get(key, "")).split()]
+        or [0.0, 0.0, 0.0]
+        for key in ("xyz", "rpy")
+    )
+    scale = [float(word) for word in mesh.get("scale", "1 1 1").split()]
+    X_LM = RigidTransform(RollPitchYaw(rpy), xyz)
+    return convex_hull((X_LM @ (mesh_points(file) * scale).T).T)
+
+
+def _converted(
+    kind: str,
+    url: str,
+    file: Path | None,
+    convert: Callable[[Path], _Mesh],
+    lost: dict[str, list[str]],
+) -> _Mesh | None:
+    """A mesh that Drake reads; None, with the reason in ``lost``, if it is left out."""
+    name = url
+    try:
+        if file is not None:
+            name = file.name
+            return convert(file)
+        reason = f"{kind} meshes that are not where the URDF says are left out"
+    except MissingExtraError as error:
+        reason = (
+            f"{kind} meshes that Drake does not read are left out, until you "
+            f"`pip install '{error.needs}'` and write the folder again"
+        )
+    except ValueError as error:
+        reason, name = f"{kind} meshes that cannot be read are left out", str(error)
+    lost.setdefault(reason, []).append(name)
+    return None
 
 
 def _gather(copy: UrdfCopy, file: Path, name: str) -> str:
@@ -220,28 +252,6 @@ def _gather(copy: UrdfCopy, file: Path, name: str) -> str:
 
 def _listed(names: Iterable[str]) -> str:
     return ", ".join(dict.fromkeys(names))
-
-
-def _points(copy: UrdfCopy, file: Path, shape: ET.Element, mesh: ET.Element) -> list[np.ndarray]:
-    """Vertices in the link's frame; none, with a note, if the mesh cannot be read."""
-    try:
-        points = mesh_points(file)
-    except MissingExtraError as error:
-        note = (
-            "no shapes are fitted to collision meshes that Drake does not read; install what does "
-            f"it by `pip install '{error.needs}'` and write the folder again"
-        )
-    except ValueError as error:
-        note = f"no shape is fitted to a collision mesh: {error}"
-    else:
-        scale = [float(value) for value in mesh.get("scale", "1 1 1").split()]
-        origin = origin_of(shape)
-        X_LM = RigidTransform(RollPitchYaw(origin[3:]), origin[:3])
-        return [(X_LM @ (points * scale).T).T]
-    if note not in copy.left_out:
-        copy.left_out.append(note)
-        copy.notes.append(note)
-    return []
 
 
 def _mesh_file(url: str, source: Path) -> Path | None:

@@ -61,7 +61,7 @@ def _solved(survey: Survey, solvers: list[_Leg]) -> dict[str, float]:
         for solver in solvers:
             angles = solver.solve(lowest)
             if angles is None:
-                reach[solver.limb.name] = share
+                reach[solver.limb.body] = share
                 break
             solved |= dict(zip(solver.limb.joints, angles.tolist(), strict=True))
         else:

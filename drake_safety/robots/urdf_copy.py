@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-import io
 import math
+import re
 import shutil
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw
 
-from drake_safety.robots.fitted_shapes import FittedShape
-from drake_safety.robots.mesh_cache import is_shown, shown_mesh
+from drake_safety.robots.meshes import is_shown, shown_mesh
 from drake_safety.robots.model_files import model_file
 
+if TYPE_CHECKING:
+    import trimesh
+
 _DRAKE = "http://drake.mit.edu"
+_PREFIX = re.compile(rb"""(xmlns:drake\s*=\s*)["'][^"']*["']""")
+ET.register_namespace("drake", _DRAKE)
 
 
 @dataclass(kw_only=True)
@@ -26,24 +30,21 @@ class UrdfCopy:
 
     Attributes:
         notes: Descriptions of the changes, one sentence each.
-        left_out: Notes about visuals that were removed.
-        lost_meshes: Vertices of removed collision meshes by link, in its frame, (n, 3) [m] each;
-            none of those that cannot be read.
-        fitted: Shapes in place of these meshes, by link.
+        left_out: Notes about meshes that were removed.
+        lost_links: Links of removed collision meshes.
         joint_friction: Removed dry friction by joint [N·m].
         meshes: Meshes of the copy: name relative to the copy -> original file.
-        hulls: Convex hulls of the copy: name relative to the copy -> OBJ.
+        hulls: Convex hulls in place of collision meshes, by link, in its frame [m].
     """
 
     source: Path
     root: ET.Element
     notes: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    lost_meshes: dict[str, list[np.ndarray]] = field(default_factory=dict)
-    fitted: dict[str, list[FittedShape]] = field(default_factory=dict)
+    lost_links: set[str] = field(default_factory=set)
     joint_friction: dict[str, float] = field(default_factory=dict)
     meshes: dict[str, Path] = field(default_factory=dict)
-    hulls: dict[str, str] = field(default_factory=dict)
+    hulls: dict[str, list[trimesh.Trimesh]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._as_read = self.text()
@@ -66,7 +67,7 @@ class UrdfCopy:
         return [
             link.get("name", "")
             for link in self.root.findall("link")
-            if link.get("name") in self.lost_meshes and link.find("collision") is None
+            if link.get("name") in self.lost_links and link.find("collision") is None
         ]
 
     def effort_limits(self) -> dict[str, float]:
@@ -146,33 +147,29 @@ class UrdfCopy:
         """Replaces all collision shapes of a link by spheres at points (n, 3) [m] in its frame."""
         link = self.link(link_name)
         _remove(link, "collision")
+        self.hulls.pop(link_name, None)
         for index, point in enumerate(points):
-            name = f"{link_name}_contact_{index}"
-            _add_collision(link, name, point, "sphere", radius=f"{radius_m:.5g}")
+            collision = ET.SubElement(link, "collision", name=f"{link_name}_contact_{index}")
+            ET.SubElement(collision, "origin", xyz=" ".join(f"{value:.5g}" for value in point))
+            geometry = ET.SubElement(collision, "geometry")
+            ET.SubElement(geometry, "sphere", radius=f"{radius_m:.5g}")
         self.notes.append(
             f"the collision shapes of link '{link_name}' are replaced by {len(points)} spheres on "
             "the ground"
         )
 
-    def set_fitted(self, link_name: str, shapes: list[FittedShape]) -> None:
-        """Sets the shapes in place of a link's removed collision meshes; earlier ones go."""
-        self.fitted[link_name] = shapes
+    def set_hulls(self, link_name: str, hulls: list[trimesh.Trimesh]) -> None:
+        """Sets the convex hulls in place of a link's collision meshes; earlier ones go."""
         link = self.link(link_name)
-        for collision in link.findall("collision"):
-            if collision.get("name", "").startswith(f"{link_name}_fitted_"):
-                link.remove(collision)
-        for index, shape in enumerate(shapes):
-            name = f"{link_name}_fitted_{index}"
-            geometry = _add_geometry(link, name, shape.X_LS)
-            if shape.kind == "hull":
-                file = f"meshes/{name}.obj"
-                self.hulls[file] = shape.obj
-                mesh = ET.SubElement(geometry, "mesh", filename=file)
-                ET.SubElement(mesh, f"{{{_DRAKE}}}declare_convex")
-                continue
-            sizes = {key: _numbers(np.atleast_1d(value)) for key, value in shape.sizes.items()}
-            tag = f"{{{_DRAKE}}}capsule" if shape.kind == "capsule" else shape.kind
-            ET.SubElement(geometry, tag, sizes)
+        for shape in link.findall("collision"):
+            if shape.get("name", "").startswith(f"{link_name}_hull_"):
+                link.remove(shape)
+        self.hulls[link_name] = hulls
+        for index in range(len(hulls)):
+            name = f"{link_name}_hull_{index}"
+            geometry = ET.SubElement(ET.SubElement(link, "collision", name=name), "geometry")
+            mesh = ET.SubElement(geometry, "mesh", filename=f"meshes/{name}.obj")
+            ET.SubElement(mesh, f"{{{_DRAKE}}}declare_convex")
 
     def ignore_collisions(self, pairs: Iterable[tuple[str, str]]) -> None:
         """Filters collisions between pairs of links."""
@@ -192,10 +189,11 @@ class UrdfCopy:
         tree = ET.ElementTree(self.root)
         ET.indent(tree)
         tree.write(path, encoding="utf-8", xml_declaration=True)
-        for name, text in self.hulls.items():
-            target = path.parent / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_text(text, encoding="utf-8")
+        for link, hulls in self.hulls.items():
+            for index, hull in enumerate(hulls):
+                target = path.parent / f"meshes/{link}_hull_{index}.obj"
+                target.parent.mkdir(parents=True, exist_ok=True)
+                hull.export(target, include_normals=False, header=None)
         for name, mesh in self.meshes.items():
             target = path.parent / name
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -211,7 +209,8 @@ def read_urdf(path: Path) -> UrdfCopy:
     if not path.is_file():
         raise ValueError(f"URDF '{path}' does not exist")
     try:
-        root = _parsed(path.read_bytes())
+        # Drake knows its elements by their prefix, whatever address the file gives.
+        root = ET.fromstring(_PREFIX.sub(rf'\1"{_DRAKE}"'.encode(), path.read_bytes()))
     except ET.ParseError as error:
         raise ValueError(f"'{path}' is not XML: {error}") from error
     if root.tag != "robot":
@@ -235,56 +234,10 @@ def read_urdf(path: Path) -> UrdfCopy:
     return UrdfCopy(source=path, root=root)
 
 
-def _parsed(content: bytes) -> ET.Element:
-    """The root element; Drake's own elements keep their prefix."""
-    root = None
-    prefixes = {"drake": _DRAKE}
-    parser = ET.iterparse(io.BytesIO(content), events=("start-ns", "start"))
-    for event, value in parser:
-        if event == "start-ns":
-            prefixes[value[0]] = value[1]
-        elif root is None:
-            root = value
-    assert root is not None  # There is no XML without an element.
-    # Drake identifies its elements by prefix, whatever the namespace's address.
-    own = f"{{{prefixes.pop('drake')}}}"
-    for element in root.iter():
-        if element.tag.startswith(own):
-            element.tag = f"{{{_DRAKE}}}{element.tag.removeprefix(own)}"
-    for prefix, address in prefixes.items():
-        ET.register_namespace(prefix, address)
-    ET.register_namespace("drake", _DRAKE)
-    return root
-
-
 def _remove(element: ET.Element, tag: str) -> None:
     """Removes all children with a tag."""
     for part in element.findall(tag):
         element.remove(part)
-
-
-def _numbers(values: np.ndarray) -> str:
-    return " ".join(f"{value:.5g}" for value in values)
-
-
-def _add_collision(
-    link: ET.Element, name: str, center: np.ndarray, shape: str, **sizes: str
-) -> None:
-    ET.SubElement(_add_geometry(link, name, RigidTransform(center)), shape, sizes)
-
-
-def _add_geometry(link: ET.Element, name: str, X_LS: RigidTransform) -> ET.Element:
-    collision = ET.SubElement(link, "collision", name=name)
-    turn = RollPitchYaw(X_LS.rotation()).vector()
-    ET.SubElement(collision, "origin", xyz=_numbers(X_LS.translation()), rpy=_numbers(turn))
-    return ET.SubElement(collision, "geometry")
-
-
-def origin_of(element: ET.Element) -> list[float]:
-    """Returns an element's origin in its parent: xyz [m] and rpy [rad], (6,)."""
-    origin = element.find("origin")
-    texts = [("" if origin is None else origin.get(key)) or "0 0 0" for key in ("xyz", "rpy")]
-    return [float(word) for word in " ".join(texts).split()]
 
 
 def _colour(material: ET.Element | None, colours: dict[str, ET.Element]) -> str:

@@ -33,7 +33,6 @@ class Limb:
         is_guess: Whether the URDF has no collision shape at the end.
     """
 
-    name: str
     body: str
     joints: list[str]
     points: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
@@ -42,13 +41,24 @@ class Limb:
     is_guess: bool = True
 
 
+@dataclass(frozen=True)
+class _Shape:
+    """A collision shape as spheres: their centres in the base's frame, (n, 3) [m]."""
+
+    body: str
+    centers: np.ndarray
+    radius_m: float
+    is_sphere: bool = False
+
+    @property
+    def lowest_m(self) -> float:
+        return float(self.centers[:, 2].min()) - self.radius_m
+
+
 class Survey:
-    """A URDF in a plant, with the base at the world's origin and all joints at or near zero.
+    """A URDF in a plant, with the base at the world's origin and all joints at or near zero."""
 
-    ``lost_meshes`` has the vertices of removed collision meshes by link, in its frame, (n, 3) [m].
-    """
-
-    def __init__(self, path: Path, lost_meshes: dict[str, list[np.ndarray]] | None = None):
+    def __init__(self, path: Path):
         builder = DiagramBuilder()
         plant: MultibodyPlant
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
@@ -61,7 +71,6 @@ class Survey:
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self.context = plant.GetMyMutableContextFromRoot(self._root)
-        self._lost = lost_meshes or {}
         floating = [
             plant.get_body(i).name()
             for i in plant.GetBodyIndices(self.instance)
@@ -193,31 +202,22 @@ class Survey:
     def arms(self, legs: list[Limb]) -> list[Limb]:
         """Returns other limbs of four joints or more; a hand's fingers are no limbs."""
         feet = {limb.body for limb in legs}
-        chains = [
-            (self.chain(group[0]), group)
-            for group in self.leaves()
-            if not feet & set(group) and len(self.chain(group[0])) >= 4
-        ]
-        arms: dict[tuple[str, ...], list] = {}
-        for chain, group in chains:
-            arms.setdefault(tuple(chain[:4]), []).append((chain, group))
+        arms: dict[tuple[str, ...], list[tuple[list[str], str]]] = {}
+        for group in self.leaves():
+            chain = self.chain(group[0])
+            if len(chain) >= 4 and not feet & set(group):
+                arms.setdefault(tuple(chain[:4]), []).append((chain, group[-1]))
         found = []
-        for members in arms.values():
-            shared = [
-                names[0]
-                for names in zip(*(chain for chain, _ in members), strict=False)
-                if len(set(names)) == 1
-            ]
-            if len(members) == 1:
-                body = members[0][1][-1]
-            else:
+        for start, members in arms.items():
+            steps = zip(*(chain for chain, _ in members), strict=False)
+            shared = [names[0] for names in steps if len(set(names)) == 1]
+            body = members[0][1]
+            if len(members) > 1:
                 joint = self.plant.GetJointByName(shared[-1], self.instance)
                 body = joint.child_body().name()
-            limb = Limb(name=body, body=body, joints=shared)
             # Joints of the torso are shared between arms.
-            others = [set(c[0][0]) for key, c in arms.items() if key != tuple(shared[:4])]
-            limb.joints = [name for name in shared if not any(name in other for other in others)]
-            found.append(limb)
+            others = {name for other in arms if other != start for name in arms[other][0][0]}
+            found.append(Limb(body=body, joints=[name for name in shared if name not in others]))
         return found
 
     def overlaps(self) -> set[tuple[str, str]]:
@@ -237,72 +237,64 @@ class Survey:
         return found
 
     def _lowest(self, group: list[str]) -> float:
-        shapes = self._shapes(group)
-        if shapes:
-            return min(float(points[:, 2].min()) - radius for _, points, radius, _ in shapes)
-        return min(float(self.pose(name).translation()[2]) for name in group)
+        lowest = [shape.lowest_m for shape in self._shapes(group)]
+        return min(lowest or [float(self.pose(name).translation()[2]) for name in group])
 
     def _leg(self, group: list[str]) -> Limb:
         joints = self.chain(group[0])
         shapes = self._shapes(group)
-        # A body whose name contains "foot", or the last one.
-        body = max(group, key=lambda name: ("foot" in name.lower(), group.index(name)))
         if not shapes:
-            return Limb(name=body, body=body, joints=joints)
-        lows = [float(points[:, 2].min()) - radius for _, points, radius, _ in shapes]
+            # A body whose name contains "foot", or the last one.
+            body = max(group, key=lambda name: ("foot" in name.lower(), group.index(name)))
+            return Limb(body=body, joints=joints)
         # A sphere of the URDF's rather than what is hardly lower, such as the shank at its height.
-        is_own = [_LEVEL_M if sphere else 0.0 for _, _, _, sphere in shapes]
-        name, points, radius, is_sphere = shapes[int(np.argmin(np.subtract(lows, is_own)))]
-        if is_sphere:
-            points = np.concatenate(
+        foot = min(shapes, key=lambda one: one.lowest_m - (_LEVEL_M if one.is_sphere else 0.0))
+        if foot.is_sphere:
+            level_m = min(shape.lowest_m for shape in shapes) + _LEVEL_M
+            centers = np.concatenate(
                 [
-                    other
-                    for (body_name, other, r, sphere), low in zip(shapes, lows, strict=True)
-                    if sphere
-                    and body_name == name
-                    and abs(r - radius) < 1e-6
-                    and low < min(lows) + _LEVEL_M
+                    one.centers
+                    for one in shapes
+                    if one.is_sphere
+                    and one.body == foot.body
+                    and abs(one.radius_m - foot.radius_m) < 1e-6
+                    and one.lowest_m < level_m
                 ]
             )
         else:
-            lowest = float(points[:, 2].min())
-            points = points[points[:, 2] < lowest + _LEVEL_M + radius]
+            heights = foot.centers[:, 2]
+            centers = foot.centers[heights < heights.min() + _LEVEL_M + foot.radius_m]
         return Limb(
-            name=name,
-            body=name,
+            body=foot.body,
             joints=joints,
-            points=(self.pose(name).inverse() @ points.T).T,
-            radius_m=radius,
-            is_own_shape=is_sphere,
+            points=(self.pose(foot.body).inverse() @ centers.T).T,
+            radius_m=foot.radius_m,
+            is_own_shape=foot.is_sphere,
             is_guess=False,
         )
 
-    def _shapes(self, group: list[str]) -> list[tuple[str, np.ndarray, float, bool]]:
-        """Shapes of bodies as (body, sphere centres (n, 3), sphere radius, whether a sphere)."""
+    def _shapes(self, group: list[str]) -> list[_Shape]:
         inspector = self._scene_graph.model_inspector()
-        found: list[tuple[str, np.ndarray, float, bool]] = []
+        found = []
         for name in group:
-            X_WB = self.pose(name)
             body = self.plant.GetBodyByName(name, self.instance)
             for geometry in self.plant.GetCollisionGeometriesForBody(body):
                 shape = inspector.GetShape(geometry)
-                X_WG = X_WB @ inspector.GetPoseInFrame(geometry)
+                X_WG = self.pose(name) @ inspector.GetPoseInFrame(geometry)
                 if isinstance(shape, Sphere):
-                    found.append((name, X_WG.translation()[None], shape.radius(), True))
+                    found.append(_Shape(name, X_WG.translation()[None], shape.radius(), True))
                 elif isinstance(shape, Capsule | Cylinder):
                     radius = shape.radius()
                     half = shape.length() / 2 - (0 if isinstance(shape, Capsule) else radius)
                     ends = np.array([[0, 0, -half], [0, 0, half]]) if half > 0 else np.zeros((1, 3))
-                    found.append((name, (X_WG @ ends.T).T, radius, False))
-                else:
-                    box = inspector.GetObbInGeometryFrame(geometry)
-                    if box is not None:
-                        X_WO = X_WG @ box.pose()
-                        found.append((name, *_corners(X_WO, np.array(box.half_width())), False))
-            for vertices in self._lost.get(name, []):
-                low, high = vertices.min(axis=0), vertices.max(axis=0)
-                X_WO = X_WB @ RigidTransform((low + high) / 2)
-                found.append((name, *_corners(X_WO, (high - low) / 2), False))
+                    found.append(_Shape(name, (X_WG @ ends.T).T, radius))
+                elif (hull := inspector.GetConvexHull(geometry)) is not None:
+                    middle, edges = hull.CalcBoundingBox()
+                    X_WO = X_WG @ RigidTransform(middle)
+                    found.append(_Shape(name, *_corners(X_WO, np.array(edges) / 2)))
+                elif (box := inspector.GetObbInGeometryFrame(geometry)) is not None:
+                    X_WO = X_WG @ box.pose()
+                    found.append(_Shape(name, *_corners(X_WO, np.array(box.half_width()))))
         return found
 
 

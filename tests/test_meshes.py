@@ -1,12 +1,20 @@
-"""Meshes that Drake does not show are converted once, upright, in their colour."""
+"""Meshes that Drake does not read: converted once, upright and in colour; hulls of few vertices."""
 
 import json
 import sys
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
 
-from drake_safety.robots.mesh_cache import cache_folder, is_shown, mesh_points, shown_mesh
+from drake_safety.robots.meshes import (
+    above,
+    cache_folder,
+    convex_hull,
+    is_shown,
+    mesh_points,
+    shown_mesh,
+)
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -132,3 +140,47 @@ def test_without_the_converter_the_extra_is_named(cache, tower, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(ValueError, match=r"pip install 'drake_safety\[robots\]'"):
         shown_mesh(tower)
+
+
+X_LM = RigidTransform(RollPitchYaw(0.4, -0.7, 1.1), [0.3, -0.2, 0.5])
+
+
+def test_the_hull_of_a_box_is_the_box_wherever_it_is():
+    points = (X_LM @ trimesh.creation.box(extents=[0.1, 0.3, 0.05]).vertices.T).T
+    assert convex_hull(points).volume == pytest.approx(0.1 * 0.3 * 0.05)
+
+
+def test_a_hull_has_few_vertices_which_are_the_meshs_and_reaches_as_far_along_the_axes():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1).vertices
+    points = np.vstack([ball, [[0.0, 0.0, 0.5]], [[0.3, 0.0, 0.0]]])
+    hull = convex_hull(points)
+    assert 4 <= len(hull.vertices) <= 42
+    # It exceeds the mesh's hull nowhere.
+    distances = np.linalg.norm(hull.vertices[:, None] - points[None], axis=2).min(axis=1)
+    assert distances.max() < 1e-6
+    np.testing.assert_allclose(hull.bounds, [points.min(axis=0), points.max(axis=0)], atol=1e-12)
+    assert hull.volume > 0.8 * trimesh.convex.convex_hull(points).volume
+
+
+@pytest.mark.parametrize(
+    ("points", "edges"),
+    [
+        ([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.0, 0.1, 1.0]], [0.2, 0.1, 1e-3]),
+        ([[0.0, 0.0, 0.0], [0.2, 0.0, 0.1], [0.1, 0.1, 0.05], [0.2, 0.2, 0.1]], [0.2, 0.2, 0.1]),
+        ([[0.5, 0.5, 0.5]], [1e-3, 1e-3, 1e-3]),
+    ],
+)
+def test_a_flat_mesh_becomes_the_box_around_it(points, edges):
+    hull = convex_hull(np.array(points))
+    assert hull.extents == pytest.approx(edges)
+    assert hull.volume == pytest.approx(np.prod(edges))
+    middle = 0.5 * (np.min(points, axis=0) + np.max(points, axis=0))
+    np.testing.assert_allclose(hull.bounds.mean(axis=0), middle, atol=1e-12)
+
+
+def test_what_is_below_a_floor_is_cut_off():
+    hull = convex_hull(np.array(trimesh.creation.box(extents=[0.1, 0.1, 0.4]).vertices))
+    up = np.array([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(above(hull, up, -0.1).bounds[:, 2], [-0.1, 0.2])
+    assert above(hull, up, -0.3).volume == pytest.approx(hull.volume)
+    assert above(hull, up, 0.3) is None

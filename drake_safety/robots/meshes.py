@@ -1,11 +1,10 @@
-"""A cache of meshes converted from formats that Drake does not render."""
+"""Meshes in formats that Drake does not read: glTF files to be seen, convex hulls to collide."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import re
-import tempfile
 import warnings
 from functools import lru_cache
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_safety.extras import require_extra
+from drake_safety.files.atomic import replacing
 
 if TYPE_CHECKING:
     import trimesh
@@ -27,6 +27,7 @@ _GREY = [0.6, 0.6, 0.6, 1.0]
 _UP_AXIS = re.compile(r"<up_axis>\s*(\w+)")  # In a COLLADA file.
 _X_ZY = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # From y up to z up.
 _VERSION = b"4"  # Version of the conversion, part of the cache's keys.
+_THINNEST_M = 1e-3  # Edge of the box around a flat mesh.
 
 
 def cache_folder() -> Path:
@@ -68,7 +69,10 @@ def shown_mesh(path: Path, rgba: str = "") -> Path:
     digest = _digest(path, path.stat().st_mtime_ns, rgba)
     target = cache_folder() / "meshes" / f"{path.stem}-{digest[:16]}.gltf"
     if not target.is_file():
-        _write(target, _to_gltf(path, rgba))
+        content = _to_gltf(path, rgba)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(target) as part:  # Other processes may read the cache.
+            part.write_bytes(content)
     return target
 
 
@@ -78,22 +82,37 @@ def _digest(path: Path, changed_ns: int, rgba: str) -> str:
     return hashlib.sha256(_VERSION + rgba.encode() + path.read_bytes()).hexdigest()
 
 
-def _write(target: Path, content: bytes) -> None:
-    """Writes atomically, as other processes may read the cache."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=target.parent, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        Path(name).replace(target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-
-
 def mesh_points(path: Path) -> np.ndarray:
     """Returns the vertices of a mesh, (n, 3), in the mesh's units."""
     return np.array(_scene(path).to_mesh().vertices, dtype=float)
+
+
+def convex_hull(points: np.ndarray) -> trimesh.Trimesh:
+    """Returns the convex hull of those of the points (n, 3) [m] that are extreme in 42 directions.
+
+    Points in a plane get the box around them, at least 1 mm thick.
+    """
+    from scipy.spatial import QhullError
+    from trimesh import convex, creation
+
+    directions = creation.icosphere(subdivisions=1).vertices
+    try:
+        corners = convex.convex_hull(points).vertices
+        return convex.convex_hull(corners[np.unique(np.argmax(corners @ directions.T, axis=0))])
+    except QhullError:
+        low, high = points.min(axis=0), points.max(axis=0)
+        half = 0.5 * np.maximum(high - low, _THINNEST_M)
+        middle = 0.5 * (low + high)
+        return creation.box(bounds=[middle - half, middle + half])
+
+
+def above(hull: trimesh.Trimesh, up: np.ndarray, height_m: float) -> trimesh.Trimesh | None:
+    """Returns the part of a hull above a height along the unit vector ``up`` (3,); None if none."""
+    from trimesh.intersections import slice_faces_plane
+
+    if (hull.vertices @ up).max() <= height_m:
+        return None
+    return convex_hull(slice_faces_plane(hull.vertices, hull.faces, up, height_m * up)[0])
 
 
 def _scene(path: Path) -> trimesh.Scene:

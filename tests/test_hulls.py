@@ -1,5 +1,6 @@
-"""`new` fits shapes to collision meshes that Drake does not read: the robot stands on its feet."""
+"""`new` replaces collision meshes that Drake does not read by hulls; the robot stands with them."""
 
+import shutil
 import sys
 import xml.etree.ElementTree as ElementTree
 
@@ -42,6 +43,12 @@ def bar(length=0.1, radius=0.02, x=0.06):
 def spider(tmp_path_factory):
     folder = tmp_path_factory.mktemp("urdf")
     urdf = shaped(folder, femur_0=bar(), femur_1=bar(), tibia_2=bar(x=0.1, length=0.15))
+    shin = (
+        f'<link name="shin">{urdf_files.mesh("collision", "shin.stl")}</link><joint name="weld" '
+        'type="fixed"><parent link="tibia_4"/><child link="shin"/></joint></robot>'
+    )
+    urdf.write_text(urdf.read_text().replace("</robot>", shin))
+    bar(x=0.14, length=0.12, radius=0.015).export(folder / "shin.stl")
     return write_robot("spider", urdf, "balancing", folder / "spider")
 
 
@@ -50,16 +57,32 @@ def collisions(written, link):
     return root.findall(f"link[@name='{link}']/collision")
 
 
-def test_lost_meshes_become_shapes_which_readme_lists(spider):
-    (shape,) = collisions(spider, "femur_0")
-    (capsule,) = shape.find("geometry")
-    assert capsule.tag.endswith("capsule")
-    assert float(capsule.get("radius")) == pytest.approx(0.02, rel=0.05)
+def hull_of(written, link):
+    """Vertices of the only hull of a link, in its frame, (n, 3)."""
+    (shape,) = collisions(written, link)
+    mesh = shape.find("geometry/mesh")
+    assert [part.tag.rpartition("}")[2] for part in mesh] == ["declare_convex"]
+    return trimesh.load_mesh(written.folder / mesh.get("filename")).vertices
+
+
+def test_collision_meshes_become_hulls_which_readme_lists(spider):
+    hull = hull_of(spider, "femur_0")
+    np.testing.assert_allclose(np.ptp(hull, axis=0), np.ptp(bar().vertices, axis=0), rtol=0.1)
     assert spider.bare == []
-    assert spider.fitted["capsule"] >= 2
+    assert spider.num_hulls == 3
     readme = (spider.folder / "README.md").read_text()
-    assert "'femur_0' capsule (" in readme
+    assert "replaced by convex hulls: femur_0.stl, femur_1.stl, tibia_2.stl, shin.stl" in readme
+    assert "Foot 'tibia_2' has no hull" in readme
     assert "without_collision" not in yaml.safe_load((spider.folder / "robot.yaml").read_text())
+
+
+def test_a_hull_that_is_welded_to_a_foot_ends_at_its_contact_points(spider):
+    survey = Survey(spider.files[0])
+    survey.set_joints(spider.posture)
+    (leg,) = (leg for leg in spider.legs if leg.body == "tibia_4")
+    heights = (survey.pose("shin") @ hull_of(spider, "shin").T)[2]
+    assert heights.min() == pytest.approx(survey.positions(leg)[0, 2], abs=1e-3)
+    assert np.ptp(heights) > 0.1
 
 
 def test_the_robot_stands_with_them(spider):
@@ -79,11 +102,11 @@ def test_a_foot_keeps_its_contact_spheres_alone(spider):
     assert [one.get("name") for one in of_mesh] == [one.get("name") for one in of_sphere]
 
 
-def test_where_a_primitive_would_touch_the_hull_is_taken_and_what_still_does_is_ignored(tmp_path):
+def test_collisions_of_a_hull_that_overlaps_another_link_are_off(tmp_path):
     # One longer than its link, across the whole robot.
     urdf = shaped(tmp_path, femur_0=bar(length=2.0, radius=0.1))
     written = write_robot("spider", urdf, "balancing", tmp_path / "spider")
-    assert written.fitted == {"hull": 1}
+    assert written.num_hulls == 1
     assert "<member" not in (tmp_path / "hexapod.urdf").read_text()
     assert_nothing_overlaps(written)
     readme = (written.folder / "README.md").read_text().lower()
@@ -110,20 +133,15 @@ def test_check_draws_the_standing_robot_beside_its_shapes(spider, tmp_path, is_l
     if is_legged:
         assert result.exit_code == 0
         text = picture.with_suffix(".svg").read_text()
-        assert "capsules" in text or picture.stat().st_size > 10_000
+        assert "convex hulls" in text or picture.stat().st_size > 10_000
     else:
         assert "--picture draws a legged robot" in str(result.exception or result.output)
 
 
-def test_mujoco_takes_the_fitted_hulls_too(tmp_path):
+def test_mujoco_takes_the_hulls_too(spider, tmp_path):
     pytest.importorskip("mujoco")
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
-    tip = trimesh.creation.cone(radius=0.02, height=0.1)
-    tip.apply_translation([0.02, 0.0, 0.0])
-    urdf = shaped(tmp_path, femur_0=trimesh.util.concatenate([ball, tip]))
-    written = write_robot("spider", urdf, "balancing", tmp_path / "spider")
-    assert written.fitted == {"hull": 1}
-    file = written.files[-1]
+    own = shutil.copytree(spider.folder, tmp_path / "own")
+    file = own / "balancing.yaml"
     text = file.read_text()
     file.write_text(text.replace("  nominal:", "  in_mujoco: {engine: mujoco}\n  nominal:", 1))
     loop = load_scenario(file).make_loop("in_mujoco", ball=False)
