@@ -193,7 +193,12 @@ def evaluate_alarms(
     judged = [motion for motion in test if not motion.leave_time_s < motion.push_time_s]
     is_unsafe = np.array([motion.has_left for motion in judged], dtype=bool)
     index = np.array([motion.index for motion in judged])
-    estimates = _motion_estimates(judged, len(test))
+    left = [motion for motion in judged if motion.has_left]
+    until_s = np.array([motion.leave_time_s - motion.push_time_s for motion in left])
+    estimates = {
+        "monitoring.motions.leave_safe_set": proportion(len(left), len(judged)),
+        "monitoring.motions.push_to_leaving_s": median(until_s),
+    }
     for alarm in alarms:
         lowest = np.array([lowest_value(m, persisting(alarm.value(m), num_rows)) for m in calm])
         threshold = equal_share_threshold(lowest, false_alarm_share)
@@ -204,20 +209,6 @@ def evaluate_alarms(
         found["threshold"] = Estimate.exact(threshold, len(calm))
         estimates |= {f"monitoring.{alarm.name}.{key}": estimate for key, estimate in found.items()}
     return estimates
-
-
-def _motion_estimates(judged: Sequence[Motion], num_test: int) -> dict[str, Estimate]:
-    left = [motion for motion in judged if motion.has_left]
-    hours = sum(float(motion.time_s[-1]) for motion in judged if not motion.has_left) / 3600.0
-    return {
-        "monitoring.motions.left_out": proportion(num_test - len(judged), num_test),
-        "monitoring.motions.leave_safe_set": proportion(len(left), len(judged)),
-        "monitoring.motions.fall": proportion(sum(m.has_fallen for m in left), len(judged)),
-        "monitoring.motions.safe_hours": Estimate.exact(hours, len(judged) - len(left)),
-        "monitoring.motions.push_to_leaving_s": median(
-            np.array([motion.leave_time_s - motion.push_time_s for motion in left])
-        ),
-    }
 
 
 def _alarm_estimates(
@@ -235,7 +226,6 @@ def _alarm_estimates(
     undisturbed_s = sum(min(motion.push_time_s, float(motion.time_s[-1])) for motion in judged)
     alarm_s = np.array([first_alarm(m, v, threshold, since_s=m.push_time_s) for m, v in left])
     leave = np.array([motion.leave_time_s for motion, _ in left])
-    pushed = np.array([motion.push_time_s for motion, _ in left])
     fall = np.array([motion.fall_time_s for motion, _ in left])
     has_fallen = np.isfinite(fall)
     return {
@@ -245,8 +235,6 @@ def _alarm_estimates(
             int(np.sum(alarm_s[has_fallen] < fall[has_fallen] - _SLACK_S)), int(has_fallen.sum())
         ),
         "lead_to_fall_s": median(fall[has_fallen] - alarm_s[has_fallen]),
-        "after_push_s": median(alarm_s - pushed),
-        "false_alarm_share": proportion(false, len(safe)),
         "false_alarms_per_hour": rate_per_hour(false, safe_s, len(safe)),
         "undisturbed_false_alarms_per_hour": rate_per_hour(early, undisturbed_s, len(judged)),
     }

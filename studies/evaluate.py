@@ -60,6 +60,7 @@ from studies.alarms import (
     threshold_alarms,
 )
 from studies.baselines import KINDS, auc_difference, classifier_scorers
+from studies.harness import CalibrationOption, EpisodesOption
 from studies.plans import Plans, Rule, evaluate_plans, plans_of, reachability_rule, scorer_rule
 from studies.pushed_motions import run_pushed_motions
 from studies.reachability import BASELINES, Reachability
@@ -73,11 +74,9 @@ _PLANT = "actual"
 def evaluate(
     scenario: ScenarioArgument,
     assessment: TrainingOption,
-    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
+    episodes: EpisodesOption = 1000,
     throws: Annotated[int, typer.Option(help="Fresh throws at the actual plant.", min=0)] = 0,
-    calibration_episodes: Annotated[
-        int, typer.Option(help="Other nominal episodes, for thresholds.", min=20)
-    ] = 300,
+    calibration_episodes: CalibrationOption = 300,
     calibration_throws: Annotated[
         int, typer.Option(help="Other throws, for thresholds of the classifiers.", min=1)
     ] = 200,

@@ -120,10 +120,11 @@ def evaluate_plans(
             found = _cause_estimates(
                 first, {k: v[rows] for k, v in causes.items()}, is_right, names
             )
-            found |= _outcome_estimates(plans.episodes, chosen)
+            outcomes = np.array([one.cause or "safe" for one in plans.episodes])[chosen]
+            for name in ("safe", *names, DIVERGED):
+                share = proportion(int(np.sum(outcomes == name)), len(outcomes))
+                found[f"outcomes.{name}"] = share
             estimates |= {f"{key}.{what}": one for what, one in found.items()}
-        share = proportion(int(plans.is_fair.sum()), len(plans.is_fair))
-        estimates[f"{prefix}.share_fair"] = share
     for prefix in twins:
         for name in rules:
             one, other = sets["plans"].first, sets[prefix].first
@@ -197,19 +198,4 @@ def _cause_estimates(
         if np.any(cause == i):
             count = int(is_right["right_cause"][cause == i].sum())
             estimates[f"causes.{name}"] = proportion(count, int(np.sum(cause == i)))
-    return estimates
-
-
-def _outcome_estimates(episodes: Episodes, chosen: np.ndarray) -> dict[str, Estimate]:
-    """Shares of outcomes, diverged ones included, and controller failures."""
-    outcomes = np.array([one.cause or "safe" for one in episodes])[chosen]
-    failures = np.array([one.num_controller_failures for one in episodes])[chosen]
-    n = len(outcomes)
-    estimates = {
-        f"outcomes.{name}": proportion(int(np.sum(outcomes == name)), n)
-        for name in ("safe", *episodes.info.constraint_names, DIVERGED)
-    }
-    key = "episodes_with_controller_failures"
-    estimates[key] = proportion(int(np.sum(failures > 0)), n)
-    estimates["controller_failures"] = Estimate.exact(float(failures.sum()), n)
     return estimates

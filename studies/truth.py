@@ -25,6 +25,7 @@ from drake_safety.evaluation.figure_style import (
     save,
 )
 from drake_safety.evaluation.metrics import Estimate, proportion
+from drake_safety.evaluation.shift_study import CONFIDENT
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.seeds import EVALUATION
@@ -37,8 +38,6 @@ from studies.harness import EpisodesOption, SeedOption, open_study
 
 THRESHOLD = 0.5
 """Lowest Γ that is classified safe."""
-CONFIDENT = 0.9
-"""Γ is confident above this, and below one minus this."""
 
 
 def truth(
@@ -252,7 +251,7 @@ def random_plan_estimates(assessment: SafetyAssessment, episodes: Episodes) -> d
 
 
 def is_confidently_wrong(is_safe: np.ndarray, probability: np.ndarray) -> np.ndarray:
-    """Whether Γ is confident and wrong, element by element."""
+    """Whether Γ is confident, at `CONFIDENT` or one minus it, and wrong, element by element."""
     return np.where(is_safe, probability <= 1 - CONFIDENT, probability >= CONFIDENT)
 
 

@@ -206,7 +206,6 @@ def alarm_estimates(
     until = np.array([motion.fall_time_s - motion.push_time_s for motion in fallen])
     estimates = {
         "pushes.fallen": proportion(len(fallen), len(judged)),
-        "pushes.left": proportion(sum(motion.has_left for motion in judged), len(judged)),
         "pushes.push_to_fall_s": median(until),
         "pushes.fallen_soon": proportion(int(np.sum(until < push_s + EARLY_S)), len(fallen)),
     }
@@ -297,23 +296,17 @@ def guard_estimates(
         guarded: The same with the guard.
         inside: Tours of commands inside the ranges, with the guard.
     """
-    without = sum(motion.has_fallen for motion in unguarded)
-    with_guard = sum(motion.has_fallen for motion in guarded)
     kept = np.array([float(np.mean(motion["guard_active"] == 0)) for motion in inside])
     estimates = {
-        "guard.falls_without": proportion(without, len(unguarded)),
-        "guard.falls_with": proportion(with_guard, len(guarded)),
+        "guard.falls_without": proportion(sum(m.has_fallen for m in unguarded), len(unguarded)),
+        "guard.falls_with": proportion(sum(m.has_fallen for m in guarded), len(guarded)),
         "guard.left_without": proportion(sum(m.has_left for m in unguarded), len(unguarded)),
         "guard.left_with": proportion(sum(m.has_left for m in guarded), len(guarded)),
-        "guard.fewer_falls": Estimate.exact(1.0 - with_guard / max(without, 1), len(guarded)),
     }
     if len(inside):
         low, high = np.quantile(kept, [0.025, 0.975])
         estimates["guard.unchanged_inside"] = Estimate(
             float(kept.mean()), float(low), float(high), len(inside)
-        )
-        estimates["guard.falls_inside"] = proportion(
-            sum(motion.has_fallen for motion in inside), len(inside)
         )
     return estimates
 

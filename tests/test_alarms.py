@@ -37,14 +37,7 @@ def motion_of(index, values, *, leaves=False, falls=False, push_time_s=PUSH_S):
     )
 
 
-def seen(delay_rows=0):
-    def value(motion):
-        calm = motion["state"][:, 0]
-        return np.concatenate([np.ones(delay_rows), calm[: len(calm) - delay_rows]])
-
-    return Alarm(name="sharpened", value=value)
-
-
+SEEN = Alarm(name="sharpened", value=lambda motion: motion["state"][:, 0])
 CALM = [motion_of(i, {1.1: 0.9 - 0.01 * i}) for i in range(20)]
 TEST = [
     motion_of(0, {1.1: 0.2}, leaves=True, falls=True),
@@ -56,54 +49,43 @@ TEST = [
 ]
 
 
-def figures_of(alarm, **options):
-    return evaluate_alarms([alarm], CALM, TEST, num_rows=1, **options)
+def figures_of(motions, num_rows=1):
+    found = evaluate_alarms([SEEN], CALM, motions, num_rows=num_rows)
+    return {key.removeprefix("monitoring."): estimate.value for key, estimate in found.items()}
 
 
-def test_what_is_noticed_is_noticed_between_push_and_leaving():
-    estimates = figures_of(seen())
+def test_what_is_noticed_is_noticed_between_push_and_leaving_and_all_else_is_false():
+    found = figures_of(TEST)
     # The first two in time, the third too late but before the fall, the fourth only too early.
-    assert estimates["monitoring.sharpened.detected"].value == 2 / 4
-    assert estimates["monitoring.sharpened.lead_to_leaving_s"].value == pytest.approx(0.0)
-    assert estimates["monitoring.sharpened.falls_detected"].value == 2 / 2
-    assert estimates["monitoring.sharpened.lead_to_fall_s"].value == pytest.approx((0.7 + 0.3) / 2)
-    assert estimates["monitoring.motions.leave_safe_set"].value == 4 / 6
-    assert estimates["monitoring.motions.push_to_leaving_s"].value == pytest.approx(0.4)
-    # Who sees the same later has that much less time.
-    late = figures_of(seen(delay_rows=2))
-    assert late["monitoring.sharpened.lead_to_fall_s"].value == pytest.approx((0.5 + 0.1) / 2)
-    assert late["monitoring.sharpened.detected"].value == 1 / 4
+    assert found["sharpened.detected"] == 2 / 4
+    assert found["sharpened.lead_to_leaving_s"] == pytest.approx(0.0)
+    assert found["sharpened.falls_detected"] == 2 / 2
+    assert found["sharpened.lead_to_fall_s"] == pytest.approx((0.7 + 0.3) / 2)
+    assert found["motions.leave_safe_set"] == 4 / 6
+    # One in two safe motions of 3.6 s each, and one in six times 1 s before a push.
+    assert found["sharpened.false_alarms_per_hour"] == pytest.approx(500)
+    assert found["sharpened.undisturbed_false_alarms_per_hour"] == pytest.approx(600)
+    # Motions that leave before the push are left out.
+    early = motion_of(6, {}, leaves=True, push_time_s=2.0)
+    unpushed = motion_of(7, {}, leaves=True, push_time_s=math.inf)
+    assert figures_of([*TEST, early, unpushed]) == found
 
 
 def test_an_alarm_of_two_rows_comes_a_row_later_and_ignores_a_single_one():
     blow = [motion_of(0, {1.0: np.nan, 1.1: 1.0})]
-    one, two = (evaluate_alarms([seen()], CALM, [*TEST, *blow], num_rows=n) for n in (1, 2))
-    leads = [found["monitoring.sharpened.lead_to_fall_s"].value for found in (one, two)]
-    assert leads[0] - leads[1] == pytest.approx(0.1)
-    false = [found["monitoring.sharpened.false_alarm_share"].value for found in (one, two)]
-    assert false == [2 / 3, 1 / 3]
-
-
-def test_false_alarms_are_counted_once_a_motion_over_all_hours():
-    estimates = figures_of(seen())
-    assert estimates["monitoring.sharpened.false_alarm_share"].value == 1 / 2
-    # One in two safe motions of 3.6 s each, and one in six times 1 s before a push.
-    assert estimates["monitoring.sharpened.false_alarms_per_hour"].value == pytest.approx(500)
-    rate = estimates["monitoring.sharpened.undisturbed_false_alarms_per_hour"]
-    assert rate.value == pytest.approx(600)
-    assert estimates["monitoring.motions.safe_hours"].value == pytest.approx(0.002)
+    one, two = (figures_of([*TEST, *blow], num_rows=n) for n in (1, 2))
+    key = "sharpened.lead_to_fall_s"
+    assert one[key] - two[key] == pytest.approx(0.1)
+    # 3.6 s of each of three safe motions.
+    key = "sharpened.false_alarms_per_hour"
+    assert [found[key] * 3 * 3.6 / 3600 for found in (one, two)] == pytest.approx([2, 1])
 
 
 def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
-    alarm = Alarm(name="one", value=lambda m: 39.37 * m["state"][:, 0] - 20.0)
-
-    def num_cries(threshold):
-        return sum(math.isfinite(first_alarm(m, alarm.value(m), threshold)) for m in CALM)
-
+    lowest = np.array([lowest_value(motion, motion["state"][:, 0]) for motion in CALM])
     for share, count in ((0.0, 0), (0.05, 1), (0.25, 5), (0.26, 5)):
-        found = figures_of(alarm, false_alarm_share=share)
-        threshold = found["monitoring.one.threshold"].value
-        assert num_cries(threshold) == count < num_cries(threshold + 39.37 * 0.011)
+        threshold = equal_share_threshold(lowest, share)
+        assert (lowest < threshold).sum() == count < (lowest < threshold + 0.011).sum()
     with pytest.raises(ValueError, match="no calibration motion stays in the safe set"):
         equal_share_threshold(np.array([]), 0.1)
 
@@ -122,14 +104,6 @@ def test_of_a_motion_that_leaves_only_what_is_between_push_and_leaving_counts():
     assert lowest_value(motion, motion["state"][:, 0]) == 0.5
     at_once = motion_of(0, {1.4: 0.1}, leaves=True, push_time_s=1.4)
     assert lowest_value(at_once, at_once["state"][:, 0]) == math.inf
-
-
-def test_motions_that_leave_before_the_push_are_left_out():
-    early = motion_of(6, {}, leaves=True, push_time_s=2.0)
-    unpushed = motion_of(7, {}, leaves=True, push_time_s=math.inf)
-    found = evaluate_alarms([seen()], CALM, [*TEST, early, unpushed])
-    assert found["monitoring.motions.left_out"].value == 2 / 8
-    assert found["monitoring.sharpened.auc"].n == 6
 
 
 def test_tilt_is_the_angle_to_the_vertical_whatever_the_yaw():

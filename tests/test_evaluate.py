@@ -2,7 +2,7 @@ import shutil
 
 import pytest
 
-from command_line import call, study
+from command_line import call
 from drake_safety.cli.training_folder import MODES, fresh_episodes_folder, load_assessment
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.seeds import SHIFTS
@@ -64,43 +64,6 @@ def count_episodes(monkeypatch):
 
     monkeypatch.setattr(rollouts, "run_episode", counted)
     return indices
-
-
-@pytest.mark.slow
-def test_shifts_and_promises_are_studied_beside_baselines(monkeypatch, capsys, shuttle_run):
-    file, folder = shuttle_run
-    out, where = folder / "beside", ("--assessment", folder, "--workers", 1)
-    shifts = ("--shifts", 6, "--episodes", 12, "--out", out)
-    assert study(monkeypatch, "evaluate", file, *where, *shifts) == 0
-    found = Results.read(out / "shifts.json")
-    assert found.entries["kinds"]["state of another row"] == "junk"
-    for method in ("gamma", "without_novelty", "gradient_boosting", "mlp", "deep_knn"):
-        assert f"shifts.gaussian.{method}.confident_error" in found
-        assert f"shifts.nominal.{method}.first.confident_error" in found
-    assert study(monkeypatch, "promises", file, *where, "--episodes", 40, "--splits", 5) == 0
-    assert "needs 99 unsafe episodes" in " ".join(capsys.readouterr().out.split())
-
-
-@pytest.mark.slow
-def test_beside_baselines_the_same_figures_and_more_come_out(monkeypatch, capsys, shuttle_run):
-    file, folder = shuttle_run
-    monkeypatch.setattr("drake_safety.cli.evaluate.save", lambda figure, path: [])
-    assert evaluate_shuttle(monkeypatch, shuttle_run) == 0
-    alone = Results.read(folder / "evaluation.json")
-    arguments = ("--other-hand", 10, "--plane-step", 0.6, "--pushes", 15)
-    assert study(monkeypatch, "evaluate", file, "--assessment", folder, *OPTIONS, *arguments) == 0
-    beside = Results.read(folder / "evaluation.json")
-    assert {key: beside[key] for key in alone} == dict(alone)
-    for method in ("sharpened", "paper", "gradient_boosting", "mlp"):
-        for prefix in ("plans", "plans.fair", "plans.other_hand", "plans.other_hand.fair"):
-            assert f"{prefix}.{method}.unsafe_recall" in beside
-    assert beside["plans.other_hand.outcomes.safe"].n == 10
-    assert "plans.plane.sharpened.right" in beside
-    alarms = {row.method for row in beside.select(set="monitoring")}
-    assert alarms > {"motions", "sharpened", "paper", "mlp", "front_margin", "smallest_margin"}
-    pushed, refused = (beside[f"monitoring.motions.{k}"] for k in ("leave_safe_set", "refused"))
-    assert refused.n == 30 and pushed.n == 30 - round(30 * refused.value)
-    assert "Alarms on pushed motions" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -11,7 +11,8 @@ pytestmark = pytest.mark.train
 
 def test_the_path_is_that_of_the_points_and_events_are_marked_where_they_happen():
     episodes = make_episodes(80)
-    assessment = SafetyAssessment(AssessmentParameters(mode="paper", **QUICK)).fit(episodes)
+    parameters = AssessmentParameters(mode="paper", **QUICK | {"epochs": 1, "ensemble_size": 1})
+    assessment = SafetyAssessment(parameters).fit(episodes)
     one = episodes[0]
     found = assessment.predict(one.true_state, one.desired_preview)
     time_s = one.time_s

@@ -7,10 +7,8 @@ from drake_safety import SafetyAssessment, run_episodes
 from drake_safety.evaluation.episode_study import promised_miss_rate
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.learning.calibration import score_threshold
-from drake_safety.learning.segments import DIVERGED, Episodes
-from shuttle_task import BOX, FAILING_Z_M, FAIR_X_M, shuttling
+from shuttle_task import FAIR_X_M, shuttling
 from studies.plans import (
-    _outcome_estimates,
     evaluate_plans,
     named_causes,
     plans_of,
@@ -69,26 +67,10 @@ def study(assessment, calibration, plans):
 def test_a_plan_is_what_is_known_at_its_first_instant_and_where_it_leads(fresh, plans):
     assert plans.first.is_first.all()
     np.testing.assert_array_equal(plans.first.state, [episode.state[0] for episode in fresh])
-    assert np.all((plans.goals >= BOX[0] - 1e-9) & (plans.goals <= BOX[1] + 1e-9))
     # Unsafe is exactly what leads beyond a wall.
     np.testing.assert_array_equal(plans.first.is_unsafe, (plans.goals[:, :2] > 1.0).any(axis=1))
     assert 0 < plans.is_fair.sum() < len(fresh)
     assert plans.goals[plans.is_fair, 0].min() >= FAIR_X_M
-
-
-def test_outcomes_controller_failures_and_diverged_episodes_are_counted(fresh, plans):
-    broken = replace(fresh[0], is_safe=False, cause=DIVERGED)
-    some = plans_of(shuttling().make_loop(), Episodes(fresh.info, [broken, *fresh[1:10]]))
-    assert (len(some.first), len(some.episodes)) == (9, 10)
-    assert _outcome_estimates(some.episodes, np.ones(10, bool))["outcomes.diverged"].value == 0.1
-    found = _outcome_estimates(fresh, np.ones(len(fresh), dtype=bool))
-    shares = [found[f"outcomes.{name}"] for name in ("safe", "front", "flank", DIVERGED)]
-    assert sum(share.value for share in shares) == pytest.approx(1.0)
-    assert shares[0].value == fresh.num_safe / len(fresh)
-    # A failure is counted where the velocity says so, which the start point shifts a little.
-    num_failing = np.sum(plans.goals[:, 2] - plans.first.state[:, 2] > FAILING_Z_M)
-    assert found["controller_failures"].value == num_failing
-    assert found["episodes_with_controller_failures"].value == num_failing / len(fresh)
 
 
 @pytest.mark.train
@@ -98,15 +80,6 @@ def test_thresholds_come_from_the_calibration_plans_and_miss_none_of_them(study,
     assert limits["sharpened"] == score_threshold(score, label, promised_miss_rate(label))
     assert (score[label] > limits["sharpened"]).all()
     assert limits["stubborn"] == 0.5
-    # Told as the safety probability below which a plan is refused.
-    assert estimates["plans.sharpened.threshold"].value == 1.0 - limits["sharpened"]
-
-
-@pytest.mark.train
-def test_who_sees_what_happens_is_right_and_who_refuses_all_has_no_safe_recall(study, plans):
-    estimates, _ = study
-    assert estimates["plans.sharpened.auc"].value == 1.0
-    assert estimates["plans.sharpened.unsafe_recall"].n == plans.first.is_unsafe.sum()
     assert estimates["plans.stubborn.unsafe_recall"].value == 1.0
     # One score for all: nothing is accepted rather than an unsafe plan.
     for name in ("stubborn", "blind"):
@@ -124,8 +97,6 @@ def test_causes_are_judged_on_the_correctly_refused_alone(study, assessment, pla
         right = np.mean((causes == first.cause)[rows])
         assert estimates[f"plans.causes.{name}"].value == right
         assert estimates[f"plans.causes.{name}"].n == rows.sum()
-    by_cause = [estimates[f"plans.causes.{name}"] for name in ("front", "flank")]
-    assert sum(one.n for one in by_cause) == rows.sum()
 
 
 def test_reachability_answers_for_the_hand_that_reaches(plans):

@@ -22,12 +22,6 @@ def reachability(robot):
     return {hand: Reachability(robot, hand) for hand in robot.reaching_frames}
 
 
-def test_where_the_hand_already_is_can_be_reached(robot, kinematics, reachability):
-    for hand, frame in robot.reaching_frames.items():
-        point = kinematics.reaching_position(kinematics.standing_positions(), frame)
-        assert reachability[hand].miss(point) < 1e-4
-
-
 def test_what_forward_kinematics_gets_to_inverse_kinematics_gets_to(
     robot, kinematics, reachability
 ):
@@ -49,34 +43,16 @@ def test_a_point_that_is_too_far_is_missed_by_as_much_more_as_it_is_further(reac
     assert far - near == pytest.approx(1.0, abs=0.05)
 
 
-def test_the_joints_between_base_and_hand_move_and_no_other(robot, reachability):
-    legs = {name for foot in robot.feet.values() for name in foot.joints}
-    for hand, frame in robot.reaching_frames.items():
-        names = set(reachability[hand].joint_names)
-        assert set(frame.joints) < names
-        assert not names & legs
-    left, right = (set(reachability[hand].joint_names) for hand in ("left", "right"))
-    assert left & right == set(reachability["left"].joint_names) - set(
-        robot.reaching_frame("left").joints
-    )
-
-
 def test_the_other_hand_reaches_the_mirror_image(kinematics, reachability):
     rng = np.random.default_rng(1)
     points = rng.uniform([0.45, -0.3, 0.5], [1.0, 1.3, 1.6], (12, 3))
     images = Mirror(kinematics).points(points)
     left, right = reachability["left"], reachability["right"]
-    np.testing.assert_allclose(
-        [left.miss(point) for point in points], [right.miss(point) for point in images], atol=5e-3
-    )
+    forward = [left.miss(point) for point in points]
+    np.testing.assert_allclose(forward, [right.miss(point) for point in images], atol=5e-3)
+    # An answer does not depend on what was asked before.
+    assert [left.miss(point) for point in points[:3][::-1]] == forward[:3][::-1]
     np.testing.assert_array_equal(left.is_reachable(points), right.is_reachable(images))
-
-
-def test_an_answer_does_not_depend_on_what_was_asked_before(reachability):
-    points = np.array([[0.7, 0.4, 1.0], [0.9, 1.2, 0.6], [0.6, 0.2, 1.5]])
-    forward = [reachability["left"].miss(point) for point in points]
-    backward = [reachability["left"].miss(point) for point in points[::-1]]
-    np.testing.assert_array_equal(forward, backward[::-1])
 
 
 def test_a_free_base_reaches_further_and_the_feet_stay_where_they_are(robot, kinematics):

@@ -5,7 +5,7 @@ import pytest
 
 from drake_safety import SafetyAssessment, run_episodes
 from drake_safety.evaluation.scorers import assessment_scorer
-from shuttle_task import BOX, FAIR_X_M, shuttling
+from shuttle_task import shuttling
 from studies.reachable_region import SAFE, reachable_region, region_figure
 
 
@@ -27,32 +27,11 @@ def region(assessment):
 
 
 @pytest.mark.train
-def test_the_plane_covers_the_target_box_and_what_needs_no_simulation_is_finer(region):
-    for fine, coarse, low, high in (
-        (region.y_m, region.simulated_y_m, *BOX[:, 1]),
-        (region.z_m, region.simulated_z_m, *BOX[:, 2]),
-    ):
-        assert (coarse[0], coarse[-1]) == (low, high)
-        assert (fine[0], fine[-1]) == (low, high)
-        # Every simulated target is one of the fine ones.
-        assert np.abs(coarse[:, None] - fine).min(axis=1).max() < 1e-12
-        assert len(fine) > 2 * len(coarse)
-    assert region.probability.shape == (len(region.z_m), len(region.y_m))
-
-
-@pytest.mark.train
 def test_the_truth_is_what_the_simulation_says_of_each_target(region):
     y = np.broadcast_to(region.simulated_y_m, region.outcomes.shape)
     # From the origin a mass that is carried beyond y = 1 leaves through the flank.
     np.testing.assert_array_equal(region.outcomes == "flank", y > 1.0)
     np.testing.assert_array_equal(region.outcomes == SAFE, y <= 1.0)
-
-
-@pytest.mark.train
-def test_beyond_a_wall_the_truth_is_that_wall(assessment):
-    region = on_plane(assessment, x_m=1.2, step_m=0.6)
-    assert set(region.outcomes[region.outcomes != "flank"]) == {"front"}
-    assert region.estimates()["share_safe"].value == 0.0
 
 
 @pytest.mark.train
@@ -78,31 +57,6 @@ def test_verdicts_are_compared_with_the_truth_where_it_is_known(region):
     is_right = verdict[np.ix_(rows, columns)] == (region.outcomes == SAFE)
     assert estimates["sharpened.right"].value == pytest.approx(is_right.mean())
     assert estimates["sharpened.right"].n == region.outcomes.size
-    # A task without a hand has no kinematics to compare with.
-    assert region.is_reachable == {}
-    assert not any(name.startswith("reachability") for name in estimates)
-
-
-@pytest.mark.train
-def test_the_plane_is_in_the_middle_of_the_fair_box_unless_it_is_said_where(assessment):
-    assert on_plane(assessment, step_m=0.8).x_m == pytest.approx(0.5 * (FAIR_X_M + BOX[1, 0]))
-
-
-@pytest.mark.train
-def test_the_picture_shows_left_on_the_left_and_every_outcome_in_the_legend(region):
-    figure = region_figure(region, ["front", "flank"])
-    (axes,) = figure.axes
-    left, right = axes.get_xlim()
-    assert left > right
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    share = np.mean(region.outcomes == "flank")
-    assert f"flank {100 * share:.0f} %" in labels
-    assert not any(label.startswith("front") for label in labels)
-    assert f"probability {region.threshold:.2f}" in labels
-    assert not any(label.startswith("inverse kinematics") for label in labels)
-    assert any("don't know" in label for label in labels) == bool(
-        np.isnan(region.probability).any()
-    )
 
 
 @pytest.mark.train
@@ -110,9 +64,13 @@ def test_what_is_not_known_is_hatched_and_not_accepted(region):
     probability = np.full_like(region.probability, 0.9)
     probability[: len(probability) // 2] = np.nan
     half = replace(region, probability=probability)
-    labels = [text.get_text() for text in region_figure(half, ["flank"]).legends[0].get_texts()]
+    figure = region_figure(half, ["front", "flank"])
+    left, right = figure.axes[0].get_xlim()
+    assert left > right  # The robot's left.
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert not any(label.startswith("front") for label in labels)
     share = 100 * np.isnan(probability).mean()
     assert f"Γ: don't know, {share:.0f} %" in labels
     accepted = probability[::4, ::4] >= half.threshold
-    right = (accepted == (half.outcomes == SAFE)).mean()
-    assert half.estimates()["sharpened.right"].value == pytest.approx(right)
+    is_right = (accepted == (half.outcomes == SAFE)).mean()
+    assert half.estimates()["sharpened.right"].value == pytest.approx(is_right)

@@ -1,19 +1,84 @@
+"""Every study's command on the smallest real input: what it writes, and what it says."""
+
+import itertools
+import math
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
+from PIL import Image
 
-from command_line import study as call
+from command_line import call, study
+from drake_safety.assessments import shipped_folder
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
-from drake_safety.evaluation.metrics import proportion
+from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.segments import training_segments
+from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
-from shuttle_task import train_shuttle
-from studies import planning, scale
+from shuttle_task import shuttling, train_shuttle
 from studies.__main__ import app
+from studies.anomalies import anomalies
+from studies.documents import render
+from studies.publish import DOCUMENTS
+from studies.scale import counts_for
+
+ROOT = Path(__file__).resolve().parents[1]
+FRESH = "--episodes 40 --calibration-episodes 30 --seed 100"
+# By command line: the file that it writes, and some of its rows.
+STUDIES = {
+    f"evaluate {FRESH} --other-hand 10 --plane-step 0.6 --pushes 15": (
+        "evaluation",
+        "plans.mlp.auc, plans.fair.gradient_boosting.safe_recall, plans.other_hand.outcomes.safe, "
+        "plans.other_hand.fair.paper.unsafe_recall, plans.plane.sharpened.right, "
+        "monitoring.mlp.auc, monitoring.front_margin.detected, monitoring.smallest_margin.auc",
+    ),
+    "evaluate --shifts 6 --episodes 12": (
+        "shifts",
+        "shifts.gaussian.deep_knn.confident_error, shifts.nominal.mlp.first.confident_error, "
+        "shifts.gaussian.without_novelty.unknown, shifts.variation actual.isolation_forest.unknown",
+    ),
+    "promises --episodes 40 --splits 5 --seed 100": (
+        "promises",
+        "promises.plan.miss_rate 0.1.missed",
+    ),
+    f"ablate {FRESH} --only min_count": (
+        "ablation",
+        "k0.baseline.auc, segments.min_count 1.auc_gain, segments.min_count 50.calibrated_auc",
+    ),
+    "plan-study --episodes 10 --candidates 3": (
+        "planning",
+        "planning.default plan.safe, planning.chosen.safe, planning.best in hindsight.safe",
+    ),
+    "monitor --motions 2 --hours 0.001": (
+        "monitor",
+        "monitor.variation_actual.confident_error_60s, monitor.nominal.false_alarms_per_hour",
+    ),
+    "adaptation --feedback 40 --evaluate 20 --pools 2 --oracle 40 --scratch": (
+        "adapted-actual/study",
+        "sharpened.calibrated.adapted 40.brier, paper.grid.oracle.auc, losses.update.brier, "
+        "sharpened.calibrated.scratch 40.brier, paper.grid.adapted 40.pools_won",
+    ),
+    f"readings {FRESH} --only none --sizes 60": (
+        "readings",
+        "readings.0.first.normalized.auc, readings.0.segments.converged.unsafe_recall",
+    ),
+    f"converged {FRESH}": (
+        "converged",
+        "converged.first.literal.auc, converged.fair.converged.auc, "
+        "converged.segments.discrepancy.brier, converged.segments.conformal.threshold",
+    ),
+    "scale --sizes 200 --exact 200 --episodes 40 --seed 100": (
+        "scale",
+        "costs.paper 200.peak GB, k0.paper 200.auc, "
+        "segments.paper 200 exact.approximate minus exact",
+    ),
+}
 
 
 @pytest.fixture(scope="module")
@@ -22,118 +87,58 @@ def run(tmp_path_factory):
     return train_shuttle(folder), folder
 
 
-def results_of(monkeypatch, capsys, folder, name, *arguments):
-    """The results that a command writes into the folder as NAME.json, and what it prints."""
-    assert call(monkeypatch, *arguments) == 0
-    results = Results.read(folder / f"{name}.json")
-    assert results.entries["command"].startswith(f"python -m studies {arguments[0]} ")
-    return results, " ".join(capsys.readouterr().out.split())
-
-
-FRESH = ("--episodes", 40, "--calibration-episodes", 30, "--seed", 100, "--workers", 1)
-
-
-@pytest.mark.slow
-def test_an_ablation_gives_rows_of_every_variant_and_goes_on_where_it_was_stopped(
-    monkeypatch, capsys, run
-):
-    file, folder = run
-    options = ("ablate", file, "--assessment", folder, "--only", "min_count", *FRESH)
-    found, printed = results_of(monkeypatch, capsys, folder, "ablation", *options)
-    names = ["baseline", "min_count 1", "min_count 20", "min_count 50"]
-    assert [row.method for row in found.select(set="k0", metric="auc")] == names
-    assert all(row.n == 40 for row in found.select(set="k0", metric="auc"))
-    assert "min_count 20" in printed.replace("min count", "min_count")
-    assert (folder / "ablation.png").is_file()
-    monkeypatch.setattr(SafetyAssessment, "fit", None)
-    again, _ = results_of(monkeypatch, capsys, folder, "ablation", *options)
-    assert dict(again) == dict(found)
-    assert call(monkeypatch, "ablate", file, "--assessment", folder, "--seed", 0) == 2
-    assert "start as the" in " ".join(capsys.readouterr().out.split())
+def results_of(file, rows):
+    """The results in a file: figures, each with an interval around it, if there is a sample."""
+    found = Results.read(file)
+    for key in rows.split(", "):
+        assert math.isfinite(found[key].value), key
+    for key, row in found.items():
+        assert not (row.low > row.value or row.value > row.high), key
+    return found
 
 
 @pytest.mark.slow
-def test_a_plan_study_tells_what_choosing_by_gamma_is_worth(monkeypatch, capsys, run, tmp_path):
-    file, trained = run
-    folder = tmp_path / "never_judged"  # Others evaluate theirs, which chooses a threshold.
-    folder.mkdir()
-    shutil.copy(trained / "sharpened.safetensors", folder)
-    options = ("plan-study", file, "--assessment", folder, "--episodes", 10, "--candidates", 3)
-    options += ("--workers", 1, "--out", tmp_path)
-    found, printed = results_of(monkeypatch, capsys, tmp_path, "planning", *options)
-    shares = [
-        found[f"planning.{name}.safe"] for name in ("default plan", "chosen", "best in hindsight")
-    ]
-    assert sorted(one.value for one in shares) == [one.value for one in shares]
-    assert {one.n for one in shares} == {10}
-    assert "promises nothing" in printed
-    # The motions are kept with the assessment: a second study simulates nothing.
-    monkeypatch.setattr(planning, "run_episode", None)
-    again, _ = results_of(monkeypatch, capsys, tmp_path, "planning", *options)
-    assert dict(again) == dict(found)
-    monkeypatch.undo()
-    assert call(monkeypatch, *options, "--seed", 0) == 2
-    assert "start as the" in capsys.readouterr().out
+@pytest.mark.parametrize("line", STUDIES)
+def test_a_study_of_a_run_writes_its_figures(monkeypatch, run, line):
+    scenario, folder = run
+    (command, *options), (name, rows) = line.split(" "), STUDIES[line]
+    # So few episodes cannot promise the recall of the documentation.
+    monkeypatch.setattr("studies.converged.PROMISED_UNSAFE_RECALL", 0.8)
+    arguments = (scenario, "--assessment", folder, "--workers", 1, *options)
+    assert study(monkeypatch, command, *arguments) == 0
+    found = results_of(folder / f"{name}.json", rows)
+    assert found.entries["command"].startswith(f"python -m studies {command} ")
+    pictures = {"shifts", "ablation", "planning", "adapted-actual/study", "scale"}
+    assert (folder / f"{name}.png").is_file() == (name in pictures)
+    if name == "evaluation":
+        # Beside baselines Γ has the figures that `drake-safety evaluate` gives.
+        alone = ("evaluate", scenario, "--assessment", folder, "--workers", 1, *FRESH.split(" "))
+        monkeypatch.setattr("drake_safety.cli.evaluate.save", lambda figure, path: [])
+        assert call(monkeypatch, *alone) == 0
+        same = Results.read(folder / "evaluation.json")
+        assert {key: found[key] for key in same} == dict(same)
 
 
 @pytest.mark.slow
-def test_studies_of_a_run_are_stored_with_its_evaluation(monkeypatch, capsys, run):
-    file, folder = run
-    options = (file, "--assessment", folder, "--episodes", 40, "--seed", 100, "--workers", 1)
-    # A promised miss rate takes more than a hundred unsafe episodes.
-    more = (*options, "--calibration-episodes", 300)
-    found, _ = results_of(monkeypatch, capsys, folder, "converged", "converged", *more)
-    assert {"converged.first.literal.auc", "converged.fair.converged.auc"} <= set(found)
-    only = ("--calibration-episodes", 30, "--only", "none", "--sizes", 60)
-    found, _ = results_of(monkeypatch, capsys, folder, "readings", "readings", *options, *only)
-    assert found.entries["names"] == ["default, 60 episodes"]
-    assert found["readings.0.first.normalized.auc"].n == 40
-    assert call(monkeypatch, "readings", *options, "--only", "default") == 2
+def test_what_a_run_is_too_small_or_not_fresh_for_is_refused(monkeypatch, capsys, run):
+    scenario, folder = run
+    given = (scenario, "--assessment", folder, "--workers", 1)
+    for command in ("ablate", "plan-study"):
+        assert study(monkeypatch, command, *given, "--seed", 0) == 2
+        assert "start as the" in " ".join(capsys.readouterr().out.split())
+    assert study(monkeypatch, "readings", *given, *FRESH.split(" "), "--only", "default") == 2
     assert "holds 60 episodes, expected at least 1024" in " ".join(capsys.readouterr().out.split())
-    Results({"plans.sharpened.auc": proportion(29, 30)}, {"command": "x"}).write(
-        folder / "evaluation.json"
-    )
-    stored = folder / "stored.json"
-    assert call(monkeypatch, "store", "--assessment", folder, "--out", stored) == 0
-    again = Results.read(stored)
-    assert {"plans.sharpened.auc", "converged.first.literal.auc"} <= set(again)
-    assert again.entries["converged"]["feedback_episodes"] == 300
-    assert again.entries["readings"]["seed"] == 100
-    for name in ("evaluation", "converged", "readings"):
-        (folder / f"{name}.json").unlink()
+    # A size is that of the first episodes with so many segments.
+    episodes, parameters = load_episodes(episodes_folder(folder)), shuttling().assessment
+    count = counts_for({100}, episodes, parameters)[100]
+    with_fewer = training_segments(episodes[: count - 1], parameters)
+    assert len(with_fewer) < 100 <= len(training_segments(episodes[:count], parameters))
+    with pytest.raises(ValueError, match=r"the 60 episodes of .* have .* segments; got sizes"):
+        counts_for({100, 10**9}, episodes, parameters)
 
 
 @pytest.mark.slow
-def test_adaptation_is_judged_on_several_pools_beside_its_baselines(monkeypatch, capsys, run):
-    file, folder = run
-    scenario = load_scenario(file)
-    name = next(one for one in scenario.variations if one != "nominal")
-    options = ("--assessment", folder, "--variation", name, "--feedback", 40, "--evaluate", 20)
-    options += ("--pools", 2, "--oracle", 40, "--scratch", "--workers", 1)
-    out = folder / f"adapted-{name}"
-    found, _ = results_of(monkeypatch, capsys, out, "study", "adaptation", file, *options)
-    assert found.entries["feedback_sets"] == [40, 40]
-    for method in ("prior", "adapted 40", "oracle", "scratch 40"):
-        assert found[f"sharpened.calibrated.{method}.brier"].n == 40
-    for picture in ("study", "adaptation_sharpened"):
-        assert (out / f"{picture}.png").is_file()
-
-
-@pytest.mark.slow
-def test_scale_learns_in_a_process_of_its_own_and_keeps_what_it_has(monkeypatch, capsys, run):
-    file, folder = run
-    options = ("scale", file, "--assessment", folder, "--sizes", "200", "--exact", "200")
-    options += ("--episodes", 20, "--seed", 100, "--workers", 1)
-    found, _ = results_of(monkeypatch, capsys, folder, "scale", *options)
-    assert found["costs.paper 200.segments"].value >= 200
-    assert "segments.paper 200 exact.approximate minus exact" in found
-    monkeypatch.setattr(scale, "learned_row", None)
-    again, _ = results_of(monkeypatch, capsys, folder, "scale", *options)
-    assert dict(again) == dict(found)
-
-
-@pytest.mark.slow
-def test_the_truth_of_the_pendulum_is_told_by_plan_and_mode(monkeypatch, capsys, tmp_path):
+def test_the_truth_of_the_pendulum_is_told_by_plan_and_mode(monkeypatch, tmp_path):
     scenario = load_scenario("pendulum")
     episodes = run_episodes(scenario, 120, num_workers=1, path=episodes_folder(tmp_path))
     for mode in MODES:
@@ -141,14 +146,114 @@ def test_the_truth_of_the_pendulum_is_told_by_plan_and_mode(monkeypatch, capsys,
         learned = SafetyAssessment(scenario.assessment).fit(episodes)
         learned.save(assessment_file(tmp_path, mode))
     options = ("--assessment", tmp_path, "--episodes", 20, "--resolution", 3, "--workers", 1)
-    found, _ = results_of(
-        monkeypatch, capsys, tmp_path, "known_truth", "truth", "pendulum", *options
-    )
+    rows = "hold.paper.safe_share, random.sharpened.confident_errors"
+    assert study(monkeypatch, "truth", "pendulum", *options) == 0
+    found = results_of(tmp_path / "known_truth.json", rows)
     assert found["hold.paper.safe_share"].n == 9
     assert found["random.sharpened.confident_errors"].n == 20
     assert (tmp_path / "known_truth_paper.png").is_file()
 
 
-def test_every_study_says_in_a_sentence_what_it_does():
+@pytest.mark.slow
+@pytest.mark.train
+def test_anomalies_are_judged_by_every_monitor_and_tabled(monkeypatch, tmp_path):
+    for module in ("anomalies", "injections"):
+        monkeypatch.setattr(f"studies.{module}.EPISODE_S", 1.6)
+    monkeypatch.setattr("studies.gru_monitor._EPOCHS", 1)
+    monkeypatch.setattr("drake_safety.simulation.rollouts.MOTION_PIECE_S", 3.0)
+    # Less motion than the command asks for.
+    options = {"episodes": 14, "calibration_episodes": 20, "motion": 0.2, "workers": 1}
+    anomalies("go2_walking", out=tmp_path, **options)
+    rows = ", ".join(
+        f"anomalies.{monitor}.{kind}.auc"
+        for monitor in ("monitor", "gru", "isolation_forest", "range_check")
+        for kind in ("pooled", "drift")
+    )
+    found = results_of(tmp_path / "anomalies.json", rows)
+    assert found["anomalies.monitor.doubled.auc"].n <= 14
+    found.entries["anomalies"] = found.entries
+    page = render("anomalies", found)
+    assert "| drift |" in page and "monitor: found" in page
+
+
+@pytest.mark.slow
+def test_walking_is_judged_on_tours_pushes_commands_and_engines(monkeypatch, tmp_path):
+    shutil.copy(assessment_file(shipped_folder("go2_walking"), MODES[0]), tmp_path)
+    # Baselines need training episodes, which do not ship.
+    monkeypatch.setattr("studies.walking.load_episodes", lambda path: None)
+    monkeypatch.setattr("studies.walking.classifier_scorers", lambda *_: [])
+    monkeypatch.setattr("studies.walking._DURATIONS_S", {"tour": 0.4, "push": 0.4, "command": 0.4})
+    monkeypatch.setattr("studies.walking._SPEED_S", 0.4)
+    counts = ("tours", "calibration-tours", "pushes", "commands", "guarded-tours", "speeds")
+    options = itertools.chain.from_iterable((f"--{name}", 1) for name in counts)
+    arguments = ("go2_walking", "--assessment", tmp_path, "--workers", 1, *options)
+    rows = "tours.without_fall, tours.sharpened.false_alarms_per_hour, pushes.fallen, "
+    rows += "alarm.sharpened.alarms_without_leaving, guard.falls_with, guard.unchanged_inside, "
+    rows += "speed.difference_to_mujoco_m_s"
+    assert study(monkeypatch, "walking", *arguments) == 0
+    results_of(tmp_path / "walking.json", rows)
+
+
+@pytest.mark.slow
+def test_a_gif_shows_every_instant_of_a_run_in_real_time(monkeypatch, tmp_path):
+    path = tmp_path / "run.gif"
+    options = ("--push", "ball", "--duration", 0.5, "--out", path)
+    assert study(monkeypatch, "animation", "laikago_balancing", *options) == 0
+    with Image.open(path) as gif:
+        assert gif.n_frames == 6
+        assert gif.info["duration"] == 100
+        frames = []
+        for i in range(gif.n_frames):
+            gif.seek(i)
+            frames.append(np.asarray(gif.convert("RGB"), dtype=float))
+    robot = slice(0, round(0.75 * len(frames[0])))
+    # What is seen moves, and so does the curve of the probability below it.
+    assert np.abs(frames[0] - frames[-1])[robot].max() > 50.0
+    for before, after in itertools.pairwise(frames):
+        assert np.abs(before - after)[robot.stop :].max() > 50.0
+
+
+def test_a_run_is_a_row_and_a_robot_with_its_figures(monkeypatch, capsys, tmp_path):
+    figures = {
+        "episodes.sharpened.auc": Estimate(0.95, 0.93, 0.97, 100),
+        "throws.falls_without_recovery": Estimate(0.4, 0.25, 0.55, 40),
+        "throws.sharpened.falls_with_recovery": Estimate(0.025, 0.0, 0.1, 40),
+    }
+    for name in ("pendulum", "laikago_balancing"):
+        (tmp_path / name).mkdir()
+        Results(figures, {"scenario": name}).write(tmp_path / name / "evaluation.json")
+    runs = (tmp_path / "pendulum", tmp_path / "laikago_balancing")
+    assert study(monkeypatch, "compare", *runs, "--out", tmp_path) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("95.0") == 2 and "40.0" in printed and "- " in printed
+    # Pendulums have no picture of their own.
+    assert (tmp_path / "comparison.png").is_file()
+
+
+def test_studies_are_stored_with_the_evaluation_of_their_run(monkeypatch, tmp_path):
+    Results({"plans.sharpened.auc": proportion(29, 30)}, {"command": "x"}).write(
+        tmp_path / "evaluation.json"
+    )
+    for name in ("converged", "readings"):
+        row = {f"{name}.first.literal.auc": proportion(3, 4)}
+        Results(row, {"command": "y", "seed": 100}).write(tmp_path / f"{name}.json")
+    stored = tmp_path / "stored.json"
+    assert study(monkeypatch, "store", "--assessment", tmp_path, "--out", stored) == 0
+    found = Results.read(stored)
+    assert {"plans.sharpened.auc", "converged.first.literal.auc"} <= set(found)
+    assert found.entries["readings"]["seed"] == 100
+
+
+def test_documents_are_written_again_as_they_are(monkeypatch, tmp_path):
+    monkeypatch.chdir(ROOT)
+    copy = shutil.copy(DOCUMENTS[1], tmp_path)
+    assert study(monkeypatch, "readme", copy) == 0
+    assert Path(copy).read_text() == DOCUMENTS[1].read_text()
+
+
+def test_every_study_is_tried_and_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
     assert all(command.help for command in commands.values())
+    others = {"truth", "anomalies", "walking", "animation", "compare", "store", "readme"}
+    elsewhere = {"bench", "ship"}  # In test_bench and test_shipped_assessments.
+    assert {line.split(" ")[0] for line in STUDIES} | others | elsewhere == set(commands)

@@ -1,5 +1,4 @@
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from studies.walking import (
     speed_estimates,
     tour_estimates,
 )
-from studies.walking_motions import run_motions, unusual_command
+from studies.walking_motions import unusual_command
 
 ALARM = Alarm(name="value", value=lambda motion: motion["features"][:, 0])
 
@@ -75,7 +74,7 @@ def test_guard_recovery_and_speeds_compare_the_same_motions():
     falls, stays = motion([1, 1], leave_s=0.1, fall_s=0.1, impact=3.0), motion([1, 1])
     softer = motion([1, 1], leave_s=0.1, fall_s=0.1, impact=2.0)
     guard = guard_estimates([falls, falls, stays], [stays, falls, stays], [motion([1], changed=1)])
-    assert guard["guard.fewer_falls"].value == 0.5
+    assert (guard["guard.falls_without"].value, guard["guard.falls_with"].value) == (2 / 3, 1 / 3)
     assert guard["guard.unchanged_inside"].value == 0.0
     saved = recovery_estimates("slower", [falls, falls], [stays, softer])
     assert saved["recovery.slower.saved"].value == 0.5
@@ -84,22 +83,11 @@ def test_guard_recovery_and_speeds_compare_the_same_motions():
     assert speed_estimates([stays], [stays])["speed.difference_to_mujoco_m_s"].value == 0.0
 
 
-def test_motions_are_kept_and_commands_are_inside_or_past_the_ranges(tmp_path: Path):
-    scenario = load_scenario("go2_walking")
-    loop = scenario.make_loop()
+def test_unusual_commands_are_past_the_ranges_and_usual_ones_inside():
+    loop = load_scenario("go2_walking").make_loop()
     limits, rng = loop.policy.parameters.command, np.random.default_rng(0)
     for _ in range(30):
         inside = loop.usual_command(rng)
         assert np.all(inside >= limits.lowest) and np.all(inside <= limits.highest)
         past = unusual_command(loop, rng)
         assert np.any(past < limits.lowest) or np.any(past > limits.highest)
-    options = {"seed": 3, "duration_s": 0.4, "folder": tmp_path}
-    (first,) = run_motions(scenario, "tour", [0], **options)
-    assert first.time_s[-1] == pytest.approx(0.4)
-    written = (tmp_path / "00000.npz").stat().st_mtime_ns
-    again = run_motions(scenario, "tour", [0, 1], **options)
-    assert (tmp_path / "00000.npz").stat().st_mtime_ns == written
-    np.testing.assert_array_equal(again[0]["state"], first["state"])
-    (tmp_path / "00001.npz").write_bytes(b"no motion")
-    with pytest.raises(ValueError, match=r"00001\.npz is damaged"):
-        run_motions(scenario, "tour", [1], **options)
