@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -17,6 +17,7 @@ from drake_safety.models import load_robot
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.physics import ENGINES_WITH_BALLS, Scene
 from drake_safety.robots.robot_model import by_pattern
+from drake_safety.simulation.closed_loop import Purpose
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.sampling import calm_start, undisturbed_start
@@ -43,8 +44,6 @@ class Balancing(LeggedLoop):
     """
 
     Parameters = BalancingParameters
-    # "We also add a random offset to the initial state to simulate the disturbances": no ball.
-    paper_options: ClassVar[dict[str, Any]] = {"ball": False}
     online_parameters = ("recovery", "demonstration")
     plan_variety = "its parameter 'start' bounds the final heights and durations of plans"
 
@@ -158,11 +157,13 @@ class Balancing(LeggedLoop):
         return fitted_to_robot(stated, RobotKinematics(load_robot(robot)))
 
     @classmethod
-    def pairing_options(cls, scenario: Scenario, variation: str) -> dict[str, Any]:
-        """Removes the ball from both diagrams if the variation's engine does not support it."""
-        if scenario.variation(variation).engine in ENGINES_WITH_BALLS:
-            return {}
-        return {"ball": False}
+    def options_for(cls, purpose: Purpose, scenario: Scenario, variation: str) -> dict[str, Any]:
+        """Removes the ball for the paper's mode, or if not both engines of a pair support it."""
+        # "We also add a random offset to the initial state to simulate the disturbances": no ball.
+        if purpose == "paper":
+            return {"ball": False}
+        has_engine = scenario.variation(variation).engine in ENGINES_WITH_BALLS
+        return {"ball": False} if purpose == "pairs" and not has_engine else {}
 
     def reset(self, context: Context, rng: np.random.Generator) -> int:
         """Samples an initial state and a plan; some episodes begin with the impact of a ball."""

@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -23,6 +23,7 @@ from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
 from drake_safety.robots.model_files import model_file
 from drake_safety.simulation.capabilities import is_in_box
+from drake_safety.simulation.closed_loop import Purpose
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
@@ -51,10 +52,6 @@ class Reaching(LeggedLoop):
     """
 
     Parameters = ReachingParameters
-    judging_options: ClassVar[dict[str, Any]] = {"exploring": False}
-    # "We do not sample an offset and do not add it to the initial state since we do not consider
-    # disturbances here."
-    paper_options = judging_options
     online_parameters = (
         "decorations",
         "fair",
@@ -162,6 +159,14 @@ class Reaching(LeggedLoop):
         """Lowest and highest corner of this hand's fair targets in the world, (2, 3) [m]."""
         parameters = self.scenario.parameters
         return np.sort(self._reflected(parameters.fair.box(parameters.target)), axis=0)
+
+    @classmethod
+    def options_for(cls, purpose: Purpose, scenario: Scenario, variation: str) -> dict[str, Any]:
+        """Straight plans without pushes for evaluation and the paper's mode."""
+        del scenario, variation
+        # "We do not sample an offset and do not add it to the initial state since we do not
+        # consider disturbances here."
+        return {} if purpose == "pairs" else {"exploring": False}
 
     @property
     def mirror_options(self) -> dict[str, str]:

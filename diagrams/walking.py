@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -22,6 +22,7 @@ from drake_safety.models import load_robot
 from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import GoalWords
+from drake_safety.simulation.closed_loop import Purpose
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.finding import Finding, failed, passed
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -59,8 +60,6 @@ class Walking(LeggedLoop):
 
     Parameters = WalkingParameters
     angular_constraints = WalkingSafeSet.angular_names
-    # Commands are judged before the robot walks, and pushes are those of a run.
-    judging_options: ClassVar[dict[str, Any]] = {"disturbed": False}
     online_parameters = (
         "guard",
         "recovery",
@@ -205,6 +204,12 @@ class Walking(LeggedLoop):
         of_robot = super().model_files(scenario)
         path = policy_file(scenario)
         return [*of_robot, path, network_file(read_policy_file(path), str(path.parent))]
+
+    @classmethod
+    def options_for(cls, purpose: Purpose, scenario: Scenario, variation: str) -> dict[str, Any]:
+        """No pushes in evaluation: commands are judged before the robot walks."""
+        del scenario, variation
+        return {"disturbed": False} if purpose == "evaluation" else {}
 
     @classmethod
     def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterator[Finding]:

@@ -25,6 +25,7 @@ from drake_safety.evaluation.metrics import (
 )
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
+from drake_safety.learning.inputs import is_rate
 from drake_safety.learning.mode_settings import mode_settings
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes, Segments, split
@@ -74,12 +75,10 @@ def ablate(
         base = study.load(MODES[0]).parameters
         training = load_episodes(episodes_folder(assessment))
         test, calibration = study.fresh(episodes), study.fresh(calibration_episodes, "thresholds")
-        variants = list_variants(
-            base,
-            len(training),
-            state_names=training.info.state_names,
-            rate_names=study.scenario.make_loop().rate_names,
-        )
+        states = training.info.state_names
+        of_legs = getattr(study.scenario.make_loop(), "rate_features", [])
+        rates = [*filter(is_rate, states), *of_legs]
+        variants = list_variants(base, len(training), state_names=states, rate_names=rates)
         variants = [one for one in variants if only in one.name or one.name == BASELINE]
         sets = (training, calibration, test)
         of_all = [base, *((one.info, len(one)) for one in sets), versions()]

@@ -67,9 +67,7 @@ def converged(
             thrown, _ = evaluate_throws(
                 study.scenario,
                 [
-                    TriggerRule(
-                        name=name, scorer=assessment_scorer(name, one), threshold=PAPER_THRESHOLD
-                    )
+                    TriggerRule(scorer=assessment_scorer(name, one), threshold=PAPER_THRESHOLD)
                     for name, one in literal.items()
                 ],
                 num_throws=throws,

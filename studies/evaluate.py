@@ -172,10 +172,10 @@ def _add_plans(
     scenario, gamma = evaluation.scenario, evaluation.assessments["sharpened"]
     sets = {"plans": test}
     if num_other:
-        mirror = loop.mirror_options
+        mirror = getattr(loop, "mirror_options", {})
         # The same random draws, mirrored.
         episodes = evaluation.fresh("fresh targets, other hand", num_other, "evaluation", **mirror)
-        mirrored = scenario.make_loop(**type(loop).judging_options, **mirror)
+        mirrored = scenario.make_loop(**scenario.options_for("evaluation"), **mirror)
         sets["plans.other_hand"] = plans_of(mirrored, episodes)
     rules: dict[str, Rule] = {
         one.name: scorer_rule(one) for one in (*evaluation.scorers, *classifiers)

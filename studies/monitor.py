@@ -45,7 +45,7 @@ def monitor(
         promise = gamma.calibrations_.get(calibration.MOTION)
         work = {}
         for name, shift in shifts.items():
-            options = {**loaded.task_class().judging_options, **shift.options}
+            options = {**loaded.options_for("evaluation"), **shift.options}
             shifted = shifted_scenario(loaded, name, shift)
             work[name.replace(" ", "_")] = (shifted, name, motions, seed, gamma, options)
         key = fingerprint(

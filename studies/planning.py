@@ -128,7 +128,7 @@ def run_trials(
     Raises:
         ValueError: The task offers no plans or only one, or too few starts are undisturbed.
     """
-    loop = scenario.make_loop(**scenario.task_class().judging_options)
+    loop = scenario.make_loop(**scenario.options_for("evaluation"))
     context = loop.CreateDefaultContext()
     indices: list[int] = []
     index = 0
@@ -166,7 +166,7 @@ def _candidates(loop: ClosedLoop, context: Any, seed: int, index: int, num_plans
 
 
 def _run_candidates(scenario: Scenario, seed: int, num_plans: int, index: int) -> Arrays:
-    loop = worker_loop(scenario, **scenario.task_class().judging_options)()
+    loop = worker_loop(scenario, **scenario.options_for("evaluation"))()
     plans = _candidates(loop, loop.CreateDefaultContext(), seed, index, num_plans)
     motions = [run_episode(loop, index, seed=seed, plan=plan) for plan in plans]
     first = {

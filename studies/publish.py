@@ -254,7 +254,7 @@ def first_verdicts(
         seed=seed,
         num_workers=num_workers,
         progress=progress,
-        **scenario.task_class().judging_options,
+        **scenario.options_for("evaluation"),
     )
     entries: list[dict[str, Any]] = [
         {"episode": episode.index, "cause": episode.cause} for episode in episodes

@@ -55,7 +55,7 @@ def run_pushed_motions(
     progress: Progress | None = None,
 ) -> list[Motion]:
     """Simulates pairs of random safe motions, undisturbed and pushed, in worker processes."""
-    make = worker_loop(scenario, variation, **scenario.task_class().judging_options)
+    make = worker_loop(scenario, variation, **scenario.options_for("evaluation"))
     pairs = map_items(
         partial(make.run, run_pushed_motion, seed=seed),
         range(num_motions),

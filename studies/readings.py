@@ -123,7 +123,7 @@ def readings_of(scenario: Scenario) -> list[Reading]:
     if any(getattr(start, "tracking_offset_m", ())):
         offset = {"tracking_offset_m": [0.0, 0.0, 0.0]}
         singles.append(Reading(name="no offset between plan and state", start=offset))
-    if scenario.task_class().paper_options:
+    if scenario.options_for("paper"):
         singles.append(Reading(name="disturbed episodes", is_exploring=True))
     singles = [
         one
@@ -195,7 +195,7 @@ class _EpisodeSets:
     def training(self, count: int) -> Episodes:
         """The first training episodes."""
         if self._is_own:
-            options = self._scenario.task_class().paper_options
+            options = self._scenario.options_for("paper")
             episodes = self._run("training", count, 0, options)
         else:
             mode = "sharpened" if self._reading.is_exploring else "paper"
@@ -213,7 +213,7 @@ class _EpisodeSets:
         """Fresh episodes, as `evaluate` draws them."""
         if not self._is_own:
             return self._study.fresh(count, purpose)
-        options = self._scenario.task_class().judging_options
+        options = self._scenario.options_for("evaluation")
         return self._run(purpose, count, self._study.seeds[purpose], options)
 
     def _run(self, what: str, count: int, seed: int, options: dict[str, Any]) -> Episodes:

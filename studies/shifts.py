@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from pydrake.math import RotationMatrix
-from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.cli.evaluate import Evaluation, add_shifts
@@ -23,20 +22,19 @@ from drake_safety.evaluation.shift_study import (
     SEEN,
     Judge,
     JudgedShift,
-    MotionRows,
     MotionSet,
-    Verdicts,
     assessment_judge,
 )
 from drake_safety.learning.adaptive_threshold import AdaptiveThreshold
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import PLAN, Calibration
 from drake_safety.learning.novelty import Novelty
-from drake_safety.learning.segments import Episodes
+from drake_safety.learning.segments import RECORDED, Episode, Episodes
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
+from drake_safety.simulation.motion import Motion, Recorder, simulate
 from drake_safety.simulation.rollouts import episode_rng, run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import map_items
@@ -62,12 +60,7 @@ def without_novelty(assessment: SafetyAssessment) -> Judge:
 
 def classifier_judge(scorer: Scorer) -> Judge:
     """A classifier, which knows no "don't know"."""
-
-    def judge(*rows: np.ndarray) -> Verdicts:
-        probability = scorer.probability(*rows[:3])
-        return Verdicts(probability=probability, is_unknown=np.isnan(probability))
-
-    return judge
+    return lambda *rows: scorer.probability(*rows[:3])
 
 
 def detector_judges(assessment: SafetyAssessment, episodes: Episodes) -> dict[str, Judge]:
@@ -111,14 +104,12 @@ def detector_judges(assessment: SafetyAssessment, episodes: Episodes) -> dict[st
 
     def judge(
         *rows: np.ndarray, score: Callable[[np.ndarray], np.ndarray], limit: float
-    ) -> Verdicts:
-        found = plain(*rows)
+    ) -> np.ndarray:
         values = assessment.inputs_of(*rows[:3])
         is_strange = np.concatenate(
             [score(part) for part in np.array_split(values, len(values) // 4096 + 1)]
         )
-        unknown = found.is_unknown | (is_strange > limit)
-        return Verdicts(probability=np.where(unknown, 0.0, found.probability), is_unknown=unknown)
+        return np.where(is_strange > limit, np.nan, plain(*rows))
 
     judges: dict[str, Judge] = {}
     for name, score in scores.items():
@@ -200,18 +191,15 @@ def run_changed_starts(
     if not isinstance(make(), LeggedLoop):
         return found
     for name in (*STARTS, *POSTURES, "falling"):
-        results = map_items(
-            partial(make.run, _changed_motion, name, seed),
-            range(num_motions),
-            num_workers=num_workers,
-        )
+        run = partial(make.run, _changed_motion, name, seed)
+        results = map_items(run, range(num_motions), num_workers=num_workers)
         motions = [motion for motion in results if len(motion.state)]
         if motions:
             found[name] = ("plan" if name in STARTS else "posture", motions)
     return found
 
 
-def _changed_motion(loop: ClosedLoop, name: str, seed: int, index: int) -> MotionRows:
+def _changed_motion(loop: ClosedLoop, name: str, seed: int, index: int) -> Episode:
     assert isinstance(loop, LeggedLoop)
     if name == "falling":
         return _fall(loop, seed, index)
@@ -220,45 +208,32 @@ def _changed_motion(loop: ClosedLoop, name: str, seed: int, index: int) -> Motio
     start = loop.start_of(context)
     if name in STARTS:
         start = STARTS[name](start, loop.kinematics)
-        return MotionRows.of_episode(run_episode(loop, index, seed=seed, start=start))
+        return run_episode(loop, index, seed=seed, start=start)
     loop.reset_to(context, episode_rng(seed, index), POSTURES[name](start, loop.kinematics))
-    return _rows_of(loop, [context])
+    recorder = Recorder(loop)
+    recorder.record(context)
+    arrays = recorder.arrays()
+    return Motion(time_s=arrays.pop("time_s"), ports=arrays, cause=name, index=index).episode()
 
 
-def _fall(loop: LeggedLoop, seed: int, index: int) -> MotionRows:
+def _fall(loop: LeggedLoop, seed: int, index: int) -> Episode:
     """The rows of a nominal episode outside the safe set, if the robot falls."""
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset(context, episode_rng(seed, index))
-    simulator.Initialize()
-    margins_port = loop.GetOutputPort("margins")
-    fall_column = loop.constraint_names.index(loop.fall_name)
-    rows, has_fallen = [], False
-    for step in range(loop.scenario.num_steps + 1):
-        try:
-            simulator.AdvanceTo(step * loop.scenario.step_s)
-        except RuntimeError:
-            break
-        margins = margins_port.Eval(context)
-        has_fallen = has_fallen or bool(margins[fall_column] < 0.0)
-        if margins.min() < 0.0:
-            rows.append(context.Clone())
-    return _rows_of(loop, rows if has_fallen else [])
-
-
-def _rows_of(loop: ClosedLoop, contexts: Sequence) -> MotionRows:
-    def stacked(name: str) -> np.ndarray:
-        port = loop.GetOutputPort(name)
-        rows = [port.Eval(context).copy() for context in contexts]
-        return np.stack(rows) if rows else np.empty((0, port.size()))
-
-    is_outside = np.any(stacked("margins") < 0.0, axis=1)
-    return MotionRows(
-        **{name: stacked(name) for name in SEEN}, is_outside=is_outside, is_unsafe=True
+    motion = simulate(
+        loop,
+        lambda context: loop.reset(context, episode_rng(seed, index)),
+        RECORDED,
+        duration_s=loop.scenario.episode_duration_s,
+        step_s=loop.scenario.step_s,
+        after_fall_s=math.inf,
+        may_fail=True,
+        index=index,
     )
+    is_kept = np.any(motion["margins"] < 0.0, axis=1) & motion.has_fallen
+    rows = {name: motion[name][is_kept] for name in RECORDED}
+    return dataclasses.replace(motion.episode(), **rows, is_safe=False)
 
 
-def junk(motions: Sequence[MotionRows], seed: int) -> dict[str, MotionSet]:
+def junk(motions: Sequence[Episode], seed: int) -> dict[str, MotionSet]:
     """Inputs that contradict themselves, in which no robot can be.
 
     "Another row" is one of another motion: those of the same motion may agree with each other.
@@ -297,12 +272,13 @@ def junk(motions: Sequence[MotionRows], seed: int) -> dict[str, MotionSet]:
         found[name] = (
             "junk",
             [
-                MotionRows(
+                dataclasses.replace(
+                    one,
                     **{key: values[key][motion == i] for key in SEEN},
-                    is_outside=np.zeros(int((motion == i).sum()), dtype=bool),
-                    is_unsafe=True,
+                    margins=np.abs(one.margins),
+                    is_safe=False,
                 )
-                for i in range(len(motions))
+                for i, one in enumerate(motions)
             ],
         )
     return found
@@ -319,19 +295,19 @@ def baseline_estimates(judged: JudgedShift) -> dict[str, Estimate]:
         promise for plans misses, with the stored threshold and one that follows outcomes.
     """
     found = {}
-    is_known, is_unsafe = ~judged.verdicts["gamma"].is_unknown, judged.is_unsafe
+    is_known, is_unsafe = ~np.isnan(judged.probability["gamma"]), judged.is_unsafe
     label = is_unsafe[judged.motion]
-    for name, verdicts in judged.verdicts.items():
+    for name, probability in judged.probability.items():
         is_wrong = judged.is_wrong(name)[judged.first]
         found[f"{name}.first.confident_error"] = proportion(int(is_wrong.sum()), len(is_wrong))
         if 0 < label[is_known].sum() < is_known.sum():
-            score = 1.0 - np.nan_to_num(verdicts.probability[is_known])
+            score = 1.0 - np.nan_to_num(probability[is_known])
             found[f"{name}.known_auc"] = auc(score, label[is_known], judged.motion[is_known])
     promise = judged.assessment.calibrations_.get(PLAN)
     if promise is None or not is_unsafe.any():
         return found
-    probability = judged.verdicts["gamma"].probability[judged.first]
-    return found | promised(promise, probability, is_unsafe)
+    gamma = np.nan_to_num(judged.probability["gamma"][judged.first])
+    return found | promised(promise, gamma, is_unsafe)
 
 
 def promised(
@@ -369,7 +345,7 @@ def add_all_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -
     }
     seed = evaluation.seeds["shifts"]
 
-    def others(nominal: Sequence[MotionRows]) -> dict[str, MotionSet]:
+    def others(nominal: Sequence[Episode]) -> dict[str, MotionSet]:
         changed = run_changed_starts(scenario, num_motions, seed, evaluation.workers)
         return changed | junk(nominal, seed)
 

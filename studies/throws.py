@@ -53,6 +53,6 @@ def classifier_rules(
 ) -> list[TriggerRule]:
     """The classifiers as triggers, with thresholds chosen on calibration throws."""
     return [
-        TriggerRule(name=one.name, scorer=one, threshold=choose_threshold(logs, one, persistence_s))
+        TriggerRule(scorer=one, threshold=choose_threshold(logs, one, persistence_s))
         for one in classifiers
     ]

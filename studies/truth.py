@@ -56,7 +56,7 @@ def truth(
     """
     with open_study("known_truth", scenario, assessment, seed=seed, workers=workers) as study:
         loop = study.scenario.make_loop()
-        planes = loop.state_planes
+        planes = getattr(loop, "state_planes", {})
         if not planes:
             raise ValueError(f"truth: task '{type(loop).__name__}' has no state planes")
         assessments = {mode: study.load(mode, [seed]) for mode in MODES}
@@ -163,7 +163,7 @@ def simulate_truth(
     """
     make = worker_loop(scenario)
     loop = make()
-    planes = loop.state_planes
+    planes = getattr(loop, "state_planes", {})
     if plane not in planes:
         raise ValueError(
             f"task '{type(loop).__name__}' has no state plane '{plane}'; it has {list(planes)}"

@@ -69,10 +69,8 @@ def test_asking_for_what_a_task_has_evaluates_none_of_its_properties():
 def test_a_task_that_says_nothing_of_itself_has_the_plain_answers():
     loop = Gliding(gliding())
     assert loop.angular_constraints == ()
-    assert loop.rate_names == []
-    assert Gliding.judging_options == {}
-    assert gliding().task_class().pairing_options(gliding(), "actual") == {}
-    assert loop.mirror_options == loop.state_planes == {}
+    for purpose in ("evaluation", "paper", "pairs"):
+        assert loop.scenario.options_for(purpose, "actual") == {}
     assert list(loop.check_files(loop.scenario, None)) == []
     assert run_episode(loop).num_controller_failures == 0
 

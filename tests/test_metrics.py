@@ -31,9 +31,9 @@ def test_a_proportion_has_the_clopper_pearson_interval_of_the_tables():
     assert estimate.high == pytest.approx(0.9748, abs=1e-4)
 
 
-def test_fifty_nine_samples_without_a_miss_bound_the_miss_rate_by_five_percent():
-    # One-sided 95 % is the lower end of a two-sided 90 % interval: 0.05 ** (1 / 59).
-    assert proportion(59, 59, confidence=0.9).low == pytest.approx(0.05 ** (1 / 59))
+def test_fifty_nine_samples_without_a_miss_bound_the_miss_rate_by_six_percent():
+    # One-sided 97.5 % is the lower end of a two-sided 95 % interval.
+    assert proportion(59, 59).low == pytest.approx(0.025 ** (1 / 59))
     assert proportion(59, 59).high == 1.0
     assert proportion(0, 59).low == 0.0
     nothing = proportion(0, 0)

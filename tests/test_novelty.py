@@ -134,7 +134,7 @@ def test_what_an_actual_robot_did_is_known_after_adaptation(novelty):
 @pytest.fixture(scope="module", params=["laikago_balancing", "atlas_reaching"])
 def robot(request):
     scenario = load_scenario(request.param)
-    loop = scenario.make_loop(**scenario.task_class().judging_options)
+    loop = scenario.make_loop(**scenario.options_for("evaluation"))
     context = loop.CreateDefaultContext()
     rng = np.random.default_rng(5)
     rows = []

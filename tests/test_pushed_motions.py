@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from drake_safety.control.safe_sets import BalanceSafeSet
+from drake_safety.learning.inputs import is_rate
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import shuttling
 from studies.pushed_motions import run_pushed_motion, run_pushed_motions
@@ -43,8 +44,8 @@ def test_what_one_would_watch_and_what_is_made_of_velocities_is_told_by_name(nam
     # Exactly the features that velocities enter change with them; gravity's are appended.
     names = loop.feature_names[: len(still)]
     changed = {f for f, a, b in zip(names, still, moving, strict=True) if a != b}
-    assert changed == set(loop.rate_names) & set(loop.feature_names)
-    rates = [n for n in loop.rate_names if n in loop.state_names]
+    assert changed == set(loop.rate_features) & set(loop.feature_names)
+    rates = [*filter(is_rate, loop.state_names)]
     assert len(rates) == len(loop.state_names) / 2
     watched = {
         what: still[loop.feature_names.index(f)] for what, f in loop.watched_features.items()

@@ -71,7 +71,10 @@ def test_the_goal_of_a_plan_with_a_detour_is_where_it_ends(hand, tmp_path):
 
 def test_what_is_judged_is_the_straight_plan_undisturbed(tmp_path):
     training, judging = exploring(tmp_path), exploring(tmp_path, exploring=False)
-    assert dict(judging.judging_options) == {"exploring": False}
+    scenario = judging.scenario
+    assert (
+        scenario.options_for("evaluation") == scenario.options_for("paper") == {"exploring": False}
+    )
     first_steps = {True: set(), False: set()}
     for seed in range(8):
         for loop in (training, judging):

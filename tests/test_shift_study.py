@@ -1,4 +1,5 @@
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -7,8 +8,6 @@ from drake_safety import AssessmentParameters, SafetyAssessment, load_assessment
 from drake_safety.evaluation.shift_study import (
     CONFIDENT,
     JudgedShift,
-    MotionRows,
-    Verdicts,
     assessment_judge,
     motions_of,
     shift_estimates,
@@ -46,24 +45,25 @@ def nominal():
 
 
 def motion(num_rows, probability, *, is_unsafe):
-    """A motion whose state is the probability that the double below returns."""
-    return MotionRows(
-        state=np.full((num_rows, 6), float(probability)),
-        desired_preview=np.zeros((num_rows, 30)),
-        features=np.zeros((num_rows, 5)),
-        is_outside=np.zeros(num_rows, dtype=bool),
-        is_unsafe=is_unsafe,
+    """A motion whose state is the probability that the double below returns, negative for none."""
+    state = np.full((num_rows, 6), float(probability))
+    rows = {"desired_preview": np.zeros((num_rows, 30)), "features": np.zeros((num_rows, 5))}
+    return SimpleNamespace(
+        state=state, **rows, margins=np.ones((num_rows, 2)), is_safe=not is_unsafe
     )
 
 
 def told(state, preview, features, is_outside):
-    probability = state[:, 0].copy()
-    is_unknown = probability < 0.0
-    return Verdicts(probability=np.where(is_unknown, 0.0, probability), is_unknown=is_unknown)
+    return np.where(state[:, 0] < 0.0, np.nan, state[:, 0])
+
+
+def rows_of(motion):
+    is_outside = (motion.margins < 0.0).any(axis=1)
+    return motion.state, motion.desired_preview, motion.features, is_outside
 
 
 def judged(motions, assessment, **others):
-    return JudgedShift.judged_by({"gamma": told} | others, motions, assessment)
+    return JudgedShift({"gamma": told} | others, motions, assessment)
 
 
 @pytest.mark.train
@@ -96,8 +96,7 @@ def test_the_ranking_is_that_of_all_rows_and_of_those_that_gamma_knows(assessmen
     ]
 
     def other(state, preview, features, is_outside):
-        probability = np.where(state[:, 0] < 0.0, 0.9, 1.0 - state[:, 0])
-        return Verdicts(probability=probability, is_unknown=np.zeros(len(state), dtype=bool))
+        return np.where(state[:, 0] < 0.0, 0.9, 1.0 - state[:, 0])
 
     shift = judged(motions, assessment, other=other)
     found = shift_estimates(shift) | baseline_estimates(shift)
@@ -127,11 +126,10 @@ def test_outside_the_safe_set_gamma_is_not_safe_but_the_grid_alone_may_be(assess
     rows = nominal[0]
     given = (rows.state, rows.desired_preview, rows.features)
     outside = np.ones(len(rows.state), dtype=bool)
-    assert not assessment_judge(assessment)(*given, outside).probability.any()
+    judged_outside = assessment_judge(assessment)(*given, outside)
+    assert (judged_outside == 0.0).any() and not np.nan_to_num(judged_outside).any()
     alone = without_novelty(assessment)
-    np.testing.assert_array_equal(
-        alone(*given, outside).probability, alone(*given, ~outside).probability
-    )
+    np.testing.assert_array_equal(alone(*given, outside), alone(*given, ~outside))
 
 
 @pytest.mark.train
@@ -146,8 +144,7 @@ def test_junk_is_dont_know_and_keeps_what_it_says_it_keeps(assessment, nominal):
     for own, changed in zip(nominal[:20], found["state of another row"], strict=True):
         assert not np.isin(changed.state[:, 0], own.state[:, 0]).any()
     judges = {"gamma": assessment_judge(assessment)}
-    shift = JudgedShift.judged_by(judges, found["columns shuffled"], assessment)
-    result = shift_estimates(shift)
+    result = shift_estimates(JudgedShift(judges, found["columns shuffled"], assessment))
     assert result["gamma.unknown"].value > 0.9
     assert result["gamma.confident_error"].value < 0.05
 
@@ -160,10 +157,9 @@ def test_published_detectors_refuse_about_as_many_safe_episodes(assessment, trai
     for judge in judges.values():
         unknown = []
         for one in nominal:
-            if one.is_unsafe:
-                continue
-            given = (one.state, one.desired_preview, one.features, one.is_outside)
-            unknown.append(np.any(judge(*given).is_unknown & ~plain(*given).is_unknown))
+            if one.is_safe:
+                given = rows_of(one)
+                unknown.append(np.any(np.isnan(judge(*given)) & ~np.isnan(plain(*given))))
         assert np.mean(unknown) < 0.2
 
 
@@ -193,7 +189,7 @@ def test_postures_and_falls_are_never_called_safe():
     judge = assessment_judge(gamma)
     for name, (kind, motions) in sets.items():
         for one in motions if kind == "posture" else ():
-            verdicts = judge(one.state, one.desired_preview, one.features, one.is_outside)
-            assert verdicts.probability.max() < CONFIDENT, name
+            probability = judge(*rows_of(one))
+            assert np.nan_to_num(probability).max() < CONFIDENT, name
             if name in POSTURES:
-                assert verdicts.is_unknown.all(), name
+                assert np.isnan(probability).all(), name

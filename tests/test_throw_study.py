@@ -47,9 +47,7 @@ def rule(name, threshold, delay_rows=0):
     def probability(state, *_):
         return np.concatenate([np.ones(delay_rows), state[: len(state) - delay_rows, 0]])
 
-    return TriggerRule(
-        name=name, scorer=Scorer(name=name, probability=probability), threshold=threshold
-    )
+    return TriggerRule(scorer=Scorer(name=name, probability=probability), threshold=threshold)
 
 
 CALM = Scorer(name="calm", probability=lambda state, *_: state[:, 0])
@@ -79,7 +77,7 @@ def test_the_chosen_threshold_is_the_highest_with_few_enough_false_triggers():
         assert (lowest < threshold).mean() <= bound
         assert (lowest < threshold + 0.0101).mean() > bound
     (one,) = classifier_rules([CALM], logs, 0.0)
-    assert (one.name, one.threshold) == ("calm", choose_threshold(logs, CALM))
+    assert (one.scorer.name, one.threshold) == ("calm", choose_threshold(logs, CALM))
     with pytest.raises(ValueError, match="no calibration throw stays in the safe set"):
         choose_threshold([log_of(0, falls=True)], CALM)
 

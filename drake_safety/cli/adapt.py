@@ -132,7 +132,7 @@ def adapt(
                 num_workers=workers,
                 path=feedback_folder(learned.out, hash_, seed) / "motion",
                 progress=partial(stages, "undisturbed actual motion"),
-                **loaded.task_class().pairing_options(loaded, variation),
+                **loaded.options_for("pairs", variation),
             )
         sets = pairs.feedback()
         adapted = {mode: prior.adapt(sets, motions=motions) for mode, prior in priors.items()}
@@ -244,7 +244,7 @@ def fresh_actual_episodes(
         path=feedback_folder(folder, scenario.simulation_hash(variation), seed) / variation,
         progress=partial(stages, what),
         extra={"command": command_line()},
-        **scenario.task_class().pairing_options(scenario, variation),
+        **scenario.options_for("pairs", variation),
     )
 
 

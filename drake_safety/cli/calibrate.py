@@ -94,7 +94,7 @@ def calibrate(
             progress,
             workers,
             plant,
-            **loaded.task_class().pairing_options(loaded, plant),
+            **loaded.options_for("pairs", plant),
         )
     segments = split(fresh, stride=1, discount=1.0, shortest=1)
     found: dict[str, list[Calibration]] = {}

@@ -44,7 +44,6 @@ from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.evaluation.shift_study import (
     Judge,
     JudgedShift,
-    MotionRows,
     MotionSet,
     shifts_tables,
 )
@@ -58,7 +57,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import PLAN, episode_scores
 from drake_safety.learning.seeds import EVALUATION, FRESH_MOTION, SHIFTS, SeedBlock
-from drake_safety.learning.segments import Episodes, Segments, split
+from drake_safety.learning.segments import Episode, Episodes, Segments, split
 from drake_safety.simulation.capabilities import HasBall, HasGoals, require
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.rollouts import run_episodes, run_motions
@@ -264,7 +263,7 @@ def add_shifts(
     num_motions: int,
     num_nominal: int,
     judges: Mapping[str, Judge] | None = None,
-    others: Callable[[Sequence[MotionRows]], Mapping[str, MotionSet]] = lambda nominal: {},
+    others: Callable[[Sequence[Episode]], Mapping[str, MotionSet]] = lambda nominal: {},
     more: Callable[[JudgedShift], Mapping[str, Estimate]] = lambda judged: {},
 ) -> dict[str, Any]:
     """Evaluates both modes, or other methods, on changed plants and faulty sensors.
@@ -292,7 +291,7 @@ def add_shifts(
     for i, (name, shift) in enumerate(shifts.items()):
         stages("shifted motions", i, len(shifts))
         shifted = shifted_scenario(scenario, name, shift)
-        options = {**scenario.task_class().judging_options, **shift.options}
+        options = {**scenario.options_for("evaluation"), **shift.options}
         hash_ = shifted.simulation_hash(name)
         episodes = run_episodes(
             shifted,

@@ -65,7 +65,7 @@ def episodes_folder(folder: Path, mode: str = MODES[0]) -> Path:
 
 def training_options(scenario: Scenario, mode: str) -> dict[str, Any]:
     """Options of the diagram for a mode's training episodes, besides the defaults."""
-    return {} if mode == MODES[0] else scenario.task_class().paper_options
+    return {} if mode == MODES[0] else scenario.options_for("paper")
 
 
 def fresh_episodes_folder(
@@ -105,7 +105,7 @@ def run_fresh_episodes(
         variation: The plant.
         **loop_options: Options of the diagram, besides those of evaluations.
     """
-    options = {**scenario.task_class().judging_options, **loop_options}
+    options = {**scenario.options_for("evaluation"), **loop_options}
     return run_episodes(
         scenario,
         num_episodes,

@@ -3,37 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PatchCollection
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
 
-from drake_safety.evaluation.figure_style import (
-    FAINT_INK,
-    INK,
-    SAFE_COLOUR,
-    SERIES_COLOURS,
-    UNSAFE_COLOUR,
-    drawing_style,
-    new_figure,
-    spoken,
-)
+from drake_safety.evaluation import figure_style as style
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, UNSAFE
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import Episodes, split
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colorbar import Colorbar
-    from matplotlib.colors import Colormap
-    from matplotlib.figure import Figure
-
 _MAX_POINTS = 12000
-FIRST_CAUSE = 3
-"""Column of the first cause in the masses of a cell."""
-SAFETY_STOPS = ("#9c3209", UNSAFE_COLOUR, "#f0b48f", "#f2efe9", "#a3c4e2", SAFE_COLOUR, "#1b4a80")
-"""Colours from unsafe through a pale middle to safe."""
 
 
 def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure:
@@ -43,8 +30,8 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
     """
     cells, grid = assessment.beliefs_[0], assessment.grid_
     count = assessment.training_.counts(grid)[0]
-    with drawing_style():
-        fig = new_figure(14.0, 4.6)
+    with style.drawing_style():
+        fig = style.new_figure(14.0, 4.6)
         left, middle, last = fig.subplots(1, 3)
         _draw_segments(fig, left, assessment, episodes)
         safe, is_empty = cells[:, SAFE], cells[:, UNCERTAINTY] >= 1.0
@@ -66,13 +53,10 @@ def _draw_segments(
     # Drawn in random order, so that neither class hides the other.
     order = np.random.default_rng(0).permutation(len(segments))[:_MAX_POINTS]
     segments = segments.take(order)
-    points = assessment.predict(
-        segments.state, segments.desired_preview, segments.features
-    ).embedding
+    found = assessment.predict(segments.state, segments.desired_preview, segments.features)
     draw_grid(axes, assessment.grid_)
     dots = axes.scatter(
-        points[:, 0],
-        points[:, 1],
+        *found.embedding.T,
         c=segments.score,
         cmap=safety_colours().reversed(),
         vmin=0.0,
@@ -101,38 +85,25 @@ def draw_safety(
     most: float = 1.0,
 ) -> None:
     """Draws cells coloured by safety (R*R,), with their numbers of training segments (R*R,)."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
     shade = ScalarMappable(Normalize(0.0, most), safety_colours())
     colours = shade.to_rgba(safe)
     draw_cells(axes, grid, colours, is_empty)
     brightness = colours[:, :3] @ [0.299, 0.587, 0.114]
-    for (x, y), number, light, empty in zip(
-        grid.centres, count, brightness > 0.6, is_empty, strict=True
-    ):
-        if number:
-            ink = FAINT_INK if empty else INK if light else "white"
-            axes.text(
-                x, y, _short(number), ha="center", va="center_baseline", fontsize=6.5, color=ink
-            )
+    ink = np.where(is_empty, style.FAINT_INK, np.where(brightness > 0.6, style.INK, "white"))
+    place: dict[str, Any] = {"ha": "center", "va": "center_baseline", "fontsize": 6.5}
+    for i in np.flatnonzero(count):
+        axes.text(*grid.centres[i], _short(count[i]), color=ink[i], **place)
     axes.set_xlabel("numbers: training segments; hatched: don't know")
     add_colour_bar(fig, axes, shade, label)
-
-
-def cause_colours(num_causes: int) -> list[str]:
-    """A colour for each cause; the first of the series is that of safe and is skipped."""
-    return [SERIES_COLOURS[(1 + i) % len(SERIES_COLOURS)] for i in range(num_causes)]
 
 
 def _draw_causes(
     fig: Figure, axes: Axes, grid: Grid, cells: np.ndarray, names: Sequence[str]
 ) -> None:
-    from matplotlib.colors import to_rgb
-    from matplotlib.patches import Patch
-
-    palette = np.array([to_rgb(colour) for colour in cause_colours(len(names))])
-    cause = cells[:, FIRST_CAUSE:].argmax(axis=1)
+    # The first colour of the series is that of safe.
+    series = [*map(to_rgb, style.SERIES_COLOURS)]
+    palette = np.array([series[(1 + i) % len(series)] for i in range(len(names))])
+    cause = cells[:, UNCERTAINTY + 1 :].argmax(axis=1)
     is_empty = cells[:, UNCERTAINTY] >= 1.0
     # From white, nothing unsafe, to the colour of the cause, all that is known unsafe.
     depth = (cells[:, UNSAFE] / np.where(is_empty, 1.0, 1.0 - cells[:, UNCERTAINTY]))[:, None]
@@ -141,7 +112,7 @@ def _draw_causes(
     draw_cells(axes, grid, colours, is_empty)
     axes.set_title("Most likely cause")
     axes.legend(
-        handles=[Patch(color=c, label=spoken(n)) for c, n in zip(palette, names, strict=True)],
+        handles=[Patch(color=palette[i], label=style.spoken(n)) for i, n in enumerate(names)],
         title="pale: unlikely",
         loc="center left",
         bbox_to_anchor=(1.0, 0.5),
@@ -159,29 +130,20 @@ def draw_grid(axes: Axes, grid: Grid) -> None:
 
 def draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarray) -> None:
     """Draws squares of given colours, RGBA (R*R, 4); empty ones, (R*R,), are hatched."""
-    from matplotlib.collections import PatchCollection
-    from matplotlib.patches import Rectangle
-
     corners = grid.centres - 0.5 * grid.cell_length
     squares = [Rectangle((x, y), grid.cell_length, grid.cell_length) for x, y in corners]
     filled = [square for square, empty in zip(squares, is_empty, strict=True) if not empty]
     hollow = [square for square, empty in zip(squares, is_empty, strict=True) if empty]
-    axes.add_collection(
-        PatchCollection(
-            hollow, facecolor="#f1f2f4", edgecolor="#dadde1", linewidth=0.5, hatch="////"
-        )
-    )
-    axes.add_collection(
-        PatchCollection(filled, facecolor=colours[~is_empty], edgecolor="white", linewidth=0.8)
-    )
+    axes.add_collection(PatchCollection(hollow, fc="#f1f2f4", ec="#dadde1", lw=0.5, hatch="////"))
+    axes.add_collection(PatchCollection(filled, fc=colours[~is_empty], ec="white", lw=0.8))
     axes.set_xlabel(f"{len(filled)} of {grid.num_cells} cells hold a belief")
 
 
 def safety_colours() -> Colormap:
     """Colour map from unsafe (0) through a pale middle to safe (1)."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("safety", list(SAFETY_STOPS))
+    pale = ("#f0b48f", "#f2efe9", "#a3c4e2")
+    stops = ["#9c3209", style.UNSAFE_COLOUR, *pale, style.SAFE_COLOUR, "#1b4a80"]
+    return LinearSegmentedColormap.from_list("safety", stops)
 
 
 def add_colour_bar(fig: Figure, axes: Axes, shade: ScalarMappable, label: str) -> Colorbar:

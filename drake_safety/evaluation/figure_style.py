@@ -10,11 +10,11 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 SAFE_COLOUR = "#2b6cb0"
 UNSAFE_COLOUR = "#d1541b"
@@ -84,16 +84,12 @@ _DPI = 200
 @contextmanager
 def drawing_style() -> Iterator[None]:
     """Applies the style to figures drawn or saved inside the block."""
-    import matplotlib as mpl
-
     with mpl.rc_context(_STYLE):
         yield
 
 
 def new_figure(width: float, height: float) -> Figure:
     """Creates an empty figure without a window; sizes in inches."""
-    from matplotlib.figure import Figure
-
     fig = Figure(figsize=(width, height), layout="constrained")
     fig.get_layout_engine().set(w_pad=0.08, h_pad=0.08)  # type: ignore[union-attr, call-arg]
     return fig

@@ -3,22 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from drake_safety.evaluation.figure_style import (
-    FAINT_INK,
-    SERIES_COLOURS,
-    drawing_style,
-    label_of,
-    new_figure,
-    spoken,
-)
+from drake_safety.evaluation import figure_style as style
 from drake_safety.evaluation.results import Result
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _MARKS = "osD^vP"
 
@@ -29,9 +19,9 @@ def interval_figure(rows: Sequence[Result]) -> Figure:
         list(dict.fromkeys(getattr(row, name) for row in rows))
         for name in ("metric", "method", "set")
     )
-    with drawing_style():
+    with style.drawing_style():
         height = 1.1 + 0.18 * len(methods) * (1 + len(sets))
-        fig = new_figure(2.2 + 2.6 * len(metrics), height)
+        fig = style.new_figure(2.2 + 2.6 * len(metrics), height)
         panels = np.atleast_1d(fig.subplots(1, len(metrics), sharey=True))
         for axes, metric in zip(panels, metrics, strict=True):
             for i, name in enumerate(sets):
@@ -46,14 +36,14 @@ def interval_figure(rows: Sequence[Result]) -> Figure:
                     np.array(places) + 0.7 * ((i + 0.5) / len(sets) - 0.5),
                     xerr=np.maximum([value - low, high - value], 0.0),
                     fmt=_MARKS[i % len(_MARKS)],
-                    color=SERIES_COLOURS[i % len(SERIES_COLOURS)],
+                    color=style.SERIES_COLOURS[i % len(style.SERIES_COLOURS)],
                     markersize=5.0,
                     capsize=2.5,
-                    label=spoken(name).replace(".", ", "),
+                    label=style.spoken(name).replace(".", ", "),
                 )
-            axes.set_title(label_of(metric))
-            axes.grid(axis="x", color=FAINT_INK, alpha=0.25)
-        panels[0].set_yticks(range(len(methods)), [label_of(method) for method in methods])
+            axes.set_title(style.label_of(metric))
+            axes.grid(axis="x", color=style.FAINT_INK, alpha=0.25)
+        panels[0].set_yticks(range(len(methods)), [style.label_of(method) for method in methods])
         panels[0].set_ylim(len(methods) - 0.5, -0.5)
         if len(sets) > 1:
             fig.legend(

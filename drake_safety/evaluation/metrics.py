@@ -42,18 +42,16 @@ class Estimate:
         return cls(value, low, high, int(row[3] or 0))
 
 
+_CONFIDENCE = 0.95  # Of all intervals.
+_ENDS = [0.5 - 0.5 * _CONFIDENCE, 0.5 + 0.5 * _CONFIDENCE]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Bootstrap:
     """Bootstrap intervals: percentiles over resamples of the independent samples."""
 
-    confidence: float = 0.95
     num_resamples: int = 1000
     seed: int = 0
-
-    @property
-    def quantiles(self) -> list[float]:
-        """Quantiles of the resamples at the ends of the interval."""
-        return [0.5 - 0.5 * self.confidence, 0.5 + 0.5 * self.confidence]
 
     def over_episodes(
         self, statistic: Callable[[np.ndarray], float], episode: np.ndarray
@@ -76,15 +74,28 @@ class Bootstrap:
             ]
         )
         # A resample without one of the classes has no value.
-        low, high = np.quantile(drawn[~np.isnan(drawn)], self.quantiles)
+        low, high = np.quantile(drawn[~np.isnan(drawn)], _ENDS)
         return Estimate(value, float(low), float(high), num_episodes)
+
+    def over_values(
+        self, statistic: Callable[[np.ndarray], np.ndarray], values: np.ndarray
+    ) -> Estimate:
+        """An order statistic of independent values (N,), of which some may be infinite.
+
+        The statistic is that of values sorted along the last axis.
+        """
+        rng = np.random.default_rng(self.seed)
+        drawn = values[rng.integers(values.size, size=(self.num_resamples, values.size))]
+        # Without interpolation, which would subtract infinities.
+        low, high = np.quantile(statistic(np.sort(drawn, axis=1)), _ENDS, method="nearest")
+        return Estimate(float(statistic(np.sort(values))), float(low), float(high), values.size)
 
 
 _BOOTSTRAP = Bootstrap()
 _MEDIAN_BOOTSTRAP = Bootstrap(num_resamples=2000)
 
 
-def proportion(count: int, n: int, *, confidence: float = 0.95) -> Estimate:
+def proportion(count: int, n: int) -> Estimate:
     """The share `count` of `n` independent samples, with its Clopper-Pearson interval.
 
     Raises:
@@ -96,7 +107,7 @@ def proportion(count: int, n: int, *, confidence: float = 0.95) -> Estimate:
 
     if n == 0:
         return Estimate(value=math.nan, low=0.0, high=1.0, n=0)
-    interval = binomtest(count, n).proportion_ci(confidence, method="exact")
+    interval = binomtest(count, n).proportion_ci(_CONFIDENCE, method="exact")
     return Estimate(value=count / n, low=float(interval.low), high=float(interval.high), n=int(n))
 
 
@@ -113,24 +124,24 @@ def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> E
         raise ValueError(f"median: {np.isnan(values).sum()} of {values.size} values are NaN")
     if values.size == 0:
         return Estimate.exact(math.nan, 0)
-    rng = np.random.default_rng(bootstrap.seed)
-    size = (bootstrap.num_resamples, values.size)
-    drawn = np.sort(rng.integers(values.size, size=size), axis=1)
-    # Order statistics, not interpolation, which would subtract infinities.
-    low, high = np.quantile(_middle(values[drawn]), bootstrap.quantiles, method="nearest")
-    return Estimate(float(_middle(values)), float(low), float(high), values.size)
+    return bootstrap.over_values(_middle, values)
 
 
-def rate_per_hour(count: int, duration_s: float, n: int, *, confidence: float = 0.95) -> Estimate:
+def quantile(values: np.ndarray, share: float, *, bootstrap: Bootstrap) -> Estimate:
+    """A quantile of independent values (N,), some infinite, with its bootstrap interval."""
+    row = min(int(share * values.size), values.size - 1)
+    return bootstrap.over_values(lambda ordered: ordered[..., row], values)
+
+
+def rate_per_hour(count: int, duration_s: float, n: int) -> Estimate:
     """Events per hour, with the exact interval of a Poisson process, observed on n motions."""
     from scipy.stats import chi2
 
     if not duration_s > 0:
         return Estimate.exact(math.nan, n)
-    tail = 0.5 * (1.0 - confidence)
     hours = duration_s / 3600.0
-    low = 0.5 * chi2.ppf(tail, 2 * count) if count else 0.0
-    high = 0.5 * chi2.ppf(1.0 - tail, 2 * count + 2)
+    low = 0.5 * chi2.ppf(_ENDS[0], 2 * count) if count else 0.0
+    high = 0.5 * chi2.ppf(_ENDS[1], 2 * count + 2)
     return Estimate(count / hours, float(low / hours), float(high / hours), n)
 
 
@@ -149,9 +160,8 @@ def area_under_curve(
     area is NaN unless both classes have weight.
     """
     score, label = _checked("area_under_curve", unsafe_score, is_unsafe)
-    rank = _ranks(score)
     weight = np.ones(len(score)) if weight is None else np.asarray(weight, dtype=float)
-    return _ranked_area(rank, label, weight)
+    return _ranked_area(_ranks(score), label, weight)
 
 
 def auc(
@@ -167,11 +177,7 @@ def auc(
     """
     score, label = _checked("auc", unsafe_score, is_unsafe, episode)
     rank = _ranks(score)
-
-    def area(weight: np.ndarray) -> float:
-        return _ranked_area(rank, label, weight)
-
-    return bootstrap.over_episodes(area, episode)
+    return bootstrap.over_episodes(lambda weight: _ranked_area(rank, label, weight), episode)
 
 
 def share(
@@ -185,14 +191,15 @@ def share(
     num_hits, num_samples = int(is_hit.sum()), len(is_hit)
     num_episodes = len(np.unique(episode))
     if num_samples == num_episodes:
-        return proportion(num_hits, num_samples, confidence=bootstrap.confidence)
+        return proportion(num_hits, num_samples)
     if num_hits in (0, num_samples):
-        count = num_episodes if num_hits else 0
-        return proportion(count, num_episodes, confidence=bootstrap.confidence)
-    return _mean(is_hit.astype(float), episode, bootstrap)
+        return proportion(num_episodes if num_hits else 0, num_episodes)
+    return mean(is_hit, episode, bootstrap=bootstrap)
 
 
-def _mean(values: np.ndarray, episode: np.ndarray, bootstrap: Bootstrap) -> Estimate:
+def mean(values: np.ndarray, episode: np.ndarray, *, bootstrap: Bootstrap) -> Estimate:
+    """The mean of the values of samples (N,), with an interval over their episodes (N,)."""
+
     def average(weight: np.ndarray) -> float:
         total = weight.sum()
         return float(weight @ values / total) if total else math.nan
@@ -226,7 +233,7 @@ def segment_estimates(
         "auc": auc(score, label, episode, bootstrap=bootstrap),
         "safe_recall": share((score <= threshold)[~label], episode[~label], bootstrap=bootstrap),
         "unsafe_recall": share((score > threshold)[label], episode[label], bootstrap=bootstrap),
-        "brier": _mean((probability - label) ** 2, episode, bootstrap),
+        "brier": mean((probability - label) ** 2, episode, bootstrap=bootstrap),
     }
 
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Estimate, proportion, rate_per_hour
-from drake_safety.evaluation.shift_study import BOOTSTRAP, CONFIDENT, Judge, mean_over
+from drake_safety.evaluation.metrics import Estimate, mean, proportion, quantile, rate_per_hour
+from drake_safety.evaluation.shift_study import BOOTSTRAP, CONFIDENT, SEEN, Judge
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector, rows_of, usual_rows
@@ -73,42 +73,28 @@ def monitored(
     every = max(1, round(info.step_s / detector.step_s))
     horizon = round(info.num_steps * info.step_s / detector.step_s)
     rows = [rows_of(one) for one in motions]
-    found_wrong = [_sure_and_wrong(one, judge, every, horizon) for one in motions]
-    wrong = [rows for rows, _ in found_wrong]
+    wrong, least = zip(
+        *(_sure_and_wrong(one, judge, every, horizon) for one in motions), strict=True
+    )
     most = round(max(SPANS_S) / detector.step_s)
-    found: dict[str, list[Any]] = {
-        "alarm_s": [],
-        "leave_s": [],
-        "error_s": [],
-        "silent_error_s": [],
-        "least": [least for _, least in found_wrong],
-    }
+    found: dict[str, Any] = {n: [] for n in ("alarm_s", "leave_s", "error_s", "silent_error_s")}
     for start in range(len(motions)):
-        order, begin = [], [0]
-        for i in (start + np.arange(len(motions))) % len(motions):
-            order.append(int(i))
-            begin.append(begin[-1] + len(rows[i]))
-            if begin[-1] >= most:
-                break
+        order = np.roll(np.arange(len(motions)), -start)
+        begin = np.cumsum([0, *(len(rows[i]) for i in order)])
+        order = order[: np.searchsorted(begin[1:], most) + 1]
         _, alarms = detector.watch([rows[i] for i in order])
-        is_alarm = np.zeros(begin[-1], dtype=bool)
+        is_alarm = np.zeros(begin[len(order)], dtype=bool)
         for alarm in alarms:
             is_alarm[alarm.begin : alarm.end] = True
         errors = np.concatenate([begin[k] + wrong[i] for k, i in enumerate(order)])
         leaves = [begin[k + 1] for k, i in enumerate(order) if not motions[i].is_safe]
-        first = {
-            "alarm_s": min((one.begin for one in alarms), default=np.inf),
-            "leave_s": min(leaves, default=np.inf),
-        }
-        for name, row in first.items():
+        for name, at in (("alarm_s", [one.begin for one in alarms]), ("leave_s", leaves)):
+            row = min(at, default=most)
             found[name].append(row * detector.step_s if row < most else np.inf)
-        for name, counted in (
-            ("error_s", errors[~is_alarm[errors]]),
-            ("silent_error_s", errors),
-        ):
-            times = detector.step_s * counted
+        for name, at in (("error_s", errors[~is_alarm[errors]]), ("silent_error_s", errors)):
+            times = detector.step_s * at
             found[name].append([every * detector.step_s * (times < span).sum() for span in SPANS_S])
-    return {name: np.array(values) for name, values in found.items()}
+    return {name: np.array(values) for name, values in (found | {"least": least}).items()}
 
 
 def _sure_and_wrong(
@@ -124,12 +110,9 @@ def _sure_and_wrong(
         return rows[:0], np.nan
     rows = rows[len(motion.time_s) - 1 - rows <= horizon]
     is_outside = np.any(motion.margins[rows] < 0.0, axis=1)
-    found = judge(
-        motion.state[rows], motion.desired_preview[rows], motion.features[rows], is_outside
-    )
-    is_sure = (found.probability >= CONFIDENT) & ~found.is_unknown
-    inside = found.probability[~is_outside]
-    return rows[is_sure], float(inside.min()) if len(inside) else 0.0
+    seen = (getattr(motion, name)[rows] for name in SEEN)
+    probability = np.nan_to_num(judge(*seen, is_outside))
+    return rows[probability >= CONFIDENT], float(min(probability[~is_outside], default=0.0))
 
 
 def monitor_estimates(
@@ -147,13 +130,13 @@ def monitor_estimates(
     estimates = {
         "monitor.alarmed": proportion(int(np.isfinite(delay).sum()), len(delay)),
         "monitor.leaves": proportion(int(np.isfinite(found["leave_s"]).sum()), len(delay)),
-        "monitor.delay_s": quantile(delay, 0.5),
-        "monitor.delay_95_s": quantile(delay, 0.95),
+        "monitor.delay_s": quantile(delay, 0.5, bootstrap=BOOTSTRAP),
+        "monitor.delay_95_s": quantile(delay, 0.95, bootstrap=BOOTSTRAP),
     }
     for i, span in enumerate(SPANS_S):
         for name in ("", "silent_"):
-            share = found[f"{name}error_s"][:, i] / span
-            estimates[f"monitor.{name}confident_error_{span:g}s"] = mean_over(share, each)
+            share = mean(found[f"{name}error_s"][:, i] / span, each, bootstrap=BOOTSTRAP)
+            estimates[f"monitor.{name}confident_error_{span:g}s"] = share
     unsafe = int(np.isfinite(found["least"]).sum())
     if promise is not None and unsafe:
         is_missed = found["least"] >= promise.threshold
@@ -161,21 +144,6 @@ def monitor_estimates(
         for name, of in missed.items():
             estimates[f"monitor.{name}"] = proportion(int(of.sum()), unsafe)
     return estimates
-
-
-def quantile(values: np.ndarray, share: float) -> Estimate:
-    """A quantile of values, some infinite, with its interval."""
-
-    def of(drawn: np.ndarray) -> float:
-        return float(np.sort(drawn)[min(int(share * len(drawn)), len(drawn) - 1)])
-
-    rng = np.random.default_rng(0)
-    drawn = [
-        of(values[rng.integers(len(values), size=len(values))])
-        for _ in range(BOOTSTRAP.num_resamples)
-    ]
-    low, high = np.quantile(drawn, BOOTSTRAP.quantiles, method="nearest")
-    return Estimate(of(values), float(low), float(high), len(values))
 
 
 def false_alarms(motions: Episodes, detector: ChangeDetector) -> Estimate:

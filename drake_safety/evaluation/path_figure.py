@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from drake_safety.evaluation.embedding_figure import draw_safety
 from drake_safety.evaluation.figure_style import INK, drawing_style, label_threshold, new_figure
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import UNCERTAINTY, safe_share
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def path_figure(

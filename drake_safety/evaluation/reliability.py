@@ -4,22 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from drake_safety.evaluation.figure_style import (
-    FAINT_INK,
-    SERIES_COLOURS,
-    SERIES_DASHES,
-    drawing_style,
-    new_figure,
-)
+from drake_safety.evaluation import figure_style as style
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, proportion, share
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE, Calibration
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _BOOTSTRAP = Bootstrap(num_resamples=100)
 
@@ -70,7 +61,6 @@ def reliability(
     episode: np.ndarray,
     *,
     num_bins: int = 10,
-    bootstrap: Bootstrap = _BOOTSTRAP,
 ) -> Reliability:
     """Compares 1 - probability of rows, (N,), NaN counting as one, with outcomes of their episodes.
 
@@ -97,8 +87,8 @@ def reliability(
     bins = _bins(p, num_bins)
     return Reliability(
         expected=np.array([p[b].mean() for b in bins]),
-        observed=[share(label[b], episode[b], bootstrap=bootstrap) for b in bins],
-        error=bootstrap.over_episodes(error, episode),
+        observed=[share(label[b], episode[b], bootstrap=_BOOTSTRAP) for b in bins],
+        error=_BOOTSTRAP.over_episodes(error, episode),
     )
 
 
@@ -111,18 +101,18 @@ def _bins(p: np.ndarray, num_bins: int) -> list[np.ndarray]:
 
 def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
     """Plots the observed share of unsafe ends over the predicted probability."""
-    with drawing_style():
-        fig = new_figure(5.4, 6.6)
+    with style.drawing_style():
+        fig = style.new_figure(5.4, 6.6)
         axes = fig.subplots()
-        axes.plot([0, 1], [0, 1], color=FAINT_INK, linewidth=0.8)
+        axes.plot([0, 1], [0, 1], color=style.FAINT_INK, linewidth=0.8)
         for i, (name, one) in enumerate(curves.items()):
             value, low, high = np.array([(s.value, s.low, s.high) for s in one.observed]).T
             axes.errorbar(
                 one.expected,
                 value,
                 yerr=np.clip([value - low, high - value], 0.0, None),
-                color=SERIES_COLOURS[i % len(SERIES_COLOURS)],
-                linestyle=SERIES_DASHES[i % len(SERIES_DASHES)],
+                color=style.SERIES_COLOURS[i % len(style.SERIES_COLOURS)],
+                linestyle=style.SERIES_DASHES[i % len(style.SERIES_DASHES)],
                 marker="o",
                 markersize=5,
                 linewidth=1.4,

@@ -61,7 +61,7 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
     page = environment.from_string(text).render(
         name=infos[0].scenario if infos else results[0].entries.get("scenario", folder.name),
         assessments=assessments,
-        training=_training_command(episodes),
+        training=read_info(episodes)[1].get("command", "") if episodes.is_dir() else "",
         results=tables,
         meanings=[(columns[key].title, MEANINGS[key]) for key in columns if key in MEANINGS],
         number=_NUMBER,
@@ -72,12 +72,6 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
     file = folder / REPORT_FILE
     file.write_text(page, encoding="utf-8")
     return file
-
-
-def _training_command(episodes: Path) -> str:
-    if not episodes.is_dir():
-        return ""
-    return str(read_info(episodes)[1].get("command", ""))
 
 
 def _motions(folder: Path) -> list[dict[str, Any]]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from pydrake.geometry import (
     Box,
     Capsule,
@@ -21,28 +21,17 @@ from pydrake.geometry import (
 )
 from pydrake.systems.framework import Context
 
-from drake_safety.evaluation.figure_style import (
-    FALSE_ALARM_COLOUR,
-    RECOVERY_COLOUR,
-    SAFE_COLOUR,
-    SERIES_COLOURS,
-    UNSAFE_COLOUR,
-    drawing_style,
-    new_figure,
-)
+from drake_safety.evaluation import figure_style as style
 from drake_safety.evaluation.stills import StillCamera
 from drake_safety.simulation.legged_loop import LeggedLoop
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 _COLOURS: dict[type[Shape], tuple[str, str]] = {
-    Box: ("boxes", SAFE_COLOUR),
-    Capsule: ("capsules", RECOVERY_COLOUR),
-    Cylinder: ("cylinders", SERIES_COLOURS[3]),
-    Sphere: ("spheres", UNSAFE_COLOUR),
-    Ellipsoid: ("ellipsoids", SERIES_COLOURS[5]),
-    Convex: ("convex hulls", FALSE_ALARM_COLOUR),
+    Box: ("boxes", style.SAFE_COLOUR),
+    Capsule: ("capsules", style.RECOVERY_COLOUR),
+    Cylinder: ("cylinders", style.SERIES_COLOURS[3]),
+    Sphere: ("spheres", style.UNSAFE_COLOUR),
+    Ellipsoid: ("ellipsoids", style.SERIES_COLOURS[5]),
+    Convex: ("convex hulls", style.FALSE_ALARM_COLOUR),
 }
 _SIZE = (900, 1000)  # Of a still [pixels].
 _VISUAL_SHARE = 0.25  # Of the robot's look in the picture of its shapes.
@@ -59,8 +48,8 @@ def robot_figure(loop: LeggedLoop) -> Figure:
     kinds = show_shapes(loop, camera.context)
     shapes = camera.render(positions)
     both = np.round(_VISUAL_SHARE * look + (1 - _VISUAL_SHARE) * shapes).astype(np.uint8)
-    with drawing_style():
-        fig = new_figure(9.0, 5.6)
+    with style.drawing_style():
+        fig = style.new_figure(9.0, 5.6)
         panels = fig.subplots(1, 2)
         titles = f"{loop.robot.name}, standing", f"{sum(kinds.values())} collision shapes"
         for axes, image, title in zip(panels, (look, both), titles, strict=True):
@@ -78,8 +67,6 @@ def robot_figure(loop: LeggedLoop) -> Figure:
 
 def show_shapes(loop: LeggedLoop, context: Context) -> dict[str, int]:
     """Shows a robot's collision shapes, coloured by kind, for its visuals, and counts them."""
-    from matplotlib.colors import to_rgb
-
     plant, scene_graph = loop.plant, loop.GetSubsystemByName("scene_graph")
     source = plant.get_source_id()
     scene_context = scene_graph.GetMyMutableContextFromRoot(context)

@@ -9,24 +9,20 @@ alarm changes no belief.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from drake_safety.evaluation.figure_style import spoken
 from drake_safety.evaluation.interval_figure import interval_figure
-from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, proportion
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, mean, proportion
 from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.evaluation.tables import Column, Table, rows_of
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.prediction import is_unknown
-from drake_safety.learning.segments import DIVERGED, Episode, Episodes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from drake_safety.learning.segments import DIVERGED, RECORDED, Episode, Episodes
 
 SEEN = ("state", "desired_preview", "features")
 """Output ports that are inputs of assessor and monitor."""
@@ -55,126 +51,62 @@ _MEANING = (
 )
 
 
-@dataclass(kw_only=True, eq=False)
-class MotionRows:
-    """The inputs of one motion, in the order of time, and its outcome.
-
-    Attributes:
-        state: (N, n_s).
-        desired_preview: (N, H n_z).
-        features: (N, n_f).
-        is_outside: Whether the state is outside the safe set, (N,).
-        is_unsafe: Whether it ends unsafely.
-    """
-
-    state: np.ndarray
-    desired_preview: np.ndarray
-    features: np.ndarray
-    is_outside: np.ndarray
-    is_unsafe: bool
-
-    @classmethod
-    def of_episode(cls, episode: Episode) -> MotionRows:
-        """The rows of an episode from its first undisturbed one."""
-        rows = slice(episode.first_step, None)
-        return cls(
-            **{name: getattr(episode, name)[rows] for name in SEEN},
-            is_outside=np.any(episode.margins[rows] < 0.0, axis=1),
-            is_unsafe=not episode.is_safe,
-        )
-
-
-MotionSet = tuple[str, list[MotionRows]]
+MotionSet = tuple[str, list[Episode]]
 """Kind of a shift, "nominal", "plant" or "sensor", and motions under it."""
+Judge = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""Maps N states, previews, features, and whether each row is outside the safe set, to safety
+probabilities (N,), NaN for "don't know"."""
 
 
-def motions_of(episodes: Episodes) -> list[MotionRows]:
-    """The motions of episodes; those that diverged are left out."""
-    motions = [MotionRows.of_episode(one) for one in episodes if one.cause != DIVERGED]
-    return [one for one in motions if len(one.state)]
+def motions_of(episodes: Episodes) -> list[Episode]:
+    """The rows of episodes from the first undisturbed one; those that diverged are left out."""
+    return [rows_from(one, one.first_step) for one in episodes if one.cause != DIVERGED]
 
 
-@dataclass(kw_only=True, eq=False)
-class Verdicts:
-    """Verdicts of one method on N rows.
-
-    Attributes:
-        probability: Safety probability, 0 for "don't know", (N,).
-        is_unknown: Whether the row is "don't know", (N,).
-    """
-
-    probability: np.ndarray
-    is_unknown: np.ndarray
-
-
-Judge = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Verdicts]
-"""Maps states, previews, features and whether a row is outside the safe set to verdicts."""
+def rows_from(episode: Episode, first: int) -> Episode:
+    """An episode without its rows before the first given one."""
+    rows = {name: getattr(episode, name)[first:] for name in ("time_s", *RECORDED)}
+    return replace(episode, **rows, first_step=0)
 
 
 def assessment_judge(assessment: SafetyAssessment) -> Judge:
     """Γ as a :class:`SafetyAssessor` with the port ``margins`` gives it, without the monitor."""
+    probability_of = assessment_scorer("gamma", assessment).probability
 
     def judge(
         state: np.ndarray, preview: np.ndarray, features: np.ndarray, is_outside: np.ndarray
-    ) -> Verdicts:
-        found = assessment.predict(state, preview, features)
-        unknown = is_unknown(found.belief, assessment.parameters.initial_uncertainty)
-        return Verdicts(
-            probability=np.where(is_outside, 0.0, found.probability), is_unknown=unknown
-        )
+    ) -> np.ndarray:
+        probability = probability_of(state, preview, features)
+        return np.where(is_outside & ~np.isnan(probability), 0.0, probability)
 
     return judge
 
 
-@dataclass(kw_only=True, eq=False)
 class JudgedShift:
-    """The verdicts of all methods on the motions of a shift.
+    """The verdicts of methods by name, of which "gamma" is Γ, on M motions with N rows in all.
 
     Attributes:
-        verdicts: By method, on all rows of all motions; "gamma" is Γ.
+        probability: Safety probability of every row by method, NaN for "don't know", (N,).
+        motion: Motion of each row, (N,).
+        first: First row of each motion, (M,).
+        is_unsafe: Whether each motion ends unsafely, (M,).
     """
 
-    motions: Sequence[MotionRows]
-    assessment: SafetyAssessment
-    verdicts: Mapping[str, Verdicts]
-
-    @classmethod
-    def judged_by(
-        cls,
-        judges: Mapping[str, Judge],
-        motions: Sequence[MotionRows],
-        assessment: SafetyAssessment,
-    ) -> JudgedShift:
-        """Judges all rows by every method."""
-        rows = [np.concatenate([getattr(m, k) for m in motions]) for k in (*SEEN, "is_outside")]
-        verdicts = {name: judge(*rows) for name, judge in judges.items()}
-        return cls(motions=motions, assessment=assessment, verdicts=verdicts)
-
-    @cached_property
-    def sizes(self) -> np.ndarray:
-        """Number of rows of each motion, (M,)."""
-        return np.array([len(one.state) for one in self.motions])
-
-    @cached_property
-    def first(self) -> np.ndarray:
-        """First row of each motion, (M,)."""
-        return np.concatenate([[0], np.cumsum(self.sizes)[:-1]])
-
-    @cached_property
-    def motion(self) -> np.ndarray:
-        """Motion of each row, (N,)."""
-        return np.repeat(np.arange(len(self.motions)), self.sizes)
-
-    @cached_property
-    def is_unsafe(self) -> np.ndarray:
-        """Whether each motion ends unsafely, (M,)."""
-        return np.array([one.is_unsafe for one in self.motions])
+    def __init__(
+        self, judges: Mapping[str, Judge], motions: Sequence[Episode], assessment: SafetyAssessment
+    ):
+        self.assessment = assessment
+        rows = [np.concatenate([getattr(one, name) for one in motions]) for name in SEEN]
+        rows.append(np.concatenate([np.any(one.margins < 0.0, axis=1) for one in motions]))
+        self.probability = {name: judge(*rows) for name, judge in judges.items()}
+        sizes = [len(one.state) for one in motions]
+        self.motion = np.repeat(np.arange(len(motions)), sizes)
+        self.first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+        self.is_unsafe = np.array([not one.is_safe for one in motions])
 
     def is_wrong(self, name: str) -> np.ndarray:
         """Whether a method is sure and wrong in each row, (N,)."""
-        one = self.verdicts[name]
-        is_sure = (one.probability >= CONFIDENT) & ~one.is_unknown
-        return is_sure & self.is_unsafe[self.motion]
+        return (self.probability[name] >= CONFIDENT) & self.is_unsafe[self.motion]
 
 
 def shift_estimates(judged: JudgedShift) -> dict[str, Estimate]:
@@ -184,22 +116,13 @@ def shift_estimates(judged: JudgedShift) -> dict[str, Estimate]:
     """
     is_unsafe, motion = judged.is_unsafe, judged.motion
     found = {"unsafe": proportion(int(is_unsafe.sum()), len(is_unsafe))}
-    for name, verdicts in judged.verdicts.items():
-        found[f"{name}.confident_error"] = mean_over(judged.is_wrong(name), motion)
-        found[f"{name}.unknown"] = mean_over(verdicts.is_unknown, motion)
+    for name, probability in judged.probability.items():
+        found[f"{name}.confident_error"] = mean(judged.is_wrong(name), motion, bootstrap=BOOTSTRAP)
+        found[f"{name}.unknown"] = mean(np.isnan(probability), motion, bootstrap=BOOTSTRAP)
         if 0 < is_unsafe.sum() < len(is_unsafe):
-            score = 1.0 - np.nan_to_num(verdicts.probability)
+            score = 1.0 - np.nan_to_num(probability)
             found[f"{name}.auc"] = auc(score, is_unsafe[motion], motion)
     return found
-
-
-def mean_over(values: np.ndarray, motion: np.ndarray) -> Estimate:
-    """Mean of the values (N,) of rows, with its interval over their motions (N,)."""
-
-    def mean(weight: np.ndarray) -> float:
-        return float(np.average(values, weights=weight)) if weight.any() else np.nan
-
-    return BOOTSTRAP.over_episodes(mean, motion)
 
 
 def evaluate_shifts(
@@ -216,7 +139,7 @@ def evaluate_shifts(
     found: dict[str, Estimate] = {}
     for i, (name, (_, motions)) in enumerate(sets.items()):
         progress("shifts", i, len(sets))
-        judged = JudgedShift.judged_by(judges, motions, assessment)
+        judged = JudgedShift(judges, motions, assessment)
         of = {**shift_estimates(judged), **more(judged)}
         found |= {f"shifts.{name}.{key}": estimate for key, estimate in of.items()}
     progress("shifts", len(sets), len(sets))
@@ -234,12 +157,10 @@ def shifts_tables(results: Results) -> list[Table]:
             f"({false.low:.2f}–{false.high:.2f}) false alarms an hour."
         )
     labels = {name: spoken(name.removeprefix("shifts.")) for name in sets}
-    rows = rows_of(results, labels, _COLUMNS)
-    table = Table(
-        corner="shift", columns=_COLUMNS, rows=rows, title="Γ under shifts", meaning=meaning
-    )
-    found = zip(*(row.estimates for row in rows), strict=True)
-    return [table.narrow([one.key for one, of in zip(_COLUMNS, found, strict=True) if any(of)])]
+    columns = [one for one in _COLUMNS if any(f"{name}.{one.key}" in results for name in sets)]
+    rows = rows_of(results, labels, columns)
+    title = "Γ under shifts"
+    return [Table(corner="shift", columns=columns, rows=rows, title=title, meaning=meaning)]
 
 
 def shifts_figure(estimates: Mapping[str, Estimate]) -> Figure:

@@ -3,34 +3,20 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS
 from drake_safety.robots.robot import ObservationNoise, Payload, PlantVariation
 from drake_safety.robots.robot_model import by_pattern
 from drake_safety.robots.shift import Fault, JointShift, Shift
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
-
-_SLOPE_RAD = math.radians(10.0)
-_SIDE_FORCE_SHARE = 0.1  # Of the weight.
-_PAYLOAD_SHARE = 0.3  # Of the mass.
-_MASS_SCALE = 1.5
-_WEAK_SHARE = 0.9  # Of the joint's static torque in the standing posture.
-_LOW_FRICTION = 0.1
-_DELAY_PERIODS = 5  # Of the controller.
-_HOLE_SHARE = 0.07  # Of the standing height.
-_JOINT_BIAS_RAD = 0.05
-_NOISE_FACTOR = 10.0
-_FROZEN_AT_S = 0.4
-_STALE_S = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +39,7 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     """
     own = {
         f"variation {name}": PlantShift(
-            kind="plant",
-            variation=variation,
-            options=scenario.task_class().pairing_options(scenario, name),
+            kind="plant", variation=variation, options=scenario.options_for("pairs", name)
         )
         for name, variation in scenario.variations.items()
         if name != "nominal"
@@ -70,44 +54,41 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     loaded = int(np.argmax(torques))
     joint = kinematics.joint_names[loaded]
     foot = kinematics.foot_names[0]
-    weak_scale = _WEAK_SHARE * torques[loaded] / _effort_limit(kinematics, joint)
-    lateral_n = _SIDE_FORCE_SHARE * mass_kg * 9.81
-    late_s = _whole(_DELAY_PERIODS * scenario.control_period_s, scenario.time_step_s)
+    plant = kinematics.plant
+    motors = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
+    limit = next(motor.effort_limit() for motor in motors if motor.joint().name() == joint)
+    weak_scale = 0.9 * torques[loaded] / limit  # It does not hold the standing posture.
+    late_s = _whole(5 * scenario.control_period_s, scenario.time_step_s)
     lasting = {
-        "slope": Shift(slope_rad=_SLOPE_RAD),
-        "side_force": Shift(base_force_n=[0.0, lateral_n, 0.0]),
+        "slope": Shift(slope_rad=math.radians(10.0)),
+        "side_force": Shift(base_force_n=[0.0, 0.1 * mass_kg * 9.81, 0.0]),
         "weak_joint": Shift(joints={joint: JointShift(effort_scale=weak_scale)}),
         "locked_joint": Shift(joints={joint: JointShift(is_locked=True)}),
         "late_command": Shift(command_delay_s=late_s),
-        "hole": Shift(holes_m={foot: _HOLE_SHARE * kinematics.standing_height}),
+        "hole": Shift(holes_m={foot: 0.07 * kinematics.standing_height}),
     }
     if by_pattern(robot.joint_gains, joint, "gains", robot.name) is not None:
         lasting["soft_joint"] = Shift(joints={joint: JointShift(stiffness_scale=0.5)})
-    names = kinematics.plant.GetStateNames(add_model_instance_prefix=False)
+    names = plant.GetStateNames(add_model_instance_prefix=False)
     n_q, period_s = kinematics.num_positions, scenario.control_period_s
     positions, velocities = names[NUM_BASE_POSITIONS:n_q], names[n_q:]
     faults = {
-        "joint_bias": Fault(kind="bias", entries=positions, value=_JOINT_BIAS_RAD),
+        "joint_bias": Fault(kind="bias", entries=positions, value=0.05),
         "dead_velocities": Fault(kind="zero", entries=velocities),
-        "stale": Fault(kind="delay", value=_whole(_STALE_S, period_s)),
+        "stale": Fault(kind="delay", value=_whole(0.2, period_s)),
         "frozen": Fault(kind="freeze"),
-        "frozen_later": Fault(kind="freeze", start_s=_FROZEN_AT_S),
+        "frozen_later": Fault(kind="freeze", start_s=0.4),
     }
     noise = nominal.input_noise
-    noisy = ObservationNoise(position=noise.position, velocity=_NOISE_FACTOR * noise.velocity)
+    noisy = ObservationNoise(position=noise.position, velocity=10.0 * noise.velocity)
     plants = {
-        **{name: dataclasses.replace(nominal, shift=shift) for name, shift in lasting.items()},
-        "payload": dataclasses.replace(nominal, payload=Payload(mass_kg=_PAYLOAD_SHARE * mass_kg)),
-        "heavy": dataclasses.replace(nominal, mass_scale=_MASS_SCALE * nominal.mass_scale),
-        "slippery": dataclasses.replace(nominal, foot_friction=_LOW_FRICTION),
+        **{name: replace(nominal, shift=shift) for name, shift in lasting.items()},
+        "payload": replace(nominal, payload=Payload(mass_kg=0.3 * mass_kg)),
+        "heavy": replace(nominal, mass_scale=1.5 * nominal.mass_scale),
+        "slippery": replace(nominal, foot_friction=0.1),
     }
-    sensors = {
-        **{
-            name: dataclasses.replace(nominal, shift=Shift(sensor_faults=[fault]))
-            for name, fault in faults.items()
-        },
-        "noisy_velocities": dataclasses.replace(nominal, input_noise=noisy),
-    }
+    sensors = {n: replace(nominal, shift=Shift(sensor_faults=[f])) for n, f in faults.items()}
+    sensors["noisy_velocities"] = replace(nominal, input_noise=noisy)
     return {
         **{name: PlantShift(kind="plant", variation=one) for name, one in plants.items()},
         **own,
@@ -118,18 +99,6 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
 def _whole(time_s: float, period_s: float) -> float:
     """The multiple of a period, at least one, that is nearest to a time."""
     return max(round(time_s / period_s), 1) * period_s
-
-
-def _effort_limit(kinematics: RobotKinematics, joint: str) -> float:
-    limit = by_pattern(kinematics.robot.effort_limits, joint, "effort limit", kinematics.robot.name)
-    if limit is None:
-        plant = kinematics.plant
-        limit = next(
-            plant.get_joint_actuator(i).effort_limit()
-            for i in plant.GetJointActuatorIndices()
-            if plant.get_joint_actuator(i).joint().name() == joint
-        )
-    return float(limit)
 
 
 def shifted_scenario(scenario: Scenario, name: str, shift: PlantShift) -> Scenario:

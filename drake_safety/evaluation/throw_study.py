@@ -26,7 +26,6 @@ PAPER_THRESHOLD = 0.6
 class TriggerRule:
     """A scorer with a threshold that triggers recovery."""
 
-    name: str
     scorer: Scorer
     threshold: float
 
@@ -37,8 +36,8 @@ def trigger_rules(
     """The scenario's rule, named "sharpened", and the paper's."""
     own, printed = assessment_scorer("sharpened", sharpened), assessment_scorer("paper", paper)
     return [
-        TriggerRule(name="sharpened", scorer=own, threshold=threshold),
-        TriggerRule(name="paper", scorer=printed, threshold=PAPER_THRESHOLD),
+        TriggerRule(scorer=own, threshold=threshold),
+        TriggerRule(scorer=printed, threshold=PAPER_THRESHOLD),
     ]
 
 
@@ -76,24 +75,15 @@ def evaluate_throws(
     throw = partial(run_throws, scenario, seed=seed, variation=variation, num_workers=num_workers)
     logs = throw(list(range(num_throws)), progress=partial(report, "throws, balancing alone"))
     triggers = {
-        rule.name: np.array(
-            [
-                trigger_time(log, log_probability(log, rule.scorer, persistence_s), rule.threshold)
-                for log in logs
-            ]
-        )
+        rule.scorer.name: [
+            trigger_time(log, log_probability(log, rule.scorer, persistence_s), rule.threshold)
+            for log in logs
+        ]
         for rule in rules
     }
-    triggered = {
-        name: {
-            log.index: float(time)
-            for log, time in zip(logs, times, strict=True)
-            if not math.isnan(time)
-        }
-        for name, times in triggers.items()
-    }
     # Rules often trigger at the same instant: each distinct recovery is simulated once.
-    wanted = sorted({pair for times in triggered.values() for pair in times.items()})
+    pairs = {pair for times in triggers.values() for pair in enumerate(times)}
+    wanted = sorted(pair for pair in pairs if not math.isnan(pair[1]))
     again = throw(
         [index for index, _ in wanted],
         trigger_times_s=[time_s for _, time_s in wanted],
@@ -102,25 +92,22 @@ def evaluate_throws(
     simulated = dict(zip(wanted, again, strict=True))
     estimates = _estimates_without_recovery(logs)
     for rule in rules:
-        recovered = {i: simulated[i, time] for i, time in triggered[rule.name].items()}
-        found = _rule_estimates(logs, triggers[rule.name], recovered)
+        times = triggers[rule.scorer.name]
+        recovered = {i: simulated[i, t] for i, t in enumerate(times) if not math.isnan(t)}
+        found = _rule_estimates(logs, np.array(times), recovered)
         found["threshold"] = Estimate.exact(rule.threshold, len(logs))
-        estimates |= {f"throws.{rule.name}.{key}": estimate for key, estimate in found.items()}
+        estimates |= {f"throws.{rule.scorer.name}.{key}": one for key, one in found.items()}
     return estimates, logs
 
 
 def _estimates_without_recovery(logs: Sequence[Motion]) -> dict[str, Estimate]:
-    left = [log for log in logs if log.has_left]
-    fell = [log for log in logs if log.has_fallen]
+    leave_s = np.array([log.leave_time_s - log.push_time_s for log in logs if log.has_left])
+    fall_s = np.array([log.fall_time_s - log.push_time_s for log in logs if log.has_fallen])
     return {
-        "throws.falls_without_recovery": proportion(len(fell), len(logs)),
-        "throws.leaves_safe_set_without_recovery": proportion(len(left), len(logs)),
-        "throws.impact_to_leaving_s": median(
-            np.array([log.leave_time_s - log.push_time_s for log in left])
-        ),
-        "throws.impact_to_fall_s": median(
-            np.array([log.fall_time_s - log.push_time_s for log in fell])
-        ),
+        "throws.falls_without_recovery": proportion(len(fall_s), len(logs)),
+        "throws.leaves_safe_set_without_recovery": proportion(len(leave_s), len(logs)),
+        "throws.impact_to_leaving_s": median(leave_s),
+        "throws.impact_to_fall_s": median(fall_s),
     }
 
 
@@ -128,36 +115,34 @@ def _rule_estimates(
     logs: Sequence[Motion], times: np.ndarray, recovered: Mapping[int, Motion]
 ) -> dict[str, Estimate]:
     """Estimates of a rule from its trigger times (N,), NaN for never, and its recoveries."""
-    n = len(logs)
-    calm = [i for i, log in enumerate(logs) if not log.has_left]
-    fell = [i for i, log in enumerate(logs) if log.has_fallen]
+    times = np.where(np.isnan(times), np.inf, times)
     touch = np.array([log.push_time_s for log in logs])
     fall = np.array([log.fall_time_s for log in logs])
-    is_triggered = ~np.isnan(times)
-    falls = sum(recovered.get(log.index, log).has_fallen for log in logs)
-    in_time = [i for i in fell if is_triggered[i] and times[i] < fall[i]]
-    after_touch = [i for i in in_time if times[i] >= touch[i] - 1e-9]
+    falls, is_early = np.isfinite(fall), times < touch - 1e-9
+    in_time = falls & (times < fall)
+    after_touch = in_time & ~is_early
+    calm = np.array([not log.has_left for log in logs])
+    false = calm & np.isfinite(times)
+    fallen = [recovered.get(i, log).has_fallen for i, log in enumerate(logs)]
     successes = [log for log in recovered.values() if not log.has_fallen]
+
+    def share(counted: np.ndarray, of: np.ndarray) -> Estimate:
+        return proportion(int(counted.sum()), int(of.sum()))
+
     estimates = {
-        "falls_with_recovery": proportion(falls, n),
-        "false_triggers": proportion(int(is_triggered[calm].sum()), len(calm)),
-        "triggers_before_impact": proportion(
-            int(np.sum(times[is_triggered] < touch[is_triggered] - 1e-9)), n
-        ),
-        "falls_missed": proportion(len(fell) - len(in_time), len(fell)),
+        "falls_with_recovery": proportion(sum(fallen), len(logs)),
+        "false_triggers": share(false, calm),
+        "triggers_before_impact": proportion(int(is_early.sum()), len(logs)),
+        "falls_missed": share(falls & ~in_time, falls),
         "trigger_after_impact_s": median(times[after_touch] - touch[after_touch]),
         "trigger_before_fall_s": median(fall[in_time] - times[in_time]),
-        "false_triggers_that_fall": proportion(
-            sum(recovered[logs[i].index].has_fallen for i in calm if is_triggered[i]),
-            int(is_triggered[calm].sum()),
-        ),
+        "false_triggers_that_fall": share(false & fallen, false),
         "settled": proportion(
             sum(log["recovery_active"][-1, 0] == 0 for log in successes), len(successes)
         ),
     }
     for kind in sorted(VIOLATIONS) if recovered else ():
         column = VIOLATIONS.index(kind)
-        estimates[f"recoveries_with_{kind}"] = proportion(
-            sum(bool(log["violations"][:, column].any()) for log in successes), len(successes)
-        )
+        violated = sum(bool(log["violations"][:, column].any()) for log in successes)
+        estimates[f"recoveries_with_{kind}"] = proportion(violated, len(successes))
     return estimates

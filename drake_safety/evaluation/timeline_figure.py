@@ -3,36 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpecBase
+from matplotlib.patches import ConnectionPatch
+from matplotlib.patheffects import withStroke
 
-from drake_safety.evaluation.figure_style import (
-    BALL_COLOUR,
-    FAINT_INK,
-    INK,
-    RECOVERY_COLOUR,
-    SAFE_COLOUR,
-    SERIES_COLOURS,
-    SERIES_DASHES,
-    UNKNOWN_COLOUR,
-    UNSAFE_COLOUR,
-    drawing_style,
-    label_threshold,
-    new_figure,
-    spoken,
-)
-from drake_safety.learning.beliefs import SAFE, UNCERTAINTY
+from drake_safety.evaluation import figure_style as style
+from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, UNSAFE
 from drake_safety.learning.change_detector import Alarm
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.pushes import Push
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.gridspec import GridSpecBase
 
 _WIDTH = 12.0  # All sizes are in inches.
 _CURVE_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 2.4, 1.0, 1.3
@@ -42,6 +28,27 @@ _LABEL_ROW_HEIGHT, _LETTER_WIDTH, _LABEL_OFFSET = 0.2, 0.066, 0.11  # Of labels 
 _LOWEST, _HIGHEST = -0.02, 1.05  # Ends of the axis without labels.
 _NUM_LEVELS, _MOST_POINTS = 4, 4000  # Curves of levels, and points of one.
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
+_Style = Mapping[str, Any]
+_LIMIT: _Style = {"linestyle": (0, (4, 3)), "linewidth": 1.2}
+_BALL: _Style = {"linestyle": (0, (1, 2)), "linewidth": 1.0}
+_TRIGGER: _Style = {"linewidth": 1.2}
+_LEAVING: _Style = {"linestyle": (0, (4, 2)), "linewidth": 1.2}
+_LEGEND: _Style = {
+    "loc": "center left",
+    "bbox_to_anchor": (1.0, 0.5),
+    "handlelength": 1.4,
+    "borderaxespad": 0.3,
+}
+
+
+@dataclass(frozen=True)
+class _Event:
+    """A named instant, with the style of its line, if it has one."""
+
+    time_s: float
+    words: str
+    colour: str
+    line: _Style | None = None
 
 
 def timeline_figure(
@@ -92,36 +99,49 @@ def timeline_figure(
             raise ValueError(
                 f"timeline_figure: a still at {instant} s is outside {time_s[0]}..{time_s[-1]} s"
             )
-    labels = _labels(throws, pushes, trigger_times_s, trigger_label, leave_time_s)
-    labels += [
-        _Label(start, "recovery steps", RECOVERY_COLOUR) for start, _ in recovery_intervals_s
+    events = [
+        _Event(one.time_s, f"{one.mass_kg:.1f} kg, {one.speed_m_s:.1f} m/s", style.INK, _BALL)
+        for one in throws
     ]
-    rows = _label_rows(labels, time_s[0], time_s[-1])
+    for push in pushes:
+        words = f"push of {push.strength_n:.0f} N for {push.duration_s:g} s"
+        events.append(_Event(push.time_s, words, style.INK))
+    for instant in trigger_times_s:
+        events.append(_Event(instant, trigger_label, style.UNSAFE_COLOUR, _TRIGGER))
+    if math.isfinite(leave_time_s):
+        events.append(_Event(leave_time_s, "leaves the safe set", style.INK, _LEAVING))
+    for start, _ in recovery_intervals_s:
+        events.append(_Event(start, "recovery steps", style.RECOVERY_COLOUR))
+    rows = _label_rows(events, time_s[0], time_s[-1])
     heights = [_CURVE_HEIGHT + _LABEL_ROW_HEIGHT * (max(rows, default=-1) + 1)]
     if belief is not None:
         heights.append(_BELIEF_HEIGHT)
     if margins is not None:
         heights.append(_MARGINS_HEIGHT)
-    with drawing_style():
+    with style.drawing_style():
         fig, pictures, panels = _lay_out(heights, [image for _, image in stills])
         curve_axes, *others = panels
         curve_axes.set_xlim(time_s[0], time_s[-1])
-        curve_axes.axhline(threshold, color=UNSAFE_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2)
-        label_threshold(curve_axes, threshold, UNSAFE_COLOUR)
-        curve_axes.step(time_s, probability, where="post", color=SAFE_COLOUR, linewidth=2.0)
+        curve_axes.axhline(threshold, color=style.UNSAFE_COLOUR, **_LIMIT)
+        style.label_threshold(curve_axes, threshold, style.UNSAFE_COLOUR)
+        curve_axes.step(time_s, probability, where="post", color=style.SAFE_COLOUR, linewidth=2.0)
         curve_axes.set(yticks=[0.0, 0.5, 1.0], ylabel="probability")
-        remaining = iter(others)
         if belief is not None:
-            _draw_belief(next(remaining), time_s, belief)
+            _draw_belief(others.pop(0), time_s, belief)
         if margins is not None:
-            _draw_margins(next(remaining), time_s, margins, constraint_names, angular_constraints)
+            _draw_margins(others.pop(0), time_s, margins, constraint_names, angular_constraints)
         for panel in panels:
-            _mark_instants(panel, throws, pushes, trigger_times_s, leave_time_s)
+            for push in pushes:
+                _span(panel, push.time_s, push.time_s + push.duration_s, style.BALL_COLOUR, 0.25)
+            for event in events:
+                if event.line is not None:
+                    panel.axvline(event.time_s, color=event.colour, **event.line)
         for start, end in recovery_intervals_s:
-            curve_axes.axvspan(start, end, color=RECOVERY_COLOUR, alpha=0.14, linewidth=0, zorder=0)
+            _span(curve_axes, start, end, style.RECOVERY_COLOUR, 0.14)
         for instant in trigger_times_s:
-            curve_axes.plot(instant, threshold, "v", color=UNSAFE_COLOUR, markersize=8, zorder=5)
-        top = _draw_labels(curve_axes, labels, rows, (_LOWEST, _HIGHEST))
+            mark: _Style = {"color": style.UNSAFE_COLOUR, "markersize": 8, "zorder": 5}
+            curve_axes.plot(instant, threshold, "v", **mark)
+        top = _draw_labels(curve_axes, events, rows, (_LOWEST, _HIGHEST))
         for axes, letter, (instant, image) in zip(pictures, _LETTERS, stills, strict=False):
             axes.imshow(image, interpolation="antialiased")
             axes.set(xticks=[], yticks=[])
@@ -144,22 +164,22 @@ def levels_figure(
     # Of a long log the largest of some rows.
     firsts = np.arange(0, len(time_s), max(1, len(time_s) // _MOST_POINTS))
     peaks, levels = levels.max(axis=0), np.maximum.reduceat(levels, firsts)
-    labels = [_Label(float(time_s[one.begin]), one.cause, UNSAFE_COLOUR) for one in alarms]
-    rows = _label_rows(labels, time_s[0], time_s[-1])
-    with drawing_style():
+    events = [_Event(float(time_s[one.begin]), one.cause, style.UNSAFE_COLOUR) for one in alarms]
+    rows = _label_rows(events, time_s[0], time_s[-1])
+    with style.drawing_style():
         heights = [_CURVE_HEIGHT + _LABEL_ROW_HEIGHT * (max(rows, default=-1) + 1)]
         fig, _, (axes,) = _lay_out(heights, [])
         axes.set(xlim=(time_s[0], time_s[-1]), xlabel="time [s]", ylabel="level")
         for i, state in enumerate(np.argsort(peaks)[: -1 - _NUM_LEVELS : -1].tolist()):
-            style = {"color": SERIES_COLOURS[2 + i], "linestyle": SERIES_DASHES[i]}
-            axes.plot(time_s[firsts], levels[:, state], linewidth=1.5, label=names[state], **style)
+            line: _Style = {"color": style.SERIES_COLOURS[2 + i], "linewidth": 1.5}
+            dashes, name = style.SERIES_DASHES[i], names[state]
+            axes.plot(time_s[firsts], levels[:, state], linestyle=dashes, label=name, **line)
         if math.isfinite(limit):
-            axes.axhline(limit, color=UNSAFE_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2)
+            axes.axhline(limit, color=style.UNSAFE_COLOUR, **_LIMIT)
         for one in alarms:
-            ends = time_s[one.begin], time_s[one.end - 1]
-            axes.axvspan(*ends, color=UNSAFE_COLOUR, alpha=0.14, linewidth=0, zorder=0)
-        _draw_labels(axes, labels, rows, (0.0, 1.05 * max(1.0, float(peaks.max()))))
-        _add_legend_on_the_right(axes, *axes.get_legend_handles_labels())
+            _span(axes, time_s[one.begin], time_s[one.end - 1], style.UNSAFE_COLOUR, 0.14)
+        _draw_labels(axes, events, rows, (0.0, 1.05 * max(1.0, float(peaks.max()))))
+        axes.legend(**_LEGEND)
     return fig
 
 
@@ -171,13 +191,13 @@ def _lay_out(
     if images:
         aspect = max(image.shape[0] / image.shape[1] for image in images)
         strip_height = min(aspect * _WIDTH / len(images), _MAX_STILL_HEIGHT) + _STILL_TITLE_HEIGHT
-        fig = new_figure(_WIDTH, sum(heights) + strip_height + _AXIS_LABEL_HEIGHT)
+        fig = style.new_figure(_WIDTH, sum(heights) + strip_height + _AXIS_LABEL_HEIGHT)
         halves = fig.add_gridspec(2, 1, height_ratios=[strip_height, sum(heights)], hspace=0.08)
         strip = halves[0, 0].subgridspec(1, len(images), wspace=0.03)
         pictures = [fig.add_subplot(strip[0, i]) for i in range(len(images))]
         rows: GridSpecBase = halves[1, 0].subgridspec(len(heights), 1, height_ratios=heights)
     else:
-        fig = new_figure(_WIDTH, sum(heights) + _AXIS_LABEL_HEIGHT)
+        fig = style.new_figure(_WIDTH, sum(heights) + _AXIS_LABEL_HEIGHT)
         rows = fig.add_gridspec(len(heights), 1, height_ratios=heights)
     panels: list[Axes] = []
     for i in range(len(heights)):
@@ -186,19 +206,17 @@ def _lay_out(
 
 
 def _draw_belief(axes: Axes, time_s: np.ndarray, belief: np.ndarray) -> None:
-    safe = belief[:, SAFE]
-    safe_or_unknown = safe + belief[:, UNCERTAINTY]
-    layers = (
-        ("safe", np.zeros_like(safe), safe, SAFE_COLOUR),
-        ("unknown", safe, safe_or_unknown, UNKNOWN_COLOUR),
-        ("unsafe", safe_or_unknown, np.ones_like(safe), UNSAFE_COLOUR),
+    axes.stackplot(
+        time_s,
+        *belief[:, [SAFE, UNCERTAINTY, UNSAFE]].T,
+        labels=["safe", "unknown", "unsafe"],
+        colors=[style.SAFE_COLOUR, style.UNKNOWN_COLOUR, style.UNSAFE_COLOUR],
+        step="post",
+        linewidth=0,
     )
-    for name, lower, upper, colour in layers:
-        axes.fill_between(time_s, lower, upper, step="post", color=colour, linewidth=0, label=name)
     axes.set(ylim=(0.0, 1.0), yticks=[0.0, 1.0], ylabel="belief")
     # The legend lists the layers from the top.
-    handles, labels = axes.get_legend_handles_labels()
-    _add_legend_on_the_right(axes, handles[::-1], labels[::-1])
+    axes.legend(**_LEGEND, reverse=True)
 
 
 def _draw_margins(
@@ -208,91 +226,30 @@ def _draw_margins(
     names: Sequence[str],
     angular: Sequence[str],
 ) -> None:
-    axes.axhline(0.0, color=FAINT_INK, linewidth=0.8)
+    axes.axhline(0.0, color=style.FAINT_INK, linewidth=0.8)
     for i, name in enumerate(names):
         is_angle = name in angular
         axes.plot(
             time_s,
             np.degrees(margins[:, i]) if is_angle else 100.0 * margins[:, i],
             # The first two colours are those of safe and unsafe.
-            color=SERIES_COLOURS[(2 + i) % len(SERIES_COLOURS)],
-            linestyle=SERIES_DASHES[i % len(SERIES_DASHES)],
+            color=style.SERIES_COLOURS[(2 + i) % len(style.SERIES_COLOURS)],
+            linestyle=style.SERIES_DASHES[i % len(style.SERIES_DASHES)],
             linewidth=1.5,
-            label=f"{spoken(name)} [°]" if is_angle else spoken(name),
+            label=f"{style.spoken(name)} [°]" if is_angle else style.spoken(name),
         )
     low, high = axes.get_ylim()
     low = min(low, -0.12 * high)
-    axes.axhspan(low, 0.0, color=UNSAFE_COLOUR, alpha=0.08, linewidth=0)
+    axes.axhspan(low, 0.0, color=style.UNSAFE_COLOUR, alpha=0.08, linewidth=0)
     axes.set(ylim=(low, high), ylabel="margin [cm]")
-    _add_legend_on_the_right(axes, *axes.get_legend_handles_labels())
+    axes.legend(**_LEGEND)
 
 
-def _add_legend_on_the_right(axes: Axes, handles: Sequence[Any], labels: Sequence[str]) -> None:
-    axes.legend(
-        handles,
-        labels,
-        loc="center left",
-        bbox_to_anchor=(1.0, 0.5),
-        handlelength=1.4,
-        borderaxespad=0.3,
-    )
+def _span(axes: Axes, start_s: float, end_s: float, colour: str, alpha: float) -> None:
+    axes.axvspan(start_s, end_s, color=colour, alpha=alpha, linewidth=0, zorder=0)
 
 
-def _mark_instants(
-    axes: Axes,
-    throws: Sequence[Throw],
-    pushes: Sequence[Push],
-    trigger_times_s: Sequence[float],
-    leave_time_s: float,
-) -> None:
-    for throw in throws:
-        axes.axvline(throw.time_s, color=INK, linewidth=1.0, linestyle=(0, (1, 2)))
-    for push in pushes:
-        axes.axvspan(
-            push.time_s,
-            push.time_s + push.duration_s,
-            color=BALL_COLOUR,
-            alpha=0.25,
-            linewidth=0,
-            zorder=0,
-        )
-    for instant in trigger_times_s:
-        axes.axvline(instant, color=UNSAFE_COLOUR, linewidth=1.2)
-    if math.isfinite(leave_time_s):
-        axes.axvline(leave_time_s, color=INK, linewidth=1.2, linestyle=(0, (4, 2)))
-
-
-@dataclass(frozen=True)
-class _Label:
-    """The name of an event; that of a ball follows a mark."""
-
-    time_s: float
-    words: str
-    colour: str
-    is_ball: bool = False
-
-
-def _labels(
-    throws: Sequence[Throw],
-    pushes: Sequence[Push],
-    trigger_times_s: Sequence[float],
-    trigger_label: str,
-    leave_time_s: float,
-) -> list[_Label]:
-    labels = [
-        _Label(one.time_s, f"{one.mass_kg:.1f} kg, {one.speed_m_s:.1f} m/s", INK, is_ball=True)
-        for one in throws
-    ]
-    for push in pushes:
-        words = f"push of {push.strength_n:.0f} N for {push.duration_s:g} s"
-        labels.append(_Label(push.time_s, words, INK))
-    labels += [_Label(instant, trigger_label, UNSAFE_COLOUR) for instant in trigger_times_s]
-    if math.isfinite(leave_time_s):
-        labels.append(_Label(leave_time_s, "leaves the safe set", INK))
-    return labels
-
-
-def _label_rows(labels: Sequence[_Label], start_s: float, end_s: float) -> list[int]:
+def _label_rows(labels: Sequence[_Event], start_s: float, end_s: float) -> list[int]:
     """Assigns labels to rows, 0 at the top, such that none covers another or its instant."""
     taken: list[list[tuple[float, float]]] = []
     found = []
@@ -311,19 +268,17 @@ def _label_rows(labels: Sequence[_Label], start_s: float, end_s: float) -> list[
 
 
 def _draw_labels(
-    axes: Axes, labels: Sequence[_Label], rows: Sequence[int], ends: tuple[float, float]
+    axes: Axes, labels: Sequence[_Event], rows: Sequence[int], ends: tuple[float, float]
 ) -> float:
     """Writes labels in rows above an axis with these ends; returns the new upper end."""
-    from matplotlib.patheffects import withStroke
-
     row_height = (ends[1] - ends[0]) * _LABEL_ROW_HEIGHT / _CURVE_HEIGHT
     top = ends[1] + row_height * (max(rows, default=-1) + 1)
     axes.set_ylim(ends[0], top)
     start_s, end_s = axes.get_xlim()
     for label, row in zip(labels, rows, strict=True):
         place = (label.time_s, top - (row + 0.5) * row_height)
-        if label.is_ball:
-            axes.plot(*place, "o", color=BALL_COLOUR, markersize=8, clip_on=False, zorder=5)
+        if label.line is _BALL:
+            axes.plot(*place, "o", color=style.BALL_COLOUR, markersize=8, clip_on=False, zorder=5)
         length = (len(label.words) * _LETTER_WIDTH + _LABEL_OFFSET) / (_WIDTH - 2.0)
         is_late = label.time_s + length * (end_s - start_s) > end_s
         axes.annotate(
@@ -346,19 +301,11 @@ def _join(
     fig: Figure, picture: Axes, curve_axes: Axes, point: tuple[float, float], top: float
 ) -> None:
     """Draws a line from the lower edge of an image to its instant, and down to the curve of Γ."""
-    from matplotlib.patches import ConnectionPatch
-
-    line = ConnectionPatch(
-        xyA=(0.5, 0.0),
-        coordsA=picture.transAxes,
-        xyB=(point[0], top),
-        coordsB=curve_axes.transData,
-        color=FAINT_INK,
-        linewidth=0.9,
-    )
-    line.set_in_layout(False)
-    fig.add_artist(line)
-    curve_axes.vlines(point[0], point[1], top, color=FAINT_INK, linewidth=0.9, alpha=0.6, zorder=1)
-    curve_axes.plot(
-        *point, "o", color="white", markeredgecolor=INK, markersize=6, clip_on=False, zorder=6
-    )
+    line: _Style = {"color": style.FAINT_INK, "linewidth": 0.9}
+    ends = (0.5, 0.0), (point[0], top), picture.transAxes, curve_axes.transData
+    above = ConnectionPatch(*ends, **line)
+    above.set_in_layout(False)
+    fig.add_artist(above)
+    curve_axes.vlines(point[0], point[1], top, alpha=0.6, zorder=1, **line)
+    ring: _Style = {"color": "white", "markeredgecolor": style.INK, "markersize": 6, "zorder": 6}
+    curve_axes.plot(*point, "o", clip_on=False, **ring)

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from drake_safety.evaluation.embedding_figure import safety_colours
 from drake_safety.evaluation.figure_style import FAINT_INK, INK, drawing_style, new_figure, spoken
 from drake_safety.evaluation.metrics import area_under_curve
+from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import check_unused
 from drake_safety.learning.segments import DIVERGED, Episodes
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.figure import Figure
 
 _OUTSIDE_COLOUR = "#6b7178"
 _HATCH = "////"
@@ -64,35 +66,34 @@ def truth_figure(
     def first(array: str) -> np.ndarray:
         return np.array([getattr(episode, array)[episode.first_step] for episode in starts])
 
-    parameters = assessment.parameters
-    state = first("true_state" if assessment.settings.uses_true_state else "state")
-    features = first("features")
-    found = assessment.predict(state, first("desired_preview"), features)
-    is_known = ~is_unknown(found.belief, parameters.initial_uncertainty)
-    # Where it does not know, the probability is zero.
-    gamma, unsafe_score = np.where(is_known, found.probability, np.nan), 1.0 - found.probability
+    scorer = assessment_scorer("Γ", assessment)
+    state = first("true_state" if scorer.uses_true_state else "state")
+    gamma = scorer.probability(state, first("desired_preview"), first("features"))
     is_safe = np.array([episode.is_safe for episode in starts])
-    is_outside = ~inside
-    area = area_under_curve(unsafe_score[inside], ~is_safe[inside])
+    area = area_under_curve(1.0 - np.nan_to_num(gamma)[inside], ~is_safe[inside])
     points = first("true_state")[:, [names.index(x), names.index(y)]]
     titles = (
         "Starts by probability" + ("" if np.isnan(area) else f", AUC {area:.3f}"),
         f"Simulated: {100 * is_safe[inside].mean():.0f} % of {inside.sum()} stay safe",
     )
-    panels = (gamma, is_known), (is_safe.astype(float), np.ones_like(is_known))
     with drawing_style():
         fig = new_figure(9.0, 4.6)
         both = fig.subplots(1, 2, sharex=True, sharey=True)
         grid = _grid_order(points)
-        for axes, title, (value, has_value) in zip(both, titles, panels, strict=True):
+        for axes, title, value in zip(both, titles, (gamma, is_safe.astype(float)), strict=True):
             if grid is None:
-                shade = _draw_points(axes, points, value, has_value, is_outside)
+                shade = _draw_points(axes, points, value, ~inside)
             else:
-                shade = _draw_cells(axes, points, value, is_outside, is_safe, grid)
+                shade = _draw_cells(axes, points, value, ~inside, is_safe, grid)
             axes.set(title=title, xlabel=spoken(x) if labels is None else labels[0])
         both[0].set_ylabel(spoken(y) if labels is None else labels[1])
-        marks = {"has_unknown": (inside & ~is_known).any(), "has_outside": is_outside.any()}
-        _add_legend(fig, **marks, is_grid=grid is not None, has_boundary=not np.isnan(area))
+        _add_legend(
+            fig,
+            has_unknown=np.isnan(gamma[inside]).any(),
+            has_outside=not inside.all(),
+            is_grid=grid is not None,
+            has_boundary=not np.isnan(area),
+        )
         bar = fig.colorbar(shade, ax=both, shrink=0.9, pad=0.02, label="probability of safety")
         bar.outline.set_visible(False)
     return fig
@@ -113,26 +114,16 @@ def _grid_order(points: np.ndarray) -> np.ndarray | None:
 
 
 def _draw_points(
-    axes: Axes, points: np.ndarray, value: np.ndarray, is_known: np.ndarray, is_outside: np.ndarray
+    axes: Axes, points: np.ndarray, value: np.ndarray, is_outside: np.ndarray
 ) -> ScalarMappable:
-    """Draws a point for each start: coloured, hollow ("don't know") or grey (outside)."""
+    """Draws a point for each start: coloured, hollow (NaN, "don't know") or grey (outside)."""
     x, y = points.T
-    hollow = ~is_known & ~is_outside
+    hollow, rows = np.isnan(value) & ~is_outside, ~np.isnan(value) & ~is_outside
     axes.scatter(x[hollow], y[hollow], s=_DOT, facecolors="white", edgecolors=INK, linewidths=0.6)
     axes.scatter(x[is_outside], y[is_outside], s=0.6 * _DOT, color=_OUTSIDE_COLOUR, marker="x")
-    rows = is_known & ~is_outside
-    return axes.scatter(
-        x[rows],
-        y[rows],
-        c=value[rows],
-        cmap=safety_colours(),
-        vmin=0.0,
-        vmax=1.0,
-        s=_DOT,
-        linewidths=0.3,
-        edgecolors=FAINT_INK,
-        rasterized=True,
-    )
+    edge: dict[str, Any] = {"linewidths": 0.3, "edgecolors": FAINT_INK, "rasterized": True}
+    shade: dict[str, Any] = {"cmap": safety_colours(), "vmin": 0.0, "vmax": 1.0}
+    return axes.scatter(x[rows], y[rows], c=value[rows], s=_DOT, **edge, **shade)
 
 
 def _draw_cells(
@@ -144,8 +135,6 @@ def _draw_cells(
     grid: np.ndarray,
 ) -> ScalarMappable:
     """Draws a cell for each start on a grid: coloured, hatched ("don't know") or grey (outside)."""
-    from matplotlib.colors import ListedColormap
-
     place = points[grid[0], 0], points[grid[:, 0], 1]
     axes.patch.set(facecolor="white", edgecolor=FAINT_INK, hatch=_HATCH)
     style: dict[str, Any] = {"shading": "nearest", "rasterized": True, "vmin": 0.0, "vmax": 1.0}
@@ -165,27 +154,20 @@ def _add_legend(
     fig: Figure, *, has_unknown: bool, has_outside: bool, is_grid: bool, has_boundary: bool
 ) -> None:
     """Adds what the colour bar does not say, below the panels."""
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
 
-    def mark(**style: Any) -> Line2D:
-        return Line2D([], [], linestyle="", **style)
+    def mark(label: str, of_cell: dict[str, Any], of_point: dict[str, Any]) -> Artist:
+        if is_grid:
+            return Patch(label=label, **of_cell)
+        return Line2D([], [], linestyle="", label=label, **of_point)
 
-    handles: list[Line2D | Patch] = []
+    handles: list[Artist] = []
     if has_unknown:
-        label = "Γ: don't know"
-        handles.append(
-            Patch(facecolor="white", edgecolor=FAINT_INK, hatch=_HATCH, label=label)
-            if is_grid
-            else mark(marker="o", markerfacecolor="white", markeredgecolor=INK, label=label)
-        )
+        cell = {"facecolor": "white", "edgecolor": FAINT_INK, "hatch": _HATCH}
+        ring = {"marker": "o", "markerfacecolor": "white", "markeredgecolor": INK}
+        handles.append(mark("Γ: don't know", cell, ring))
     if has_outside:
-        label = "outside the safe set"
-        handles.append(
-            Patch(color=_OUTSIDE_COLOUR, label=label)
-            if is_grid
-            else mark(marker="x", color=_OUTSIDE_COLOUR, label=label)
-        )
+        grey = {"color": _OUTSIDE_COLOUR}
+        handles.append(mark("outside the safe set", grey, {"marker": "x", **grey}))
     if is_grid and has_boundary:
         handles.append(Line2D([], [], color=INK, linewidth=1.6, label="boundary by simulation"))
     if handles:

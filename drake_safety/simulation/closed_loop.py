@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.inputs import is_rate
 from drake_safety.learning.segments import RECORDED
 from drake_safety.systems.safety_assessor import AddSafetyAssessor, SafetyAssessor
 
 if TYPE_CHECKING:
     from drake_safety.control.kinematics import RobotKinematics
-    from drake_safety.simulation.episode_start import StatePlane
     from drake_safety.simulation.finding import Finding
 
 REQUIRED_PORTS = (*RECORDED, "safe")
 """Output ports of every task."""
 ASSESSMENT_PORTS = ("safety_probability", "belief")
 """Further output ports of a task with an assessment."""
+
+Purpose = Literal["evaluation", "paper", "pairs"]
+"""What a diagram is built for; see :meth:`ClosedLoop.options_for`."""
 
 _MOST_NAMES = 8  # Of a list that an error quotes whole.
 _SIZED_BY = {
@@ -78,13 +79,6 @@ class ClosedLoop(Diagram):
     angular_constraints: tuple[str, ...] = ()
     """Constraints whose margins are angles [rad]; the others are lengths [m]."""
 
-    judging_options: ClassVar[dict[str, Any]] = {}
-    """Options of the diagram for evaluation, if they differ from training's."""
-
-    paper_options: ClassVar[dict[str, Any]] = {}
-    """Options of the diagram for training episodes of the paper's mode, which has no disturbances
-    but the offsets of the initial state."""
-
     monitored_states: list[str] | None = None
     """States that the change monitor predicts, such as those that a real robot measures; None for
     all of them."""
@@ -117,9 +111,15 @@ class ClosedLoop(Diagram):
         return stated
 
     @classmethod
-    def pairing_options(cls, scenario: Any, variation: str) -> dict[str, Any]:
-        """Options with which an actual variation and its nominal twin can start alike."""
-        del scenario, variation
+    def options_for(cls, purpose: Purpose, scenario: Any, variation: str) -> dict[str, Any]:
+        """Options of the diagram that differ from those of training in the sharpened mode.
+
+        Args:
+            purpose: "evaluation"; "paper", for training of the paper's mode, which has no
+                disturbances but the offsets of the initial state; "pairs", with which an actual
+                variation and its nominal twin can start alike.
+        """
+        del purpose, scenario, variation
         return {}
 
     @classmethod
@@ -133,21 +133,6 @@ class ClosedLoop(Diagram):
         """Findings about the task's own files, which ``check`` checks before the diagram."""
         del scenario, kinematics
         return ()
-
-    @property
-    def rate_names(self) -> list[str]:
-        """States and features that depend on velocities."""
-        return [*filter(is_rate, self.state_names)]
-
-    @property
-    def mirror_options(self) -> dict[str, Any]:
-        """Options of the mirrored diagram; empty without a mirror image."""
-        return {}
-
-    @property
-    def state_planes(self) -> Mapping[str, StatePlane]:
-        """Planes of starts on which the true safe set can be simulated, by name of the plan."""
-        return {}
 
     def remove_visuals(self, context: Context) -> None:
         """Removes shapes that only pictures need from the Context of a simulation without them."""
@@ -258,12 +243,17 @@ def _told_from(value: Any, other: Any) -> str:
     return f"{len(value)} names, of which {own} are its own"
 
 
+def port_sizes(diagram: Diagram) -> dict[str, int]:
+    """Sizes of a diagram's output ports by name."""
+    ports = map(diagram.get_output_port, range(diagram.num_output_ports()))
+    return {port.get_name(): port.size() for port in ports}
+
+
 def require_ports(loop: ClosedLoop, names: Iterable[str], who: str = "") -> None:
     """Checks that a loop has output ports."""
     missing = [name for name in names if not loop.HasOutputPort(name)]
     if missing:
-        ports = [loop.get_output_port(i).get_name() for i in range(loop.num_output_ports())]
-        task = type(loop).__name__
+        task, ports = type(loop).__name__, list(port_sizes(loop))
         raise ValueError(f"{who}task '{task}' exports no port {missing}; it exports {ports}")
 
 
@@ -271,10 +261,7 @@ def check_ports(loop: ClosedLoop) -> None:
     """Checks that the required ports exist; those with names must have as many entries."""
     who = f"task '{type(loop).__name__}'"
     require_ports(loop, REQUIRED_PORTS + (ASSESSMENT_PORTS if loop.assessment else ()))
-    ports = {
-        port.get_name(): port.size()
-        for port in (loop.get_output_port(i) for i in range(loop.num_output_ports()))
-    }
+    ports = port_sizes(loop)
     sizes = {"safe": 1}
     for port, attribute in _SIZED_BY.items():
         names = vars(loop).get(attribute)

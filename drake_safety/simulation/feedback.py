@@ -67,13 +67,12 @@ def run_pairs(
         variation: The actual plant.
         path: Folder for the episodes, with a folder for either plant; episodes that it already
             holds are not simulated again.
-        **loop_options: Options of the task; they replace those of
-            ``pairing_options`` of the task.
+        **loop_options: Options of the task; they replace those for pairs.
 
     Raises:
         ValueError: No such variation, or the folder holds other sets.
     """
-    loop_options = scenario.task_class().pairing_options(scenario, variation) | loop_options
+    loop_options = scenario.options_for("pairs", variation) | loop_options
     sets = {}
     with shown(progress, lambda stages: partial(stages, "episodes and their twins")) as report:
 

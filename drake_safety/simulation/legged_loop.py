@@ -76,6 +76,7 @@ class LeggedLoop(PlannedLoop):
         plant: A MultibodyPlant with the robot, to be read only, whatever engine simulates it.
         watched_features: Features that a conventional monitor thresholds, by quantity; larger
             values are safer.
+        rate_features: Features that depend on velocities.
         tick_s: Time between two systems that update one after the other [s].
     """
 
@@ -92,11 +93,6 @@ class LeggedLoop(PlannedLoop):
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's YAML and model file."""
         return robot_files(scenario.robot)
-
-    @property
-    def rate_names(self) -> list[str]:
-        """States and features that depend on velocities."""
-        return [*super().rate_names, *self._rate_features]
 
     def _add_robot(self, builder: DiagramBuilder, scene: Scene, *, servos: bool) -> Physics:
         """Adds the robot and its scene; its joints have position servos or torque inputs."""
@@ -164,7 +160,7 @@ class LeggedLoop(PlannedLoop):
         """Adds monitor and features: the safe set's, gravity, servo loads, the controller's."""
         self.fall_name = safe_set.fall_name
         self.watched_features = safe_set.watched_features
-        self._rate_features = safe_set.rate_features
+        self.rate_features = safe_set.rate_features
         self._add_safe_set(
             builder,
             safe_set,

@@ -152,8 +152,6 @@ def simulate(
     after_fall_s: float = 0.0,
     events: Iterable[tuple[float, Callable[[Context], object]]] = (),
     each_row: Callable[[Context, float], None] = lambda context, time_s: None,
-    margins: str = "margins",
-    safe: str | None = "safe",
     constraint_names: Sequence[str] | None = None,
     may_fail: bool = False,
     realtime_rate: float = 0.0,
@@ -168,7 +166,9 @@ def simulate(
     Args:
         start: Sets state and plan of the root Context, which is the default one. It may return the
             first row whose future is undisturbed, if that is not 0.
-        ports: Ports to log; a mapping from logged names to those of ports renames them.
+        ports: Ports to log; a mapping from logged names to those of ports renames them, also
+            ``margins`` and ``safe``, which is below 1 outside the safe set; without a port
+            ``safe`` that is where a margin is negative.
         duration_s: End time [s].
         step_s: Time between two rows [s].
         watch_period_s: Sampling period of the safe set, counted from each row [s]; by default it
@@ -177,9 +177,6 @@ def simulate(
         after_fall_s: Time for which it goes on after a fall [s]; only a :class:`CanFall` falls.
         events: Times [s] and what is done then with the Context.
         each_row: Called with Context and time [s] after each row.
-        margins: Name of the port of margins.
-        safe: Name of the port that is below 1 outside the safe set; None if that is where a margin
-            is negative.
         constraint_names: Names of the margins; by default the diagram's.
         may_fail: Whether a failure of the simulation is a result, ``Motion.failure``. The motion
             then has the rows that are finite.
@@ -197,8 +194,9 @@ def simulate(
         constraint_names = constraint_names or diagram.constraint_names
     names = list(constraint_names or ())
     recorder = Recorder(diagram, logged)
-    margins_port = diagram.GetOutputPort(margins)
-    safe_port = None if safe is None else diagram.GetOutputPort(safe)
+    margins_port = diagram.GetOutputPort(logged.get("margins", "margins"))
+    safe = logged.get("safe", "safe")
+    safe_port = diagram.GetOutputPort(safe) if diagram.HasOutputPort(safe) else None
     fall = names.index(diagram.fall_name) if isinstance(diagram, CanFall) else None
     simulator = Simulator(diagram)
     simulator.set_target_realtime_rate(realtime_rate)

@@ -19,7 +19,7 @@ from drake_safety.learning.segments import (
     EpisodesInfo,
     installed_versions,
 )
-from drake_safety.simulation.contract import REQUIRED_PORTS
+from drake_safety.simulation.closed_loop import REQUIRED_PORTS, port_sizes
 from drake_safety.simulation.dataset import is_same
 from drake_safety.simulation.motion import simulate
 from drake_safety.simulation.rollouts import collect_episodes, episode_rng
@@ -160,13 +160,11 @@ def _record(
         return simulate(
             diagram,
             start,
-            {name: port for name, port in ports.items() if name != "safe"},
+            ports,
             duration_s=info.num_steps * info.step_s,
             step_s=info.step_s,
             watch_period_s=watch_period_s,
             after_leaving_s=0.0,
-            margins=ports["margins"],
-            safe=ports.get("safe"),
             constraint_names=info.constraint_names,
             may_fail=True,
             index=index,
@@ -190,10 +188,7 @@ def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str]
         raise ValueError(
             f"record_episodes: ports has {sorted(unknown)}; expected some of {REQUIRED_PORTS}"
         )
-    there = {
-        port.get_name(): port.size()
-        for port in (diagram.get_output_port(i) for i in range(diagram.num_output_ports()))
-    }
+    there = port_sizes(diagram)
     used = {name: given.get(name, name) for name in REQUIRED_PORTS}
     missing = {
         name: port

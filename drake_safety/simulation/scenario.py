@@ -19,7 +19,7 @@ from drake_safety.files.reading import did_you_mean, parse_yaml, reading
 from drake_safety.files.schema import Positive, load_typed, schema
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.closed_loop import ClosedLoop, Purpose
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -137,6 +137,10 @@ class Scenario:
         if _takes(task, "meshcat"):
             options["meshcat"] = meshcat
         return task(self, variation, assessment=assessment, **options)
+
+    def options_for(self, purpose: Purpose, variation: str = "nominal") -> dict[str, Any]:
+        """The task's options for a purpose; see :meth:`ClosedLoop.options_for`."""
+        return self.task_class().options_for(purpose, self, variation)
 
     def to_yaml(self) -> str:
         """The scenario as canonical YAML text with all defaults."""

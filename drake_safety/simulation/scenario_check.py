@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import is_dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import Sphere
@@ -27,8 +27,6 @@ from drake_safety.simulation.finding import Finding, failed, passed, warned
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
-
-_Result = TypeVar("_Result")
 
 _Check = Generator[Finding, None, None]
 _STANDS = "stands for 1 s"
@@ -58,46 +56,48 @@ def check_scenario(
             files are checked.
     """
     report: StageProgress = progress or (lambda stage, done, total: None)
-    scenario = yield from _guarded("scenario", _scenario(name, is_imported))
+    scenario = yield from _guarded("scenario", _scenario, name, is_imported)
     if scenario is None:
         return
     kinematics = None
     if scenario.robot:
-        robot = yield from _guarded("robot.yaml", _robot(scenario))
+        robot = yield from _guarded("robot.yaml", _robot, scenario)
         if robot is None:
             return
-        kinematics = yield from _guarded("bodies and joints", _kinematics(robot))
+        kinematics = yield from _guarded("bodies and joints", _kinematics, robot)
         if kinematics is None:
             return
-        yield from _guarded("standing posture", _posture(kinematics))
-        yield from _guarded("motors", _motors(kinematics))
-        yield from _guarded("collision shapes", _collisions(robot))
+        yield from _guarded("standing posture", _posture, kinematics)
+        yield from _guarded("motors", _motors, kinematics)
+        yield from _guarded("collision shapes", _collisions, robot)
     if not is_imported:
         return
-    own = list(_guarded("files of the task", _own(scenario, kinematics)))
-    yield from own
-    if not all(finding.is_ok for finding in own):
-        return
-    loop = yield from _guarded("diagram", _diagram(scenario))
+    if kinematics is not None:
+        check_files = scenario.task_class().check_files
+        own = list(_guarded("files of the task", check_files, scenario, kinematics))
+        yield from own
+        if not all(finding.is_ok for finding in own):
+            return
+    loop = yield from _guarded("diagram", _diagram, scenario)
     if loop is None:
         return
     if isinstance(loop, LeggedLoop):
-        yield from _guarded("contact spheres", _contacts(loop))
-        yield from _guarded("shape of the base", _target(loop))
+        yield from _guarded("contact spheres", _contacts, loop)
+        yield from _guarded("shape of the base", _target, loop)
         report(_STANDS, 0, 1)
-        yield from _guarded(_STANDS, _stands(loop))
+        yield from _guarded(_STANDS, _stands, loop)
         report(_STANDS, 1, 1)
-    yield from _guarded("contract", _contract(loop, seed))
+    yield from _guarded("contract", check_contract, loop, seed=seed)
     if num_episodes:
-        yield from _guarded("episodes", _episodes(loop, num_episodes, seed, report))
+        yield from _guarded("episodes", _episodes, loop, num_episodes, seed, report)
 
 
 def _guarded(
-    item: str, check: Generator[Finding, None, _Result]
-) -> Generator[Finding, None, _Result | None]:
+    item: str, check: Callable[..., Any], *arguments: Any, **options: Any
+) -> Generator[Finding, None, Any]:
     """A check's findings and result; an exception is a finding, and the result None."""
     try:
-        return (yield from check)
+        return (yield from check(*arguments, **options))
     # A user's task may raise anything, and so may Drake's parser.
     except Exception as error:
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
@@ -212,19 +212,10 @@ def _posture(kinematics: RobotKinematics) -> _Check:
         )
 
 
-def _own(scenario: Scenario, kinematics: RobotKinematics | None) -> _Check:
-    if kinematics is not None:
-        yield from scenario.task_class().check_files(scenario, kinematics)
-
-
 def _diagram(scenario: Scenario) -> Generator[Finding, None, ClosedLoop]:
     loop = scenario.make_loop()
     yield passed("diagram", f"{type(loop).__name__} is built")
     return loop
-
-
-def _contract(loop: ClosedLoop, seed: int) -> _Check:
-    yield from check_contract(loop, seed=seed)
 
 
 def _motors(kinematics: RobotKinematics) -> _Check:
