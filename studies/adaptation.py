@@ -17,8 +17,8 @@ from drake_safety.cli.console import (
     AssessmentOption,
     ScenarioArgument,
     WorkersOption,
-    print_path,
     print_shipped,
+    say,
 )
 from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_folder
 from drake_safety.evaluation.figure_style import save
@@ -142,7 +142,7 @@ def adaptation(
             "differing_pairs": [sum(pair.differs for pair in one) for one in sets],
         }
     for path in pictures:
-        print_path("picture", path)
+        say("picture", path)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,9 +11,9 @@ import numpy as np
 import typer
 from PIL import Image
 
-from drake_safety.cli.console import AssessmentOption, ScenarioArgument, print_path
+from drake_safety.cli.ask import parse_target
+from drake_safety.cli.console import AssessmentOption, ScenarioArgument, TargetOption, say
 from drake_safety.cli.run import alarm_row, motion_threshold, named_push, parse_pushes
-from drake_safety.cli.targets import TargetOption, parse_target
 from drake_safety.cli.training_folder import (
     MODES,
     assessment_folder,
@@ -76,7 +76,7 @@ def animation(
         events = [] if alarm is None else [float(log.time_s[alarm])]
     probability, positions = log[_PORT][:, 0], stack_positions(loop, states)
     save_animation(loop, log.time_s, positions, probability, threshold, out, events)
-    print_path("animation", out)
+    say("animation", out)
 
 
 def save_animation(

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from drake_safety.cli.console import console, interval, new_table, print_path
+from drake_safety.cli.console import console, new_table, say
 from drake_safety.evaluation.figure_style import drawing_style, new_figure, save
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.stills import StillCamera
+from drake_safety.evaluation.tables import Column
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import load_scenario
@@ -33,6 +34,7 @@ _COLUMNS = {
     "beyond a speed limit [%]": ("throws.sharpened.recoveries_with_joint_velocity",),
 }
 """Keys of the estimates by column; of several, the one that the run has."""
+_POINTS = Column("", "", "points", digits=1)
 _NUM_COLUMNS = 4
 _SIZE = (480, 400)  # Of a still [pixels].
 
@@ -53,11 +55,11 @@ def compare(
     table = new_table("scenario", *_COLUMNS)
     for name, estimates in rows.items():
         found = (_first(estimates, keys) for keys in _COLUMNS.values())
-        table.add_row(name, *("-" if one is None else interval(one, 100, 1) for one in found))
+        table.add_row(name, *map(_POINTS.text, found))
     console.print(table)
     if stills:
         for picture in save(comparison_figure(rows, stills), out / "comparison"):
-            print_path("picture", picture)
+            say("picture", picture)
 
 
 def _first(estimates: Mapping[str, Estimate], keys: tuple[str, ...]) -> Estimate | None:

@@ -19,22 +19,18 @@ from drake_safety.cli.console import (
     ScenarioArgument,
     TrainingOption,
     WorkersOption,
-    command_line,
 )
 from drake_safety.cli.evaluate import (
-    SHIFTS_FILE,
     Evaluation,
     add_reliability,
     add_throws,
     add_verdicts,
-    begun,
-    write,
+    evaluating,
 )
 from drake_safety.cli.training_folder import check_writable, episodes_folder
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer
-from drake_safety.evaluation.shift_study import shifts_tables
 from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
 from drake_safety.learning.seeds import EVALUATION, SHIFTS
@@ -69,6 +65,7 @@ from studies.shifts import add_all_shifts
 from studies.throws import classifier_rules
 
 _PLANT = "actual"
+_PROGRAM = "python -m studies"
 
 
 def evaluate(
@@ -104,9 +101,10 @@ def evaluate(
     loaded, folder = load_scenario(scenario), out or assessment
     check_writable(assessment, folder)
     if shifts:
-        with begun(loaded, assessment, SHIFTS, seed, folder, workers) as evaluation:
-            entries = add_all_shifts(evaluation, shifts, episodes)
-        write(evaluation, SHIFTS_FILE, command_line("python -m studies"), shifts_tables, entries)
+        with evaluating(
+            loaded, assessment, folder, SHIFTS, seed, workers, program=_PROGRAM
+        ) as evaluation:
+            add_all_shifts(evaluation, shifts, episodes)
         return
     loop = loaded.make_loop()
     if throws:
@@ -114,7 +112,10 @@ def evaluate(
     if pushes:
         require(loop, CanBePushed)
     training = load_episodes(episodes_folder(assessment))
-    with begun(loaded, assessment, EVALUATION, seed, folder, workers) as evaluation:
+    with evaluating(
+        loaded, assessment, folder, EVALUATION, seed, workers, _tables, _PROGRAM
+    ) as evaluation:
+        evaluation.entries["calibration_episodes"] = calibration_episodes
         test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
         other = evaluation.fresh("calibration episodes", calibration_episodes, "thresholds")
         shortest = evaluation.assessments["sharpened"].parameters.shortest_segment or None
@@ -131,9 +132,6 @@ def evaluate(
         add_reliability(evaluation, test)
         if throws:
             _add_throws(evaluation, loop, classifiers, throws, calibration_throws)
-    made_by = command_line("python -m studies")
-    entries = {"calibration_episodes": calibration_episodes}
-    write(evaluation, "evaluation.json", made_by, _tables, entries)
 
 
 def _tables(results: Results) -> list[Table]:

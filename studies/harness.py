@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from drake_safety.cli.console import command_line, console, open_stages, print_path, versions
+from drake_safety.cli.console import console, made_by, open_stages, say
 from drake_safety.cli.training_folder import check_fresh, load_assessment, run_fresh_episodes
 from drake_safety.evaluation.figure_style import label_of, save, spoken
 from drake_safety.evaluation.interval_figure import interval_figure
@@ -92,13 +92,8 @@ class Study:
 
     def results(self) -> Results:
         """The rows, and what made them."""
-        made = {
-            "command": command_line("python -m studies"),
-            "scenario": self.scenario.name,
-            "scenario_hash": self.scenario.simulation_hash(),
-            "seed": self.seed,
-            "versions": versions(),
-        }
+        made = made_by(self.scenario.name, "python -m studies")
+        made |= {"scenario_hash": self.scenario.simulation_hash(), "seed": self.seed}
         return Results(self.rows, made | self.entries)
 
 
@@ -140,10 +135,10 @@ def open_study(
         labels = {f"{set_}.{row.method}".strip("."): label_of(row.method) for row in rows}
         table = Table(corner=set_, columns=columns, rows=rows_of(results, labels, columns))
         console.print(table.to_rich())
-    print_path("figures", file)
+    say("figures", file)
     drawn = list(filter(plotted, results.values())) if plotted else []
     for picture in save(interval_figure(drawn), file) if drawn else ():
-        print_path("picture", picture)
+        say("picture", picture)
 
 
 def kept(

@@ -16,8 +16,8 @@ from drake_safety.cli.console import (
     AssessmentOption,
     ScenarioArgument,
     WorkersOption,
-    console,
     print_shipped,
+    say,
 )
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, proportion
@@ -69,9 +69,7 @@ def plan_study(
         gamma = study.load(mode, [seed])
         rule = goal_threshold(learned.path, gamma)
         print_shipped(learned)
-        console.print(
-            f"threshold {rule.threshold:.3f}, {rule.origin}", highlight=False, soft_wrap=True
-        )
+        say(f"threshold {rule.threshold:.3f}, {rule.origin}")
         trials = run_trials(
             study.scenario,
             episodes,

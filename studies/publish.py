@@ -18,7 +18,7 @@ import numpy as np
 import typer
 
 from drake_safety.assessments import assessed_scenarios, shipped_folder
-from drake_safety.cli.console import TrainingOption, open_stages, print_path
+from drake_safety.cli.console import TrainingOption, open_stages, say
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import assessment_scorer
@@ -52,7 +52,7 @@ def store(
     """Store the evaluation in ASSESSMENT, with its studies if there are any."""
     out.parent.mkdir(parents=True, exist_ok=True)
     evaluated(assessment).write(out)
-    print_path("stored", out)
+    say("stored", out)
 
 
 def readme(
@@ -70,11 +70,11 @@ def readme(
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
         path.write_text(generated, encoding="utf-8")
-        print_path("results in", path)
+        say("results in", path)
     for name in [] if paths else assessed_scenarios():
         card = shipped_folder(name) / CARD_FILE
         card.write_text(card_text(card.parent, load_scenario(name)), encoding="utf-8")
-        print_path("card", card)
+        say("card", card)
 
 
 def ship(
@@ -134,7 +134,7 @@ def ship(
         shutil.copyfile(file, folder / file.name)
     results.write(folder / EVALUATION_FILE)
     (folder / CARD_FILE).write_text(card_text(folder, scenario), encoding="utf-8")
-    print_path("shipped", folder)
+    say("shipped", folder)
 
 
 def evaluated(folder: Path) -> Results:

@@ -7,7 +7,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 from pydrake.math import RotationMatrix
@@ -331,7 +330,7 @@ def promised(
     return found
 
 
-def add_all_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> dict[str, Any]:
+def add_all_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> None:
     """As `drake-safety evaluate`, beside baselines, on more than plants and sensors."""
     scenario, gamma = evaluation.scenario, evaluation.assessments["sharpened"]
     training = load_episodes(episodes_folder(evaluation.run_folder))
@@ -349,4 +348,4 @@ def add_all_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -
         changed = run_changed_starts(scenario, num_motions, seed, evaluation.workers)
         return changed | junk(nominal, seed)
 
-    return add_shifts(evaluation, num_motions, num_nominal, judges, others, baseline_estimates)
+    add_shifts(evaluation, num_motions, num_nominal, judges, others, baseline_estimates)

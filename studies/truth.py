@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from scipy.ndimage import distance_transform_edt
 
-from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption, print_path
+from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption, say
 from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.figure_style import (
     INK,
@@ -86,7 +86,7 @@ def truth(
             figure = known_truth_figure(panels, f"{study.scenario.name}, {mode}")
             pictures += save(figure, assessment / f"known_truth_{mode}")
     for path in pictures:
-        print_path("picture", path)
+        say("picture", path)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_safety.cli.run import events_table
+from drake_safety.cli.run import event_rows
 from drake_safety.evaluation.timeline_figure import levels_figure
 from drake_safety.learning.change_detector import RECOVERED_LEVEL, RECOVERY_S, Alarm
 from drake_safety.simulation.motion import Motion
@@ -50,14 +50,11 @@ def test_the_events_of_a_run_have_begin_and_end_of_every_alarm():
     cause[10:20], cause[40:] = "inputs frozen", "pushed steadily down"
     ports = {"safety_probability": np.ones((50, 1)), "alarm": alarm, "alarm_cause": cause}
     told = [
-        [*zip(*(column.cells for column in table.columns), strict=True)]
-        for table in (
-            events_table(events, Motion(time_s=time_s, ports=given), SimpleNamespace(**gamma))
-            for events, given, gamma in (
-                ([(0.5, "ball")], ports, {"calibrations_": {}}),
-                ([], ports, {"calibrations_": {"plan": None}}),
-                ([], {"safety_probability": alarm}, {"calibrations_": {}}),
-            )
+        event_rows(events, Motion(time_s=time_s, ports=given), SimpleNamespace(**gamma))
+        for events, given, gamma in (
+            ([(0.5, "ball")], ports, {"calibrations_": {}}),
+            ([], ports, {"calibrations_": {"plan": None}}),
+            ([], {"safety_probability": alarm}, {"calibrations_": {}}),
         )
     ]
     assert told[0] == [

@@ -12,8 +12,8 @@ import pytest
 
 import command_line
 from drake_safety.cli import join_targets
+from drake_safety.cli.ask import parse_target
 from drake_safety.cli.run import alarm_row, named_push
-from drake_safety.cli.targets import parse_target
 from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file, goal_threshold
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
@@ -106,7 +106,7 @@ def test_a_refused_target_is_told_with_its_cause_and_what_would_be_accepted(call
 @pytest.mark.parametrize("target", [NEAR, FAR])
 def test_the_answer_as_json_is_the_library_s_own(call, folder, trained, loop, target, monkeypatch):
     verdict = assess_goal(loop, trained[1], np.array(target), threshold=DEFAULT_THRESHOLD)
-    monkeypatch.setattr("drake_safety.cli.ask.nearest_accepted", lambda *arguments: verdict)
+    monkeypatch.setattr("drake_safety.cli.ask.nearest_accepted_goal", lambda *_, **options: verdict)
     options = ("--assessment", folder, "--target", *target, "--json")
     code, told = call("ask", SCENARIO, *options)
     answer = json.loads(told)
@@ -165,8 +165,8 @@ def test_a_run_with_the_shipped_assessment_writes_to_the_working_folder(
     call, shipped, nothing_near, tmp_path, monkeypatch
 ):
     folders = []
-    monkeypatch.setattr("drake_safety.cli.run._go", lambda *_, **options: ())
-    monkeypatch.setattr("drake_safety.cli.run._save", lambda folder, viewer: folders.append(folder))
+    monkeypatch.setattr("drake_safety.cli.run._go", lambda *_, **options: None)
+    monkeypatch.setattr("drake_safety.cli.run._save", lambda folder, *_: folders.append(folder))
     assert call("run", SCENARIO, "--target", "blue_box", "--force")[0] == 0
     assert folders == [Path("runs") / f"{SCENARIO}-shipped" / "run"]
     assert call("run", SCENARIO, "--target", "blue_box", "--force", "--out", tmp_path)[0] == 0
@@ -243,7 +243,7 @@ def test_options_that_a_task_or_a_run_does_not_know_are_refused(call, folder, ar
 @pytest.fixture
 def nothing_near(monkeypatch):
     """Spares the search for what would be accepted."""
-    monkeypatch.setattr("drake_safety.cli.run.nearest_accepted", lambda *arguments: None)
+    monkeypatch.setattr("drake_safety.cli.ask.nearest_accepted_goal", lambda *_, **options: None)
 
 
 def test_a_run_obeys_a_refusal(call, folder, nothing_near):
@@ -258,11 +258,10 @@ def test_a_run_goes_where_it_is_let(call, folder, monkeypatch):
     calibrate(folder, 0.0)
     saved = []
     monkeypatch.setattr("drake_safety.cli.run._save", lambda *shown: saved.append(shown))
-    monkeypatch.setattr("drake_safety.cli.run._timeline", lambda *_, **options: None)
     options = ("--assessment", folder, "--target", *NEAR, "--duration", 0.1)
     assert call("run", SCENARIO, *options)[0] == 0
-    ((_, _, figures, events, _),) = saved
-    assert figures.keys() == {"timeline"} and events.row_count >= 2
+    ((*_, shown),) = saved
+    assert shown.marked is None and len(shown.events) >= 2
 
 
 @pytest.mark.slow

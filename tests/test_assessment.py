@@ -343,7 +343,9 @@ def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_
     save_file(load_file(path), tmp_path / "old", metadata)
     with pytest.raises(ValueError, match=f"schema version 8, this version reads {SCHEMA_VERSION}"):
         SafetyAssessment.load(tmp_path / "old")
-    save_file(load_file(path), tmp_path / "hollow", {SCHEMA: '{"schema_version": 10}'})
+    save_file(
+        load_file(path), tmp_path / "hollow", {SCHEMA: f'{{"schema_version": {SCHEMA_VERSION}}}'}
+    )
     with pytest.raises(ValueError, match="damaged safety assessment: it has no 'sha256'"):
         SafetyAssessment.load(tmp_path / "hollow")
     for text in ("", "[]", "{}", "[" * 100_000):

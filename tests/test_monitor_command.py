@@ -126,7 +126,7 @@ def folder(detector, tmp_path_factory):
 
 def test_one_command_judges_a_folder(folder, monkeypatch, capsys, detector):
     folder, assessment = folder
-    monkeypatch.setattr("drake_safety.cli.monitor.load_assessment", lambda *_: assessment)
+    monkeypatch.setattr("drake_safety.cli.training_folder.load_assessment", lambda *_: assessment)
     options = ("--map", folder / "map.yaml", "--assessment", folder, "--out", folder / "out")
     assert not call(monkeypatch, "monitor", "laikago_balancing", "--log", folder / "runs", *options)
     printed = " ".join(capsys.readouterr().out.split())
@@ -149,7 +149,7 @@ def test_one_command_judges_a_folder(folder, monkeypatch, capsys, detector):
 
 def test_a_folder_without_logs_is_refused(folder, monkeypatch, capsys, tmp_path):
     folder, assessment = folder
-    monkeypatch.setattr("drake_safety.cli.monitor.load_assessment", lambda *_: assessment)
+    monkeypatch.setattr("drake_safety.cli.training_folder.load_assessment", lambda *_: assessment)
     options = ("--map", folder / "map.yaml", "--assessment", folder)
     for log, told in ((tmp_path, "has no log; known are ['.csv'"), ("x.npz", "does not exist")):
         assert call(monkeypatch, "monitor", "laikago_balancing", "--log", log, *options) == 2

@@ -7,85 +7,54 @@ imported.
 
 from __future__ import annotations
 
+import ast
 import logging
 import os
 import signal
 import sys
 from collections.abc import Container, Mapping, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.logging import RichHandler
 from typer.core import TyperCommand
 
-from drake_safety.cli.console import COMMAND, TARGET, ScenarioArgument, command_line, console
+from drake_safety.cli import console
 from drake_safety.extras import require_extra
 from drake_safety.files.reading import is_number
 from drake_safety.learning.segments import EpisodeError, installed_versions
 
 
 class Entry(NamedTuple):
-    """A command.
+    """A command: its module, and the extra that it needs, said before it does anything.
 
     Attributes:
-        module: Its module.
-        line: First line of its help.
-        extra: The extra that it needs, said before it does anything.
         resumed: Option with which the same line continues it after Ctrl-C; None where nothing is
             kept.
     """
 
     module: str
-    line: str
     extra: str = ""
     resumed: str | None = None
 
 
 # In the order in which the help lists them.
 COMMANDS = {
-    "scenarios": Entry("prepare", "List the scenarios that come with the package."),
-    "new": Entry(
-        "prepare", "Write the folder of a robot and a first scenario from a URDF, for review."
-    ),
-    "check": Entry(
-        "prepare", "Check a scenario and its robot, and print problems with their remedies."
-    ),
-    "train": Entry("train", "Simulate the nominal closed loop and train Γ.", "train", "--resume"),
-    "calibrate": Entry(
-        "calibrate", "Choose thresholds with a promised miss rate on fresh episodes.", "train", ""
-    ),
-    "ask": Entry(
-        "ask", "Print the verdict on a target, or on a command of a walking robot; nothing moves."
-    ),
-    "run": Entry(
-        "run", "Simulate once with Γ in the loop; write a recording, a timeline and the events."
-    ),
-    "play": Entry(
-        "play",
-        "Simulate a task on a page in the browser, in real time, until Stop or Ctrl-C.",
-        "live",
-    ),
-    "evaluate": Entry(
-        "evaluate",
-        "Evaluate Γ, and the paper's form, on fresh episodes, throws and, with --shifts, other "
-        "plants.",
-        "train",
-        "",
-    ),
-    "adapt": Entry(
-        "adapt", "Adapt Γ to an actual robot, and evaluate it before and after.", "train", ""
-    ),
-    "monitor": Entry(
-        "monitor",
-        "Run the change monitor over logs of a robot: its alarms, their causes, and its levels.",
-    ),
-    "export": Entry(
-        "export", "Write Γ as one ONNX file, which runs without this package and without Drake."
-    ),
-    "report": Entry(
-        "report", "Write RUN/report.html, a self-contained page of what is there.", "report"
-    ),
+    "scenarios": Entry("prepare"),
+    "new": Entry("prepare"),
+    "check": Entry("prepare"),
+    "train": Entry("train", "train", "--resume"),
+    "calibrate": Entry("calibrate", "train", ""),
+    "ask": Entry("ask"),
+    "run": Entry("run"),
+    "play": Entry("play", "live"),
+    "evaluate": Entry("evaluate", "train", ""),
+    "adapt": Entry("adapt", "train", ""),
+    "monitor": Entry("monitor"),
+    "export": Entry("export"),
+    "report": Entry("report", "report"),
 }
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.
@@ -100,8 +69,7 @@ class _Command(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Runs the command."""
-        extra = COMMANDS[self.name or ""].extra
-        if extra:
+        if extra := COMMANDS[self.name or ""].extra:
             require_extra(extra, self.name or "")
         address = ctx.params.get("cluster")
         if address is None:
@@ -113,31 +81,22 @@ class _Command(TyperCommand):
 
 
 def join_targets(args: Sequence[str]) -> list[str]:
-    """Joins the numbers of a target or command: an option has a fixed number of words.
-
-    Args:
-        args: The words of a command line.
-    """
+    """Joins the numbers of a target or command: an option has a fixed number of words."""
     joined: list[str] = []
     words = list(args)
     while words:
         word = words.pop(0)
-        if word not in (TARGET, COMMAND) or not words:
-            joined.append(word)
-            continue
-        numbers = [words.pop(0)]
-        while words and len(numbers) < 3 and is_number(numbers[-1]) and is_number(words[0]):
-            numbers.append(words.pop(0))
-        joined.append(f"{word}={' '.join(numbers)}")
+        if word in ("--target", "--command") and words:
+            numbers = [words.pop(0)]
+            while words and len(numbers) < 3 and is_number(numbers[-1]) and is_number(words[0]):
+                numbers.append(words.pop(0))
+            word = f"{word}={' '.join(numbers)}"
+        joined.append(word)
     return joined
 
 
 def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
-    """The commands.
-
-    Args:
-        called: Those whose modules are imported; the others have a name and a line of help.
-    """
+    """The commands; those that are not called have a name and a line of help."""
     app = typer.Typer(
         help="Learn safety assessments of robot motions from simulations, and use them before and "
         f"during motions. With {_DEBUG}, anywhere in the line, errors show their traceback.",
@@ -146,15 +105,23 @@ def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     app.callback()(_common)
-    for name, (module, line, *_) in COMMANDS.items():
+    for name, (module, *_) in COMMANDS.items():
         function: Any = _not_called
         if name in called:
             function = getattr(import_module(f"drake_safety.cli.{module}"), name)
-        app.command(name, cls=_Command, short_help=line)(function)
+        app.command(name, cls=_Command, short_help=_line(module, name))(function)
     return app
 
 
-def _not_called(scenario: ScenarioArgument) -> None:
+def _line(module: str, name: str) -> str:
+    """First line of a command's help, whose module is not imported."""
+    source = (Path(__file__).parent / f"{module}.py").read_text(encoding="utf-8")
+    functions = (one for one in ast.parse(source).body if isinstance(one, ast.FunctionDef))
+    documented = next(one for one in functions if one.name == name)
+    return (ast.get_docstring(documented) or "").splitlines()[0]
+
+
+def _not_called(scenario: console.ScenarioArgument) -> None:
     """Stands for a command in the help of others, and where a shell completes a scenario."""
 
 
@@ -169,12 +136,9 @@ def _called() -> list[str]:
 
 def _print_version(is_wanted: bool) -> None:
     if is_wanted:
-        found = installed_versions("drake")
-        console.print(
-            f"drake-safety {found['drake_safety']}, drake {found['drake']}, "
-            f"Python {sys.version.split()[0]}",
-            highlight=False,
-        )
+        package, drake = (installed_versions("drake")[name] for name in ("drake_safety", "drake"))
+        python = sys.version.split()[0]
+        console.say(f"drake-safety {package}, drake {drake}, Python {python}")
         raise typer.Exit()
 
 
@@ -201,11 +165,10 @@ def run_app(commands: typer.Typer, program: str, resumed: Mapping[str, str] | No
     SIGTERM stops it as Ctrl-C does.
 
     Args:
-        commands: The commands.
         program: Name of the program.
         resumed: Commands that can be continued after Ctrl-C, and the option that does so or "".
     """
-    handler = RichHandler(console=console, show_path=False)
+    handler = RichHandler(console=console.console, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     arguments = [argument for argument in sys.argv[1:] if argument != _DEBUG]
@@ -215,17 +178,16 @@ def run_app(commands: typer.Typer, program: str, resumed: Mapping[str, str] | No
             raise KeyboardInterrupt
         sys.exit(code)
     except (typer.Abort, KeyboardInterrupt):
-        console.print("stopped; finished episodes are kept", highlight=False)
+        console.say("stopped; finished episodes are kept")
         option = (resumed or {}).get(next(iter(arguments), ""))
         if option is not None:
-            line = command_line(program, option)
-            console.print("continue with:", line, highlight=False, soft_wrap=True)
+            console.say("continue with:", console.command_line(program, option))
         sys.exit(_STOPPED)
     except Exception as error:
         if isinstance(error, (ValueError, OSError, EpisodeError)) and _DEBUG not in sys.argv:
-            console.print("error", error, style="red", highlight=False, soft_wrap=True)
+            console.say("error", error, style="red")
             if isinstance(error, EpisodeError):
-                console.print(f"{_DEBUG} in the command line shows where", highlight=False)
+                console.say(f"{_DEBUG} in the command line shows where")
             sys.exit(2)
         # Typer's own errors (unknown options, wrong types) have `show`.
         if not hasattr(error, "exit_code") or not hasattr(error, "show"):

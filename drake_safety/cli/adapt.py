@@ -2,92 +2,61 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import typer
-from rich.table import Table
+from typer import Option
 
-from drake_safety.cli.console import (
-    AssessmentOption,
-    ClusterOption,
-    ScenarioArgument,
-    WorkersOption,
-    command_line,
-    console,
-    interval,
-    new_table,
-    open_stages,
-    print_path,
-    print_shipped,
-    versions,
-)
-from drake_safety.cli.training_folder import (
-    MODES,
-    adapted_folder,
-    assessment_file,
-    assessment_folder,
-    check_fresh,
-    check_writable,
-    feedback_folder,
-    load_assessment,
-)
+from drake_safety.cli import console
+from drake_safety.cli import training_folder as folders
+from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.metrics import Estimate, segment_estimates
 from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.tables import Column, Table, rows_of
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import ADAPTATION, MOTION
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.logs.episodes import cut_log, motions_from_log
-from drake_safety.logs.robot_log import LogPieces, RobotLog, read_log, read_pieces
+from drake_safety.logs.robot_log import RobotLog, read_log, read_pieces
 from drake_safety.models import load_robot
 from drake_safety.simulation.feedback import EpisodePairs, pair_starts, run_pairs
 from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
-_JUDGED = {"before": "before feedback", "after": "after feedback"}
-_COLUMNS = ("brier", "auc", "unsafe_recall", "safe_recall")
+_COLUMNS = [Column(key, key) for key in ("brier", "auc", "unsafe_recall", "safe_recall")]
+_UNCHANGED = "unchanged"
 _MOST_CUTS = 3  # Printed of a log.
 _MOTION_S = 240.0  # Undisturbed motion of a simulated actual plant, for the monitor.
 _THRESHOLD = 0.5  # Safety probability below which a segment is classified unsafe.
 
 
 def adapt(
-    scenario: ScenarioArgument,
-    assessment: AssessmentOption = None,
+    scenario: console.ScenarioArgument,
+    assessment: console.AssessmentOption = None,
     feedback: Annotated[
-        int, typer.Option(help="Actual episodes, each beside its nominal twin.", min=1)
+        int, Option(help="Actual episodes, each with a nominal twin.", min=1)
     ] = 160,
-    variation: Annotated[str, typer.Option(help="Variation of the actual plant.")] = "actual",
-    evaluate: Annotated[
-        int, typer.Option(help="Fresh actual episodes for evaluation; 0 for none.", min=0)
-    ] = 0,
+    variation: Annotated[str, Option(help="Variation of the actual plant.")] = "actual",
+    evaluate: Annotated[int, Option(help="Fresh actual episodes to evaluate on.", min=0)] = 0,
     log: Annotated[
         list[Path] | None,
-        typer.Option(
-            help="Log of a real robot, in place of a simulated variation; may be repeated.",
-            exists=True,
-        ),
+        Option(help="Log of a robot, in place of a variation; may be repeated.", exists=True),
     ] = None,
-    log_map: Annotated[
-        Path | None, typer.Option("--map", help="Map of the columns of the logs, a YAML file.")
-    ] = None,
+    log_map: Annotated[Path | None, Option("--map", help="Map of their columns (YAML).")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write; ASSESSMENT/adapted-VARIATION by default.")
+        Path | None, Option(help="Folder to write; ASSESSMENT/adapted-VARIATION by default.")
     ] = None,
     strict: Annotated[
-        bool,
-        typer.Option(
-            "--strict",
-            help="Refuse a log with a missing value or a gap, instead of cutting it there.",
-        ),
+        bool, Option("--strict", help="Refuse a log with a missing value or a gap: do not cut it.")
     ] = False,
     seed: Annotated[
-        int, typer.Option(help="Seed of the feedback; that of the evaluation follows.")
+        int, Option(help="Seed of the feedback; that of the evaluation follows.")
     ] = ADAPTATION.first,
-    workers: WorkersOption = None,
-    cluster: ClusterOption = None,
+    workers: console.WorkersOption = None,
+    cluster: console.ClusterOption = None,
 ) -> None:
     """Adapt Γ to an actual robot, and evaluate it before and after.
 
@@ -96,11 +65,11 @@ def adapt(
     continues when called again. For a shipped assessment, ASSESSMENT is runs/SCENARIO-shipped.
     """
     loaded = load_scenario(scenario)
-    learned = assessment_folder(loaded, assessment)
-    priors = {mode: load_assessment(learned.path, mode) for mode in MODES}
+    learned = folders.assessment_folder(loaded, assessment)
+    priors = {mode: folders.load_assessment(learned.path, mode) for mode in MODES}
     seeds = ADAPTATION.seeds(seed)
     for prior in priors.values():
-        check_fresh(prior, loaded, list(seeds.values())[1:] if evaluate else ())
+        folders.check_fresh(prior, loaded, list(seeds.values())[1:] if evaluate else ())
         prior.check_unused(seed, purpose="adaptation")
     logs = log or []
     if bool(logs) != (log_map is not None):
@@ -108,13 +77,14 @@ def adapt(
     if logs and evaluate:
         raise ValueError("adapt: a log has no fresh episodes for evaluation; leave out --evaluate")
     if len({one.resolve() for one in logs}) < len(logs):
-        raise ValueError(f"adapt: logs must differ; got {', '.join(str(one) for one in logs)}")
+        raise ValueError(f"adapt: logs must differ; got {', '.join(map(str, logs))}")
     name = logs[0].stem if logs else variation
-    print_shipped(learned)
-    folder = out or adapted_folder(learned.out, name)
+    console.print_shipped(learned)
+    folder = out or folders.adapted_folder(learned.out, name)
     judged: dict[str, Estimate] = {}
-    check_writable(folder)
-    with open_stages() as stages:
+    folders.check_writable(folder)
+    with console.open_stages() as stages:
+        simulated = (learned.out, workers, stages)
         if log_map is not None:
             pieces = log_pieces(loaded, logs, log_map, is_strict=strict)
             actual, starts = cut_log(pieces, loaded)
@@ -122,43 +92,27 @@ def adapt(
             step_s = priors[MODES[0]].detector_.step_s
             motions = motions_from_log(pieces, loaded, step_s=step_s)
         else:
-            pairs = paired_episodes(loaded, feedback, variation, seed, learned.out, workers, stages)
-            hash_ = loaded.simulation_hash(variation)
-            motions = run_motions(
-                loaded,
-                _MOTION_S,
-                variation=variation,
-                seed=MOTION.seeds()["motion of the actual robot"],
-                num_workers=workers,
-                path=feedback_folder(learned.out, hash_, seed) / "motion",
-                progress=partial(stages, "undisturbed actual motion"),
-                **loaded.options_for("pairs", variation),
-            )
+            pairs = paired_episodes(loaded, feedback, variation, seed, *simulated)
+            kept = _kept(loaded, variation, seed, learned.out, workers)
+            kept["seed"] = MOTION.seeds()["motion of the actual robot"]
+            kept["path"] /= "motion"
+            progress = partial(stages, "undisturbed actual motion")
+            pairing = loaded.options_for("pairs", variation)
+            motions = run_motions(loaded, _MOTION_S, progress=progress, **kept, **pairing)
         sets = pairs.feedback()
         adapted = {mode: prior.adapt(sets, motions=motions) for mode, prior in priors.items()}
         folder.mkdir(parents=True, exist_ok=True)
         for mode, one in adapted.items():
-            one.save(assessment_file(folder, mode))
+            one.save(folders.assessment_file(folder, mode))
         if evaluate:
-            fresh = fresh_actual_episodes(
-                loaded,
-                evaluate,
-                variation,
-                seeds["evaluation of the adaptation"],
-                learned.out,
-                workers,
-                stages,
-            )
+            seed_of_fresh = seeds["evaluation of the adaptation"]
+            fresh = fresh_actual_episodes(loaded, evaluate, variation, seed_of_fresh, *simulated)
             for mode in MODES:
-                judged |= {
-                    f"{mode}.{who}.{key}": estimate
-                    for who, one in (("before", priors[mode]), ("after", adapted[mode]))
-                    for key, estimate in _judge(one, fresh).items()
-                }
+                for who, one in (("before", priors[mode]), ("after", adapted[mode])):
+                    found = _judge(one, fresh).items()
+                    judged |= {f"{mode}.{who}.{key}": estimate for key, estimate in found}
     differing, num_pairs = pairs.gap
     entries = {
-        "command": command_line(),
-        "scenario": loaded.name,
         "scenario_hash": pairs.actual.info.scenario_hash,
         "nominal_hash": pairs.nominal.info.scenario_hash,
         "variation": name,
@@ -167,18 +121,32 @@ def adapt(
         "feedback_sets": num_pairs,
         "differing_pairs": differing,
         "change": {mode: one.correction_.change.tolist() for mode, one in adapted.items()},
-        "versions": versions(),
     }
-    file = folder / "adaptation.json"
-    Results(judged, entries).write(file)
-    console.print(_adaptation_table(adapted, differing, num_pairs, name))
-    if not differing:
-        _print_unchanged(loaded, adapted, num_pairs)
+    results = Results(judged, console.made_by(loaded.name) | entries)
+    results.write(folder / "adaptation.json")
+    _print_changes(loaded, adapted, differing, num_pairs, name)
     if judged:
-        console.print(_judged_table(judged, variation))
+        labels = {
+            f"{mode}.{when}": f"{mode}, {when} feedback"
+            for mode in MODES
+            for when in ("before", "after")
+        }
+        rows = rows_of(results, labels, _COLUMNS)
+        n = results[f"{MODES[0]}.before.auc"].n
+        title = f"{n} fresh episodes of '{variation}', recalls at {_THRESHOLD:g}"
+        console.show(Table(corner="", columns=_COLUMNS, rows=rows, title=title).to_rich())
     for mode in adapted:
-        print_path("assessment", assessment_file(folder, mode))
-    print_path("figures   ", file)
+        console.say("assessment", folders.assessment_file(folder, mode))
+    console.say("figures   ", folder / "adaptation.json")
+
+
+def _kept(
+    scenario: Scenario, variation: str, seed: int, folder: Path, workers: int | None
+) -> dict[str, Any]:
+    """Options of simulations of an actual plant that the folder of a training keeps."""
+    path = folder / "feedback" / f"{scenario.simulation_hash(variation)[:12]}-{seed}"
+    made = {"extra": {"command": console.command_line()}}
+    return {"variation": variation, "seed": seed, "num_workers": workers, "path": path, **made}
 
 
 def paired_episodes(
@@ -190,27 +158,10 @@ def paired_episodes(
     workers: int | None,
     stages: StageProgress,
 ) -> EpisodePairs:
-    """Simulates pairs of actual episodes and nominal twins, and keeps them in the folder.
-
-    Args:
-        scenario: The scenario.
-        num_pairs: Number of pairs.
-        variation: Variation of the actual plant.
-        seed: Seed of the episodes.
-        folder: Folder of the training.
-        workers: Number of worker processes; None for one a core.
-        stages: Progress bars.
-    """
-    return run_pairs(
-        scenario,
-        num_pairs,
-        variation=variation,
-        seed=seed,
-        num_workers=workers,
-        path=feedback_folder(folder, scenario.simulation_hash(variation), seed),
-        progress=partial(stages, "actual episodes and their twins"),
-        extra={"command": command_line()},
-    )
+    """Simulates pairs of actual episodes and nominal twins, kept in the folder of the training."""
+    kept = _kept(scenario, variation, seed, folder, workers)
+    progress = partial(stages, "actual episodes and their twins")
+    return run_pairs(scenario, num_pairs, progress=progress, **kept)
 
 
 def fresh_actual_episodes(
@@ -223,29 +174,11 @@ def fresh_actual_episodes(
     stages: StageProgress,
     what: str = "fresh actual episodes",
 ) -> Episodes:
-    """Simulates other episodes of the actual plant, and keeps them in the folder.
-
-    Args:
-        scenario: The scenario.
-        num_episodes: Number of episodes.
-        variation: Variation of the plant.
-        seed: Seed of the episodes.
-        folder: Folder of the training.
-        workers: Number of worker processes; None for one a core.
-        stages: Progress bars.
-        what: Name of the stage.
-    """
-    return run_episodes(
-        scenario,
-        num_episodes,
-        variation=variation,
-        seed=seed,
-        num_workers=workers,
-        path=feedback_folder(folder, scenario.simulation_hash(variation), seed) / variation,
-        progress=partial(stages, what),
-        extra={"command": command_line()},
-        **scenario.options_for("pairs", variation),
-    )
+    """Simulates other episodes of the actual plant, kept in the folder of the training."""
+    kept = _kept(scenario, variation, seed, folder, workers)
+    kept["path"] /= variation
+    pairing = scenario.options_for("pairs", variation)
+    return run_episodes(scenario, num_episodes, progress=partial(stages, what), **kept, **pairing)
 
 
 def log_pieces(
@@ -253,54 +186,54 @@ def log_pieces(
 ) -> list[RobotLog]:
     """The pieces of logs without gaps; where they are cut is printed."""
     robot = load_robot(scenario.robot)
+    if is_strict:
+        return [read_log(log, log_map, robot) for log in logs]
     pieces: list[RobotLog] = []
     for log in logs:
-        if is_strict:
-            pieces.append(read_log(log, log_map, robot))
-            continue
         found = read_pieces(log, log_map, robot)
         pieces += found.pieces
-        if found.cuts:
-            _print_cuts(log, found)
+        if not found.cuts:
+            continue
+        console.say(
+            f"log '{log}' is cut where values are missing and at gaps: "
+            f"{100 * found.kept_share:.1f} % of {found.duration_s:.1f} s are kept, in "
+            f"{len(found.pieces)} pieces",
+            *found.cuts[:_MOST_CUTS],
+            sep="\n",
+            style="yellow",
+        )
+        if num_more := len(found.cuts[_MOST_CUTS:]):
+            console.say(f"... and {num_more} more; --strict refuses such a log", style="yellow")
     return pieces
 
 
-def _print_unchanged(
-    scenario: Scenario, adapted: dict[str, SafetyAssessment], num_pairs: int
+def _print_changes(
+    scenario: Scenario, adapted: Mapping[str, Any], differing: int, num_pairs: int, variation: str
 ) -> None:
-    """Says which modes have learned nothing from pairs that all end alike, and what it takes."""
-    unchanged = [mode for mode, one in adapted.items() if _is_unchanged(one)]
-    if not unchanged:
+    """Prints what has changed; or that pairs that all end alike change nothing, and what does."""
+    changes = {}
+    for mode, one in adapted.items():
+        changes[mode] = ["-"] * 3
+        if one.adaptation_.method == "recalibration":
+            change = one.correction_.change
+            is_any = one.correction_.is_any
+            changes[mode] = [f"{value:+.2f}" if is_any else _UNCHANGED for value in change]
+    columns = ("mode", "method", "added to the offset", "safety slope", "margin slope")
+    rows = [(mode, adapted[mode].adaptation_.method, *change) for mode, change in changes.items()]
+    title = f"Adapted to '{variation}': {differing} of {num_pairs} pairs end differently"
+    console.show(console.new_table(*columns, rows=rows, title=title))
+    unchanged = [mode for mode, change in changes.items() if _UNCHANGED in change]
+    if differing or not unchanged:
         return
     num_needed = scenario.assessment.adaptation.update_interval
     duration_s = num_needed * scenario.episode_duration_s
     pairs = "the only pair ends" if num_pairs == 1 else f"all {num_pairs} pairs end"
-    console.print(
+    console.say(
         f"nothing changed ({', '.join(unchanged)}): {pairs} as on the nominal plant, and it learns "
         f"from those that do not. A first update takes about {num_needed} pairs, as of "
         f"{duration_s:g} s of logs, some of which end otherwise",
         style="yellow",
-        highlight=False,
-        soft_wrap=True,
     )
-
-
-def _is_unchanged(adapted: SafetyAssessment) -> bool:
-    found = adapted.adaptation_
-    is_corrected = found is not None and found.method == "recalibration"
-    return is_corrected and not adapted.correction_.is_any
-
-
-def _print_cuts(log: Path, found: LogPieces) -> None:
-    lines = [
-        f"log '{log}' is cut where values are missing and at gaps: {100 * found.kept_share:.1f} % "
-        f"of {found.duration_s:.1f} s are kept, in {len(found.pieces)} pieces",
-        *found.cuts[:_MOST_CUTS],
-    ]
-    if len(found.cuts) > _MOST_CUTS:
-        lines.append(f"... and {len(found.cuts) - _MOST_CUTS} more; --strict refuses such a log")
-    for line in lines:
-        console.print(line, style="yellow", highlight=False, soft_wrap=True)
 
 
 def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Estimate]:
@@ -308,37 +241,3 @@ def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Estimate]
     segments = split(fresh, stride=1, discount=1.0, shortest=assessment.settings.shortest)
     result = assessment.predict_rows(segments, fresh.info.variation)
     return segment_estimates(segments, 1.0 - result.probability, threshold=1.0 - _THRESHOLD)
-
-
-def _adaptation_table(
-    adapted: dict[str, SafetyAssessment], differing: int, num_pairs: int, variation: str
-) -> Table:
-    table = new_table(
-        "mode",
-        "method",
-        "added to the offset",
-        "safety slope",
-        "margin slope",
-        title=f"Adapted to '{variation}': {differing} of {num_pairs} pairs end differently",
-    )
-    for mode, one in adapted.items():
-        found = one.adaptation_
-        if found is not None:
-            is_changed = found.method == "recalibration"
-            change = [f"{value:+.2f}" if is_changed else "-" for value in one.correction_.change]
-            if _is_unchanged(one):
-                change = ["unchanged"] * len(change)
-            table.add_row(mode, found.method, *change)
-    return table
-
-
-def _judged_table(judged: dict[str, Estimate], variation: str) -> Table:
-    n = judged[f"{MODES[0]}.before.auc"].n
-    table = new_table(
-        "", *_COLUMNS, title=f"{n} fresh episodes of '{variation}', recalls at {_THRESHOLD:g}"
-    )
-    for mode in MODES:
-        for who, label in _JUDGED.items():
-            estimates = (judged[f"{mode}.{who}.{key}"] for key in _COLUMNS)
-            table.add_row(f"{mode}, {label}", *map(interval, estimates))
-    return table

@@ -1,40 +1,39 @@
-"""``drake-safety ask``: the verdict on a target, without motion."""
+"""``drake-safety ask``: the verdict on a target, without motion; and targets of other commands."""
 
 from __future__ import annotations
 
 import json
 from typing import Annotated, Any
 
-import typer
+import numpy as np
+from typer import Exit, Option
 
-from drake_safety.cli.console import AssessmentOption, ScenarioArgument, console, print_shipped
-from drake_safety.cli.targets import (
-    COMMAND,
-    TARGET,
-    HandOption,
-    TargetOption,
-    nearest_accepted,
-    parse_target,
-    print_verdict,
-)
-from drake_safety.cli.training_folder import assessment_folder, goal_threshold, load_assessment
-from drake_safety.planning.goal_verdict import assess_goal
-from drake_safety.simulation.scenario import load_scenario
+from drake_safety.cli import console
+from drake_safety.cli import training_folder as folders
+from drake_safety.cli.training_folder import MODES
+from drake_safety.files.reading import did_you_mean, is_number
+from drake_safety.learning.causes import describe_margin
+from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
+from drake_safety.planning.nearest_goal import nearest_accepted_goal
+from drake_safety.simulation.capabilities import HasGoals, goal_words, require
+from drake_safety.simulation.closed_loop import ClosedLoop
+
+_SEARCH_SEED = 0  # Fixed, so that results are reproducible.
 
 
 def ask(
-    scenario: ScenarioArgument,
-    target: TargetOption = None,
-    assessment: AssessmentOption = None,
-    hand: HandOption = None,
+    scenario: console.ScenarioArgument,
+    target: console.TargetOption = None,
+    assessment: console.AssessmentOption = None,
+    hand: console.HandOption = None,
     duration: Annotated[
         float | None,
-        typer.Option(
+        Option(
             help="Of a command [s], after which the robot stops; an episode by default.", min=0.1
         ),
     ] = None,
-    mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    mode: console.ModeOption = MODES[0],
+    as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print the verdict on a target, or on a command of a walking robot; nothing moves.
 
@@ -42,27 +41,84 @@ def ask(
     Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
     """
     if target is None:
-        raise ValueError(f"ask: pass {TARGET}, or for a walking robot {COMMAND}")
-    loaded = load_scenario(scenario)
-    folder = assessment_folder(loaded, assessment)
-    gamma = load_assessment(folder.path, mode)
-    given = {"hand": hand, "command_s": duration}
-    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    loop = loaded.make_loop(assessment=gamma, **options)
-    goal = parse_target(loop, target)
-    threshold, unsafe_below, origin = goal_threshold(folder.path, gamma)
-    verdict = assess_goal(loop, gamma, goal, threshold=threshold, unsafe_below=unsafe_below)
-    nearest = None if verdict.is_accepted else nearest_accepted(loop, gamma, verdict)
+        raise ValueError("ask: pass --target, or for a walking robot --command")
+    loaded, folder, gamma = folders.open_assessment(scenario, assessment, mode)
+    loop = loaded.make_loop(assessment=gamma, **console.given(hand=hand, command_s=duration))
+    goal, rule = parse_target(loop, target), folders.goal_threshold(folder.path, gamma)
+    verdict, nearest = judge_target(loop, goal, rule)
     if as_json:
         answer = verdict.to_json() | {
             "assessment": str(folder.path),
             "hand": loop.hand,
             "nearest_accepted": None if nearest is None else nearest.goal.tolist(),
-            "threshold_origin": origin,
+            "threshold_origin": rule.origin,
         }
-        console.print(json.dumps(answer), soft_wrap=True, highlight=False)
+        console.say(json.dumps(answer))
     else:
-        print_shipped(folder, gamma)
-        print_verdict(loop, verdict, nearest, origin)
+        console.print_shipped(folder, gamma)
+        print_verdict(loop, verdict, nearest, rule.origin)
     if not verdict.is_accepted:
-        raise typer.Exit(1)
+        raise Exit(1)
+
+
+def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
+    """The goal of ``--target`` or ``--command``, (3,): a name, or three numbers with spaces."""
+    with_goals = require(loop, HasGoals, "--target")
+    named_targets, words = with_goals.named_targets, goal_words(with_goals)
+    if text in named_targets:
+        return np.array(named_targets[text], dtype=float)
+    entries = text.split()
+    if len(entries) == 3 and all(map(is_number, entries)):
+        return np.array([float(entry) for entry in entries])
+    raise ValueError(
+        f"{words.goal} '{text}'{did_you_mean(text, named_targets)}: give {' '.join(words.axes)}, "
+        "three numbers "
+        f"[{', '.join(words.units)}], or one of the names that scenario '{loop.scenario.name}' "
+        f"gives: {list(named_targets)}"
+    )
+
+
+def judge_target(
+    loop: Any, goal: np.ndarray, rule: folders.GoalThreshold
+) -> tuple[GoalVerdict, GoalVerdict | None]:
+    """The verdict on a target and, for a refusal, on the nearest one accepted with reserve."""
+    limits = {"threshold": rule.threshold, "unsafe_below": rule.unsafe_below}
+    verdict = assess_goal(loop, loop.assessment, goal, **limits)
+    if verdict.is_accepted:
+        return verdict, None
+    rng = np.random.default_rng(_SEARCH_SEED)
+    return verdict, nearest_accepted_goal(
+        loop, loop.assessment, goal, threshold=rule.threshold, rng=rng
+    )
+
+
+def print_verdict(
+    loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None, origin: str
+) -> None:
+    """Prints a verdict, where its threshold is from, and for a refusal what would be accepted."""
+    words = goal_words(require(loop, HasGoals))
+    of = f" of {words.subject}" if words.is_point else ""
+    lines = {words.goal: f"{words.value(verdict.goal)}{of}"}
+    probability, threshold = verdict.probability, verdict.threshold
+    sign = "<" if probability < threshold else "≥"
+    numbers = f"probability {probability:.3f} {sign} threshold {threshold:.3f}"
+    lines["verdict"] = f"{verdict.verdict}: {verdict.reason or numbers}"
+    if np.isfinite(probability):
+        safe, unsafe, unknown = verdict.belief.tolist()
+        lines["belief"] = f"safe {safe:.2f}, unsafe {unsafe:.2f}, don't know {unknown:.2f}"
+    if not verdict.is_accepted and verdict.cause:
+        margin, masses = verdict.cause_margin, verdict.cause_probability
+        cause = describe_margin(verdict.cause, margin, loop.angular_constraints)
+        if not np.isfinite(margin):
+            cause = f"{verdict.cause} ({100 * masses.max() / masses.sum():.0f} %)"
+        lines["likely cause"] = cause
+    if nearest is not None:
+        distance = words.distance(nearest.goal - verdict.goal)
+        told = f"{distance} away, probability {nearest.probability:.3f}"
+        lines["nearest accepted"] = f"{words.value(nearest.goal)}, {told}"
+    elif not verdict.is_accepted and np.isfinite(verdict.goal).all():
+        lines["nearest accepted"] = "none found that is accepted with reserve"
+    if nearest is not None or np.isfinite(probability):
+        lines["threshold"] = f"{threshold:.3f}, {origin}"
+    for name, text in lines.items():
+        console.say(f"{name:<16}  {text}")

@@ -3,34 +3,15 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
-import typer
-from rich.table import Table
+from typer import Option
 
-from drake_safety.cli.console import (
-    AssessmentOption,
-    ClusterOption,
-    ScenarioArgument,
-    WorkersOption,
-    console,
-    new_table,
-    open_stages,
-    print_path,
-    print_shipped,
-)
-from drake_safety.cli.training_folder import (
-    MODES,
-    assessment_file,
-    assessment_folder,
-    check_fresh,
-    check_writable,
-    load_assessment,
-    run_fresh_episodes,
-)
+from drake_safety.cli import console
+from drake_safety.cli import training_folder as folders
+from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.scorers import assessment_scorer
-from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.calibration import KINDS, Calibration, episode_scores
+from drake_safety.learning.calibration import KINDS, episode_scores
 from drake_safety.learning.calibration import calibrate as choose
 from drake_safety.learning.seeds import CALIBRATION
 from drake_safety.learning.segments import split
@@ -38,30 +19,25 @@ from drake_safety.simulation.scenario import load_scenario
 
 
 def calibrate(
-    scenario: ScenarioArgument,
-    assessment: AssessmentOption = None,
+    scenario: console.ScenarioArgument,
+    assessment: console.AssessmentOption = None,
     miss_rate: Annotated[
-        float, typer.Option(help="Promised miss rate: share of unsafe episodes classified safe.")
+        float, Option(help="Promised miss rate: share of unsafe episodes classified safe.")
     ] = 0.01,
     false_alarm_rate: Annotated[
-        float,
-        typer.Option(help="Promised share of safe episodes classified unsafe, not 'don't know'."),
+        float, Option(help="Promised share of safe episodes classified unsafe, not 'don't know'.")
     ] = 0.05,
     confidence: Annotated[
-        float | None,
-        typer.Option(help="Confidence of the promise, such as 0.95; on average by default."),
+        float | None, Option(help="Confidence of the promise, such as 0.95; on average by default.")
     ] = None,
-    episodes: Annotated[int, typer.Option(help="Fresh episodes.", min=2)] = 1000,
+    episodes: Annotated[int, Option(help="Fresh episodes.", min=2)] = 1000,
     variation: Annotated[
         str | None,
-        typer.Option(
-            help="Plant of the episodes, for which the promise holds; by default that which the "
-            "assessment was adapted to, else nominal."
-        ),
+        Option(help="Plant of the promise; by default that of the adaptation, else nominal."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = CALIBRATION.first,
-    workers: WorkersOption = None,
-    cluster: ClusterOption = None,
+    seed: Annotated[int, Option(help="Seed of the episodes.")] = CALIBRATION.first,
+    workers: console.WorkersOption = None,
+    cluster: console.ClusterOption = None,
 ) -> None:
     """Choose thresholds with a promised miss rate on fresh episodes.
 
@@ -71,80 +47,61 @@ def calibrate(
     copy is written to runs/SCENARIO-shipped.
     """
     loaded = load_scenario(scenario)
-    folder = assessment_folder(loaded, assessment)
-    print_shipped(folder)
+    folder = folders.assessment_folder(loaded, assessment)
+    console.print_shipped(folder)
     learned = {
-        mode: load_assessment(folder.path, mode)
+        mode: folders.load_assessment(folder.path, mode)
         for mode in MODES
-        if mode == MODES[0] or assessment_file(folder.path, mode).is_file()
+        if mode == MODES[0] or folders.assessment_file(folder.path, mode).is_file()
     }
-    plant = variation or _adapted_to(learned[MODES[0]]) or "nominal"
-    scenario_hash = loaded.simulation_hash(plant)
+    adaptation = learned[MODES[0]].adaptation_
+    plant = variation or ("nominal" if adaptation is None else adaptation.variation)
     for gamma in learned.values():
-        check_fresh(gamma, loaded)
+        folders.check_fresh(gamma, loaded)
         gamma.check_unused(seed, purpose="calibration")
-    check_writable(folder.out)
-    with open_stages() as stages:
-        progress = partial(stages, "calibration episodes")
-        fresh = run_fresh_episodes(
+    folders.check_writable(folder.out)
+    with console.open_stages() as stages:
+        fresh = folders.run_fresh_episodes(
             loaded,
             folder.out,
             episodes,
             seed,
-            progress,
+            partial(stages, "calibration episodes"),
             workers,
             plant,
             **loaded.options_for("pairs", plant),
         )
     segments = split(fresh, stride=1, discount=1.0, shortest=1)
-    found: dict[str, list[Calibration]] = {}
+    promise: dict[str, Any] = {
+        "miss_rate": miss_rate,
+        "false_alarm_rate": false_alarm_rate,
+        "confidence": confidence,
+        "seed": seed,
+        "scenario_hash": loaded.simulation_hash(plant),
+        "variation": plant,
+    }
+    found = {}
     for mode, gamma in learned.items():
         score = assessment_scorer(mode, gamma).unsafe_score(segments)
-        for kind in KINDS:
-            of_episodes, is_unsafe = episode_scores(segments, score, kind)
-            one = choose(
-                of_episodes,
-                is_unsafe,
-                kind=kind,
-                miss_rate=miss_rate,
-                false_alarm_rate=false_alarm_rate,
-                confidence=confidence,
-                seed=seed,
-                scenario_hash=scenario_hash,
-                variation=plant,
-            )
-            found.setdefault(mode, []).append(one)
+        scores = {kind: episode_scores(segments, score, kind) for kind in KINDS}
+        found[mode] = [choose(*scores[kind], kind=kind, **promise) for kind in KINDS]
     for mode, gamma in learned.items():
         gamma.adopt_calibrations(found[mode], fresh.info, len(fresh))
-        gamma.save(assessment_file(folder.out, mode))
-    console.print(_table(found))
+        gamma.save(folders.assessment_file(folder.out, mode))
+    rows = [
+        (
+            mode,
+            {"plan": "first row", "motion": "worst row"}[one.kind],
+            f"{one.threshold:.4f}",
+            f"{one.unsafe_below:.4f}",
+            f"{one.num_missed} of {one.num_unsafe}",
+            f"{one.num_accepted} of {one.num_safe}",
+        )
+        for mode in found
+        for one in found[mode]
+    ]
+    columns = ("mode", "score", "safe from probability", "unsafe below", "misses", "safe recall")
+    title = f"Promised: {found[MODES[0]][0].promise}"
+    console.show(console.new_table(*columns, rows=rows, title=title))
     for mode in learned:
-        print_path("calibrated", assessment_file(folder.out, mode))
-
-
-def _adapted_to(assessment: SafetyAssessment) -> str:
-    return "" if assessment.adaptation_ is None else assessment.adaptation_.variation
-
-
-def _table(found: dict[str, list[Calibration]]) -> Table:
-    one = next(iter(found.values()))[0]
-    table = new_table(
-        "mode",
-        "score",
-        "safe from probability",
-        "unsafe below",
-        "misses",
-        "safe recall",
-        title=f"Promised: {one.promise}",
-    )
-    for mode, calibrations in found.items():
-        for calibration in calibrations:
-            table.add_row(
-                mode,
-                {"plan": "first row", "motion": "worst row"}[calibration.kind],
-                f"{calibration.threshold:.4f}",
-                f"{calibration.unsafe_below:.4f}",
-                f"{calibration.num_missed} of {calibration.num_unsafe}",
-                f"{calibration.num_accepted} of {calibration.num_safe}",
-            )
-    return table
+        console.say("calibrated", folders.assessment_file(folder.out, mode))

@@ -10,29 +10,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from matplotlib.figure import Figure
+from typer import Option
 
-from drake_safety.cli.console import (
-    ClusterOption,
-    ScenarioArgument,
-    TrainingOption,
-    WorkersOption,
-    command_line,
-    console,
-    open_stages,
-    print_path,
-    versions,
-)
-from drake_safety.cli.training_folder import (
-    MODES,
-    assessment_file,
-    check_fresh,
-    check_writable,
-    fresh_episodes_folder,
-    load_assessment,
-    run_fresh_episodes,
-)
+from drake_safety.cli import console
+from drake_safety.cli import training_folder as folders
+from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation import monitor_study, shift_study
 from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.episode_study import evaluate_episodes, evaluate_plans
@@ -45,14 +28,12 @@ from drake_safety.evaluation.shift_study import (
     Judge,
     JudgedShift,
     MotionSet,
-    shifts_tables,
 )
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
 from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws, trigger_rules
 from drake_safety.evaluation.verdict_tables import verdict_tables
 from drake_safety.files.progress import StageProgress
-from drake_safety.learning import calibration
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import PLAN, episode_scores
@@ -60,15 +41,14 @@ from drake_safety.learning.seeds import EVALUATION, FRESH_MOTION, SHIFTS, SeedBl
 from drake_safety.learning.segments import Episode, Episodes, Segments, split
 from drake_safety.simulation.capabilities import HasBall, HasGoals, require
 from drake_safety.simulation.motion import Motion
-from drake_safety.simulation.rollouts import run_episodes, run_motions
+from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
-SHIFTS_FILE = "shifts.json"
 _DEFAULT_THROWS = 600
 _MOST_JUDGED = 1000  # Nominal motions under `--shifts`.
 
 
-@dataclass(kw_only=True)
+@dataclass
 class Evaluation:
     """An evaluation under way: what is judged, where the results go, and what was found.
 
@@ -77,6 +57,7 @@ class Evaluation:
         seeds: Seeds of fresh simulations by purpose.
         estimates: By dotted key.
         pictures: Files of the figures.
+        entries: What the file says besides estimates.
     """
 
     scenario: Scenario
@@ -88,6 +69,7 @@ class Evaluation:
     stages: StageProgress
     estimates: dict[str, Estimate] = field(default_factory=dict)
     pictures: list[Path] = field(default_factory=list)
+    entries: dict[str, Any] = field(default_factory=dict)
 
     @property
     def scorers(self) -> list[Scorer]:
@@ -97,12 +79,12 @@ class Evaluation:
     @property
     def plan_thresholds(self) -> dict[str, float]:
         """Stored thresholds of plans by mode, of the unsafe score."""
-        stored = {mode: one.calibrations_.get("plan") for mode, one in self.assessments.items()}
+        stored = {mode: one.calibrations_.get(PLAN) for mode, one in self.assessments.items()}
         return {mode: 1.0 - one.threshold for mode, one in stored.items() if one is not None}
 
     def fresh(self, what: str, number: int, purpose: str, **options: str) -> Episodes:
         """Fresh nominal episodes, kept in the run's folder."""
-        return run_fresh_episodes(
+        return folders.run_fresh_episodes(
             self.scenario,
             self.run_folder,
             number,
@@ -120,33 +102,30 @@ class Evaluation:
 
 
 def evaluate(
-    scenario: ScenarioArgument,
-    assessment: TrainingOption,
-    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
-    calibration_episodes: Annotated[
-        int, typer.Option(help="Other nominal episodes, for thresholds of the recalls.", min=20)
-    ] = 300,
+    scenario: console.ScenarioArgument,
+    assessment: console.TrainingOption,
+    episodes: Annotated[int, Option(help="Fresh nominal episodes.", min=1)] = 1000,
+    calibration_episodes: Annotated[int, Option(help="Others, for thresholds.", min=20)] = 300,
     throws: Annotated[
         int | None,
-        typer.Option(help="Fresh throws at the actual plant; 600 for tasks with recovery.", min=0),
+        Option(help="Fresh throws at the actual plant; 600 for tasks with recovery.", min=0),
     ] = None,
     shifts: Annotated[
         int,
-        typer.Option(
-            help="Motions of each changed plant and faulty sensor: evaluates Γ's \"don't know\" "
+        Option(
+            help="Motions of each changed plant and faulty sensor, to evaluate Γ's \"don't know\" "
             "and the monitor instead of all else.",
             min=0,
         ),
     ] = 0,
     seed: Annotated[
-        int | None,
-        typer.Option(help=f"First seed; {EVALUATION.first}, or {SHIFTS.first} with --shifts."),
+        int | None, Option(help=f"First seed; {EVALUATION.first}, or {SHIFTS.first} with --shifts.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
+        Path | None, Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
     ] = None,
-    workers: WorkersOption = None,
-    cluster: ClusterOption = None,
+    workers: console.WorkersOption = None,
+    cluster: console.ClusterOption = None,
 ) -> None:
     """Evaluate Γ, and the paper's form, on fresh episodes, throws and, with --shifts, other plants.
 
@@ -154,11 +133,10 @@ def evaluate(
     with and without recovery. Episodes are kept in ASSESSMENT: a stopped evaluation continues.
     """
     loaded, folder = load_scenario(scenario), out or assessment
-    check_writable(assessment, folder)
+    folders.check_writable(assessment, folder)
     if shifts:
-        with begun(loaded, assessment, SHIFTS, seed, folder, workers) as evaluation:
-            entries = add_shifts(evaluation, shifts, episodes)
-        write(evaluation, SHIFTS_FILE, command_line(), shifts_tables, entries)
+        with evaluating(loaded, assessment, folder, SHIFTS, seed, workers) as evaluation:
+            add_shifts(evaluation, shifts, episodes)
         return
     loop = loaded.make_loop()
     if throws is None:
@@ -166,41 +144,57 @@ def evaluate(
         throws = _DEFAULT_THROWS if is_thrown_at else 0
     if throws:
         require(loop, HasBall, "evaluate: pass --throws 0")
-    with begun(loaded, assessment, EVALUATION, seed, folder, workers) as evaluation:
+    with evaluating(loaded, assessment, folder, EVALUATION, seed, workers) as evaluation:
+        evaluation.entries["calibration_episodes"] = calibration_episodes
         test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
         other = evaluation.fresh("calibration episodes", calibration_episodes, "thresholds")
         add_verdicts(evaluation, evaluation.scorers, other, test)
         add_reliability(evaluation, test)
         if throws:
             add_throws(evaluation, throws)
-    entries = {"calibration_episodes": calibration_episodes}
-    write(evaluation, "evaluation.json", command_line(), verdict_tables, entries)
 
 
 @contextmanager
-def begun(
+def evaluating(
     scenario: Scenario,
     run_folder: Path,
+    folder: Path,
     block: SeedBlock,
     seed: int | None,
-    folder: Path,
     workers: int | None,
+    tables: Callable[[Results], Sequence[Table]] = verdict_tables,
+    program: str = "drake-safety",
 ) -> Iterator[Evaluation]:
-    """An evaluation of a run by seeds of a block, which begin at `seed` or the default."""
-    assessments = {mode: load_assessment(run_folder, mode) for mode in MODES}
+    """An evaluation of a run in the block of the statement; then its results are written.
+
+    Seeds are those of a block, and begin at `seed` or the default.
+    """
+    assessments = {mode: folders.load_assessment(run_folder, mode) for mode in MODES}
     seeds = block.seeds(seed)
     for gamma in assessments.values():
-        check_fresh(gamma, scenario, seeds.values())
-    with open_stages() as stages:
-        yield Evaluation(
-            scenario=scenario,
-            assessments=assessments,
-            run_folder=run_folder,
-            folder=folder,
-            seeds=seeds,
-            workers=workers,
-            stages=stages,
-        )
+        folders.check_fresh(gamma, scenario, seeds.values())
+    with console.open_stages() as stages:
+        evaluation = Evaluation(scenario, assessments, run_folder, folder, seeds, workers, stages)
+        yield evaluation
+    sharpened = assessments[MODES[0]]
+    trained = next(one for one in sharpened.used_ if one.purpose == "training")
+    files = {mode: folders.assessment_file(run_folder, mode) for mode in MODES}
+    made = console.made_by(scenario.name, program) | {
+        "scenario_hash": sharpened.info_.scenario_hash,
+        "seed": next(iter(seeds.values())),
+        "training_seed": trained.seed,
+        "training_episodes": trained.num_episodes,
+        "assessment_sha256": {mode: file_hash(file) for mode, file in files.items()},
+    }
+    results = Results(evaluation.estimates, made | evaluation.entries)
+    file = folder / ("shifts.json" if block is SHIFTS else "evaluation.json")
+    results.write(file)
+    for table in shift_study.shifts_tables(results) if block is SHIFTS else tables(results):
+        console.show(table.to_rich())
+    console.say(sharpened.detector_.describe())
+    console.say("figures", file)
+    for picture in evaluation.pictures:
+        console.say("picture", picture)
 
 
 def add_verdicts(
@@ -265,57 +259,42 @@ def add_shifts(
     judges: Mapping[str, Judge] | None = None,
     others: Callable[[Sequence[Episode]], Mapping[str, MotionSet]] = lambda nominal: {},
     more: Callable[[JudgedShift], Mapping[str, Estimate]] = lambda judged: {},
-) -> dict[str, Any]:
+) -> None:
     """Evaluates both modes, or other methods, on changed plants and faulty sensors.
 
     Args:
-        evaluation: The evaluation.
         num_motions: Motions of each shift.
         num_nominal: Nominal motions, for false alarms.
         judges: Methods; Γ, named "gamma", and the paper's mode by default.
         others: Further sets, made of the nominal motions.
         more: Further estimates of a shift.
-
-    Returns:
-        The kind of each shift.
     """
     gamma, paper = evaluation.assessments.values()
     if judges is None:
-        modes = {"gamma": gamma, "paper": paper}
-        judges = {name: shift_study.assessment_judge(one) for name, one in modes.items()}
+        judges = {
+            "gamma": shift_study.assessment_judge(gamma),
+            "paper": shift_study.assessment_judge(paper),
+        }
     scenario, seed, stages = evaluation.scenario, evaluation.seeds["shifts"], evaluation.stages
+    folder, workers = evaluation.run_folder, evaluation.workers
     nominal = shift_study.motions_of(evaluation.fresh("nominal motions", num_nominal, "shifts"))
+    promise = gamma.calibrations_.get("motion")
     found: dict[str, Estimate] = {}
-    sets: dict[str, MotionSet] = {"nominal": ("nominal", nominal[:_MOST_JUDGED])}
+    sets: dict[str, shift_study.MotionSet] = {"nominal": ("nominal", nominal[:_MOST_JUDGED])}
     shifts = plant_shifts(scenario, scenario.make_loop())
     for i, (name, shift) in enumerate(shifts.items()):
         stages("shifted motions", i, len(shifts))
         shifted = shifted_scenario(scenario, name, shift)
         options = {**scenario.options_for("evaluation"), **shift.options}
-        hash_ = shifted.simulation_hash(name)
-        episodes = run_episodes(
-            shifted,
-            num_motions,
-            variation=name,
-            seed=seed,
-            num_workers=evaluation.workers,
-            path=fresh_episodes_folder(evaluation.run_folder, hash_, seed, options),
-            **options,
+        episodes = folders.run_fresh_episodes(
+            shifted, folder, num_motions, seed, None, workers, name, **options
         )
         sets[name] = (shift.kind, shift_study.motions_of(episodes))
         motions = monitor_study.run_monitored(
-            shifted,
-            name,
-            num_motions,
-            seed,
-            gamma.detector_,
-            options=options,
-            num_workers=evaluation.workers,
+            shifted, name, num_motions, seed, gamma.detector_, options=options, num_workers=workers
         )
         watched = monitor_study.monitored(motions, gamma, judges["gamma"])
-        of_monitor = monitor_study.monitor_estimates(
-            watched, gamma.calibrations_.get(calibration.MOTION)
-        )
+        of_monitor = monitor_study.monitor_estimates(watched, promise)
         found |= {f"shifts.{name}.{key}": estimate for key, estimate in of_monitor.items()}
     stages("shifted motions", len(shifts), len(shifts))
     sets |= others(nominal[:num_motions])
@@ -324,42 +303,11 @@ def add_shifts(
         scenario,
         num_nominal * scenario.episode_duration_s,
         seed=FRESH_MOTION.first,
-        num_workers=evaluation.workers,
-        path=evaluation.run_folder / "fresh" / "motion",
+        num_workers=workers,
+        path=folder / "fresh" / "motion",
         progress=partial(stages, "undisturbed nominal motion"),
     )
     alarms = monitor_study.false_alarms(usual, gamma.detector_)
     found["shifts.nominal.monitor.false_alarms_per_hour"] = alarms
     evaluation.add(found, shifts=shift_study.shifts_figure(found))
-    return {"kinds": {name: kind for name, (kind, _) in sets.items()}}
-
-
-def write(
-    evaluation: Evaluation,
-    name: str,
-    command: str,
-    tables: Callable[[Results], Sequence[Table]],
-    entries: Mapping[str, Any],
-) -> None:
-    """Writes what was found to a file of results, and prints its tables."""
-    sharpened = evaluation.assessments[MODES[0]]
-    trained = next(one for one in sharpened.used_ if one.purpose == "training")
-    files = {mode: assessment_file(evaluation.run_folder, mode) for mode in MODES}
-    origin = {
-        "command": command,
-        "scenario": evaluation.scenario.name,
-        "scenario_hash": sharpened.info_.scenario_hash,
-        "seed": next(iter(evaluation.seeds.values())),
-        "training_seed": trained.seed,
-        "training_episodes": trained.num_episodes,
-        "assessment_sha256": {mode: file_hash(file) for mode, file in files.items()},
-        "versions": versions(),
-    }
-    results = Results(evaluation.estimates, {**origin, **entries})
-    results.write(evaluation.folder / name)
-    for table in tables(results):
-        console.print(table.to_rich())
-    console.print(sharpened.detector_.describe(), highlight=False, soft_wrap=True)
-    print_path("figures", evaluation.folder / name)
-    for picture in evaluation.pictures:
-        print_path("picture", picture)
+    evaluation.entries["kinds"] = {name: kind for name, (kind, _) in sets.items()}

@@ -7,28 +7,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.table import Table
+from typer import Option
 
+from drake_safety.cli import console
+from drake_safety.cli import training_folder as folders
 from drake_safety.cli.adapt import log_pieces
-from drake_safety.cli.console import (
-    AssessmentOption,
-    ScenarioArgument,
-    command_line,
-    console,
-    new_table,
-    open_stages,
-    print_path,
-    print_shipped,
-    versions,
-)
-from drake_safety.cli.training_folder import (
-    MODES,
-    assessment_folder,
-    check_fresh,
-    check_writable,
-    load_assessment,
-)
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.timeline_figure import levels_figure
@@ -39,50 +23,45 @@ from drake_safety.logs.episodes import motions_from_log
 from drake_safety.logs.robot_log import FORMATS
 from drake_safety.logs.sequences import Motion, SequenceMap, read_sequences
 from drake_safety.simulation.rollouts import worker_loop
-from drake_safety.simulation.scenario import Scenario, load_scenario
+from drake_safety.simulation.scenario import Scenario
 
 _SEQUENCES = ".npz"
 
 
 def monitor(
-    scenario: ScenarioArgument,
+    scenario: console.ScenarioArgument,
     log: Annotated[
         list[Path],
-        typer.Option(
-            help="Log of a robot, .npz file of sequences, or a folder of either; may be repeated."
-        ),
+        Option(help="Log of a robot, .npz file of sequences, or folder of either; repeatable."),
     ],
-    log_map: Annotated[Path, typer.Option("--map", help="Map of their columns, a YAML file.")],
-    assessment: AssessmentOption = None,
+    log_map: Annotated[Path, Option("--map", help="Map of their columns, a YAML file.")],
+    assessment: console.AssessmentOption = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write; ASSESSMENT/monitor by default.")
+        Path | None, Option(help="Folder to write; ASSESSMENT/monitor by default.")
     ] = None,
 ) -> None:
     """Run the change monitor over logs of a robot: its alarms, their causes, and its levels.
 
     Writes monitor.json and a picture of each log, or sequence of an .npz file.
     """
-    loaded = load_scenario(scenario)
-    learned = assessment_folder(loaded, assessment)
-    gamma = load_assessment(learned.path, MODES[0])
-    check_fresh(gamma, loaded)
+    loaded, learned, gamma = folders.open_assessment(scenario, assessment)
+    folders.check_fresh(gamma, loaded)
     folder = out or learned.out / "monitor"
-    check_writable(folder)
-    print_shipped(learned, gamma)
+    folders.check_writable(folder)
+    console.print_shipped(learned, gamma)
     files = [file for given in log for file in _files(given)]
     found: list[dict[str, Any]] = []
-    with open_stages() as stages:
+    with console.open_stages() as stages:
         for i, file in enumerate(files):
             for what, motions in _motions(file, log_map, loaded, gamma):
                 picture = folder / f"{file.stem}-{len(found) + 1}"
                 found.append(what | _judged(motions, gamma, picture))
             stages("logs", i + 1, len(files))
-    entries = {"command": command_line(), "scenario": loaded.name, "versions": versions()}
-    monitored = {"monitor": gamma.detector_.describe(), "logs": found}
-    Results({}, {**entries, **monitored}).write(folder / "monitor.json")
-    console.print(_table(found))
-    print_path("figures ", folder / "monitor.json")
-    print_path("pictures", folder)
+    entries = {"monitor": gamma.detector_.describe(), "logs": found}
+    Results({}, console.made_by(loaded.name) | entries).write(folder / "monitor.json")
+    console.show(_table(found))
+    console.say("figures ", folder / "monitor.json")
+    console.say("pictures", folder)
 
 
 def _files(given: Path) -> list[Path]:
@@ -141,17 +120,18 @@ def _judged(motions: Sequence[Motion], gamma: SafetyAssessment, picture: Path) -
 
 
 def _table(found: Sequence[Mapping[str, Any]]) -> Table:
-    table = new_table("log", "until [s]", "alarm [s]", "ends [s]", "largest level", "cause")
+    rows = []
     for one in found:
         number = "" if one["sequence"] is None else f" [{one['sequence']}]"
         left = one["left_safe_set"] and f", left the safe set: {one['left_safe_set']}"
         head = [f"{Path(*Path(one['log']).parts[-2:])}{number}", f"{one['end_s']:.2f}{left}"]
         if not one["alarms"]:
             told = f"no alarm; largest: {one['state']}"
-            table.add_row(*head, "-", "-", f"{one['level']:.2f}", told)
+            rows.append([*head, "-", "-", f"{one['level']:.2f}", told])
         for alarm in one["alarms"]:
             numbers = (alarm[key] for key in ("begin_s", "end_s", "level"))
             cells = ["goes on" if value is None else f"{value:.2f}" for value in numbers]
-            table.add_row(*head, *cells, alarm["cause"])
+            rows.append([*head, *cells, alarm["cause"]])
             head = ["", ""]
-    return table
+    columns = ("log", "until [s]", "alarm [s]", "ends [s]", "largest level", "cause")
+    return console.new_table(*columns, rows=rows)

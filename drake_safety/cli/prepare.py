@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from rich.text import Text
+from typer import Argument, Exit, Option
 
-from drake_safety.cli.console import ScenarioArgument, console, new_table, open_stages, print_path
+from drake_safety.cli import console
 from drake_safety.control.policy_template import survey_policy
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.robot_figure import robot_figure
@@ -19,43 +19,31 @@ from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import load_scenario, scenario_names
 from drake_safety.simulation.scenario_check import check_scenario
 
-# By whether a check passed, and whether with a warning.
-_WORDS = {
-    (True, False): ("OK     ", "green"),
-    (True, True): ("warning", "bold yellow"),
-    (False, False): ("problem", "red"),
-}
-
 
 def scenarios() -> None:
     """List the scenarios that come with the package."""
-    table = new_table("scenario", "task", "robot", "plants", "horizon", "needs")
+    rows: list[tuple[str, ...]] = []
     for name in scenario_names():
         try:
             scenario = load_scenario(name)
             scenario.task_class().model_files(scenario)
         except MissingExtraError as error:
-            table.add_row(name, *4 * ["–"], error.needs)
+            rows.append((name, *4 * ["–"], error.needs))
             continue
-        horizon_s = scenario.assessment.horizon * scenario.preview_step_s
-        table.add_row(
-            name,
-            scenario.task.rpartition(":")[2],
-            scenario.robot,
-            ", ".join(scenario.variations),
-            f"{scenario.assessment.horizon} steps, {horizon_s:g} s",
-            "",
-        )
-    console.print(table)
+        num_steps, task = scenario.assessment.horizon, scenario.task.rpartition(":")[2]
+        horizon = f"{num_steps} steps, {num_steps * scenario.preview_step_s:g} s"
+        rows.append((name, task, scenario.robot, ", ".join(scenario.variations), horizon, ""))
+    columns = ("scenario", "task", "robot", "plants", "horizon", "needs")
+    console.show(console.new_table(*columns, rows=rows))
 
 
 def new(
-    name: Annotated[str, typer.Argument(help="Name of the robot, and of its folder.")],
-    urdf: Annotated[Path, typer.Option(help="Its URDF.", dir_okay=False)],
-    task: Annotated[str, typer.Option(help="'balancing', 'reaching' or 'walking'.")] = "balancing",
+    name: Annotated[str, Argument(help="Name of the robot, and of its folder.")],
+    urdf: Annotated[Path, Option(help="Its URDF.", dir_okay=False)],
+    task: Annotated[str, Option(help="'balancing', 'reaching' or 'walking'.")] = "balancing",
     policy: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="For 'walking': its network (.onnx, .pt), a deploy.yaml of unitree_rl_lab or a "
             "config.yaml of rl_sar.",
             dir_okay=False,
@@ -63,16 +51,12 @@ def new(
     ] = None,
     motors: Annotated[
         str | None,
-        typer.Option(
-            help="Joints in the order of the robot's motors, with commas, for a deploy.yaml, which "
-            "numbers them."
-        ),
+        Option(help="Joints in the order of the motors, with commas, for a deploy.yaml."),
     ] = None,
     feet: Annotated[
-        str | None,
-        typer.Option(help="Links that touch the ground, with commas; the lowest by default."),
+        str | None, Option(help="Links that touch the ground, with commas; the lowest by default.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to write; NAME by default.")] = None,
+    out: Annotated[Path | None, Option(help="Folder to write; NAME by default.")] = None,
 ) -> None:
     """Write the folder of a robot and a first scenario from a URDF, for review.
 
@@ -85,43 +69,35 @@ def new(
         )
     # Before anything is written.
     template = None if policy is None else survey_policy(policy, _names(motors))
+    moved = () if template is None else template.joints or None
     written = write_robot(
-        name,
-        urdf,
-        task,
-        Path(name) if out is None else out,
-        feet=_names(feet) or None,
-        moved=() if template is None else template.joints or None,
+        name, urdf, task, out or Path(name), feet=_names(feet) or None, moved=moved
     )
-    files, asked = written.files, written.asked
+    files, asked, sizes = written.files, written.asked, written.sizes
     if template is not None:
         more, unknown = template.write(written.folder, written.joints, written.posture)
         files, asked = [*files[:-1], *more, files[-1]], [*asked, *unknown]
-    mass_kg, height_m = written.sizes.mass_kg, written.sizes.height_m
-    _say(f"{name}: {mass_kg:.1f} kg, its base '{written.sizes.base}' stands {height_m:.3f} m high")
+    mass, height = f"{sizes.mass_kg:.1f} kg", f"{sizes.height_m:.3f} m"
+    console.say(f"{name}: {mass}, its base '{sizes.base}' stands {height} high")
     for path in files:
-        print_path("wrote", path)
+        console.say("wrote", path)
     if written.num_hulls:
-        _say(
+        console.say(
             f"{written.num_hulls} convex hulls replace collision meshes that Drake does not read. "
             f"Look at them: drake-safety check {written.files[-1]} --picture FILE"
         )
     for what in written.copy.left_out:
-        _say(f"note  {what}", "yellow")
+        console.say(f"note  {what}", style="yellow")
     if written.bare:
-        _say(
+        console.say(
             f"WARNING  {len(written.bare)} links have lost their collision meshes, which are "
             "missing or cannot be read: everything passes through "
             f"{', '.join(written.bare)}. Add boxes or capsules to {files[0]}; `check` reminds you",
-            "bold red",
+            style="bold red",
         )
     for what in asked:
-        _say(f"ask   {what}", "yellow")
-    print_path("next: drake-safety check", written.files[-1])
-
-
-def _say(text: str, style: str | None = None) -> None:
-    console.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
+        console.say(f"ask   {what}", style="yellow")
+    console.say("next: drake-safety check", written.files[-1])
 
 
 def _names(text: str | None) -> list[str]:
@@ -129,24 +105,20 @@ def _names(text: str | None) -> list[str]:
 
 
 def check(
-    scenario: ScenarioArgument,
-    episodes: Annotated[
-        int, typer.Option(help="Episodes simulated for the share of unsafe ones.", min=0)
-    ] = 16,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Leave these episodes out, as by --episodes 0.")
-    ] = False,
-    seed: Annotated[int, typer.Option(help="Seed of these episodes.")] = DEMONSTRATION.first,
+    scenario: console.ScenarioArgument,
+    episodes: Annotated[int, Option(help="Episodes for the share of unsafe ones.", min=0)] = 16,
+    quick: Annotated[bool, Option("--quick", help="The same as --episodes 0.")] = False,
+    seed: Annotated[int, Option(help="Seed of these episodes.")] = DEMONSTRATION.first,
     picture: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Draw the standing robot beside its collision shapes, as FILE.png and FILE.svg.",
             dir_okay=False,
         ),
     ] = None,
     import_: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--import/--no-import",
             help="Import the scenario's task, which runs its code. Without, only its files are "
             "checked: for a scenario from a stranger.",
@@ -160,46 +132,32 @@ def check(
     if picture is not None and not import_:
         raise ValueError("check: --picture needs the task, which --no-import does not import")
     num_problems = 0
-    with open_stages() as stages:
+    num_episodes = 0 if quick else episodes
+    with console.open_stages() as stages:
         for finding in check_scenario(
-            scenario,
-            num_episodes=0 if quick else episodes,
-            seed=seed,
-            is_imported=import_,
-            progress=stages,
+            scenario, num_episodes=num_episodes, seed=seed, is_imported=import_, progress=stages
         ):
             num_problems += not finding.is_ok
-            word, style = _WORDS[finding.is_ok, finding.is_warning]
-            text = Text.assemble((word, style), f"  {finding.item}: {finding.message}")
+            word = ("OK     ", "green") if finding.is_ok else ("problem", "red")
+            word = ("warning", "bold yellow") if finding.is_warning else word
+            text = Text.assemble(word, f"  {finding.item}: {finding.message}")
             if finding.remedy:
                 text.append(f"\n         fix: {finding.remedy}")
-            console.print(text, highlight=False, soft_wrap=True)
+            console.say(text)
     if picture is not None:
-        _draw(scenario, picture)
-    if num_problems:
-        console.print(f"{num_problems} problems", style="red", highlight=False)
-        raise typer.Exit(1)
-    if import_:
-        if quick:
-            console.print(
-                "not checked: the share of unsafe episodes; leave out --quick before you train",
-                highlight=False,
+        loop = load_scenario(scenario).make_loop()
+        if not isinstance(loop, LeggedLoop):
+            raise ValueError(
+                f"check: --picture draws a legged robot; task '{type(loop).__name__}' has none"
             )
-        console.print("ready: drake-safety train", scenario, "--out FOLDER", highlight=False)
-    else:
-        console.print("its files are right; its code was not run", highlight=False)
-
-
-def _draw(scenario: str, picture: Path) -> None:
-    """Draws a robot beside its collision shapes.
-
-    Raises:
-        ValueError: The scenario has no legged robot, or its diagram cannot be built.
-    """
-    loop = load_scenario(scenario).make_loop()
-    if not isinstance(loop, LeggedLoop):
-        raise ValueError(
-            f"check: --picture draws a legged robot; task '{type(loop).__name__}' has none"
-        )
-    for path in save(robot_figure(loop), picture):
-        print_path("picture", path)
+        for path in save(robot_figure(loop), picture):
+            console.say("picture", path)
+    if num_problems:
+        console.say(f"{num_problems} problems", style="red")
+        raise Exit(1)
+    if not import_:
+        console.say("its files are right; its code was not run")
+        return
+    if quick:
+        console.say("not checked: the share of unsafe episodes; leave out --quick before you train")
+    console.say("ready: drake-safety train", scenario, "--out FOLDER")

@@ -5,43 +5,20 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-import typer
 from matplotlib.figure import Figure
 from pydrake.geometry import Meshcat
-from rich.table import Table
+from typer import Exit, Option
 
-from drake_safety.cli.console import (
-    LOOPBACK,
-    AssessmentOption,
-    HostOption,
-    ScenarioArgument,
-    cause_words,
-    command_line,
-    console,
-    new_table,
-    open_viewer,
-    print_path,
-    print_shipped,
-    versions,
-    warn_of_empty_scene,
-)
-from drake_safety.cli.targets import (
-    HandOption,
-    TargetOption,
-    nearest_accepted,
-    parse_target,
-    print_verdict,
-)
-from drake_safety.cli.training_folder import (
-    GoalThreshold,
-    assessment_folder,
-    goal_threshold,
-    load_assessment,
-)
+from drake_safety.cli import console
+from drake_safety.cli import training_folder as folders
+from drake_safety.cli.ask import judge_target, parse_target, print_verdict
+from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.path_figure import path_figure
 from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
@@ -49,22 +26,16 @@ from drake_safety.evaluation.timeline_figure import timeline_figure
 from drake_safety.files.reading import did_you_mean
 from drake_safety.files.schema import load_typed
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.causes import describe_margin, likely_cause
 from drake_safety.learning.seeds import DEMONSTRATION
-from drake_safety.planning.goal_verdict import assess_goal
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.pushes import Push
-from drake_safety.simulation.capabilities import (
-    CanBePushed,
-    HasBall,
-    HasGoals,
-    goal_words,
-    require,
-)
+from drake_safety.simulation.capabilities import CanBePushed, HasBall, HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.motion import Motion, simulate
 from drake_safety.simulation.rollouts import episode_rng, run_to_goal
-from drake_safety.simulation.scenario import Scenario, load_scenario
+from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.throws import run_throw
 
 _WITH_BALLS_S = 5.0  # Duration of a run with balls.
@@ -79,63 +50,39 @@ _HAPPENING = {
     "recovery_active": "recovery triggered",
 }
 """Ports that a loop may have, and what it means when they become positive."""
+_COLUMNS = ("time [s]", "event", "probability")  # Of events.
 # Keys of a ball on the command line, and fields of a throw.
-_THROW_FIELDS = {
-    "time": "time_s",
-    "mass": "mass_kg",
-    "speed": "speed_m_s",
-    "direction": "direction_rad",
-    "offset": "offset_m",
-    "height": "height_m",
-}
+_THROW_FIELDS = {field.name.partition("_")[0]: field.name for field in fields(Throw)}
 
 
 def run(
-    scenario: ScenarioArgument,
-    assessment: AssessmentOption = None,
-    target: TargetOption = None,
-    hand: HandOption = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Go to the target even if Γ refuses it.")
-    ] = False,
-    guard: Annotated[
-        bool, typer.Option("--guard", help="Pass on the nearest accepted command instead.")
-    ] = False,
+    scenario: console.ScenarioArgument,
+    assessment: console.AssessmentOption = None,
+    target: console.TargetOption = None,
+    hand: console.HandOption = None,
+    force: Annotated[bool, Option("--force", help="Go there even if Γ refuses it.")] = False,
+    guard: Annotated[bool, Option("--guard", help="Pass on the nearest accepted command.")] = False,
     push: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             help="With a target: the name of a push in the scenario. Otherwise: 'ball' for the "
             "scenario's balls, or a ball, repeatable: 'time=1 mass=3 speed=9 direction=90' "
             "[s, kg, m/s, degrees from x]."
         ),
     ] = None,
-    variation: Annotated[str, typer.Option(help="Variation of the plant.")] = "actual",
-    recovery: Annotated[
-        bool | None, typer.Option("--recovery/--no-recovery", help="Recovery; the task's default.")
-    ] = None,
+    variation: console.VariationOption = "actual",
+    recovery: console.RecoveryOption = None,
     duration: Annotated[
         float | None,
-        typer.Option(
-            help="Seconds to simulate; by default 5 with balls, one more than an episode with a "
-            "target, and otherwise an episode.",
-            min=0.1,
-        ),
+        Option(help="Seconds: by default 5 with balls, else an episode, +1 to a target.", min=0.1),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of start, plan and noise.")] = (
-        DEMONSTRATION.first
-    ),
-    mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
+    seed: Annotated[int, Option(help="Seed of start, plan and noise.")] = DEMONSTRATION.first,
+    mode: console.ModeOption = MODES[0],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for recording and figures; by default ASSESSMENT, or else "
-            "runs/SCENARIO-shipped."
-        ),
+        Path | None, Option(help="Folder; by default ASSESSMENT, or else runs/SCENARIO-shipped.")
     ] = None,
-    meshcat: Annotated[
-        bool, typer.Option("--meshcat", help="Show the run live in the browser, in real time.")
-    ] = False,
-    host: HostOption = LOOPBACK,
+    meshcat: Annotated[bool, Option("--meshcat", help="Show it live in the browser.")] = False,
+    host: console.HostOption = console.LOOPBACK,
 ) -> None:
     """Simulate once with Γ in the loop; write a recording, a timeline and the events.
 
@@ -143,23 +90,25 @@ def run(
     """
     if force and target is None:
         raise ValueError("run: --force goes to a target that Γ refuses: pass that too")
-    loaded = load_scenario(scenario)
-    learned = assessment_folder(loaded, assessment)
-    gamma = load_assessment(learned.path, mode)
-    given = {"hand": hand, "recovery": recovery, "guard": guard or None}
-    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    print_shipped(learned, gamma)
-    rule = goal_threshold(learned.path, gamma)
-    # The verdict is on what is asked, whatever a guard would pass on.
-    asked = {name: value for name, value in options.items() if target is None or name != "guard"}
-    # Check the capabilities of the task before a browser is opened.
+    loaded, learned, gamma = folders.open_assessment(scenario, assessment, mode)
+    options = console.given(hand=hand, recovery=recovery)
+    guarded = console.given(guard=guard or None)
+    console.print_shipped(learned, gamma)
+    rule = folders.goal_threshold(learned.path, gamma)
+    # Check the capabilities of the task before a browser is opened. The verdict is on what is
+    # asked, whatever a guard would pass on.
+    asked = options if target is not None else options | guarded
     loop = loaded.make_loop(variation, assessment=gamma, **asked)
-    goal, one_push, throws = None, None, None
+    duration_s, simulated = loaded.episode_duration_s, partial(_move, rule=rule)
     if target is not None:
         goal, one_push = parse_target(loop, target), named_push(loop, push or [])
-        if not (_ask(loop, gamma, goal, rule) or force or guard):
-            console.print("refused: nothing moved; --force goes there", highlight=False)
-            raise typer.Exit(1)
+        verdict, nearest = judge_target(loop, goal, rule)
+        print_verdict(loop, verdict, nearest, rule.origin)
+        if not (verdict.is_accepted or force or guard):
+            console.say("refused: nothing moved; --force goes there")
+            raise Exit(1)
+        duration_s += _AFTER_EPISODE_S
+        simulated = partial(_go, goal=goal, push=one_push, rule=rule)
     elif isinstance(loop, HasGoals):
         words = goal_words(loop)
         raise ValueError(
@@ -167,210 +116,176 @@ def run(
             f"{' '.join(words.axes)}, or one of the names {list(loop.named_targets)}"
         )
     elif isinstance(loop, HasBall):
-        throws = parse_pushes(loaded, push or [])
-        options["ball"] = True
+        duration_s, options["ball"] = _WITH_BALLS_S, True
+        simulated = partial(_throw, throws=parse_pushes(loaded, push or []))
     elif push:
         require(loop, HasBall, "run: --push")
-    viewer = open_viewer(host)
+    viewer = console.open_viewer(host)
+    loop = loaded.make_loop(variation, assessment=gamma, meshcat=viewer, **options, **guarded)
     if meshcat:
-        console.print(f"live at {viewer.web_url()}")
-    loop = loaded.make_loop(variation, assessment=gamma, meshcat=viewer, **options)
-    if meshcat:
+        console.say(f"live at {viewer.web_url()}")
         input("Press Enter when the browser shows the robot. ")
     viewer.StartRecording()
-    simulated: dict[str, Any] = {"seed": seed, "realtime_rate": 1.0 if meshcat else 0.0}
-    if goal is not None:
-        shown = _go(loop, gamma, goal, one_push, rule, duration, **simulated)
-    elif throws is not None:
-        shown = _throw(loop, gamma, throws, duration, **simulated)
-    else:
-        shown = _move(loop, gamma, rule, duration, **simulated)
-    warn_of_empty_scene(viewer, loaded.task)
-    _save((out or learned.out) / "run", viewer, *shown)
+    rate = 1.0 if meshcat else 0.0
+    shown = simulated(loop, duration_s=duration or duration_s, seed=seed, realtime_rate=rate)
+    console.warn_of_empty_scene(viewer, loaded.task)
+    _save((out or learned.out) / "run", viewer, loop, shown)
 
 
-_Shown = tuple[Mapping[str, Figure], Table, str]  # Figures, events, and the threshold in words.
+_Events = list[tuple[float, str]]  # Times [s] and words.
 
 
-def _ask(loop: ClosedLoop, gamma: SafetyAssessment, goal: np.ndarray, rule: GoalThreshold) -> bool:
-    """Prints the verdict on a goal, and returns whether it is accepted."""
-    verdict = assess_goal(
-        loop, gamma, goal, threshold=rule.threshold, unsafe_below=rule.unsafe_below
-    )
-    nearest = None if verdict.is_accepted else nearest_accepted(loop, gamma, verdict)
-    print_verdict(loop, verdict, nearest, rule.origin)
-    return verdict.is_accepted
+class _Shown(NamedTuple):
+    """What is shown of a motion.
+
+    Attributes:
+        told: The threshold in words.
+        timeline: Further arguments of the timeline.
+        marked: Times marked on the path in the map, by name [s]; without them there is no figure.
+    """
+
+    motion: Motion
+    events: _Events
+    threshold: float
+    told: str
+    timeline: dict[str, Any]
+    marked: Mapping[str, float] | None = None
 
 
 def _go(
-    loop: ClosedLoop,
-    gamma: SafetyAssessment,
-    goal: np.ndarray,
-    push: Push | None,
-    rule: GoalThreshold,
-    duration_s: float | None,
-    **options: Any,
+    loop: Any, goal: np.ndarray, push: Push | None, rule: folders.GoalThreshold, **options: Any
 ) -> _Shown:
     """Moves to a goal, pushed or not."""
-    ports = (*_logged_ports(loop), *filter(loop.HasOutputPort, _HAPPENING))
-    duration_s = duration_s or loop.scenario.episode_duration_s + _AFTER_EPISODE_S
-    motion = run_to_goal(loop, goal, push=push, duration_s=duration_s, ports=ports, **options)
-    threshold, origin = motion_threshold(gamma, rule)
+    motion = run_to_goal(loop, goal, push=push, ports=_logged_ports(loop), **options)
+    end_s, output = float(motion.time_s[-1]), motion["output"]
+    threshold, origin = motion_threshold(loop.assessment, rule)
     alarm = alarm_row(motion, threshold)
-    words = goal_words(require(loop, HasGoals))
+    words = goal_words(loop)
     instants = [motion.leave_time_s, motion.fall_time_s]
-    events = [(0.0, f"{words.subject} starts")]
+    events: _Events = [(0.0, f"{words.subject} starts")]
     for port, happens in _HAPPENING.items():
         if port in motion.ports and (motion[port] > 0).any():
-            row = int(np.argmax(motion[port][:, 0] > 0))
-            events.append((float(motion.time_s[row]), happens))
+            events.append((float(motion.time_s[np.argmax(motion[port][:, 0] > 0)]), happens))
     if push is not None:
         instants += [push.time_s, push.time_s + push.duration_s + _AFTER_PUSH_S]
         told = f"{push.body} is pushed with {push.force_n} N for {push.duration_s:g} s"
         events.append((push.time_s, told))
-    if alarm is not None:
-        told = f"probability below {threshold:.3f}; {_expected(loop, gamma, motion, alarm)}"
-        events.append((float(motion.time_s[alarm]), told))
-    if motion.has_left:
-        events.append((motion.leave_time_s, f"left the safe set: {motion.cause}"))
+    events += _outcome(loop, motion, alarm, threshold)
+    place = "" if motion.has_left else ", inside the safe set throughout"
     if motion.has_fallen:
         events.append((motion.fall_time_s, "the robot fell"))
+    elif words.is_point:
+        miss = words.distance(output[-1] - goal)
+        events.append((end_s, f"standing{place}; {miss} from the {words.goal}"))
     else:
-        place = "" if motion.has_left else ", inside the safe set throughout"
-        output = motion["output"]
-        if words.is_point:
-            miss = words.distance(output[-1] - goal)
-            told = f"standing{place}; {miss} from the {words.goal}"
-        else:
-            reached = np.round(output[len(output) // 2 :].mean(axis=0), 2)
-            told = f"on its feet{place}; mean of the second half {words.value(reached)}"
-        events.append((float(motion.time_s[-1]), told))
-    timeline = _timeline(
-        loop,
-        motion,
-        threshold,
-        instants=[instant for instant in instants if instant <= motion.time_s[-1]],
-        num_stills=_NUM_STILLS,
-        pushes=[] if push is None else [push],
-        alarm=alarm,
-    )
+        reached = np.round(output[len(output) // 2 :].mean(axis=0), 2)
+        told = f"on its feet{place}; mean of the second half {words.value(reached)}"
+        events.append((end_s, told))
     told = f"alarm where the probability is below {threshold:.3f} in any row, {origin}"
-    return {"timeline": timeline}, events_table(events, motion, gamma), told
+    timeline = {
+        "instants": [instant for instant in instants if instant <= end_s],
+        "num_stills": _NUM_STILLS,
+        "pushes": [] if push is None else [push],
+        "alarm": alarm,
+    }
+    return _Shown(motion, events, threshold, told, timeline)
 
 
-def _throw(
-    loop: ClosedLoop,
-    gamma: SafetyAssessment,
-    throws: list[Throw],
-    duration_s: float | None,
-    **options: Any,
-) -> _Shown:
+def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
     """Throws balls at a robot in undisturbed motion."""
     ports = (*_logged_ports(loop), "embedding", "ball_state")
-    duration_s = duration_s or _WITH_BALLS_S
-    motion = run_throw(loop, 0, throws=throws, duration_s=duration_s, ports=ports, **options)
+    motion = run_throw(loop, 0, throws=throws, ports=ports, **options)
     threshold = loop.scenario.parameters.recovery.threshold
     triggers = [start_s for start_s, _ in motion.recovery_intervals_s]
-    events = [
-        (
-            throw.time_s,
-            f"ball of {throw.mass_kg:g} kg at {throw.speed_m_s:g} m/s towards "
-            f"{np.degrees(throw.direction_rad):.0f}°",
-        )
-        for throw in throws
-    ]
+    events: _Events = []
+    for throw in throws:
+        flight = f"{throw.speed_m_s:g} m/s towards {np.degrees(throw.direction_rad):.0f}°"
+        events.append((throw.time_s, f"ball of {throw.mass_kg:g} kg at {flight}"))
     for time_s in triggers:
         row = int(np.abs(motion.time_s - time_s).argmin())
-        told = f"recovery triggered; {_expected(loop, gamma, motion, row)}"
-        events.append((time_s, told))
+        events.append((time_s, f"recovery triggered; {_expected(loop, motion, row)}"))
     fall = (motion.fall_time_s, "the robot fell")
     events.append(fall if motion.has_fallen else (float(motion.time_s[-1]), "standing"))
     instants = [throw.time_s + after_s for throw in throws for after_s in _AROUND_IMPACT_S]
     instants += [trigger_s + _AFTER_TRIGGER_S for trigger_s in triggers[:1]]
-    timeline = _timeline(
-        loop, motion, threshold, instants=instants, throws=throws, trigger_times_s=triggers
-    )
-    marked = {f"ball {i}": throw.time_s for i, throw in enumerate(throws, start=1)}
+    timeline = {"instants": instants, "throws": throws, "trigger_times_s": triggers}
+    marked = {"start": 0.0} | {f"ball {i}": one.time_s for i, one in enumerate(throws, start=1)}
     marked |= {f"recovery {i}": start_s for i, start_s in enumerate(triggers, start=1)}
-    path = path_figure(
-        gamma,
-        motion.time_s,
-        motion["embedding"],
-        motion["safety_probability"][:, 0],
-        threshold,
-        {"start": 0.0, **marked},
-    )
-    told = (
-        f"recovery where the probability is below {threshold:g}, that of scenario "
-        f"'{loop.scenario.name}'"
-    )
-    return {"timeline": timeline, "path": path}, events_table(events, motion, gamma), told
+    name = loop.scenario.name
+    told = f"recovery where the probability is below {threshold:g}, that of scenario '{name}'"
+    return _Shown(motion, events, threshold, told, timeline, marked)
 
 
-def _move(
-    loop: ClosedLoop,
-    gamma: SafetyAssessment,
-    rule: GoalThreshold,
-    duration_s: float | None,
-    *,
-    seed: int,
-    realtime_rate: float,
-) -> _Shown:
+def _move(loop: ClosedLoop, rule: folders.GoalThreshold, *, seed: int, **options: Any) -> _Shown:
     """Simulates an episode from a random start, and a little beyond the safe set."""
     motion = simulate(
         loop,
         lambda context: loop.reset(context, episode_rng(seed, 0)),
         ("margins", *_logged_ports(loop)),
-        duration_s=duration_s or loop.scenario.episode_duration_s,
         after_leaving_s=_AFTER_LEAVING_S,
         may_fail=True,
-        realtime_rate=realtime_rate,
         who=f"run of '{loop.scenario.name}' (seed {seed})",
+        **options,
     )
-    alarm = first_below(motion["safety_probability"][:, 0], rule.threshold)
-    events = [(0.0, "the episode starts")]
-    if alarm is not None:
-        told = f"probability below the threshold; {_expected(loop, gamma, motion, alarm)}"
-        events.append((float(motion.time_s[alarm]), told))
-    end = "the end, inside the safe set throughout"
-    if motion.has_left:
-        events.append((motion.leave_time_s, f"left the safe set: {motion.cause}"))
-        end = "the end"
+    alarm = _first_below(motion, rule.threshold)
+    end = "the end" if motion.has_left else "the end, inside the safe set throughout"
     if motion.failure:
         end = f"the simulation failed: {motion.failure}"
-    events.append((float(motion.time_s[-1]), end))
-    figures = {"timeline": _timeline(loop, motion, rule.threshold, alarm=alarm)}
+    events: _Events = [
+        (0.0, "the episode starts"),
+        *_outcome(loop, motion, alarm, rule.threshold),
+        (float(motion.time_s[-1]), end),
+    ]
     told = f"{rule.threshold:.3g}, {rule.origin}"
-    return figures, events_table(events, motion, gamma), told
+    return _Shown(motion, events, rule.threshold, told, {"alarm": alarm})
 
 
-def _save(
-    folder: Path,
-    viewer: Meshcat,
-    figures: Mapping[str, Figure],
-    events: Table,
-    threshold: str,
-) -> None:
-    """Writes recording, figures and events, and prints the events and the paths."""
-    viewer.StopRecording()
-    viewer.PublishRecording()
-    folder.mkdir(parents=True, exist_ok=True)
-    recording = folder / "recording.html"
-    recording.write_text(viewer.StaticHtml(), encoding="utf-8")
-    pictures = [path for name in figures for path in save(figures[name], folder / name)]
-    content = {
-        "command": command_line(),
-        "versions": versions(),
-        "columns": [str(column.header) for column in events.columns],
-        "rows": [list(row) for row in zip(*(c.cells for c in events.columns), strict=True)],
-    }
-    text = json.dumps(content, indent=2, ensure_ascii=False) + "\n"
-    (folder / "run.json").write_text(text, encoding="utf-8")
-    console.print(events)
-    console.print("threshold", threshold, highlight=False, soft_wrap=True)
-    print_path("recording", recording)
-    for path in pictures:
-        print_path("picture  ", path)
+def _outcome(loop: Any, motion: Motion, alarm: int | None, threshold: float) -> _Events:
+    """The alarm of a motion, in a row, and where it leaves the safe set."""
+    events: _Events = []
+    if alarm is not None:
+        told = f"probability below {threshold:.3f}; {_expected(loop, motion, alarm)}"
+        events.append((float(motion.time_s[alarm]), told))
+    if motion.has_left:
+        events.append((motion.leave_time_s, f"left the safe set: {motion.cause}"))
+    return events
+
+
+def _expected(loop: Any, motion: Motion, row: int) -> str:
+    """The constraint most likely to be violated, with its predicted margin if there is one."""
+    names, margins = loop.constraint_names, motion["predicted_margins"][row]
+    unit = loop.assessment.parameters.margin_unit
+    cause = likely_cause(names, motion["cause_probability"][row], margins, unit)
+    if not cause:
+        return "expected violation: unknown"
+    told = describe_margin(cause, margins[names.index(cause)], loop.angular_constraints)
+    return f"expected violation: {told}"
+
+
+def _logged_ports(loop: ClosedLoop) -> tuple[str, ...]:
+    """The ports of Γ and, if the loop has them, of the monitor and of what happens."""
+    of_gamma = ("safety_probability", "belief", "cause_probability", "predicted_margins")
+    return (*of_gamma, *filter(loop.HasOutputPort, ("alarm", "alarm_cause", *_HAPPENING)))
+
+
+def _first_below(motion: Motion, threshold: float) -> int | None:
+    """First row in which the probability is below a threshold or NaN; None for never."""
+    is_below = ~(motion["safety_probability"][:, 0] >= threshold)
+    return int(np.argmax(is_below)) if is_below.any() else None
+
+
+def alarm_row(motion: Motion, threshold: float) -> int | None:
+    """First row with the probability below the threshold, if it was above at the start, or None."""
+    return _first_below(motion, threshold) or None
+
+
+def motion_threshold(gamma: SafetyAssessment, rule: folders.GoalThreshold) -> tuple[float, str]:
+    """Threshold of alarms during a motion, and its origin."""
+    # A motion has many rows: its promise has its own threshold.
+    calibration = gamma.calibrations_.get("motion")
+    if calibration is None:
+        return rule.threshold, "that of the verdict"
+    return calibration.threshold, calibration.origin
 
 
 def _timeline(
@@ -408,46 +323,10 @@ def _timeline(
     )
 
 
-def _logged_ports(loop: ClosedLoop) -> tuple[str, ...]:
-    """The ports of Γ and, if the loop has them, of the monitor."""
-    of_gamma = ("safety_probability", "belief", "cause_probability", "predicted_margins")
-    return (*of_gamma, *filter(loop.HasOutputPort, ("alarm", "alarm_cause")))
-
-
-def _expected(loop: ClosedLoop, gamma: SafetyAssessment, motion: Motion, row: int) -> str:
-    masses, margins = motion["cause_probability"][row], motion["predicted_margins"][row]
-    return f"expected violation: {cause_words(loop, gamma, masses, margins)}"
-
-
-def first_below(probability: np.ndarray, threshold: float) -> int | None:
-    """First row in which the probability is below a threshold or NaN; None for never."""
-    is_below = ~(probability >= threshold)
-    return int(np.argmax(is_below)) if is_below.any() else None
-
-
-def alarm_row(motion: Motion, threshold: float) -> int | None:
-    """First row with the probability below the threshold, if it was above at the start, or None."""
-    # Row 0 is no alarm: it was below from the start.
-    return first_below(motion["safety_probability"][:, 0], threshold) or None
-
-
-def motion_threshold(gamma: SafetyAssessment, rule: GoalThreshold) -> tuple[float, str]:
-    """Threshold of alarms during a motion, and its origin."""
-    # A motion has many rows: its promise has its own threshold.
-    calibration = gamma.calibrations_.get("motion")
-    if calibration is None:
-        return rule.threshold, "that of the verdict"
-    return calibration.threshold, calibration.origin
-
-
-def events_table(
-    events: Sequence[tuple[float, str]], motion: Motion, gamma: SafetyAssessment
-) -> Table:
-    """A table of events, times [s] and words, and the monitor's alarms, with the probability then.
-
-    The motion has the port ``safety_probability``, and those of the monitor if there is one.
-    """
-    table = new_table("time [s]", "event", "probability")
+def event_rows(
+    events: _Events, motion: Motion, gamma: SafetyAssessment
+) -> list[tuple[str, str, str]]:
+    """Rows of events and of the monitor's alarms: time [s], words, and the probability then."""
     time_s, probability = motion.time_s, motion["safety_probability"][:, 0]
     is_on = motion.ports.get("alarm", np.zeros((len(time_s), 1)))[:, 0] > 0.5
     withdrawn = ". The promise is withdrawn" if gamma.calibrations_ else ""
@@ -455,22 +334,38 @@ def events_table(
     for k in np.flatnonzero(np.diff(is_on, prepend=False)).tolist():
         told = f"{motion['alarm_cause'][k]}{withdrawn}" if is_on[k] else "the alarm ends"
         alarms.append((float(time_s[k]), f"monitor: {told}"))
-    for instant, event in sorted([*events, *alarms], key=lambda one: one[0]):
-        row = abs(time_s - instant).argmin()
-        table.add_row(f"{instant:.2f}", event, f"{probability[row]:.2f}")
-    return table
+    return [
+        (f"{instant:.2f}", event, f"{probability[abs(time_s - instant).argmin()]:.2f}")
+        for instant, event in sorted([*events, *alarms], key=lambda one: one[0])
+    ]
+
+
+def _save(folder: Path, viewer: Meshcat, loop: Any, shown: _Shown) -> None:
+    """Writes recording, figures and events, and prints the events and the paths."""
+    motion, threshold = shown.motion, shown.threshold
+    figures = {"timeline": _timeline(loop, motion, threshold, **shown.timeline)}
+    if shown.marked is not None:
+        curve = (motion.time_s, motion["embedding"], motion["safety_probability"][:, 0])
+        figures["path"] = path_figure(loop.assessment, *curve, threshold, shown.marked)
+    viewer.StopRecording()
+    viewer.PublishRecording()
+    folder.mkdir(parents=True, exist_ok=True)
+    recording = folder / "recording.html"
+    recording.write_text(viewer.StaticHtml(), encoding="utf-8")
+    rows = event_rows(shown.events, motion, loop.assessment)
+    content = console.made_by(loop.scenario.name) | {"columns": _COLUMNS, "rows": rows}
+    text = json.dumps(content, indent=2, ensure_ascii=False) + "\n"
+    (folder / "run.json").write_text(text, encoding="utf-8")
+    console.show(console.new_table(*_COLUMNS, rows=rows))
+    console.say("threshold", shown.told)
+    console.say("recording", recording)
+    for name, figure in figures.items():
+        for path in save(figure, folder / name):
+            console.say("picture  ", path)
 
 
 def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
-    """The push of ``--push``, if any.
-
-    Args:
-        loop: The closed loop.
-        names: Values of ``--push``.
-
-    Raises:
-        ValueError: The push does not exist, or there is more than one.
-    """
+    """The one push that ``--push`` names, if any."""
     if not names:
         return None
     if len(names) > 1:
@@ -486,15 +381,7 @@ def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
 
 
 def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
-    """The balls of ``--push``.
-
-    Args:
-        scenario: The scenario, whose balls 'ball' stands for.
-        pushes: Each 'ball', or KEY=NUMBER pairs.
-
-    Raises:
-        ValueError: A key is unknown, a value is not a number, or a ball is invalid.
-    """
+    """The balls of ``--push``: each 'ball', those of the scenario, or KEY=NUMBER pairs."""
     throws: list[Throw] = []
     for text in pushes:
         if text == "ball":

@@ -11,29 +11,14 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
 from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.process_executor import BrokenProcessPool
+from typer import Option
 
-from drake_safety.cli.console import (
-    ClusterOption,
-    ScenarioArgument,
-    WorkersOption,
-    command_line,
-    console,
-    new_table,
-    open_stages,
-    print_path,
-)
-from drake_safety.cli.training_folder import (
-    MODES,
-    assessment_file,
-    check_writable,
-    episodes_folder,
-    load_assessment,
-    training_options,
-)
-from drake_safety.files.progress import StageProgress
+from drake_safety.cli import console
+from drake_safety.cli import training_folder as folders
+from drake_safety.cli.training_folder import MODES
+from drake_safety.files.progress import StageProgress, ignore, stage_of
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.seeds import TRAINING
@@ -43,27 +28,19 @@ from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 from drake_safety.simulation.worker_processes import end_with_parent
 
-DEFAULT_MOTION_MIN = 48.0
-"""Minutes of undisturbed motion, half of them for the limits."""
-
 
 def train(
-    scenario: ScenarioArgument,
-    out: Annotated[Path, typer.Option(help="Folder for episodes and assessments.")],
-    episodes: Annotated[int, typer.Option(help="Nominal training episodes.", min=1)] = 2048,
-    seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = TRAINING.first,
-    motion: Annotated[
-        float,
-        typer.Option(help="Minutes of undisturbed motion from which the monitor learns.", min=0.0),
-    ] = DEFAULT_MOTION_MIN,
+    scenario: console.ScenarioArgument,
+    out: Annotated[Path, Option(help="Folder for episodes and assessments.")],
+    episodes: Annotated[int, Option(help="Nominal training episodes.", min=1)] = 2048,
+    seed: Annotated[int, Option(help="Seed of the episodes.")] = TRAINING.first,
+    motion: Annotated[float, Option(help="Minutes of motion for the monitor.", min=0.0)] = 48.0,
     mode: Annotated[
-        str, typer.Option(help="'sharpened', 'paper' (the method as published), or 'both'.")
+        str, Option(help="'sharpened', 'paper' (the method as published), or 'both'.")
     ] = "both",
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue with the episodes in OUT.")
-    ] = False,
-    workers: WorkersOption = None,
-    cluster: ClusterOption = None,
+    resume: Annotated[bool, Option("--resume", help="Continue with the episodes in OUT.")] = False,
+    workers: console.WorkersOption = None,
+    cluster: console.ClusterOption = None,
 ) -> None:
     """Simulate the nominal closed loop and train Γ.
 
@@ -76,7 +53,7 @@ def train(
     # Folders of episodes and the options of their diagram; modes may share one.
     sets = {}
     for name in modes:
-        options = training_options(loaded, name)
+        options = folders.training_options(loaded, name)
         sets[out / (f"episodes_{name}" if options else "episodes")] = options
     for folder in sets:
         if folder.exists() and completed(folder) and not resume:
@@ -84,8 +61,8 @@ def train(
                 f"{folder} already holds {len(completed(folder))} episodes: pass --resume to "
                 "continue with them, or choose another --out"
             )
-    check_writable(out)
-    with open_stages() as stages:
+    folders.check_writable(out)
+    with console.open_stages() as stages:
         for folder, options in sets.items():
             run_episodes(
                 loaded,
@@ -94,7 +71,7 @@ def train(
                 num_workers=workers,
                 path=folder,
                 progress=partial(stages, f"nominal {folder.name.replace('_', ', ')}"),
-                extra={"command": command_line(), "scenario_yaml": loaded.to_yaml()},
+                extra={"command": console.command_line(), "scenario_yaml": loaded.to_yaml()},
                 **options,
             )
         detector = None
@@ -106,27 +83,21 @@ def train(
                 path=out / "motion",
                 progress=partial(stages, "undisturbed motion"),
             )
-            detector = ChangeDetector.fit(
-                motions, lambda done: stages("monitor", round(100 * done), 100)
-            )
+            detector = ChangeDetector.fit(motions, stage_of(stages, "monitor"))
         # The modes are independent: the first is trained here, the others in worker processes.
         with _worker_processes(len(modes) - 1) as submit:
             beside = {name: submit(_learn, loaded, name, out, detector) for name in modes[1:]}
-            learned = [_learn(loaded, modes[0], out, detector, stages)]
+            rows = [_learn(loaded, modes[0], out, detector, stages)]
             for name, result in beside.items():
                 stages(name, 0, 1)
-                learned.append(result.result())
+                rows.append(result.result())
                 stages(name, 1, 1)
-    table = new_table("mode", "segments", "unsafe episodes", "CPU time")
-    for name, (num_segments, unsafe, cpu_s) in zip(modes, learned, strict=True):
-        table.add_row(name, f"{num_segments}", unsafe, f"{cpu_s:.0f} s")
-    console.print(table)
-    described = load_assessment(out, modes[0]).detector_.describe()
-    console.print(described, highlight=False, soft_wrap=True)
+    console.show(console.new_table("mode", "segments", "unsafe episodes", "CPU time", rows=rows))
+    console.say(folders.load_assessment(out, modes[0]).detector_.describe())
     for folder in sets:
-        print_path("episodes  ", folder)
+        console.say("episodes  ", folder)
     for name in modes:
-        print_path("assessment", assessment_file(out, name))
+        console.say("assessment", folders.assessment_file(out, name))
 
 
 @contextlib.contextmanager
@@ -153,32 +124,21 @@ def _learn(
     mode: str,
     out: Path,
     detector: ChangeDetector | None,
-    stages: StageProgress | None = None,
-) -> tuple[int, str, float]:
-    """Trains and saves one mode.
+    stages: StageProgress = ignore,
+) -> tuple[str, str, str, str]:
+    """Trains and saves one mode; returns its row of the table.
 
-    Args:
-        scenario: The scenario.
-        mode: The mode.
-        out: Folder of the training.
-        detector: That of undisturbed motion; by default it is learned from the episodes.
-        stages: Progress bars.
-
-    Returns:
-        The number of segments, the share of unsafe episodes, and the CPU time [s].
+    Without a detector, of undisturbed motion, it is learned from the episodes.
     """
-
-    def report(stage: str, done: int, wanted: int) -> None:
-        if stages is not None:
-            stages(f"{mode}: {stage}", done, wanted)
-
     started = time.process_time()
     scenario.assessment.mode = mode  # type: ignore[assignment]  # Checked before.
-    data = load_episodes(episodes_folder(out, mode))
+    data = load_episodes(folders.episodes_folder(out, mode))
     # Γ is that of the scenario's diagram, whatever the options of its training episodes.
     data.info = replace(data.info, scenario_hash=scenario.simulation_hash())
-    assessment = SafetyAssessment(scenario.assessment).fit(data, report, detector=detector)
-    assessment.save(assessment_file(out, mode))
+    assessment = SafetyAssessment(scenario.assessment).fit(
+        data, lambda stage, *done: stages(f"{mode}: {stage}", *done), detector=detector
+    )
+    assessment.save(folders.assessment_file(out, mode))
     unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
     num_segments = len(training_segments(data, scenario.assessment))
-    return num_segments, unsafe, time.process_time() - started
+    return mode, f"{num_segments}", unsafe, f"{time.process_time() - started:.0f} s"

@@ -55,8 +55,10 @@ def _draw_segments(
     segments = segments.take(order)
     found = assessment.predict(segments.state, segments.desired_preview, segments.features)
     draw_grid(axes, assessment.grid_)
+    x, y = found.embedding.T
     dots = axes.scatter(
-        *found.embedding.T,
+        x,
+        y,
         c=segments.score,
         cmap=safety_colours().reversed(),
         vmin=0.0,
@@ -92,7 +94,8 @@ def draw_safety(
     ink = np.where(is_empty, style.FAINT_INK, np.where(brightness > 0.6, style.INK, "white"))
     place: dict[str, Any] = {"ha": "center", "va": "center_baseline", "fontsize": 6.5}
     for i in np.flatnonzero(count):
-        axes.text(*grid.centres[i], _short(count[i]), color=ink[i], **place)
+        x, y = grid.centres[i]
+        axes.text(x, y, _short(count[i]), color=ink[i], **place)
     axes.set_xlabel("numbers: training segments; hatched: don't know")
     add_colour_bar(fig, axes, shade, label)
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, mean, proportion, quantile, rate_per_hour
-from drake_safety.evaluation.shift_study import BOOTSTRAP, CONFIDENT, SEEN, Judge
+from drake_safety.evaluation.shift_study import BOOTSTRAP, CONFIDENT, Judge
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector, rows_of, usual_rows
@@ -73,28 +73,27 @@ def monitored(
     every = max(1, round(info.step_s / detector.step_s))
     horizon = round(info.num_steps * info.step_s / detector.step_s)
     rows = [rows_of(one) for one in motions]
-    wrong, least = zip(
-        *(_sure_and_wrong(one, judge, every, horizon) for one in motions), strict=True
-    )
+    judged = [_sure_and_wrong(one, judge, every, horizon) for one in motions]
     most = round(max(SPANS_S) / detector.step_s)
     found: dict[str, Any] = {n: [] for n in ("alarm_s", "leave_s", "error_s", "silent_error_s")}
     for start in range(len(motions)):
-        order = np.roll(np.arange(len(motions)), -start)
+        order = np.roll(np.arange(len(motions)), -start).tolist()
         begin = np.cumsum([0, *(len(rows[i]) for i in order)])
         order = order[: np.searchsorted(begin[1:], most) + 1]
         _, alarms = detector.watch([rows[i] for i in order])
         is_alarm = np.zeros(begin[len(order)], dtype=bool)
         for alarm in alarms:
             is_alarm[alarm.begin : alarm.end] = True
-        errors = np.concatenate([begin[k] + wrong[i] for k, i in enumerate(order)])
+        wrong = np.concatenate([begin[k] + judged[i][0] for k, i in enumerate(order)])
         leaves = [begin[k + 1] for k, i in enumerate(order) if not motions[i].is_safe]
         for name, at in (("alarm_s", [one.begin for one in alarms]), ("leave_s", leaves)):
             row = min(at, default=most)
             found[name].append(row * detector.step_s if row < most else np.inf)
-        for name, at in (("error_s", errors[~is_alarm[errors]]), ("silent_error_s", errors)):
-            times = detector.step_s * at
+        for name, errors in (("error_s", wrong[~is_alarm[wrong]]), ("silent_error_s", wrong)):
+            times = detector.step_s * errors
             found[name].append([every * detector.step_s * (times < span).sum() for span in SPANS_S])
-    return {name: np.array(values) for name, values in (found | {"least": least}).items()}
+    found["least"] = [least for _, least in judged]
+    return {name: np.array(values) for name, values in found.items()}
 
 
 def _sure_and_wrong(
@@ -110,7 +109,7 @@ def _sure_and_wrong(
         return rows[:0], np.nan
     rows = rows[len(motion.time_s) - 1 - rows <= horizon]
     is_outside = np.any(motion.margins[rows] < 0.0, axis=1)
-    seen = (getattr(motion, name)[rows] for name in SEEN)
+    seen = motion.state[rows], motion.desired_preview[rows], motion.features[rows]
     probability = np.nan_to_num(judge(*seen, is_outside))
     return rows[probability >= CONFIDENT], float(min(probability[~is_outside], default=0.0))
 

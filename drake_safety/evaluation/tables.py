@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 
 import rich.table
@@ -87,6 +87,12 @@ class Table:
     rows: Sequence[Row]
     title: str = ""
     meaning: str = ""
+
+    def narrow(self, keys: Sequence[str]) -> Table:
+        """The table with some of its columns, in its order."""
+        shown = [i for i, column in enumerate(self.columns) if column.key in keys]
+        rows = [replace(row, estimates=[row.estimates[i] for i in shown]) for row in self.rows]
+        return replace(self, columns=[self.columns[i] for i in shown], rows=rows)
 
     def best(self, column: int) -> set[int]:
         """Indices of the best rows of a column; empty if there is nothing to compare."""

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pydrake.systems.framework import Context
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import likely_cause
 from drake_safety.learning.prediction import is_unknown
-from drake_safety.simulation.capabilities import GoalWords, HasGoals, goal_words, is_in_box, require
+from drake_safety.simulation.capabilities import HasGoals, goal_words, is_in_box, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 
@@ -23,10 +25,8 @@ class GoalVerdict:
 
     Attributes:
         goal: The goal in the world, (3,) [m].
-        verdict: "safe", "unsafe" or "don't know".
         belief: (safe, unsafe, don't know), (3,); its first entry is the paper's Γ.
-        probability: The probability of staying safe; NaN where it was not evaluated, because the
-            goal is outside the region sampled in training.
+        probability: The probability of staying safe; NaN outside the region sampled in training.
         threshold: Lowest probability of a safe goal.
         predicted_margins: Smallest margin predicted for each constraint [m, rad], (n_c,); NaN
             where none is predicted.
@@ -35,7 +35,6 @@ class GoalVerdict:
     """
 
     goal: np.ndarray
-    verdict: str
     belief: np.ndarray
     probability: float
     threshold: float
@@ -44,6 +43,13 @@ class GoalVerdict:
     predicted_margins: np.ndarray
     margin_unit: float = 1.0
     reason: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """The verdict: "safe", "unsafe" or "don't know"."""
+        if self.reason:
+            return UNKNOWN
+        return SAFE if self.probability >= self.threshold else UNSAFE
 
     @property
     def is_accepted(self) -> bool:
@@ -60,13 +66,12 @@ class GoalVerdict:
     @property
     def cause_margin(self) -> float:
         """The margin predicted for the cause [m, rad]; NaN if there is none."""
-        if not self.cause:
-            return math.nan
-        return float(self.predicted_margins[self.constraint_names.index(self.cause)])
+        names, cause = self.constraint_names, self.cause
+        return float(self.predicted_margins[names.index(cause)]) if cause else math.nan
 
     def to_json(self) -> dict[str, Any]:
         """Returns the verdict as JSON types; unknown values are None."""
-        by_name = zip(self.constraint_names, self.cause_probability.tolist(), strict=True)
+        masses = dict(zip(self.constraint_names, self.cause_probability.tolist(), strict=True))
         return {
             "goal": [_finite(value) for value in self.goal.tolist()],
             "verdict": self.verdict,
@@ -75,7 +80,7 @@ class GoalVerdict:
             "probability": _finite(self.probability),
             "threshold": self.threshold,
             "cause": self.cause or None,
-            "cause_probability": dict(by_name),
+            "cause_probability": masses,
             "cause_margin": _finite(self.cause_margin),
         }
 
@@ -90,15 +95,13 @@ def assess_goal(
 ) -> GoalVerdict:
     """Assesses the motion from the standing posture to a goal.
 
-    Nothing is simulated: Γ is evaluated on the state, the plan and the features of the first
-    instant.
+    Nothing is simulated: Γ is evaluated on state, plan and features of the first instant.
 
     Args:
-        goal: In the world, (3,) [m]. The verdict on a goal that is not finite, or outside the
-            region sampled in training, is "don't know".
+        goal: In the world, (3,) [m]; "don't know" outside the region sampled in training.
         threshold: Lowest probability of a safe goal.
-        unsafe_below: A probability below this is unsafe, between this and the threshold "don't
-            know"; the threshold by default.
+        unsafe_below: A probability below this is unsafe, from there to the threshold "don't know";
+            the threshold by default.
 
     Raises:
         ValueError: The loop's plans have no goal, or the goal is not three numbers.
@@ -111,18 +114,20 @@ def assess_goal(
             loop, assessment, goal[None], threshold=threshold, unsafe_below=unsafe_below
         )
         return verdict
-    position = "is outside" if np.isfinite(goal).all() else "is not finite, so not in"
+    place = "is outside" if np.isfinite(goal).all() else "is not finite, so not in"
+    entries = zip(words.axes, *box.tolist(), strict=True)
+    region = ", ".join(f"{axis} {low:g}…{high:g}" for axis, low, high in entries)
+    region += " m" if words.is_point else ""
     names = tuple(loop.constraint_names)
     return GoalVerdict(
         goal=goal,
-        verdict=UNKNOWN,
         belief=np.array(EMPTY, dtype=float),
         probability=math.nan,
         threshold=threshold,
         constraint_names=names,
         cause_probability=np.zeros(len(names)),
         predicted_margins=np.full(len(names), np.nan),
-        reason=f"the {words.goal} {position} the region sampled in training, {_region(box, words)}",
+        reason=f"the {words.goal} {place} the region sampled in training, {region}",
     )
 
 
@@ -148,56 +153,55 @@ def assess_goals(
     has_no_data = is_unknown(prediction.belief, assessment.parameters.initial_uncertainty)
     verdicts = []
     for i, goal in enumerate(goals):
-        probability = float(prediction.probability[i])
-        reason = ""
-        verdict = SAFE if probability >= threshold else UNSAFE
-        if unsafe_below <= probability < threshold:
-            verdict = UNKNOWN
-            reason = (
-                f"the probability {probability:.3f} lies between {unsafe_below:.3f} and "
-                f"{threshold:.3f}, where safe and unsafe {noun}s cannot be distinguished"
-            )
+        probability, reason = float(prediction.probability[i]), ""
         if prediction.novelty[i] > 1.0:
-            verdict = UNKNOWN
             name, deviation = assessment.strangest_input(*(part[i] for part in seen))
             reason = (
                 f"the input is unlike those of training: '{name}' differs by {abs(deviation):.0f} "
                 "standard deviations from what the other entries say"
             )
         elif has_no_data[i]:
-            verdict = UNKNOWN
             reason = f"too little training data near this {noun}'s embedding"
-        verdicts.append(
-            GoalVerdict(
-                goal=np.array(goal, dtype=float),
-                verdict=verdict,
-                belief=prediction.belief[i],
-                probability=probability,
-                threshold=threshold,
-                constraint_names=tuple(loop.constraint_names),
-                cause_probability=prediction.cause_probability[i],
-                predicted_margins=prediction.predicted_margins[i],
-                margin_unit=assessment.parameters.margin_unit,
-                reason=reason,
+        elif unsafe_below <= probability < threshold:
+            reason = (
+                f"the probability {probability:.3f} lies between {unsafe_below:.3f} and "
+                f"{threshold:.3f}, where safe and unsafe {noun}s cannot be distinguished"
             )
+        one = GoalVerdict(
+            goal=np.array(goal, dtype=float),
+            belief=prediction.belief[i],
+            probability=probability,
+            threshold=threshold,
+            constraint_names=tuple(loop.constraint_names),
+            cause_probability=prediction.cause_probability[i],
+            predicted_margins=prediction.predicted_margins[i],
+            margin_unit=assessment.parameters.margin_unit,
+            reason=reason,
         )
+        verdicts.append(one)
     return verdicts
 
 
-def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> tuple[np.ndarray, ...]:
+def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> list[np.ndarray]:
     """The assessment's inputs at the first instant of motions from standing to goals (N, 3) [m].
 
     Returns:
         State (N, n_s), desired preview (N, H n_z) and features (N, n_f).
     """
-    context = loop.CreateDefaultContext()
+    reset = require(loop, HasGoals).reset_standing
+    return inputs_of_each(loop, loop.CreateDefaultContext(), reset, goals)
+
+
+def inputs_of_each(
+    loop: ClosedLoop, context: Context, setting: Callable[..., object], values: Iterable[Any]
+) -> list[np.ndarray]:
+    """State, desired preview and features, (N, ...) each, after setting each of N values."""
     ports = [loop.GetOutputPort(name) for name in ("state", "desired_preview", "features")]
     rows = []
-    with_goals = require(loop, HasGoals)
-    for goal in goals:
-        with_goals.reset_standing(context, goal)
+    for value in values:
+        setting(context, value)
         rows.append([port.Eval(context).copy() for port in ports])
-    return tuple(np.array(column) for column in zip(*rows, strict=True))
+    return [np.array(column) for column in zip(*rows, strict=True)]
 
 
 def checked_goal(goal: np.ndarray) -> np.ndarray:
@@ -206,13 +210,6 @@ def checked_goal(goal: np.ndarray) -> np.ndarray:
     if goal.shape != (3,):
         raise ValueError(f"a goal is three numbers; got {goal.tolist()}")
     return goal
-
-
-def _region(box: np.ndarray, words: GoalWords) -> str:
-    entries = zip(words.axes, *box.tolist(), strict=True)
-    return ", ".join(f"{axis} {low:g}…{high:g}" for axis, low, high in entries) + (
-        " m" if words.is_point else ""
-    )
 
 
 def _finite(value: float) -> float | None:

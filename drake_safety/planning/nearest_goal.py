@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,22 +14,12 @@ from drake_safety.planning.goal_verdict import GoalVerdict, assess_goals, checke
 from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
-METHODS = ("both", "gradient", "search")
-"""Methods of :func:`nearest_accepted_goal`."""
-RESERVE = 0.8
-"""Share of the interval from the threshold to 1 by which a suggested goal exceeds the threshold.
-
-Of the goals at the threshold itself, about half are unsafe."""
-
-_Nearest = Callable[[np.ndarray], GoalVerdict | None]
-"""The accepted candidate, of (N, 3) [m], nearest to the goal."""
-
+_METHODS = ("both", "gradient", "search")
 _DIFFERENCE_M = 1e-3  # Step of the finite differences of the inputs by the goal.
 _MAX_STEPS = 12  # Along the gradient.
 _LONGEST_STEP_M = 0.15  # The logit is nearly linear over that distance.
 _MARGIN = 0.5  # By how much the target logit falls where Γ does not follow it.
 _LARGEST_LOGIT = 8.0
-
 _FIRST_RADIUS_M = 0.05
 _GROWTH = 1.6  # From one ball of candidates to the next.
 _LAST_CHANCE = 16  # Times as many candidates in the whole region if no ball had an accepted one.
@@ -45,7 +35,7 @@ def nearest_accepted_goal(
     *,
     threshold: float,
     rng: np.random.Generator,
-    reserve: float = RESERVE,
+    reserve: float = 0.8,
     num_candidates: int = 64,
     resolution_m: float = 1e-3,
     method: str = "both",
@@ -53,8 +43,8 @@ def nearest_accepted_goal(
     """Finds an accepted goal near a given one, with a reserve.
 
     With reserve: probability ≥ threshold + reserve (p - threshold), where p is the largest
-    probability: 1, or 1 - mu_ini in the paper's mode. The goal found lies at the limit of the
-    search, and of the goals at the threshold itself many are unsafe.
+    probability: 1, or 1 - mu_ini in the paper's mode. Of the goals at the threshold itself, about
+    half are unsafe.
 
     Descent along the gradient of the safety head's logit finds an accepted goal with few
     evaluations, but often not the nearest one: it stays in one basin, and Γ follows the logit only
@@ -69,7 +59,6 @@ def nearest_accepted_goal(
         reserve: Share of the interval from the threshold to the largest probability, in [0, 1].
         num_candidates: Candidates of the search per batch; half as many if the descent has found
             an accepted goal.
-        resolution_m: Spacing of the grid of candidates [m].
         method: ``both``, or the ``gradient`` or the ``search`` alone.
 
     Returns:
@@ -77,151 +66,143 @@ def nearest_accepted_goal(
         finite, or no goal was found that is accepted with the reserve.
 
     Raises:
-        ValueError: The loop's plans have no goal, the goal is not three numbers, the reserve is
-            not in [0, 1], the method is unknown, or it is ``gradient`` and the maps have no safety
-            head.
+        ValueError: The loop's plans have no goal, the goal is not three numbers, an argument is out
+            of range, or the method is ``gradient`` and the maps have no safety head.
     """
-    if method not in METHODS:
-        raise ValueError(f"nearest accepted goal: method must be one of {METHODS}; got '{method}'")
+    if method not in _METHODS:
+        raise ValueError(f"nearest accepted goal: method must be one of {_METHODS}; got '{method}'")
     if not 0.0 <= reserve <= 1.0:
         raise ValueError(f"nearest accepted goal: reserve is {reserve}, expected a value in [0, 1]")
     # Without a logit the probability is b_safe.
-    has_logit = assessment.base_logit_ is not None
-    highest = 1.0 if has_logit else 1.0 - assessment.parameters.initial_uncertainty
-    stricter = threshold + reserve * max(highest - threshold, 0.0)
+    unknown = assessment.parameters.initial_uncertainty if assessment.base_logit_ is None else 0.0
+    stricter = threshold + reserve * max(1.0 - unknown - threshold, 0.0)
     goal = checked_goal(goal)
     if not np.isfinite(goal).all():
         return None
     box = require(loop, HasGoals).target_box
-
-    def nearest_of(candidates: np.ndarray) -> GoalVerdict | None:
-        points = np.unique(on_grid(candidates, resolution_m), axis=0)
-        inside = points[np.all((points >= box[0]) & (points <= box[1]), axis=1)]
-        verdicts = assess_goals(loop, assessment, inside, threshold=stricter)
-        return _nearest((verdict for verdict in verdicts if verdict.is_accepted), goal)
-
-    best: GoalVerdict | None = None
-    if method == "gradient" or (method == "both" and assessment.embedding_.has_safety_head):
-        best = _descend(loop, assessment, goal, box, stricter, nearest_of, resolution_m)
+    near = _Search(loop, assessment, goal, box, stricter, resolution_m)
+    has_head = method == "both" and assessment.embedding_.has_safety_head
+    best = near.descend() if method == "gradient" or has_head else None
     if method != "gradient":
-        best = _search(goal, box, nearest_of, best, rng, num_candidates, resolution_m)
+        best = near.search(best, rng, num_candidates)
     return None if best is None else replace(best, threshold=threshold)
 
 
-def _descend(
-    loop: ClosedLoop,
-    assessment: SafetyAssessment,
-    goal: np.ndarray,
-    box: np.ndarray,
-    threshold: float,
-    nearest_of: _Nearest,
-    resolution_m: float,
-) -> GoalVerdict | None:
-    """Moves a refused goal along the gradient to an accepted one.
+@dataclass(frozen=True)
+class _Search:
+    """The search for the goal in a box, (2, 3) [m], that is nearest to a given one."""
 
-    Each step goes to the point nearest to the goal on the plane where the linearised logit has the
-    target value. The gradient of the network is exact; the derivative of its inputs by the goal is
-    a finite difference of four goals. The target value falls until Γ accepts the goal.
-    """
-    bound = 1.0 / (1.0 + math.exp(-_LARGEST_LOGIT))
-    share = min(max(threshold, 1.0 - bound), bound)
-    aim = math.log((1.0 - share) / share)
-    best: GoalVerdict | None = None
-    point = centre = np.clip(goal, *box)
-    for _ in range(_MAX_STEPS):
-        # Differences point inwards: there is no training data beyond the region.
-        inwards = np.where(point + _DIFFERENCE_M > box[1], -_DIFFERENCE_M, _DIFFERENCE_M)
-        inputs = goal_inputs(loop, point + np.vstack([np.zeros(3), np.diag(inwards)]))
-        x, logit, gradient = assessment.unsafe_logits(*inputs)
-        slope = (x[1:] - x[0]) @ gradient[0] / inwards
-        found = nearest_of(point[None])
-        if found is None and logit[0] <= aim + 0.1:
-            aim = logit[0] - _MARGIN
-        best = _nearest((best, found), goal)
-        steepness = float(slope @ slope)
-        if steepness < 1e-12:
-            break
-        ahead = goal + slope * (slope @ (point - goal) - (logit[0] - aim)) / steepness
-        step = np.clip(ahead, *box) - point
-        length = float(np.linalg.norm(step))
-        if length < resolution_m:
-            break
-        point = point + step * min(1.0, _LONGEST_STEP_M / length)
-    return None if best is None else _bisect(best, centre, nearest_of, resolution_m)
+    loop: ClosedLoop
+    assessment: SafetyAssessment
+    goal: np.ndarray
+    box: np.ndarray
+    threshold: float
+    resolution_m: float
 
+    def nearest_of(self, candidates: np.ndarray) -> GoalVerdict | None:
+        """The nearest accepted one of candidates, (N, 3) [m]."""
+        points = np.unique(on_grid(candidates, self.resolution_m), axis=0)
+        inside = points[np.all((points >= self.box[0]) & (points <= self.box[1]), axis=1)]
+        verdicts = assess_goals(self.loop, self.assessment, inside, threshold=self.threshold)
+        return self.nearest(verdict for verdict in verdicts if verdict.is_accepted)
 
-def _search(
-    goal: np.ndarray,
-    box: np.ndarray,
-    nearest_of: _Nearest,
-    known: GoalVerdict | None,
-    rng: np.random.Generator,
-    num_candidates: int,
-    resolution_m: float,
-) -> GoalVerdict | None:
-    """Searches the nearest accepted goal in all directions.
+    def nearest(self, verdicts: Iterable[GoalVerdict | None]) -> GoalVerdict | None:
+        """The nearest one of verdicts, if any."""
+        found = [verdict for verdict in verdicts if verdict is not None]
+        return min(found, key=lambda verdict: _distance(verdict.goal, self.goal), default=None)
 
-    Candidates fill growing balls about the goal until one of them is accepted: up to the distance
-    of the known goal, or else in the end the whole region. Each round of refinement then bisects
-    towards the goal, and draws candidates about the best goal and in the ball that it bounds.
-    """
-    centre = np.clip(goal, *box)
-    best = nearest_of(centre[None])
-    num_in_ball, num_rounds = num_candidates, _NUM_ROUNDS
-    radius, farthest = _FIRST_RADIUS_M, _distance(*box)
-    if known is not None:
-        num_candidates, num_rounds = max(num_candidates // 2, 2), _ROUNDS_FROM_KNOWN
-        num_in_ball, farthest = num_candidates // 2, _distance(known.goal, goal)
-    while best is None and radius < farthest:
-        best = nearest_of(centre + radius * _in_unit_ball(rng, num_in_ball))
-        radius *= _GROWTH
-    best = _nearest((best, known), goal)
-    if best is None:
-        best = nearest_of(rng.uniform(box[0], box[1], (_LAST_CHANCE * num_candidates, 3)))
-    if best is None:
-        return None
+    def descend(self) -> GoalVerdict | None:
+        """Moves a refused goal along the gradient to an accepted one.
 
-    for _ in range(num_rounds):
-        best = _bisect(best, centre, nearest_of, resolution_m)
-        distance = _distance(best.goal, goal)
-        if distance < resolution_m:
-            break
-        about = best.goal + _SPREAD * distance * _in_unit_ball(rng, num_candidates // 2)
-        ball = goal + distance * _in_unit_ball(rng, num_candidates - num_candidates // 2)
-        candidates = np.clip(np.concatenate([about, ball]), *box)
-        is_nearer = np.linalg.norm(candidates - goal, axis=1) < distance
-        found = nearest_of(candidates[is_nearer])
-        if found is not None and _distance(found.goal, goal) < distance:
-            best = found
-    return best
+        Each step goes to the point nearest to the goal on the plane where the linearised logit has
+        the target value. The gradient of the network is exact; the derivative of its inputs by the
+        goal is a finite difference of four goals. The target value falls until Γ accepts the goal.
+        """
+        goal, box = self.goal, self.box
+        best: GoalVerdict | None = None
+        bound = 1.0 / (1.0 + math.exp(-_LARGEST_LOGIT))
+        share = min(max(self.threshold, 1.0 - bound), bound)
+        aim = math.log((1.0 - share) / share)
+        point = np.clip(goal, *box)
+        for _ in range(_MAX_STEPS):
+            # Differences point inwards: there is no training data beyond the region.
+            inwards = np.where(point + _DIFFERENCE_M > box[1], -_DIFFERENCE_M, _DIFFERENCE_M)
+            inputs = goal_inputs(self.loop, point + np.vstack([np.zeros(3), np.diag(inwards)]))
+            x, logit, gradient = self.assessment.unsafe_logits(*inputs)
+            slope = (x[1:] - x[0]) @ gradient[0] / inwards
+            found = self.nearest_of(point[None])
+            if found is None and logit[0] <= aim + 0.1:
+                aim = logit[0] - _MARGIN
+            best = self.nearest((best, found))
+            steepness = float(slope @ slope)
+            if steepness < 1e-12:
+                break
+            ahead = goal + slope * (slope @ (point - goal) - (logit[0] - aim)) / steepness
+            step = np.clip(ahead, *box) - point
+            length = float(np.linalg.norm(step))
+            if length < self.resolution_m:
+                break
+            point = point + step * min(1.0, _LONGEST_STEP_M / length)
+        return None if best is None else self.bisect(best)
 
+    def search(
+        self, known: GoalVerdict | None, rng: np.random.Generator, num_candidates: int
+    ) -> GoalVerdict | None:
+        """Searches the nearest accepted goal in all directions.
 
-def _bisect(
-    best: GoalVerdict, centre: np.ndarray, nearest_of: _Nearest, resolution_m: float
-) -> GoalVerdict:
-    """Moves an accepted goal straight towards the centre while it stays accepted."""
-    refused = centre
-    while _distance(best.goal, refused) > resolution_m:
-        between = 0.5 * (best.goal + refused)
-        found = nearest_of(between[None])
-        if found is None:
-            refused = between
-        elif _distance(found.goal, centre) < _distance(best.goal, centre):
-            best = found
-        else:
-            break
-    return best
+        Candidates fill growing balls about the goal until one is accepted: up to the known goal, or
+        else in the end the whole region. Each round of refinement then bisects towards the goal,
+        and draws candidates about the best goal and in the ball that it bounds.
+        """
+        goal, box = self.goal, self.box
+        centre = np.clip(goal, *box)
+        best = self.nearest_of(centre[None])
+        num_in_ball, num_rounds = num_candidates, _NUM_ROUNDS
+        radius, farthest = _FIRST_RADIUS_M, _distance(*box)
+        if known is not None:
+            num_candidates, num_rounds = max(num_candidates // 2, 2), _ROUNDS_FROM_KNOWN
+            num_in_ball, farthest = num_candidates // 2, _distance(known.goal, goal)
+        while best is None and radius < farthest:
+            best = self.nearest_of(centre + radius * _in_unit_ball(rng, num_in_ball))
+            radius *= _GROWTH
+        best = self.nearest((best, known))
+        if best is None:
+            best = self.nearest_of(rng.uniform(box[0], box[1], (_LAST_CHANCE * num_candidates, 3)))
+        if best is None:
+            return None
+        for _ in range(num_rounds):
+            best = self.bisect(best)
+            distance = _distance(best.goal, goal)
+            if distance < self.resolution_m:
+                break
+            about = best.goal + _SPREAD * distance * _in_unit_ball(rng, num_candidates // 2)
+            ball = goal + distance * _in_unit_ball(rng, num_candidates - num_candidates // 2)
+            candidates = np.clip(np.concatenate([about, ball]), *box)
+            is_nearer = np.linalg.norm(candidates - goal, axis=1) < distance
+            found = self.nearest_of(candidates[is_nearer])
+            if found is not None and _distance(found.goal, goal) < distance:
+                best = found
+        return best
+
+    def bisect(self, best: GoalVerdict) -> GoalVerdict:
+        """Moves an accepted goal straight towards the given one while it stays accepted."""
+        refused = centre = np.clip(self.goal, *self.box)
+        while _distance(best.goal, refused) > self.resolution_m:
+            between = 0.5 * (best.goal + refused)
+            found = self.nearest_of(between[None])
+            if found is None:
+                refused = between
+            elif _distance(found.goal, centre) < _distance(best.goal, centre):
+                best = found
+            else:
+                break
+        return best
 
 
 def on_grid(points: np.ndarray, resolution_m: float) -> np.ndarray:
     """Rounds points to the grid of candidates."""
     # A multiple of the spacing differs in its last bits from the same number read from a text.
     return np.round(np.round(points / resolution_m) * resolution_m, 9)
-
-
-def _nearest(verdicts: Iterable[GoalVerdict | None], goal: np.ndarray) -> GoalVerdict | None:
-    found = [verdict for verdict in verdicts if verdict is not None]
-    return min(found, key=lambda verdict: _distance(verdict.goal, goal), default=None)
 
 
 def _in_unit_ball(rng: np.random.Generator, num_points: int) -> np.ndarray:

@@ -10,20 +10,14 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.planning.goal_verdict import inputs_of_each
 from drake_safety.simulation.capabilities import OffersPlans, require
 from drake_safety.simulation.closed_loop import ClosedLoop
-
-_INPUTS = ("state", "desired_preview", "features")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlanChoice:
-    """The chosen plan, and the probability of all candidates.
-
-    Attributes:
-        index: Position of the chosen plan among the candidates.
-        threshold: Lowest probability of an accepted plan.
-    """
+    """The chosen plan, by its index among the candidates, and the probability of all of them."""
 
     index: int
     probability: np.ndarray
@@ -35,29 +29,16 @@ class PlanChoice:
         return bool(self.probability[self.index] >= self.threshold)
 
 
-def plan_inputs(
-    loop: ClosedLoop, context: Context, plans: Sequence[Any]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The assessment's inputs for each plan, in the state of a Context.
+def plan_inputs(loop: ClosedLoop, context: Context, plans: Sequence[Any]) -> list[np.ndarray]:
+    """State (M, n_s), desired preview (M, H n_z) and features (M, n_f) of M plans.
 
-    Args:
-        context: Its Context; it keeps its plan.
-        plans: M candidates, the first of them the plan of the Context.
-
-    Returns:
-        State (M, n_s), desired preview (M, H n_z) and features (M, n_f).
+    The first of the plans is that of the Context, which keeps it.
     """
-    offering = require(loop, OffersPlans)
-    ports = [loop.GetOutputPort(name) for name in _INPUTS]
-    rows = []
+    set_plan = require(loop, OffersPlans).set_plan
     try:
-        for plan in plans:
-            offering.set_plan(context, plan)
-            rows.append([port.Eval(context).copy() for port in ports])
+        return inputs_of_each(loop, context, set_plan, plans)
     finally:
-        offering.set_plan(context, plans[0])
-    state, preview, features = (np.array(column) for column in zip(*rows, strict=True))
-    return state, preview, features
+        set_plan(context, plans[0])
 
 
 def choose_plan(
@@ -72,17 +53,15 @@ def choose_plan(
     """Sets the plan with the highest probability; the present plan is one of the candidates.
 
     Args:
-        context: Its Context, in the state to plan from; the chosen plan is set in it.
-        threshold: Lowest probability of an accepted plan. If no candidate reaches it, the best
-            one is set, and ``is_accepted`` is False.
+        context: In the state to plan from; the chosen plan is set in it.
+        threshold: Lowest probability of an accepted plan; the best one is set also if it is lower.
 
     Raises:
         ValueError: The task's plans cannot be chosen.
     """
     offering = require(loop, OffersPlans)
     plans = offering.candidate_plans(context, rng, num_plans)
-    state, preview, features = plan_inputs(loop, context, plans)
-    probability = assessment.predict(state, preview, features).probability
+    probability = assessment.predict(*plan_inputs(loop, context, plans)).probability
     best = int(np.argmax(probability))  # The first of equals: the present plan, if any.
     offering.set_plan(context, plans[best])
     return PlanChoice(index=best, probability=probability, threshold=threshold)
