@@ -228,7 +228,7 @@ def test_a_run_is_a_row_and_a_robot_with_its_figures(monkeypatch, capsys, tmp_pa
     runs = (tmp_path / "pendulum", tmp_path / "laikago_balancing")
     assert study(monkeypatch, "compare", *runs, "--out", tmp_path) == 0
     printed = capsys.readouterr().out
-    assert printed.count("95.0") == 2 and "40.0" in printed and "- " in printed
+    assert printed.count("95.0") == 2 and "40.0" in printed and "–" in printed
     # Pendulums have no picture of their own.
     assert (tmp_path / "comparison.png").is_file()
 
