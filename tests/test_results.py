@@ -91,6 +91,7 @@ def test_a_table_has_a_row_a_method_and_marks_the_best_in_every_form():
     )
     assert table.to_html().count("<td class=best>") == 4
     assert table.to_rich().row_count == 3
+    assert [column.key for column in table.narrow(["brier", "auc"]).columns] == ["auc", "brier"]
     titles = [one.title for one in verdict_tables(results)]
     assert "Stored calibrations on fresh motions: before the motion" in titles
 
