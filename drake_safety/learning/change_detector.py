@@ -23,7 +23,7 @@ FALSE_ALARMS_PER_HOUR = 0.1
 LEAST_MOTION_S = 360.0
 """Motion for the limits, below which there is no alarm."""
 MOST_PREDICTOR_S = 3600.0
-"""Motion for the prediction, beyond which all is for the limits."""
+"""Longest motion for the prediction; the rest is for the limits."""
 RECOVERED_LEVEL, RECOVERY_S = 0.7, 5.0
 """Every level must be below the first for a time before an alarm ends [s]."""
 NUM_PREVIEWED = 2
@@ -100,9 +100,7 @@ class ChangeDetector:
 
     @classmethod
     def fit(cls, motions: Episodes, progress: Callable[[float], object] = ignore) -> ChangeDetector:
-        """Learns the prediction from one half of the motions, and the limits from the others.
-
-        Of more than two hours, the prediction learns from one.
+        """Learns a prediction from half of the motions, at most an hour; limits from the rest.
 
         Limits from the errors of other predictions, as in cross-validation, do not see what this
         one gets wrong: on a mass on a spring they gave 16 to 71 false alarms in four hours.
