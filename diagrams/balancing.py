@@ -159,11 +159,12 @@ class Balancing(LeggedLoop):
     @classmethod
     def options_for(cls, purpose: Purpose, scenario: Scenario, variation: str) -> dict[str, Any]:
         """Removes the ball for the paper's mode, or if not both engines of a pair support it."""
-        # "We also add a random offset to the initial state to simulate the disturbances": no ball.
         if purpose == "paper":
+            # "We also add a random offset to the initial state to simulate the disturbances".
             return {"ball": False}
-        has_engine = scenario.variation(variation).engine in ENGINES_WITH_BALLS
-        return {"ball": False} if purpose == "pairs" and not has_engine else {}
+        if purpose == "pairs" and scenario.variation(variation).engine not in ENGINES_WITH_BALLS:
+            return {"ball": False}
+        return {}
 
     def reset(self, context: Context, rng: np.random.Generator) -> int:
         """Samples an initial state and a plan; some episodes begin with the impact of a ball."""

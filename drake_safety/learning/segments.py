@@ -34,11 +34,11 @@ DIVERGED = "diverged"
 
 
 class DivergenceError(RuntimeError):
-    """A simulation that diverged; raised by a plant."""
+    """A simulation that diverged."""
 
 
 class EpisodeError(RuntimeError):
-    """An error raised by a diagram during an episode, other than a diverged simulation."""
+    """An error during a motion: of a system, or a divergence where that is no result."""
 
 
 def installed_versions(*packages: str) -> dict[str, str]:

@@ -31,6 +31,7 @@ from drake_safety.simulation.capabilities import (
     HasBall,
     HasGoals,
     goal_words,
+    require,
 )
 from drake_safety.simulation.closed_loop import ClosedLoop, require_ports
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -59,8 +60,7 @@ STEPS = (
 """Name and key of each button that changes a command, the entry of it, and the sign of the step."""
 
 _PORTS = ("safety_probability", "belief", "cause_probability", "predicted_margins")
-_LYING_S = 1.5  # From a fall to the next start.
-_SHOWN_S = 1.5  # From the end of an episode to the next start.
+_SHOWN_S = 1.5  # From a fall, a failure or the end of an episode to the next start.
 _FLIGHT_S = 0.2  # From a ball's release to its impact, so that it is visible.
 _NUM_CANDIDATES = 24  # Per batch of the search: few, because the user waits for the answer.
 _SIZE_M = 1.0  # Of a plant without legs, for markers.
@@ -94,9 +94,11 @@ class LiveSession:
     What the controls do follows from what the loop can: commands change while a robot walks, it
     moves to targets that Γ accepts, or balls are thrown at it. Any other task runs episode after
     episode from random starts: an episode ends 1.5 s after the state left the safe set, or 1.5 s
-    after its duration. A simulation that fails is shown for 1.5 s; then it starts anew.
+    after its duration. A simulation that fails is shown for 1.5 s; then it starts anew, except that
+    a robot that moves to targets waits for Start again or Go.
 
-    The loop is built with this Meshcat and with an assessment.
+    The loop is built with this Meshcat and with an assessment. Every start has a new Context: what
+    was adopted in the last one is forgotten.
 
     Attributes:
         threshold: Lowest probability that is shown as "safe", and of accepted targets.
@@ -146,10 +148,10 @@ class LiveSession:
             loop.constraint_names.index(loop.fall_name) if isinstance(loop, CanFall) else None
         )
         if self._is_commanded:
+            require(loop, HasGoals, "live session")
             for name, key, entry, sign in STEPS:
                 self._add(name, key, partial(self._step, entry, sign))
             self._add(HALT, "KeyH", partial(self._set_command, np.zeros(3)))
-            self._add(PUSH, "Space", self._push)
             self._add(GUARD, "KeyG", self._switch_guard)
         elif self._has_goals:
             self._add(ASK, "KeyA", partial(self._assess, is_thorough=True))
@@ -161,7 +163,7 @@ class LiveSession:
             self.panel.add_slider(MASS, 1.0, 5.0, 0.5, 3.0)
             self.panel.add_slider(SPEED, 1.0, 11.0, 0.5, 8.0)
             self.panel.add_slider(DIRECTION, -180.0, 180.0, 15.0, -75.0)
-        elif isinstance(loop, CanBePushed):
+        if isinstance(loop, CanBePushed) and (self._is_commanded or self._runs_episodes):
             self._add(PUSH, "Space", self._push)
         self.panel.add_button(START, "KeyR")
         with self._shows_failure():
@@ -301,7 +303,7 @@ class LiveSession:
                 self._end_s = now_s + _SHOWN_S
         note = self._note()
         if self.has_fallen:
-            self._end_s = min(self._end_s, now_s + _LYING_S)
+            self._end_s = min(self._end_s, now_s + _SHOWN_S)
             self.panel.show("fallen", note=note, tone="unsafe")
         elif self._is_on("recovery_active"):
             self.panel.show("recovering", cause=self._cause(), note=note, tone="recovery")
@@ -309,7 +311,7 @@ class LiveSession:
             name = left.replace("_", " ")
             self.panel.show(f"left the safe set: {name}", note=note, tone="unsafe")
         elif self._has_goals:
-            self._show_way(note)
+            self._show_way()
         elif self._is_on("guard_active") and self.is_guarded:
             passed = goal_words(loop).value(np.round(self._eval("desired_output"), 2))
             told = f"{passed}; asked: {note}"
@@ -456,7 +458,7 @@ class LiveSession:
         note = "; ".join(filter(None, notes))
         self.panel.show(f"refused: {told}", cause=cause, note=note, tone="unsafe")
 
-    def _show_way(self, note: str) -> None:
+    def _show_way(self) -> None:
         if self._is_over:
             miss_m = float(np.linalg.norm(self._eval("output") - self._goal))
             self.panel.show("there", note=f"{100 * miss_m:.1f} cm off", tone="recovery")

@@ -43,8 +43,8 @@ def nearest_accepted_goal(
     """Finds an accepted goal near a given one, with a reserve.
 
     With reserve: probability ≥ threshold + reserve (p - threshold), where p is the largest
-    probability: 1, or 1 - mu_ini in the paper's mode. Of the goals at the threshold itself, about
-    half are unsafe.
+    probability: 1, or 1 - mu_ini without heads, as in the paper's mode. Of the goals at the
+    threshold itself, about half are unsafe.
 
     Descent along the gradient of the safety head's logit finds an accepted goal with few
     evaluations, but often not the nearest one: it stays in one basin, and Γ follows the logit only
@@ -73,7 +73,7 @@ def nearest_accepted_goal(
         raise ValueError(f"nearest accepted goal: method must be one of {_METHODS}; got '{method}'")
     if not 0.0 <= reserve <= 1.0:
         raise ValueError(f"nearest accepted goal: reserve is {reserve}, expected a value in [0, 1]")
-    # Without a logit the probability is b_safe.
+    # Without heads the probability is b_safe.
     unknown = assessment.parameters.initial_uncertainty if assessment.base_logit_ is None else 0.0
     stricter = threshold + reserve * max(1.0 - unknown - threshold, 0.0)
     goal = checked_goal(goal)
@@ -81,8 +81,8 @@ def nearest_accepted_goal(
         return None
     box = require(loop, HasGoals).target_box
     near = _Search(loop, assessment, goal, box, stricter, resolution_m)
-    has_head = method == "both" and assessment.embedding_.has_safety_head
-    best = near.descend() if method == "gradient" or has_head else None
+    has_head = assessment.embedding_.has_safety_head
+    best = near.descend() if method == "gradient" or (method == "both" and has_head) else None
     if method != "gradient":
         best = near.search(best, rng, num_candidates)
     return None if best is None else replace(best, threshold=threshold)

@@ -114,6 +114,7 @@ def record_episodes(
     key = uuid.uuid4().hex
     make = MadeOnce(key, Sent(partial(make_diagram, **dict(parameters or {}))))
     used, sizes = _used_ports(make(), dict(ports or {}))
+    # As the hash has always been made of it, so that kept sets stay valid.
     times = f"EpisodeTiming({step_s=}, {num_steps=}, monitor_period_s={period_s!r})"
     identity = f"({name!r}, {times}, {used}, {sorted((parameters or {}).items())})"
     info = EpisodesInfo(

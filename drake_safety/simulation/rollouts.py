@@ -180,6 +180,7 @@ def run_to_goal(
         if push is not None:
             require(loop, CanBePushed).set_push(context, push)
 
+    options.setdefault("who", f"motion of '{loop.scenario.name}' to a goal (seed {seed})")
     motion = simulate(loop, begin, ("output", "margins", "plant_state", *ports), **options)
     motion.push_time_s = math.inf if push is None else push.time_s
     return motion

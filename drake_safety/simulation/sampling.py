@@ -15,7 +15,7 @@ from drake_safety.control.kinematics import (
     fit_stance,
     planar_pose,
 )
-from drake_safety.files.schema import Bounds, Pair, Share, Triple, schema
+from drake_safety.files.schema import Bounds, Pair, Positive, Share, Triple, schema
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.systems.trajectory_planner import interpolate
@@ -44,7 +44,7 @@ class StartSampling:
     """Where the plan ends, along x and along y of the stance frame."""
     target_height_m: Bounds[FiniteFloat] = field(default_factory=lambda: [0.34, 0.46])
     """Lowest and highest height at which the plan ends."""
-    plan_duration_s: Bounds[FiniteFloat] = field(default_factory=lambda: [0.8, 1.6])
+    plan_duration_s: Bounds[Positive] = field(default_factory=lambda: [0.8, 1.6])
     """Shortest and longest duration of the planned motion."""
 
     def sample(self, kinematics: RobotKinematics, rng: np.random.Generator) -> EpisodeStart:
@@ -80,9 +80,9 @@ class PushSampling:
 
     share: Share = 0.25
     """Share of nominal episodes that begin with the impact of a ball."""
-    mass_kg: Bounds[FiniteFloat] = field(default_factory=lambda: [2.0, 4.0])
+    mass_kg: Bounds[Positive] = field(default_factory=lambda: [2.0, 4.0])
     """Lowest and highest."""
-    speed_m_s: Bounds[FiniteFloat] = field(default_factory=lambda: [2.0, 11.0])
+    speed_m_s: Bounds[Positive] = field(default_factory=lambda: [2.0, 11.0])
     """Lowest and highest."""
     offset_m: float = 0.0
     """Half-width of a throw's ``offset_m``."""

@@ -7,12 +7,13 @@ import inspect
 import math
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, field
+from dataclasses import field
 from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, cast
 
+import pydantic
 import yaml
 
 from drake_safety.files.reading import did_you_mean, parse_yaml, reading
@@ -20,6 +21,7 @@ from drake_safety.files.schema import Positive, load_typed, schema
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.closed_loop import ClosedLoop, Purpose
+from drake_safety.systems.safety_assessor import OnAlarm
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -49,7 +51,7 @@ class Scenario:
     """Step of the discrete plant [s]."""
     control_period_s: Positive = 0.01
     """Period of the controller and of the safety monitor [s]."""
-    on_alarm: Literal["unknown", "report"] = "unknown"
+    on_alarm: OnAlarm = "unknown"
     """What an alarm of the monitor does: ``unknown`` makes every belief "don't know", so that the
     robot recovers or refuses plans; ``report`` only reports it."""
     variations: dict[str, PlantVariation] = field(default_factory=dict)
@@ -147,13 +149,18 @@ class Scenario:
         return yaml.safe_dump(self._values(), default_flow_style=None, sort_keys=False)
 
     def _values(self) -> dict[str, Any]:
-        """All values but optional ones that are not set."""
+        """All values but optional ones that are not set, by the types of the schema.
 
-        def stated(items: list[tuple[str, Any]]) -> dict[str, Any]:
-            return {name: value for name, value in items if value is not None}
+        A value that was set in Python, such as an integer in place of a float, is no other one.
+        """
 
-        parameters = asdict(self.parameters, dict_factory=stated)
-        return asdict(self, dict_factory=stated) | {"parameters": parameters}
+        def plain(one: Any) -> dict[str, Any]:
+            values: dict[str, Any] = pydantic.TypeAdapter(type(one)).dump_python(
+                one, mode="json", exclude_none=True, warnings=False
+            )
+            return values
+
+        return plain(self) | {"parameters": plain(self.parameters)}
 
     def simulation_hash(self, variation: str = "nominal") -> str:
         """SHA-256 of all parameters that determine a rollout, and of the robot's files.

@@ -111,21 +111,26 @@ def run_throw(
         loop: A closed loop with a ball. If it has an input port ``safety_probability`` (recovery
             without an assessment), recovery is triggered at ``trigger_time_s``; otherwise by Γ.
         index: Number of the throw; it and the seed determine start, plan and ball.
-        duration_s: End time [s]; by default 2.5 s after the first impact.
+        duration_s: End time [s]; by default 2.5 s after the first impact, or the latest possible
+            one where nothing is thrown.
         ports: Ports to log besides the assessor's inputs, ``margins``, ``plant_state``,
             ``recovery_active`` if there is one, and ``violations``, (N, 4), whether the state has
             each of `VIOLATIONS`.
         **options: Those of :func:`~drake_safety.simulation.motion.simulate`.
 
     Raises:
-        ValueError: The loop has no ball, or another engine than Drake.
-        EpisodeError: A system of the loop raised an error, or the simulation failed.
+        ValueError: The task has no balls, or the plant another engine than Drake.
+        EpisodeError: A ball misses the robot or the loop was built without one, a system of the
+            loop raised an error, or the simulation failed.
     """
-    rng, thrown = episode_rng(seed, index), require(loop, HasBall)
-    thrown.reset_calm(loop.CreateDefaultContext(), rng)  # The ball is drawn after the start.
-    sampled = thrown.sample_throw(rng, rng.uniform(_EARLIEST_S, _LATEST_S))
-    throws = [sampled] if throws is None else throws
-    impact_s = (throws[0] if throws else sampled).time_s
+    thrown = require(loop, HasBall)
+    if throws is None:
+        rng = episode_rng(seed, index)
+        thrown.reset_calm(loop.CreateDefaultContext(), rng)  # The ball is drawn after the start.
+        throws = [thrown.sample_throw(rng, rng.uniform(_EARLIEST_S, _LATEST_S))]
+    impact_s = min((throw.time_s for throw in throws), default=math.inf)
+    if duration_s is None:
+        duration_s = _AFTER_S + (impact_s if throws else _LATEST_S)
     has_recovery = loop.HasOutputPort("recovery_active")
     is_triggered_here = loop.HasInputPort("safety_probability")
     violations, rows = Violations(loop), []
@@ -154,7 +159,7 @@ def run_throw(
         loop,
         start,
         (*_PORTS, *ports, *(["recovery_active"] if has_recovery else [])),
-        duration_s=impact_s + _AFTER_S if duration_s is None else duration_s,
+        duration_s=duration_s,
         events=map(release, throws),
         each_row=each_row,
         index=index,

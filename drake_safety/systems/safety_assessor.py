@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
 from drake_safety.systems.change_monitor import ChangeMonitor
 
-ON_ALARM = ("unknown", "report")
+OnAlarm = Literal["unknown", "report"]
 """What an alarm does: every belief is unknown, or only the port ``alarm`` says so."""
+ON_ALARM = get_args(OnAlarm)
 
 
 class SafetyAssessor(Diagram):
