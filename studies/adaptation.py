@@ -25,6 +25,7 @@ from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import Prediction, SafetyAssessment
+from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.feedback import EpisodePair
 from drake_safety.learning.prediction import is_unknown
@@ -215,7 +216,7 @@ class Pool:
     """Feedback and the test set on which it is judged, with seeds of their own.
 
     Attributes:
-        feedback: Feedback sets.
+        feedback: Pairs of episodes.
         test: Fresh actual episodes.
     """
 
@@ -237,8 +238,8 @@ def pool_estimates(
 
     Args:
         assessment: The assessment before feedback.
-        pools: Feedback, of which the first N sets are used, each with a test set.
-        sizes: The N; those above the number of sets are left out.
+        pools: Feedback, of which the first N pairs are used, each with a test set.
+        sizes: The N; those above the number of pairs are left out.
         baselines: Other assessments by name.
         progress: Called with a stage, the number done and the number wanted.
 
@@ -308,7 +309,7 @@ def train_baselines(
     wanted = sorted(episodes.items(), key=lambda item: -len(item[1]))
     learned = dict(
         map_items(
-            partial(_learned, assessment),
+            partial(_learned, assessment.parameters),
             wanted,
             num_workers=num_workers,
             batch_size=1,
@@ -319,10 +320,9 @@ def train_baselines(
 
 
 def _learned(
-    assessment: SafetyAssessment, item: tuple[str, Episodes]
+    parameters: AssessmentParameters, item: tuple[str, Episodes]
 ) -> tuple[str, SafetyAssessment | None]:
     name, episodes = item
-    parameters = copy.deepcopy(assessment.parameters)
     try:
         return name, SafetyAssessment(parameters).fit(episodes)
     except ValueError:

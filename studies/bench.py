@@ -38,7 +38,7 @@ def read_run(path: Path) -> dict[str, Any]:
     """
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        content["figures"]
+        run_text(content)  # Raises for whatever it lacks.
     except (ValueError, LookupError, TypeError) as error:
         raise ValueError(
             f"{path} holds no figures of benchmarks ({error}): `make bench` writes them"

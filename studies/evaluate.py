@@ -171,6 +171,8 @@ def _add_plans(
     sets = {"plans": test}
     if num_other:
         mirror = getattr(loop, "mirror_options", {})
+        if not mirror:
+            raise ValueError("--other-hand: the task has no other hand")
         # The same random draws, mirrored.
         episodes = evaluation.fresh("fresh targets, other hand", num_other, "evaluation", **mirror)
         mirrored = scenario.make_loop(**scenario.options_for("evaluation"), **mirror)

@@ -95,7 +95,7 @@ class GruMonitor:
         per_epoch = max(1, round(int(rows.sum()) / (_WINDOW * _BATCH)))
         num_steps = min(_EPOCHS * per_epoch, _MOST_STEPS)
         rng = np.random.default_rng(0)
-        with one_torch_thread(), torch.random.fork_rng(devices=[]):
+        with one_torch_thread():
             torch.manual_seed(0)
             network = _network(len(self._mean), self._num_states)
             optimiser = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_DECAY)

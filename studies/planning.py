@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -126,7 +126,8 @@ def run_trials(
     Raises:
         ValueError: The task offers no plans or only one, or too few starts are undisturbed.
     """
-    loop = scenario.make_loop(**scenario.options_for("evaluation"))
+    make = worker_loop(scenario, **scenario.options_for("evaluation"))
+    loop = make()
     context = loop.CreateDefaultContext()
     indices: list[int] = []
     index = 0
@@ -146,7 +147,7 @@ def run_trials(
         )
     found = kept(
         path / f"{scenario.simulation_hash()[:12]}-{seed}-of-{num_plans}",
-        {f"{index}": (scenario, seed, num_plans, index) for index in indices},
+        {f"{index}": (make, seed, num_plans, index) for index in indices},
         _run_candidates,
         workers=num_workers,
         progress=progress,
@@ -163,8 +164,10 @@ def _candidates(loop: ClosedLoop, context: Any, seed: int, index: int, num_plans
     )
 
 
-def _run_candidates(scenario: Scenario, seed: int, num_plans: int, index: int) -> Arrays:
-    loop = worker_loop(scenario, **scenario.options_for("evaluation"))()
+def _run_candidates(
+    make: Callable[[], ClosedLoop], seed: int, num_plans: int, index: int
+) -> Arrays:
+    loop = make()
     plans = _candidates(loop, loop.CreateDefaultContext(), seed, index, num_plans)
     motions = [run_episode(loop, index, seed=seed, plan=plan) for plan in plans]
     first = {

@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption, console
-from drake_safety.cli.training_folder import MODES, load_assessment
+from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.calibration import (
@@ -41,7 +41,7 @@ def promises(
     Writes ASSESSMENT/promises.json.
     """
     with open_study("promises", scenario, assessment, seed=seed, workers=workers) as study:
-        scorer = assessment_scorer(MODES[0], load_assessment(assessment, MODES[0]))
+        scorer = assessment_scorer(MODES[0], study.load(MODES[0], []))
         segments = split(study.fresh(episodes), stride=1, discount=1.0, shortest=1)
         score = scorer.unsafe_score(segments)
         options: dict[str, Any] = {"confidence": confidence, "num_splits": splits, "seed": seed}

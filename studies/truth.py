@@ -16,6 +16,7 @@ from scipy.ndimage import distance_transform_edt
 
 from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption, say
 from drake_safety.cli.training_folder import MODES
+from drake_safety.evaluation.episode_study import first_segments
 from drake_safety.evaluation.figure_style import (
     INK,
     SAFE_COLOUR,
@@ -29,7 +30,7 @@ from drake_safety.evaluation.shift_study import CONFIDENT
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.seeds import EVALUATION
-from drake_safety.learning.segments import Episodes, split
+from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario
@@ -235,8 +236,7 @@ def random_plan_estimates(assessment: SafetyAssessment, episodes: Episodes) -> d
     Returns:
         "safe_share", "intersection_over_union" and "confident_errors", as in `Agreement`.
     """
-    segments = split(episodes, stride=episodes.info.horizon, discount=1.0, shortest=1)
-    first = segments.take(segments.is_first)
+    first = first_segments(episodes)
     found = assessment.predict_rows(first)
     probability = safe_share(found.belief)
     is_safe, says_safe = ~first.is_unsafe, probability >= THRESHOLD

@@ -66,6 +66,7 @@ def walking(
     """
     with open_study("walking", scenario, assessment, workers=workers) as study:
         walker, gamma = study.scenario, study.load(MODES[0], [])
+        sha256 = file_hash(assessment_file(assessment, MODES[0]))
 
         def run(
             kind: str,
@@ -83,13 +84,16 @@ def walking(
                 which = copy.copy(walker)
                 which.parameters = replace(walker.parameters, recovery=recovery)
             seed = _SEEDS[seeds or kind]
-            name = "-".join(filter(None, (seeds or kind, plant, branch, *options)))
+            seconds = duration_s or _DURATIONS_S[kind]
+            by = sha256[:12] if options else ""  # Γ, where it has a say.
+            parts = (seeds or kind, plant, branch, *options, f"{seconds:g}s", by)
+            name = "-".join(filter(None, parts))
             return run_motions(
                 which,
                 kind,
                 indices,
                 seed=seed,
-                duration_s=duration_s or _DURATIONS_S[kind],
+                duration_s=seconds,
                 folder=assessment / f"walking/{which.simulation_hash(plant)[:12]}-{seed}-{name}",
                 variation=plant,
                 assessment=gamma if options else None,
@@ -105,7 +109,7 @@ def walking(
         study.entries |= {
             "variation": variation,
             "seeds": _SEEDS,
-            "assessment_sha256": file_hash(assessment_file(assessment, MODES[0])),
+            "assessment_sha256": sha256,
             "thresholds": thresholds,
         }
         pushed = run("push", range(pushes))

@@ -12,12 +12,11 @@ import numpy as np
 from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.motion import Motion, simulate
-from drake_safety.simulation.rollouts import episode_rng, run_to_goal, worker_loop
+from drake_safety.simulation.rollouts import episode_rng, run_to_goal
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import MadeOnce, Progress
 from studies.harness import Arrays, kept
 
-_PORTS = (*SEEN, "desired_output")
 _AFTER_FALL_S = 0.6  # Until the robot lies.
 
 
@@ -35,7 +34,7 @@ def run_tour(loop: Any, index: int, *, seed: int, duration_s: float) -> Motion:
     return simulate(
         loop,
         lambda context: loop.reset_undisturbed(context, episode_rng(seed, index), duration_s),
-        (*_PORTS, "margins", "output", *filter(loop.HasOutputPort, ["guard_active"])),
+        (*SEEN, "margins", "output", *filter(loop.HasOutputPort, ["guard_active"])),
         duration_s=duration_s,
         index=index,
     )
@@ -68,7 +67,7 @@ def _walked(
         command,
         duration_s=duration_s,
         seed=int(rng.integers(2**31)),
-        ports=(*_PORTS, *filter(loop.HasOutputPort, ["guard_active"])),
+        ports=(*SEEN, *filter(loop.HasOutputPort, ["guard_active"])),
         after_fall_s=_AFTER_FALL_S,
         index=index,
         **options,
@@ -114,10 +113,12 @@ def run_motions(
         num_workers: Number of worker processes; one a core by default.
         progress: Called with the number done and in all.
     """
-    common = (scenario, variation, assessment, options or {}, kind, seed, duration_s)
+    # The folder is named after all that a loop depends on.
+    loop = partial(scenario.make_loop, variation, assessment=assessment, **(options or {}))
+    make = MadeOnce(str(folder), loop)
     found = kept(
         folder,
-        {f"{i:05d}": (*common, i) for i in indices},
+        {f"{i:05d}": (make, kind, seed, duration_s, i) for i in indices},
         _run_motion,
         workers=num_workers,
         progress=progress,
@@ -132,22 +133,8 @@ def _motion(arrays: Arrays) -> Motion:
 
 
 def _run_motion(
-    scenario: Scenario,
-    variation: str,
-    assessment: SafetyAssessment | None,
-    options: dict[str, Any],
-    kind: str,
-    seed: int,
-    duration_s: float,
-    index: int,
+    make: Callable[[], Any], kind: str, seed: int, duration_s: float, index: int
 ) -> Arrays:
-    if assessment is None:
-        make = worker_loop(scenario, variation, **options)
-    else:
-        key = (scenario.to_yaml(), variation, repr(options))
-        assessed = partial(scenario.make_loop, variation, assessment=assessment, **options)
-        make = MadeOnce(key, assessed)
     motion = KINDS[kind](make(), index, seed=seed, duration_s=duration_s)
-    scalars = vars(motion) | {"ports": None}
-    arrays = {n: np.asarray(value) for n, value in scalars.items() if value is not None}
+    arrays = {name: np.asarray(one) for name, one in vars(motion).items() if name != "ports"}
     return arrays | {name: rows.astype(np.float32) for name, rows in motion.ports.items()}

@@ -53,7 +53,7 @@ def charts(detector, motions):
 
 
 def whitened_distances(known, x, plan):
-    """The same by whitening along every axis, the variance of each bounded from below."""
+    """Distances of a Novelty by whitening each axis, its variance bounded from below."""
     scale = np.maximum(np.sqrt(np.diag(known.covariance)), 1e-2)
     found = []
     for columns, least, most in (

@@ -58,6 +58,7 @@ def test_the_baseline_is_what_training_makes_of_the_same_episodes(sets, scores):
         for one in found.values():
             gain = one[set_]["auc"].value - base["auc"].value
             assert one[set_]["auc_gain"].value == pytest.approx(gain)
+            assert one[set_]["auc"].n == 40
 
 
 def test_what_a_variant_does_not_see_makes_no_difference_to_it(sets):
@@ -96,18 +97,26 @@ def test_each_variant_makes_one_choice_otherwise():
     base, rates = AssessmentParameters(shortest_segment=8), ["velocity_x", "capture_point"]
     found = list_variants(base, 200, state_names=["x", "velocity_x"], rate_names=rates)
     assert found[0] == Variant(name=BASELINE)
+    assert len({variant.name for variant in found}) == len(found)
     for variant in found[1:]:
         parameters = variant.parameters(base)
         differs = {k for k, v in asdict(parameters).items() if v != asdict(base)[k]}
-        assert differs <= set(variant.changes)
+        same = {k for k, v in variant.changes.items() if v == getattr(base, k)}
+        assert differs == set(variant.changes) - same
         assert differs or variant.num_episodes or variant.without
         # The extent of the grid is no choice of these.
         assert parameters.resolution * parameters.cell_length == pytest.approx(140.0)
     assert [list(v.without) for v in found if "velocities" in v.name] == [rates[:1], rates]
+    choices = {variant.name.partition(" ")[0] for variant in found}
+    assert choices > {"score_weight", "horizon", "perplexity", "resolution", "min_count", "paper"}
+    assert {v.num_episodes for v in found if "episodes" in v.name} == {25, 50, 100}
+    plain = list_variants(base, 200, state_names=["x", "velocity_x"], rate_names=[])
+    assert not any(variant.without for variant in plain)
 
 
 def test_everyone_is_judged_at_the_baselines_rows_and_what_cannot_be_learned_says_why(sets):
     scores = unsafe_scores(Variant(name="horizon", changes={"horizon": 5}), BASE, *sets)
     assert len(scores["test"]) == len(judged_segments(sets[2], BASE))
+    assert len(scores["calibration"]) == len(judged_segments(sets[1], BASE))
     crowded = Variant(name="crowded", changes={"perplexity": 5000.0})
     assert "needs more than 15000" in str(unsafe_scores(crowded, BASE, *sets)["failed"])

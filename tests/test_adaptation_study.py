@@ -3,9 +3,20 @@ import pytest
 
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
+from drake_safety.learning.prediction import is_unknown
+from drake_safety.learning.segments import Episodes
 from lip_assessments import QUICK, worse
 from lip_episodes import make_episodes
-from studies.adaptation import STEPS, Pool, TestSet, losses, pool_estimates, scores
+from studies.adaptation import (
+    STEPS,
+    Pool,
+    TestSet,
+    losses,
+    pool_estimates,
+    scores,
+    train_baselines,
+)
+from studies.adaptation_figure import adaptation_figure
 
 pytestmark = pytest.mark.train
 
@@ -35,6 +46,17 @@ def test_scores_are_those_of_what_is_published(assessment, judged):
         assert found[f"{name}.k0"]["brier"] == pytest.approx(squared[first].mean())
         caught = (unsafe > 0.5)[segments.is_unsafe].mean()
         assert found[name]["unsafe_recall"] == pytest.approx(caught)
+        unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
+        assert found[name]["unknown"] == unknown.mean()
+
+
+def test_too_few_episodes_give_no_baseline(assessment):
+    episodes = make_episodes(40, seed=5, noise=0.002)
+    few = {"scratch 1": episodes[:1], "scratch 40": episodes}
+    baselines = train_baselines(assessment, few, num_workers=1)
+    assert list(baselines) == ["scratch 40"]
+    assert baselines["scratch 40"].parameters == assessment.parameters
+    np.testing.assert_array_equal(baselines["scratch 40"].correction_.change, 0.0)
 
 
 def test_pools_differ_and_the_oracle_bounds_the_gap(assessment, judged):
@@ -72,3 +94,9 @@ def test_what_is_lost_is_told_step_by_step(assessment, judged):
     assert brier[STEPS.index("psi")] < brier[STEPS.index("grid")] + 0.01
     # Feedback that contradicts what the fresh episodes do can but harm.
     assert brier[STEPS.index("update")] > brier[STEPS.index("grid")]
+    assert found["x.brier"].n == len(judged.episodes)
+    safe = Episodes(learned.info, [one for one in learned if one.is_safe])
+    with pytest.raises(ValueError, match="end alike"):
+        losses(assessment, worse(), safe, judged)
+    with pytest.raises(ValueError, match="fewer than the 40 of update 1"):
+        adaptation_figure(assessment, worse()[:39])

@@ -62,6 +62,7 @@ def test_what_is_noticed_is_noticed_between_push_and_leaving_and_all_else_is_fal
     assert found["sharpened.falls_detected"] == 2 / 2
     assert found["sharpened.lead_to_fall_s"] == pytest.approx((0.7 + 0.3) / 2)
     assert found["motions.leave_safe_set"] == 4 / 6
+    assert found["motions.push_to_leaving_s"] == pytest.approx(0.4)
     # One in two safe motions of 3.6 s each, and one in six times 1 s before a push.
     assert found["sharpened.false_alarms_per_hour"] == pytest.approx(500)
     assert found["sharpened.undisturbed_false_alarms_per_hour"] == pytest.approx(600)
@@ -86,6 +87,8 @@ def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
     for share, count in ((0.0, 0), (0.05, 1), (0.25, 5), (0.26, 5)):
         threshold = equal_share_threshold(lowest, share)
         assert (lowest < threshold).sum() == count < (lowest < threshold + 0.011).sum()
+        found = evaluate_alarms([SEEN], CALM, TEST, num_rows=1, false_alarm_share=share)
+        assert found["monitoring.sharpened.threshold"].value == threshold
     with pytest.raises(ValueError, match="no calibration motion stays in the safe set"):
         equal_share_threshold(np.array([]), 0.1)
 

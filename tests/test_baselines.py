@@ -64,9 +64,15 @@ def test_the_episodes_that_decide_when_to_stop_are_held_out_whole(training):
 
 def test_who_learns_from_short_segments_has_seen_how_safe_episodes_end(fresh):
     episodes = make_episodes(40, seed=3, noise=0.05)
-    whole, *_ = classifier_scorers(episodes, lambda *report: None)
+    reports = []
+    whole, other = classifier_scorers(episodes, lambda *report: reports.append(report))
+    assert [done for _, done, _ in reports] == list(range(len(KINDS) + 1))
+    assert [whole.name, other.name] == list(KINDS) and whole.used[0].seed == 3
+    assert not np.array_equal(whole.unsafe_score(fresh), other.unsafe_score(fresh))
+    for scorer in (whole, other):
+        score = scorer.unsafe_score(fresh)
+        assert score[fresh.is_unsafe].mean() > score[~fresh.is_unsafe].mean()
     short, *_ = classifier_scorers(episodes, lambda *report: None, shortest=1)
-    assert (whole.name, whole.used[0].seed) == (KINDS[0], 3)
     segments = split(episodes, stride=1, discount=1.0, shortest=1)
     rows = segments.take(~segments.is_unsafe & (segments.length < episodes.info.horizon))
     assert short.unsafe_score(rows).mean() < whole.unsafe_score(rows).mean()

@@ -131,7 +131,10 @@ def test_runs_are_compared_by_the_ratio_to_their_peers_and_ratios_as_they_are():
     assert "Only before: gone." in text and "Only after: new." in text
 
 
-@pytest.mark.parametrize("text", ["{}", "[]", "{"])
+DAMAGED = json.dumps(run_of({"name": "tick", "value": 1.0}))
+
+
+@pytest.mark.parametrize("text", ["{}", '{"figures": 1}', "[]", "{", DAMAGED])
 def test_a_file_that_is_no_run_is_refused_by_name(tmp_path, text):
     file = tmp_path / "other.json"
     file.write_text(text)

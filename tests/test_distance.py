@@ -24,7 +24,9 @@ def segments():
 
 @pytest.fixture(scope="module")
 def warping(segments):
-    return {cost: naive.dtw(segments.error, segments.length, cost) for _, cost in WAYS[:3]}
+    return {
+        cost: naive.dtw(segments.error, segments.length, cost) for cost in distance.WARPING_COSTS
+    }
 
 
 def dtw_matrix(error, length, **options):

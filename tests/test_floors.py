@@ -158,6 +158,15 @@ def upward_imports(source, name):
     return offences
 
 
+DRAWING = {
+    f"drake_safety/evaluation/{name}.py"
+    for name in (
+        *(f"{what}_figure" for what in ("embedding", "interval", "path", "robot", "timeline")),
+        *("truth_figure", "figure_style", "reliability", "shift_study"),
+    )
+}
+
+
 def forbidden_imports(source, name):
     room = room_of(module_of(name))
     offences = []
@@ -168,8 +177,8 @@ def forbidden_imports(source, name):
         if name not in ONLY_IN.get(top, [name]):
             rooms = " or ".join(ONLY_IN[top])
             offences.append(f"{name}:{line} imports {dotted}, which belongs in {rooms}")
-        # Only the module of a command, which is imported when it is called, imports figures.
-        draws = room in ("cli", "evaluation") and top == "matplotlib"
+        # Modules of commands and of figures are imported when a command is called.
+        draws = top == "matplotlib" and (room == "cli" or name in DRAWING)
         if top in HEAVY and runs and not draws:
             offences.append(f"{name}:{line} imports {dotted} outside a function")
     return offences
@@ -342,6 +351,7 @@ IN_FUNCTIONS = "if TYPE_CHECKING:\n    import torch\ndef f():\n    import torch"
         (forbidden_imports, LEARNING, "import pydrake.math", "learning"),
         (forbidden_imports, EVALUATION, "def f():\n    import torch.nn", "belongs in drake_safety"),
         (forbidden_imports, LEARNING, "import matplotlib", "outside"),
+        (forbidden_imports, EVALUATION, "import matplotlib", "outside"),
         (forbidden_imports, EVALUATION, "class A:\n    from sklearn import svm", "outside"),
         (forbidden_anywhere, "tests/a.py", "from pydrake.all import x", "pydrake.all"),
         (forbidden_anywhere, "tests/a.py", "import pickle", "pickle"),
@@ -358,7 +368,7 @@ IN_FUNCTIONS = "if TYPE_CHECKING:\n    import torch\ndef f():\n    import torch"
         (upward_imports, "models/__init__.py", "from drake_safety.robots.robot import x", None),
         (upward_imports, ROOM("cli"), "from drake_safety import __version__", None),
         (forbidden_imports, "drake_safety/learning/maps.py", IN_FUNCTIONS, None),
-        (forbidden_imports, EVALUATION, "import matplotlib", None),
+        (forbidden_imports, "drake_safety/evaluation/path_figure.py", "import matplotlib", None),
         (forbidden_anywhere, "tests/a.py", "np.load(path, allow_pickle=False)", None),
         (forbidden_anywhere, "tests/a.py", "import drake_safety.models", None),
         (borrowed_tests, "tests/test_a.py", "from lip_episodes import make_episodes", None),

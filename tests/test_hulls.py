@@ -67,7 +67,7 @@ def hull_of(written, link):
 
 def test_collision_meshes_become_hulls_which_readme_lists(spider):
     hull = hull_of(spider, "femur_0")
-    np.testing.assert_allclose(np.ptp(hull, axis=0), np.ptp(bar().vertices, axis=0), rtol=0.1)
+    np.testing.assert_allclose(np.ptp(hull, axis=0), np.ptp(bar().vertices, axis=0), rtol=1e-3)
     assert spider.bare == []
     assert spider.num_hulls == 3
     readme = (spider.folder / "README.md").read_text()
@@ -133,7 +133,7 @@ def test_check_draws_the_standing_robot_beside_its_shapes(spider, tmp_path, is_l
     if is_legged:
         assert result.exit_code == 0
         text = picture.with_suffix(".svg").read_text()
-        assert "convex hulls" in text or picture.stat().st_size > 10_000
+        assert "convex hulls" in text
     else:
         assert "--picture draws a legged robot" in str(result.exception or result.output)
 

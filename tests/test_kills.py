@@ -47,7 +47,7 @@ def workers_of(process):
 
 @pytest.fixture(scope="module")
 def undisturbed():
-    return run_episodes(load_scenario("pendulum"), 200, num_workers=2)
+    return run_episodes(load_scenario("pendulum"), 400, num_workers=2)
 
 
 def assert_kept(folder, undisturbed):

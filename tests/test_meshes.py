@@ -168,6 +168,7 @@ def test_a_hull_has_few_vertices_which_are_the_meshs_and_reaches_as_far_along_th
         ([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.0, 0.1, 1.0]], [0.2, 0.1, 1e-3]),
         ([[0.0, 0.0, 0.0], [0.2, 0.0, 0.1], [0.1, 0.1, 0.05], [0.2, 0.2, 0.1]], [0.2, 0.2, 0.1]),
         ([[0.5, 0.5, 0.5]], [1e-3, 1e-3, 1e-3]),
+        ([[x / 30, y / 45, 0.2] for x in range(10) for y in range(10)], [0.3, 0.2, 1e-3]),
     ],
 )
 def test_a_flat_mesh_becomes_the_box_around_it(points, edges):

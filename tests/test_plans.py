@@ -7,6 +7,7 @@ from drake_safety import SafetyAssessment, run_episodes
 from drake_safety.evaluation.episode_study import promised_miss_rate
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.learning.calibration import score_threshold
+from drake_safety.learning.segments import DIVERGED, Episodes
 from shuttle_task import FAIR_X_M, shuttling
 from studies.plans import (
     evaluate_plans,
@@ -71,16 +72,28 @@ def test_a_plan_is_what_is_known_at_its_first_instant_and_where_it_leads(fresh, 
     np.testing.assert_array_equal(plans.first.is_unsafe, (plans.goals[:, :2] > 1.0).any(axis=1))
     assert 0 < plans.is_fair.sum() < len(fresh)
     assert plans.goals[plans.is_fair, 0].min() >= FAIR_X_M
+    broken = replace(fresh[0], is_safe=False, cause=DIVERGED)
+    some = plans_of(shuttling().make_loop(), Episodes(fresh.info, [broken, *fresh[1:10]]))
+    assert (len(some.first), len(some.episodes)) == (9, 10)
 
 
 @pytest.mark.train
-def test_thresholds_come_from_the_calibration_plans_and_miss_none_of_them(study, calibration):
+def test_thresholds_come_from_the_calibration_plans_and_miss_none_of_them(
+    study, calibration, fresh, plans
+):
     estimates, limits = study
     score, label = RULES["sharpened"](calibration), calibration.first.is_unsafe
     assert limits["sharpened"] == score_threshold(score, label, promised_miss_rate(label))
     assert (score[label] > limits["sharpened"]).all()
     assert limits["stubborn"] == 0.5
     assert estimates["plans.stubborn.unsafe_recall"].value == 1.0
+    # Told as the safety probability below which a plan is refused.
+    assert estimates["plans.sharpened.threshold"].value == 1.0 - limits["sharpened"]
+    assert estimates["plans.sharpened.auc"].value == 1.0
+    assert estimates["plans.sharpened.unsafe_recall"].n == plans.first.is_unsafe.sum()
+    shares = [estimates[f"plans.outcomes.{name}"] for name in ("safe", "front", "flank", DIVERGED)]
+    assert sum(one.value for one in shares) == pytest.approx(1.0)
+    assert shares[0].value == fresh.num_safe / len(fresh)
     # One score for all: nothing is accepted rather than an unsafe plan.
     for name in ("stubborn", "blind"):
         assert estimates[f"plans.{name}.safe_recall"].value == 0.0
@@ -97,6 +110,7 @@ def test_causes_are_judged_on_the_correctly_refused_alone(study, assessment, pla
         right = np.mean((causes == first.cause)[rows])
         assert estimates[f"plans.causes.{name}"].value == right
         assert estimates[f"plans.causes.{name}"].n == rows.sum()
+    assert sum(estimates[f"plans.causes.{name}"].n for name in ("front", "flank")) == rows.sum()
 
 
 def test_reachability_answers_for_the_hand_that_reaches(plans):

@@ -24,9 +24,16 @@ def test_every_motion_is_safe_until_somebody_pushes_and_the_same_until_then():
         assert not other.leave_time_s <= other.push_time_s
     assert 0 < sum(motion.has_left for motion in pushed) < 12
     # A motion follows from its seed and index alone.
-    for again, before in zip(run_pushed_motion(loop, 5, seed=4), motions[10:], strict=False):
+    for again, before in zip(run_pushed_motion(loop, 5, seed=4), motions[10:12], strict=True):
         np.testing.assert_array_equal(again["state"], before["state"])
         assert again.push_time_s == before.push_time_s
+
+
+def test_goals_that_nobody_reaches_safely_are_no_place_to_be_pushed_on_the_way_to(monkeypatch):
+    loop = shuttling().make_loop()
+    monkeypatch.setattr(type(loop), "target_box", np.array([[1.3, 0.0, 0.2], [1.4, 0.1, 0.3]]))
+    with pytest.raises(ValueError, match="none of 50 random goals is reached safely"):
+        run_pushed_motion(loop, 0, seed=4)
 
 
 @pytest.mark.parametrize("name", ["laikago_balancing", "atlas_reaching"])

@@ -37,6 +37,17 @@ def test_what_forward_kinematics_gets_to_inverse_kinematics_gets_to(
     assert reachability["left"].is_reachable(np.array(points)).mean() >= 0.9
 
 
+def test_the_joints_between_base_and_hand_move_and_no_other(robot, kinematics, reachability):
+    legs = {name for foot in robot.feet.values() for name in foot.joints}
+    for hand, frame in robot.reaching_frames.items():
+        names = set(reachability[hand].joint_names)
+        assert set(frame.joints) < names and not names & legs
+        point = kinematics.reaching_position(kinematics.standing_positions(), frame)
+        assert reachability[hand].miss(point) < 1e-4
+    left, right = (set(reachability[hand].joint_names) for hand in ("left", "right"))
+    assert left & right == left - set(robot.reaching_frame("left").joints)
+
+
 def test_a_point_that_is_too_far_is_missed_by_as_much_more_as_it_is_further(reachability):
     near, far = (reachability["left"].miss(np.array([x, 0.3, 1.2])) for x in (3.0, 4.0))
     assert near > 1.0

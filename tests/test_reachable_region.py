@@ -5,7 +5,7 @@ import pytest
 
 from drake_safety import SafetyAssessment, run_episodes
 from drake_safety.evaluation.scorers import assessment_scorer
-from shuttle_task import shuttling
+from shuttle_task import BOX, FAIR_X_M, shuttling
 from studies.reachable_region import SAFE, reachable_region, region_figure
 
 
@@ -74,3 +74,17 @@ def test_what_is_not_known_is_hatched_and_not_accepted(region):
     accepted = probability[::4, ::4] >= half.threshold
     is_right = (accepted == (half.outcomes == SAFE)).mean()
     assert half.estimates()["sharpened.right"].value == pytest.approx(is_right)
+
+
+@pytest.mark.train
+def test_the_plane_covers_the_target_box_and_what_needs_no_simulation_is_finer(region, assessment):
+    for fine, coarse, low, high in (
+        (region.y_m, region.simulated_y_m, *BOX[:, 1]),
+        (region.z_m, region.simulated_z_m, *BOX[:, 2]),
+    ):
+        assert (coarse[0], coarse[-1]) == (fine[0], fine[-1]) == (low, high)
+        assert np.abs(coarse[:, None] - fine).min(axis=1).max() < 1e-12
+        assert len(fine) > 2 * len(coarse)
+    assert region.probability.shape == (len(region.z_m), len(region.y_m))
+    assert region.is_reachable == {}  # A task without a hand.
+    assert on_plane(assessment, step_m=0.8).x_m == pytest.approx(0.5 * (FAIR_X_M + BOX[1, 0]))

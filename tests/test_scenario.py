@@ -2,6 +2,7 @@ import importlib
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -246,8 +247,12 @@ def test_what_changes_a_rollout_and_nothing_else_changes_the_hash(text, is_same)
 
 def test_a_default_that_changes_is_another_simulation(monkeypatch):
     before = parsed(SCENARIO).simulation_hash()
-    default = GlidingParameters.__init__.__kwdefaults__
-    monkeypatch.setitem(default, "speed_m_s", 2.5)
+
+    @dataclass
+    class Faster(GlidingParameters):
+        speed_m_s: float = 2.5
+
+    monkeypatch.setattr(Gliding, "Parameters", Faster)
     assert parsed(SCENARIO).parameters.speed_m_s == 2.5
     assert parsed(SCENARIO).simulation_hash() != before
 

@@ -135,6 +135,8 @@ def test_outside_the_safe_set_gamma_is_not_safe_but_the_grid_alone_may_be(assess
 @pytest.mark.train
 def test_junk_is_dont_know_and_keeps_what_it_says_it_keeps(assessment, nominal):
     found = {name: motions for name, (_, motions) in junk(nominal[:20], seed=3).items()}
+    others = {f"{what} of another row" for what in ("state", "plan", "features")}
+    assert set(found) == {"columns shuffled", "gaussian", *others}
     plain = np.concatenate([one.state for one in nominal[:20]])
     shuffled = np.concatenate([one.state for one in found["columns shuffled"]])
     np.testing.assert_array_equal(np.sort(shuffled, axis=0), np.sort(plain, axis=0))

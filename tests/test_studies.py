@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -23,8 +24,11 @@ from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import shuttling, train_shuttle
 from studies.__main__ import app
+from studies.animation import save_animation
 from studies.anomalies import anomalies
+from studies.compare import comparison_figure, standing_still
 from studies.documents import render
+from studies.injections import SENSORS, changed_episode
 from studies.publish import DOCUMENTS
 from studies.scale import counts_for
 
@@ -93,10 +97,11 @@ def results_of(file, rows):
     for key in rows.split(", "):
         assert math.isfinite(found[key].value), key
     for key, row in found.items():
-        if row.metric == "expected_calibration_error":  # Resampling raises it.
-            assert not row.low > row.high, key
-            continue
-        assert not (row.low > row.value or row.value > row.high), key
+        if math.isfinite(row.value):
+            # Resampling raises a calibration error.
+            is_raised = row.metric == "expected_calibration_error"
+            assert (0.0 if is_raised else row.low) <= row.value <= row.high, key
+            assert row.low <= row.high, key
     return found
 
 
@@ -111,6 +116,32 @@ def test_a_study_of_a_run_writes_its_figures(monkeypatch, run, line):
     assert study(monkeypatch, command, *arguments) == 0
     found = results_of(folder / f"{name}.json", rows)
     assert found.entries["command"].startswith(f"python -m studies {command} ")
+    numbers = {
+        "evaluation": ("plans.other_hand.outcomes.safe", 10),
+        "ablation": ("k0.min_count 20.auc", 40),
+        "planning": ("planning.chosen.safe", 10),
+        "readings": ("readings.0.first.normalized.auc", 40),
+        "adapted-actual/study": ("sharpened.calibrated.scratch 40.brier", 40),
+    }
+    if name in numbers:
+        key, n = numbers[name]
+        assert found[key].n == n
+    if name == "ablation":
+        names = ["baseline", "min_count 1", "min_count 20", "min_count 50"]
+        assert [row.method for row in found.select(set="k0", metric="auc")] == names
+    if name == "adapted-actual/study":
+        assert found.entries["feedback_sets"] == [40, 40]
+        assert (folder / "adapted-actual/adaptation_sharpened.png").is_file()
+    makers = {
+        "ablation": "drake_safety.learning.assessment.SafetyAssessment.fit",
+        "planning": "studies.planning.run_episode",
+        "scale": "studies.scale.learned_row",
+    }
+    if name in makers:  # What is kept is not made again.
+        with monkeypatch.context() as patched:
+            patched.setattr(makers[name], None)
+            assert study(monkeypatch, command, *arguments) == 0
+        assert repr(dict(Results.read(folder / f"{name}.json"))) == repr(dict(found))
     pictures = {"shifts", "ablation", "planning", "adapted-actual/study", "scale"}
     assert (folder / f"{name}.png").is_file() == (name in pictures)
     if name == "evaluation":
@@ -131,6 +162,9 @@ def test_what_a_run_is_too_small_or_not_fresh_for_is_refused(monkeypatch, capsys
         assert "start as the" in " ".join(capsys.readouterr().out.split())
     assert study(monkeypatch, "readings", *given, *FRESH.split(" "), "--only", "default") == 2
     assert "holds 60 episodes, expected at least 1024" in " ".join(capsys.readouterr().out.split())
+    options = ("--episodes", 40, "--splits", 5, "--seed", 100)
+    assert study(monkeypatch, "promises", *given, *options) == 0
+    assert "needs 99 unsafe episodes" in " ".join(capsys.readouterr().out.split())
     # A size is that of the first episodes with so many segments.
     episodes, parameters = load_episodes(episodes_folder(folder)), shuttling().assessment
     count = counts_for({100}, episodes, parameters)[100]
@@ -170,9 +204,20 @@ def test_anomalies_are_judged_by_every_monitor_and_tabled(monkeypatch, tmp_path)
     rows = ", ".join(
         f"anomalies.{monitor}.{kind}.auc"
         for monitor in ("monitor", "gru", "isolation_forest", "range_check")
-        for kind in ("pooled", "drift")
+        for kind in ("pooled", *SENSORS)
     )
     found = results_of(tmp_path / "anomalies.json", rows)
+    assert all(0.0 <= row.low <= row.high <= 1.0 for row in found.select(metric="auc"))
+    again = []
+
+    def changed_again(*given):
+        again.append(given[-1])
+        return changed_episode(*given)
+
+    monkeypatch.setattr("studies.injections.changed_episode", changed_again)
+    anomalies("go2_walking", out=tmp_path, **options)
+    assert len(again) == 1  # One of those that are kept is simulated again.
+    assert repr(dict(Results.read(tmp_path / "anomalies.json"))) == repr(dict(found))
     assert found["anomalies.monitor.doubled.auc"].n <= 14
     found.entries["anomalies"] = found.entries
     page = render("anomalies", found)
@@ -197,22 +242,34 @@ def test_walking_is_judged_on_tours_pushes_commands_and_engines(monkeypatch, tmp
     results_of(tmp_path / "walking.json", rows)
 
 
-@pytest.mark.slow
-def test_a_gif_shows_every_instant_of_a_run_in_real_time(monkeypatch, tmp_path):
-    path = tmp_path / "run.gif"
-    options = ("--push", "ball", "--duration", 0.5, "--out", path)
-    assert study(monkeypatch, "animation", "laikago_balancing", *options) == 0
+def frames_of(path):
     with Image.open(path) as gif:
         assert gif.n_frames == 6
         assert gif.info["duration"] == 100
-        frames = []
         for i in range(gif.n_frames):
             gif.seek(i)
-            frames.append(np.asarray(gif.convert("RGB"), dtype=float))
-    robot = slice(0, round(0.75 * len(frames[0])))
-    # What is seen moves, and so does the curve of the probability below it.
-    assert np.abs(frames[0] - frames[-1])[robot].max() > 50.0
-    for before, after in itertools.pairwise(frames):
+            yield np.asarray(gif.convert("RGB"), dtype=float)
+
+
+@pytest.mark.slow
+def test_a_run_becomes_a_gif(monkeypatch, tmp_path):
+    path = tmp_path / "run.gif"
+    options = ("--push", "ball", "--duration", 0.5, "--out", path)
+    assert study(monkeypatch, "animation", "laikago_balancing", *options) == 0
+    first, *_, last = frames_of(path)
+    assert np.abs(first - last).max() > 50.0
+
+
+def test_a_gif_shows_every_instant_in_real_time(tmp_path):
+    loop = load_scenario("laikago_balancing").make_loop(ball=False)
+    positions = np.tile(loop.kinematics.standing_positions(), (6, 1))
+    positions[:, 6] += np.linspace(0.0, 0.1, 6)  # It rises.
+    gamma, path = np.linspace(1.0, 0.0, 6), tmp_path / "run.gif"
+    save_animation(loop, 0.1 * np.arange(6), positions, gamma, 0.5, path, [0.3])
+    # The robot moves, and so does the curve of the probability below it.
+    for before, after in itertools.pairwise(frames_of(path)):
+        robot = slice(0, round(0.75 * len(before)))
+        assert np.abs(before - after)[robot].max() > 50.0
         assert np.abs(before - after)[robot.stop :].max() > 50.0
 
 
@@ -228,9 +285,26 @@ def test_a_run_is_a_row_and_a_robot_with_its_figures(monkeypatch, capsys, tmp_pa
     runs = (tmp_path / "pendulum", tmp_path / "laikago_balancing")
     assert study(monkeypatch, "compare", *runs, "--out", tmp_path) == 0
     printed = capsys.readouterr().out
-    assert printed.count("95.0") == 2 and "40.0" in printed and "–" in printed
-    # Pendulums have no picture of their own.
+    # Two runs with three figures, each an interval, and with five dashes.
+    assert printed.count("95.0") == 2 and "40.0" in printed and printed.count("–") == 2 * (3 + 5)
     assert (tmp_path / "comparison.png").is_file()
+    assert study(monkeypatch, "compare", runs[0], "--out", tmp_path) == 0
+    assert "picture" not in capsys.readouterr().out  # A pendulum has none.
+
+
+def test_the_picture_shows_each_robot_with_what_its_run_says():
+    figures = {
+        "episodes.sharpened.auc": Estimate(0.95, 0.93, 0.97, 100),
+        "throws.falls_without_recovery": Estimate(0.4, 0.25, 0.55, 40),
+        "throws.sharpened.falls_with_recovery": Estimate(0.025, 0.0, 0.1, 40),
+    }
+    assert standing_still(shuttling().make_loop()) is None
+    still = standing_still(load_scenario("laikago_balancing").make_loop())
+    middle, corner = still[still.shape[0] // 2, still.shape[1] // 2], still[2, 2]
+    assert np.abs(middle.astype(int) - corner).max() > 20
+    (axes,) = comparison_figure({"laikago_balancing": figures}, {"laikago_balancing": still}).axes
+    assert axes.get_title(loc="left") == "laikago balancing"
+    assert axes.texts[0].get_text() == "AUC at planning time 0.950\nfalls 40 % → 2.5 %"
 
 
 def test_studies_are_stored_with_the_evaluation_of_their_run(monkeypatch, tmp_path):
@@ -249,9 +323,11 @@ def test_studies_are_stored_with_the_evaluation_of_their_run(monkeypatch, tmp_pa
 
 def test_documents_are_written_again_as_they_are(monkeypatch, tmp_path):
     monkeypatch.chdir(ROOT)
-    copy = shutil.copy(DOCUMENTS[1], tmp_path)
+    text, copy = DOCUMENTS[1].read_text(encoding="utf-8"), tmp_path / "results.md"
+    copy.write_text(re.sub(r"(<!-- results: [\w-]+ -->\n)", r"\1forged\n", text), encoding="utf-8")
+    assert "forged" in copy.read_text(encoding="utf-8")
     assert study(monkeypatch, "readme", copy) == 0
-    assert Path(copy).read_text() == DOCUMENTS[1].read_text()
+    assert copy.read_text(encoding="utf-8") == text
 
 
 def test_every_study_is_tried_and_says_in_a_sentence_what_it_does():

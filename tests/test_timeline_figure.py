@@ -50,7 +50,7 @@ def test_the_timeline_joins_each_still_to_its_instant_on_the_curve(run):
 def test_the_timeline_marks_throw_threshold_trigger_and_recovery(run):
     gamma = timeline_figure(**run).axes[2]
     labels = [text.get_text() for text in gamma.texts]
-    assert {"threshold 0.6", "3.0 kg, 8.0 m/s", "trigger", "recovery steps"} <= set(labels)
+    assert {"threshold 0.6", "3.0 kg, 8.0 m/s", "trigger", "recovery"} <= set(labels)
     marks = [line.get_xydata()[0].tolist() for line in gamma.lines if len(line.get_xydata()) == 1]
     assert [1.0, 0.6] in marks
     (span,) = [p for p in gamma.patches if to_hex(p.get_facecolor()) == RECOVERY_COLOUR]

@@ -14,7 +14,7 @@ from studies.walking import (
     speed_estimates,
     tour_estimates,
 )
-from studies.walking_motions import unusual_command
+from studies.walking_motions import run_motions, run_push, unusual_command
 
 ALARM = Alarm(name="value", value=lambda motion: motion["features"][:, 0])
 
@@ -91,3 +91,15 @@ def test_unusual_commands_are_past_the_ranges_and_usual_ones_inside():
         assert np.all(inside >= limits.lowest) and np.all(inside <= limits.highest)
         past = unusual_command(loop, rng)
         assert np.any(past < limits.lowest) or np.any(past > limits.highest)
+
+
+def test_a_motion_that_is_kept_is_the_one_that_was_simulated(tmp_path):
+    scenario, options = load_scenario("go2_walking"), {"seed": 3, "duration_s": 0.4}
+    (kept,) = run_motions(scenario, "push", [2], folder=tmp_path, num_workers=1, **options)
+    motion = run_push(scenario.make_loop(), 2, **options)
+    np.testing.assert_array_equal(kept.time_s, motion.time_s)
+    for name in ("index", "cause", "push_time_s", "leave_time_s", "fall_time_s"):
+        assert getattr(kept, name) == getattr(motion, name)
+    assert kept.ports.keys() == motion.ports.keys()
+    for port, rows in motion.ports.items():
+        np.testing.assert_array_equal(kept[port], rows.astype(np.float32))

@@ -105,11 +105,14 @@ def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     app.callback()(_common)
+    is_listed = not any(name in called for name in COMMANDS)
     for name, (module, *_) in COMMANDS.items():
         function: Any = _not_called
+        line = _line(module, name) if is_listed else None
         if name in called:
             function = getattr(import_module(f"drake_safety.cli.{module}"), name)
-        app.command(name, cls=_Command, short_help=_line(module, name))(function)
+            line = (function.__doc__ or "").splitlines()[0]
+        app.command(name, cls=_Command, short_help=line)(function)
     return app
 
 
@@ -136,9 +139,10 @@ def _called() -> list[str]:
 
 def _print_version(is_wanted: bool) -> None:
     if is_wanted:
-        package, drake = (installed_versions("drake")[name] for name in ("drake_safety", "drake"))
-        python = sys.version.split()[0]
-        console.say(f"drake-safety {package}, drake {drake}, Python {python}")
+        found, python = installed_versions("drake"), sys.version.split()[0]
+        console.say(
+            f"drake-safety {found['drake_safety']}, drake {found['drake']}, Python {python}"
+        )
         raise typer.Exit()
 
 

@@ -145,8 +145,13 @@ def _kept(
 ) -> dict[str, Any]:
     """Options of simulations of an actual plant that the folder of a training keeps."""
     path = folder / "feedback" / f"{scenario.simulation_hash(variation)[:12]}-{seed}"
-    made = {"extra": {"command": console.command_line()}}
-    return {"variation": variation, "seed": seed, "num_workers": workers, "path": path, **made}
+    return {
+        "variation": variation,
+        "seed": seed,
+        "num_workers": workers,
+        "path": path,
+        "extra": {"command": console.command_line()},
+    }
 
 
 def paired_episodes(
@@ -208,18 +213,24 @@ def log_pieces(
 
 
 def _print_changes(
-    scenario: Scenario, adapted: Mapping[str, Any], differing: int, num_pairs: int, variation: str
+    scenario: Scenario,
+    adapted: Mapping[str, SafetyAssessment],
+    differing: int,
+    num_pairs: int,
+    variation: str,
 ) -> None:
     """Prints what has changed; or that pairs that all end alike change nothing, and what does."""
-    changes = {}
+    changes, methods = {}, {}
     for mode, one in adapted.items():
         changes[mode] = ["-"] * 3
-        if one.adaptation_.method == "recalibration":
+        assert one.adaptation_ is not None
+        methods[mode] = one.adaptation_.method
+        if methods[mode] == "recalibration":
             change = one.correction_.change
             is_any = one.correction_.is_any
             changes[mode] = [f"{value:+.2f}" if is_any else _UNCHANGED for value in change]
     columns = ("mode", "method", "added to the offset", "safety slope", "margin slope")
-    rows = [(mode, adapted[mode].adaptation_.method, *change) for mode, change in changes.items()]
+    rows = [(mode, methods[mode], *change) for mode, change in changes.items()]
     title = f"Adapted to '{variation}': {differing} of {num_pairs} pairs end differently"
     console.show(console.new_table(*columns, rows=rows, title=title))
     unchanged = [mode for mode, change in changes.items() if _UNCHANGED in change]

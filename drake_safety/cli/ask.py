@@ -108,10 +108,9 @@ def print_verdict(
         lines["belief"] = f"safe {safe:.2f}, unsafe {unsafe:.2f}, don't know {unknown:.2f}"
     if not verdict.is_accepted and verdict.cause:
         margin, masses = verdict.cause_margin, verdict.cause_probability
-        cause = describe_margin(verdict.cause, margin, loop.angular_constraints)
+        lines["likely cause"] = describe_margin(verdict.cause, margin, loop.angular_constraints)
         if not np.isfinite(margin):
-            cause = f"{verdict.cause} ({100 * masses.max() / masses.sum():.0f} %)"
-        lines["likely cause"] = cause
+            lines["likely cause"] += f" ({100 * masses.max() / masses.sum():.0f} %)"
     if nearest is not None:
         distance = words.distance(nearest.goal - verdict.goal)
         told = f"{distance} away, probability {nearest.probability:.3f}"

@@ -72,7 +72,7 @@ def calibrate(
             **loaded.options_for("pairs", plant),
         )
     segments = split(fresh, stride=1, discount=1.0, shortest=1)
-    promise: dict[str, Any] = {
+    common: dict[str, Any] = {
         "miss_rate": miss_rate,
         "false_alarm_rate": false_alarm_rate,
         "confidence": confidence,
@@ -84,7 +84,7 @@ def calibrate(
     for mode, gamma in learned.items():
         score = assessment_scorer(mode, gamma).unsafe_score(segments)
         scores = {kind: episode_scores(segments, score, kind) for kind in KINDS}
-        found[mode] = [choose(*scores[kind], kind=kind, **promise) for kind in KINDS]
+        found[mode] = [choose(*scores[kind], kind=kind, **common) for kind in KINDS]
     for mode, gamma in learned.items():
         gamma.adopt_calibrations(found[mode], fresh.info, len(fresh))
         gamma.save(folders.assessment_file(folder.out, mode))

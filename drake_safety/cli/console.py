@@ -64,7 +64,11 @@ HandOption = Annotated[
     str | None, Option("--hand", help="Reaching hand; the trained one by default.")
 ]
 RecoveryOption = Annotated[
-    bool | None, Option("--recovery/--no-recovery", help="Recovery; the task's default.")
+    bool | None,
+    Option(
+        "--recovery/--no-recovery",
+        help="Whether Γ triggers recovery; by default in balancing, not in walking.",
+    ),
 ]
 WorkersOption = Annotated[
     int | None, Option("--workers", help="Worker processes; one a core by default.")
@@ -73,7 +77,8 @@ ClusterOption = Annotated[
     str | None,
     Option(
         "--cluster",
-        help="Address of dask's scheduler, such as tcp://10.0.0.1:8786, whose workers simulate.",
+        help="Address of dask's scheduler, such as tcp://10.0.0.1:8786, whose workers simulate in "
+        "place of this machine's; without --workers.",
     ),
 ]
 LOOPBACK = "127.0.0.1"

@@ -24,11 +24,7 @@ from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
-from drake_safety.evaluation.shift_study import (
-    Judge,
-    JudgedShift,
-    MotionSet,
-)
+from drake_safety.evaluation.shift_study import Judge, JudgedShift, MotionSet
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
 from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws, trigger_rules
@@ -36,7 +32,7 @@ from drake_safety.evaluation.verdict_tables import verdict_tables
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
-from drake_safety.learning.calibration import PLAN, episode_scores
+from drake_safety.learning.calibration import MOTION, PLAN, episode_scores
 from drake_safety.learning.seeds import EVALUATION, FRESH_MOTION, SHIFTS, SeedBlock
 from drake_safety.learning.segments import Episode, Episodes, Segments, split
 from drake_safety.simulation.capabilities import HasBall, HasGoals, require
@@ -48,7 +44,7 @@ _DEFAULT_THROWS = 600
 _MOST_JUDGED = 1000  # Nominal motions under `--shifts`.
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Evaluation:
     """An evaluation under way: what is judged, where the results go, and what was found.
 
@@ -105,7 +101,9 @@ def evaluate(
     scenario: console.ScenarioArgument,
     assessment: console.TrainingOption,
     episodes: Annotated[int, Option(help="Fresh nominal episodes.", min=1)] = 1000,
-    calibration_episodes: Annotated[int, Option(help="Others, for thresholds.", min=20)] = 300,
+    calibration_episodes: Annotated[
+        int, Option(help="Other nominal ones, for thresholds.", min=20)
+    ] = 300,
     throws: Annotated[
         int | None,
         Option(help="Fresh throws at the actual plant; 600 for tasks with recovery.", min=0),
@@ -165,16 +163,24 @@ def evaluating(
     tables: Callable[[Results], Sequence[Table]] = verdict_tables,
     program: str = "drake-safety",
 ) -> Iterator[Evaluation]:
-    """An evaluation of a run in the block of the statement; then its results are written.
+    """Yields an evaluation of a run; after the `with` statement its results are written.
 
-    Seeds are those of a block, and begin at `seed` or the default.
+    Seeds are those of `block`, from `seed` or its default on.
     """
     assessments = {mode: folders.load_assessment(run_folder, mode) for mode in MODES}
     seeds = block.seeds(seed)
     for gamma in assessments.values():
         folders.check_fresh(gamma, scenario, seeds.values())
     with console.open_stages() as stages:
-        evaluation = Evaluation(scenario, assessments, run_folder, folder, seeds, workers, stages)
+        evaluation = Evaluation(
+            scenario=scenario,
+            assessments=assessments,
+            run_folder=run_folder,
+            folder=folder,
+            seeds=seeds,
+            workers=workers,
+            stages=stages,
+        )
         yield evaluation
     sharpened = assessments[MODES[0]]
     trained = next(one for one in sharpened.used_ if one.purpose == "training")
@@ -189,7 +195,7 @@ def evaluating(
     results = Results(evaluation.estimates, made | evaluation.entries)
     file = folder / ("shifts.json" if block is SHIFTS else "evaluation.json")
     results.write(file)
-    for table in shift_study.shifts_tables(results) if block is SHIFTS else tables(results):
+    for table in [*tables(results), *shift_study.shifts_tables(results)]:
         console.show(table.to_rich())
     console.say(sharpened.detector_.describe())
     console.say("figures", file)
@@ -278,9 +284,9 @@ def add_shifts(
     scenario, seed, stages = evaluation.scenario, evaluation.seeds["shifts"], evaluation.stages
     folder, workers = evaluation.run_folder, evaluation.workers
     nominal = shift_study.motions_of(evaluation.fresh("nominal motions", num_nominal, "shifts"))
-    promise = gamma.calibrations_.get("motion")
+    promise = gamma.calibrations_.get(MOTION)
     found: dict[str, Estimate] = {}
-    sets: dict[str, shift_study.MotionSet] = {"nominal": ("nominal", nominal[:_MOST_JUDGED])}
+    sets: dict[str, MotionSet] = {"nominal": ("nominal", nominal[:_MOST_JUDGED])}
     shifts = plant_shifts(scenario, scenario.make_loop())
     for i, (name, shift) in enumerate(shifts.items()):
         stages("shifted motions", i, len(shifts))
@@ -304,7 +310,7 @@ def add_shifts(
         num_nominal * scenario.episode_duration_s,
         seed=FRESH_MOTION.first,
         num_workers=workers,
-        path=folder / "fresh" / "motion",
+        path=folders.fresh_episodes_folder(folder, "motion", FRESH_MOTION.first, {}),
         progress=partial(stages, "undisturbed nominal motion"),
     )
     alarms = monitor_study.false_alarms(usual, gamma.detector_)

@@ -51,7 +51,9 @@ def new(
     ] = None,
     motors: Annotated[
         str | None,
-        Option(help="Joints in the order of the motors, with commas, for a deploy.yaml."),
+        Option(
+            help="Joints in the order of the motors, with commas: a deploy.yaml only numbers them."
+        ),
     ] = None,
     feet: Annotated[
         str | None, Option(help="Links that touch the ground, with commas; the lowest by default.")
@@ -138,8 +140,9 @@ def check(
             scenario, num_episodes=num_episodes, seed=seed, is_imported=import_, progress=stages
         ):
             num_problems += not finding.is_ok
-            word = ("OK     ", "green") if finding.is_ok else ("problem", "red")
-            word = ("warning", "bold yellow") if finding.is_warning else word
+            word = ("problem", "red")
+            if finding.is_ok:
+                word = ("warning", "bold yellow") if finding.is_warning else ("OK     ", "green")
             text = Text.assemble(word, f"  {finding.item}: {finding.message}")
             if finding.remedy:
                 text.append(f"\n         fix: {finding.remedy}")
@@ -158,6 +161,8 @@ def check(
     if not import_:
         console.say("its files are right; its code was not run")
         return
-    if quick:
-        console.say("not checked: the share of unsafe episodes; leave out --quick before you train")
+    if not num_episodes:
+        console.say(
+            "not checked: the share of unsafe episodes; check without --quick before you train"
+        )
     console.say("ready: drake-safety train", scenario, "--out FOLDER")

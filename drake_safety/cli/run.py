@@ -60,8 +60,10 @@ def run(
     assessment: console.AssessmentOption = None,
     target: console.TargetOption = None,
     hand: console.HandOption = None,
-    force: Annotated[bool, Option("--force", help="Go there even if Γ refuses it.")] = False,
-    guard: Annotated[bool, Option("--guard", help="Pass on the nearest accepted command.")] = False,
+    force: Annotated[bool, Option("--force", help="Go to the target even if Γ refuses.")] = False,
+    guard: Annotated[
+        bool, Option("--guard", help="Pass on the nearest accepted command instead.")
+    ] = False,
     push: Annotated[
         list[str] | None,
         Option(
@@ -74,14 +76,18 @@ def run(
     recovery: console.RecoveryOption = None,
     duration: Annotated[
         float | None,
-        Option(help="Seconds: by default 5 with balls, else an episode, +1 to a target.", min=0.1),
+        Option(help="Seconds: by default 5 with balls, an episode, one more to a target.", min=0.1),
     ] = None,
     seed: Annotated[int, Option(help="Seed of start, plan and noise.")] = DEMONSTRATION.first,
     mode: console.ModeOption = MODES[0],
     out: Annotated[
-        Path | None, Option(help="Folder; by default ASSESSMENT, or else runs/SCENARIO-shipped.")
+        Path | None,
+        Option(
+            help="Folder of run/: recording, figures, events; by default ASSESSMENT, or else "
+            "runs/SCENARIO-shipped."
+        ),
     ] = None,
-    meshcat: Annotated[bool, Option("--meshcat", help="Show it live in the browser.")] = False,
+    meshcat: Annotated[bool, Option("--meshcat", help="Show it live, in real time.")] = False,
     host: console.HostOption = console.LOOPBACK,
 ) -> None:
     """Simulate once with Γ in the loop; write a recording, a timeline and the events.

@@ -34,7 +34,10 @@ def train(
     out: Annotated[Path, Option(help="Folder for episodes and assessments.")],
     episodes: Annotated[int, Option(help="Nominal training episodes.", min=1)] = 2048,
     seed: Annotated[int, Option(help="Seed of the episodes.")] = TRAINING.first,
-    motion: Annotated[float, Option(help="Minutes of motion for the monitor.", min=0.0)] = 48.0,
+    motion: Annotated[
+        float,
+        Option(help="Minutes of undisturbed motion, half for the monitor's limits.", min=0.0),
+    ] = 48.0,
     mode: Annotated[
         str, Option(help="'sharpened', 'paper' (the method as published), or 'both'.")
     ] = "both",
@@ -56,9 +59,9 @@ def train(
         options = folders.training_options(loaded, name)
         sets[out / (f"episodes_{name}" if options else "episodes")] = options
     for folder in sets:
-        if folder.exists() and completed(folder) and not resume:
+        if not resume and folder.exists() and (kept := completed(folder)):
             raise ValueError(
-                f"{folder} already holds {len(completed(folder))} episodes: pass --resume to "
+                f"{folder} already holds {len(kept)} episodes: pass --resume to "
                 "continue with them, or choose another --out"
             )
     folders.check_writable(out)
@@ -128,7 +131,7 @@ def _learn(
 ) -> tuple[str, str, str, str]:
     """Trains and saves one mode; returns its row of the table.
 
-    Without a detector, of undisturbed motion, it is learned from the episodes.
+    Without a detector, one is learned from the episodes.
     """
     started = time.process_time()
     scenario.assessment.mode = mode  # type: ignore[assignment]  # Checked before.

@@ -106,7 +106,7 @@ def _draw_causes(
     # The first colour of the series is that of safe.
     series = [*map(to_rgb, style.SERIES_COLOURS)]
     palette = np.array([series[(1 + i) % len(series)] for i in range(len(names))])
-    cause = cells[:, UNCERTAINTY + 1 :].argmax(axis=1)
+    cause = cells[:, 3:].argmax(axis=1)  # See `learning.beliefs`.
     is_empty = cells[:, UNCERTAINTY] >= 1.0
     # From white, nothing unsafe, to the colour of the cause, all that is known unsafe.
     depth = (cells[:, UNSAFE] / np.where(is_empty, 1.0, 1.0 - cells[:, UNCERTAINTY]))[:, None]

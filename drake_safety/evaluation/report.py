@@ -48,10 +48,7 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
             "`drake-safety train` and `evaluate` write them"
         )
     infos = [assessment.info_ for assessment in assessments.values()]
-    tables = [
-        (one, [*verdict_tables(one), *(shifts_tables(one) if one.has("shifts.") else [])])
-        for one in results
-    ]
+    tables = [(one, [*verdict_tables(one), *shifts_tables(one)]) for one in results]
     columns = {one.key: one for _, found in tables for table in found for one in table.columns}
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True

@@ -90,6 +90,7 @@ class JudgedShift:
         motion: Motion of each row, (N,).
         first: First row of each motion, (M,).
         is_unsafe: Whether each motion ends unsafely, (M,).
+        assessment: Γ, with its promises.
     """
 
     def __init__(
@@ -147,8 +148,10 @@ def evaluate_shifts(
 
 
 def shifts_tables(results: Results) -> list[Table]:
-    """The table of all shifts."""
+    """The table of all shifts, if there are any."""
     sets = dict.fromkeys(row.set for row in results.values() if row.set.startswith("shifts."))
+    if not sets:
+        return []
     false = results.get("shifts.nominal.monitor.false_alarms_per_hour")
     meaning = _MEANING
     if false is not None:

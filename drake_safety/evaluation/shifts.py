@@ -13,6 +13,7 @@ import numpy as np
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS
 from drake_safety.robots.robot import ObservationNoise, Payload, PlantVariation
 from drake_safety.robots.robot_model import by_pattern
+from drake_safety.robots.robot_size import GRAVITY_M_S2
 from drake_safety.robots.shift import Fault, JointShift, Shift
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -57,11 +58,11 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     plant = kinematics.plant
     motors = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
     limit = next(motor.effort_limit() for motor in motors if motor.joint().name() == joint)
-    weak_scale = 0.9 * torques[loaded] / limit  # It does not hold the standing posture.
+    weak_scale = 0.9 * torques[loaded] / limit  # Too weak to stand.
     late_s = _whole(5 * scenario.control_period_s, scenario.time_step_s)
     lasting = {
         "slope": Shift(slope_rad=math.radians(10.0)),
-        "side_force": Shift(base_force_n=[0.0, 0.1 * mass_kg * 9.81, 0.0]),
+        "side_force": Shift(base_force_n=[0.0, 0.1 * mass_kg * GRAVITY_M_S2, 0.0]),
         "weak_joint": Shift(joints={joint: JointShift(effort_scale=weak_scale)}),
         "locked_joint": Shift(joints={joint: JointShift(is_locked=True)}),
         "late_command": Shift(command_delay_s=late_s),

@@ -49,6 +49,7 @@ class _Event:
     words: str
     colour: str
     line: _Style | None = None
+    is_ball: bool = False
 
 
 def timeline_figure(
@@ -100,7 +101,7 @@ def timeline_figure(
                 f"timeline_figure: a still at {instant} s is outside {time_s[0]}..{time_s[-1]} s"
             )
     events = [
-        _Event(one.time_s, f"{one.mass_kg:.1f} kg, {one.speed_m_s:.1f} m/s", style.INK, _BALL)
+        _Event(one.time_s, f"{one.mass_kg:.1f} kg, {one.speed_m_s:.1f} m/s", style.INK, _BALL, True)
         for one in throws
     ]
     for push in pushes:
@@ -111,7 +112,7 @@ def timeline_figure(
     if math.isfinite(leave_time_s):
         events.append(_Event(leave_time_s, "leaves the safe set", style.INK, _LEAVING))
     for start, _ in recovery_intervals_s:
-        events.append(_Event(start, "recovery steps", style.RECOVERY_COLOUR))
+        events.append(_Event(start, "recovery", style.RECOVERY_COLOUR))
     rows = _label_rows(events, time_s[0], time_s[-1])
     heights = [_CURVE_HEIGHT + _LABEL_ROW_HEIGHT * (max(rows, default=-1) + 1)]
     if belief is not None:
@@ -277,7 +278,7 @@ def _draw_labels(
     start_s, end_s = axes.get_xlim()
     for label, row in zip(labels, rows, strict=True):
         place = (label.time_s, top - (row + 0.5) * row_height)
-        if label.line is _BALL:
+        if label.is_ball:
             axes.plot(*place, "o", color=style.BALL_COLOUR, markersize=8, clip_on=False, zorder=5)
         length = (len(label.words) * _LETTER_WIDTH + _LABEL_OFFSET) / (_WIDTH - 2.0)
         is_late = label.time_s + length * (end_s - start_s) > end_s

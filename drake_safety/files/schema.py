@@ -5,18 +5,20 @@ from __future__ import annotations
 import functools
 import json
 import re
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import MISSING, asdict, fields, is_dataclass
+from enum import Enum
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
+import numpy as np
 import pydantic
 import pydantic.dataclasses
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat
 
 from drake_safety.files.reading import did_you_mean, parse_yaml, reading, shortened
 
-_STRICT = ConfigDict(extra="forbid", defer_build=True)
+_NO_OTHER_KEYS = ConfigDict(extra="forbid", defer_build=True)
 _UNKNOWN = "unexpected_keyword_argument"
 _Value = TypeVar("_Value")
 
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     # For mypy, only this one makes a class that `dataclasses.replace` takes.
     from dataclasses import dataclass as schema
 else:
-    schema = functools.partial(pydantic.dataclasses.dataclass, config=_STRICT)
+    schema = functools.partial(pydantic.dataclasses.dataclass, config=_NO_OTHER_KEYS)
     """A dataclass whose constructor checks the types and ranges of its annotations."""
 
 
@@ -73,10 +75,11 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
     """
     try:
         text = json.dumps({"value": _completed(schema, raw)}, default=_plain)
-        known: Any = schema
-        document: Any = _document(known).model_validate_json(text, strict=True)
     except TypeError as error:  # A key that is no text.
         raise ValueError(f"{who}: {error}") from None
+    known: Any = schema  # For mypy, the cache wants what can be hashed.
+    try:
+        document: Any = _document(known).model_validate_json(text, strict=True)
     except pydantic.ValidationError as error:
         # An unknown key may be the reason for the others.
         first = min(error.errors(), key=lambda one: one["type"] != _UNKNOWN)
@@ -94,15 +97,20 @@ def load_typed_file(schema: type[_Value], path: Path, who: str) -> _Value:
 
 @functools.cache
 def _document(schema: Any) -> type[pydantic.BaseModel]:
-    # Inside it, dataclasses of the standard library, such as a user's task has, are strict too.
-    return pydantic.create_model("Document", __config__=_STRICT, value=(schema, ...))
+    # Inside it, dataclasses of the standard library, such as a user's task has, refuse them too.
+    return pydantic.create_model("Document", __config__=_NO_OTHER_KEYS, value=(schema, ...))
 
 
 def _completed(schema: Any, raw: Any) -> Any:
-    try:
-        return _merged(schema(), raw)
-    except (TypeError, ValueError):
-        return raw  # It has keys without a default.
+    """What is stated, with the rest of nested defaults that are stated in part."""
+    if not (is_dataclass(schema) and isinstance(raw, dict)):
+        return raw
+    defaults = {
+        one.name: one.default if one.default_factory is MISSING else one.default_factory()
+        for one in fields(schema)
+        if isinstance(raw.get(one.name), dict)
+    }
+    return {key: _merged(defaults.get(key), one) for key, one in raw.items()}
 
 
 def _merged(default: Any, raw: Any) -> Any:
@@ -114,12 +122,18 @@ def _merged(default: Any, raw: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Enum):
+        return value.value
     return asdict(value) if is_dataclass(value) and not isinstance(value, type) else str(value)
 
 
 def _message(schema: Any, error: Any) -> str:
     """The path of a key, what it must be, what it is, and what may have been meant."""
-    place, kind, got = error["loc"][1:], error["type"], shortened(repr(error["input"]))
+    # pydantic names a key that is wrong itself by the mark that follows it.
+    place = tuple(one for one in error["loc"][1:] if one != "[key]")
+    kind, got = error["type"], shortened(repr(error["input"]))
     name = f"'{'.'.join(map(str, place))}'" if place else "this"
     if kind == _UNKNOWN:
         known = _keys(schema, place[:-1])

@@ -177,8 +177,7 @@ class SafetyAssessment:
             parameters.novelty_rate,
             plan=columns.plan,
         )
-        detector = ChangeDetector.fit(episodes) if detector is None else detector
-        stage_of(progress, "monitor")(1.0)
+        detector = detector or ChangeDetector.fit(episodes, stage_of(progress, "monitor"))
         return {
             "info_": info,
             "grid_": grid,
@@ -355,7 +354,7 @@ class SafetyAssessment:
             novelty: Says which inputs are novel; `novelty_` by default.
 
         Returns:
-            The assessments. Novel inputs and those that are not finite get the empty belief, whose
+            The prediction. Novel inputs and those that are not finite get the empty belief, whose
             probability is 0. A row has the same bits whatever the others are.
 
         Raises:

@@ -174,7 +174,7 @@ def _learned(
         "info_": info,
         "grid_": Grid.of(parameters),
         "columns_": columns,
-        # Files from before the range was stored have none: their maps extrapolate.
+        # Maps of the paper's mode, and of files from before the range was stored, extrapolate.
         "embedding_": Embedding(
             group("embedding."),
             num_margins=numbers["num_margins"],

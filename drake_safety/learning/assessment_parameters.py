@@ -1,6 +1,6 @@
 """The schema of a scenario's `assessment`: parameters of training and adaptation."""
 
-from dataclasses import field, replace
+from dataclasses import asdict, field
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -12,6 +12,7 @@ from drake_safety.files.schema import (
     Positive,
     Share,
     ShareBelowOne,
+    load_typed,
     schema,
 )
 from drake_safety.learning.distance import Backend, WarpingCost
@@ -203,4 +204,4 @@ class AssessmentParameters:
 
     def check(self) -> None:
         """Checks all values, which may have been set since the construction."""
-        replace(self, paper=replace(self.paper), adaptation=replace(self.adaptation))
+        load_typed(type(self), asdict(self), type(self).__name__)

@@ -25,8 +25,10 @@ from drake_safety.learning.segments import Segments
 
 SAFE, UNSAFE, UNKNOWN = "safe", "unsafe", "don't know"
 """The verdicts."""
-PLAN, MOTION = "plan", "motion"
+Kind = Literal["plan", "motion"]
 """Score of an episode: that of its first row, at planning time, or that of its worst row."""
+PLAN: Kind = "plan"
+MOTION: Kind = "motion"
 KINDS = (PLAN, MOTION)
 
 _BELOW_ALL = 1e-6  # Distance of a threshold below the lowest score, robust against rounding.
@@ -53,7 +55,7 @@ class Calibration:
         variation: The plant of the episodes, for which alone the rates are promised.
     """
 
-    kind: Literal["plan", "motion"]
+    kind: Kind
     miss_rate: Share
     false_alarm_rate: Share
     confidence: Share | None
@@ -106,7 +108,7 @@ def calibrate(
     unsafe_score: np.ndarray,
     is_unsafe: np.ndarray,
     *,
-    kind: str,
+    kind: Kind,
     miss_rate: float,
     false_alarm_rate: float = 0.05,
     confidence: float | None = None,
@@ -132,7 +134,7 @@ def calibrate(
     # The same rule for the safe class, with the order of the scores reversed.
     below = -score_threshold(-score, ~label, false_alarm_rate, confidence=confidence, whose="safe")
     return Calibration(
-        kind=kind,  # type: ignore[arg-type]  # The schema refuses others.
+        kind=kind,
         miss_rate=miss_rate,
         false_alarm_rate=false_alarm_rate,
         confidence=confidence,

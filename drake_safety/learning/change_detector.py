@@ -19,7 +19,7 @@ from drake_safety.learning.state_predictor import StatePredictor
 TIME_CONSTANTS_S = (0.1, 0.5, 2.0)
 """Memories of the charts."""
 FALSE_ALARMS_PER_HOUR = 0.1
-"""For which the limits are made: at most one in ten hours of nominal motion."""
+"""Rate to which the limits are extrapolated: one in ten hours of nominal motion."""
 LEAST_MOTION_S = 360.0
 """Motion for the limits, below which there is no alarm."""
 MOST_PREDICTOR_S = 3600.0

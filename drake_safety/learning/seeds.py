@@ -21,7 +21,7 @@ class SeedBlock(NamedTuple):
     """Consecutive seeds, one for each set of episodes that a command draws.
 
     Attributes:
-        first: Default of the first seed; the blocks are 100 000 apart.
+        first: Default of the first seed; the blocks are at least 100 000 apart.
         purposes: Purposes of the sets, in the order of their seeds.
     """
 
@@ -50,7 +50,7 @@ SHIFTS = SeedBlock(8_000_000, ("shifts",))
 MOTION = SeedBlock(9_000_000, ("motion", "motion of the actual robot"))
 """Undisturbed motion, of which a monitor learns what is usual."""
 FRESH_MOTION = SeedBlock(9_100_000, ("fresh motion",))
-"""Undisturbed motion that shows how often it alarms."""
+"""Undisturbed motion that shows how often the monitor alarms."""
 ANOMALIES = SeedBlock(10_000_000, ("unperturbed", "perturbed", "thresholds"))
 """Motion with and without an anomaly, and that for thresholds."""
 BLOCKS = (

@@ -28,7 +28,7 @@ RECORDED = (
 )
 """Arrays that an episode holds per row, besides its time."""
 LARGEST = 1e12
-"""Any quantity in SI units is smaller; a larger one means that the simulation diverged."""
+"""Any quantity in SI units is smaller; a larger one is an error of a log, or a divergence."""
 DIVERGED = "diverged"
 """Cause of an episode whose simulation failed; it has no safety label."""
 

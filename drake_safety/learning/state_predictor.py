@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_safety.files.progress import ignore
+from drake_safety.learning.maps import one_torch_thread
 
 HIDDEN_SIZES = (256, 256)
 """Units of the hidden layers."""
@@ -52,8 +53,6 @@ class StatePredictor:
         """Learns from inputs (K, n_u) and states (K, n_w) of motions of at least three rows."""
         import torch
 
-        from drake_safety.learning.maps import one_torch_thread
-
         every = np.concatenate(inputs)
         mean, scale = every.mean(axis=0), np.maximum(every.std(axis=0), _SMALLEST_SPREAD)
         change = np.concatenate([np.diff(one, axis=0)[1:] for one in states])
@@ -83,6 +82,7 @@ class StatePredictor:
                 schedule.step()
                 if step % 50 == 0:
                     progress(step / num_steps)
+        progress(1.0)
         weights = {k: v.detach().numpy().T.copy() for k, v in network.state_dict().items()}
         return replace(start, weights=weights)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_safety.logs.log_map import TIME_UNITS
+from drake_safety.logs.log_map import TIME_UNITS, TimeUnit
 
 _MANY = 40  # Largest number of names in a message.
 
@@ -28,7 +28,7 @@ class Channel:
     path: Path
     topic: str
     time: np.ndarray
-    time_unit: str
+    time_unit: TimeUnit
     time_name: str
     columns: dict[str, np.ndarray]
     row_name: str

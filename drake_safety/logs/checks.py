@@ -10,12 +10,12 @@ import numpy as np
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.observation import quaternion_of
+from drake_safety.learning.segments import LARGEST
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, ORDERS, TIME_UNITS, LogMap
 
 MIN_ROWS = 3
 """Least number of rows, for derivatives."""
-_LARGEST = 1e12  # Of any quantity in SI units.
 _INTERVALS_S = (1e-4, 0.5)  # Range of the median time between two rows.
 _NORM_TOLERANCE = 0.01
 _MAX_TILT_RAD = math.radians(60.0)
@@ -82,13 +82,13 @@ def check_finite(channel: Channel) -> None:
         row = rows[name]
         raise ValueError(
             f"{channel.where(row, name)}: the value is {channel.columns[name][row]}, expected a "
-            f"finite number below {_LARGEST:g}"
+            f"finite number below {LARGEST:g}"
         )
 
 
 def bad_values(channel: Channel) -> dict[str, np.ndarray]:
     """Returns which values are missing, not finite or absurdly large, (N,) by column."""
-    return {name: ~(np.abs(values) < _LARGEST) for name, values in channel.columns.items()}
+    return {name: ~(np.abs(values) < LARGEST) for name, values in channel.columns.items()}
 
 
 def check_norms(channel: Channel, names: list[str]) -> None:
@@ -147,8 +147,8 @@ def check_stillness(
     but the feet seem to slip twice as far as the base moves.
     """
     other = copy.deepcopy(log_map)
-    is_first = log_map.base_orientation.order == "wxyz"
-    other.base_orientation.order = "xyzw" if is_first else "wxyz"
+    order = log_map.base_orientation.order
+    other.base_orientation.order = "xyzw" if order == "wxyz" else "wxyz"
     slips = []
     for read_by in (log_map, other):
         feet = np.array([kinematics.contact_positions(q) for q in positions(read_by)])

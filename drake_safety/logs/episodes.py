@@ -12,6 +12,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import planar_pose
 from drake_safety.learning.assessment_parameters import AssessmentParameters
+from drake_safety.learning.mode_settings import mode_settings
 from drake_safety.learning.seeds import NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.logs.conversion import values_at
@@ -138,7 +139,7 @@ class _Rows(NamedTuple):
 
 def shortest_steps(assessment: AssessmentParameters) -> int:
     """Least number of steps of a safe part of a log that gives an episode."""
-    return assessment.preview_stride * (assessment.shortest_segment or assessment.horizon)
+    return assessment.preview_stride * mode_settings(assessment).shortest
 
 
 def _by_log(logs: Sequence[RobotLog]) -> list[list[RobotLog]]:

@@ -2,27 +2,27 @@
 
 from dataclasses import field
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 from drake_safety.files.schema import Positive, load_typed_file, schema
 
-TIME_UNITS = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}
+TimeUnit = Literal["s", "ms", "us", "ns"]
+LengthUnit = Literal["m", "mm"]
+AngleUnit = Literal["rad", "deg"]
+Order = Literal["wxyz", "xyzw"]
+TIME_UNITS: dict[TimeUnit, int] = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}
 """Units per second."""
-LENGTH_UNITS = {"m": 1.0, "mm": 1e-3}
+LENGTH_UNITS: dict[LengthUnit, float] = {"m": 1.0, "mm": 1e-3}
 """Metres per unit; for velocities, per second."""
-ANGLE_UNITS = {"rad": 1.0, "deg": 0.017453292519943295}
+ANGLE_UNITS: dict[AngleUnit, float] = {"rad": 1.0, "deg": 0.017453292519943295}
 """Radians per unit; for rates, per second."""
-ORDERS = ("wxyz", "xyzw")
+ORDERS = get_args(Order)
 """Orders of a quaternion's columns."""
 _NO_POSITION = (
     ": a log of joints and an inertial measurement unit has none; a state estimator for legged "
     "robots adds it, such as MUSE, Pronto or invariant-ekf (docs/logs.md, 'Logs without a base "
     "position')"
 )
-
-
-LengthUnit = Literal["m", "mm"]
-AngleUnit = Literal["rad", "deg"]
 
 
 @schema(kw_only=True)
@@ -32,7 +32,7 @@ class LogTime:
     column: str = ""
     """The column, or the field of every message (``header.stamp``); empty for the recording time
     of messages."""
-    unit: Literal["s", "ms", "us", "ns"] = "s"
+    unit: TimeUnit = "s"
     """Unit of a number; ignored for ROS stamps, recording times and dates."""
 
 
@@ -66,7 +66,7 @@ class Orientation(_Columns):
     """The base's orientation in the world, a quaternion."""
 
     multiple: ClassVar[int] = 4
-    order: Literal["wxyz", "xyzw"] = "wxyz"
+    order: Order = "wxyz"
     """Order of the columns."""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.files.schema import load_typed
 from drake_safety.logs import checks
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.conversion import (
@@ -179,7 +180,9 @@ def _opened(
     step_s: float | None,
 ) -> tuple[Path, LogMap, RobotKinematics, dict[str, Channel]]:
     path = Path(path)
-    if not isinstance(log_map, LogMap):
+    if isinstance(log_map, LogMap):  # Its values may have been set since the construction.
+        log_map = load_typed(LogMap, asdict(log_map), "map")
+    else:
         log_map = load_log_map(Path(log_map))
     if step_s is not None and not step_s > 0:
         raise ValueError(f"read_log: step_s must be positive; got {step_s}")

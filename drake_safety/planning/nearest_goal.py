@@ -81,8 +81,10 @@ def nearest_accepted_goal(
         return None
     box = require(loop, HasGoals).target_box
     near = _Search(loop, assessment, goal, box, stricter, resolution_m)
-    has_head = assessment.embedding_.has_safety_head
-    best = near.descend() if method == "gradient" or (method == "both" and has_head) else None
+    descends = method == "gradient" or (
+        method == "both" and assessment.embedding_.has_safety_head
+    )
+    best = near.descend() if descends else None
     if method != "gradient":
         best = near.search(best, rng, num_candidates)
     return None if best is None else replace(best, threshold=threshold)

@@ -98,12 +98,15 @@ def convex_hull(points: np.ndarray) -> trimesh.Trimesh:
     directions = creation.icosphere(subdivisions=1).vertices
     try:
         corners = convex.convex_hull(points).vertices
-        return convex.convex_hull(corners[np.unique(np.argmax(corners @ directions.T, axis=0))])
+        hull = convex.convex_hull(corners[np.unique(np.argmax(corners @ directions.T, axis=0))])
+        if hull.volume > _THINNEST_M**3:  # Otherwise flat: trimesh joggles such points.
+            return hull
     except QhullError:
-        low, high = points.min(axis=0), points.max(axis=0)
-        half = 0.5 * np.maximum(high - low, _THINNEST_M)
-        middle = 0.5 * (low + high)
-        return creation.box(bounds=[middle - half, middle + half])
+        pass
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = 0.5 * np.maximum(high - low, _THINNEST_M)
+    middle = 0.5 * (low + high)
+    return creation.box(bounds=[middle - half, middle + half])
 
 
 def above(hull: trimesh.Trimesh, up: np.ndarray, height_m: float) -> trimesh.Trimesh | None:

@@ -65,9 +65,9 @@ class Fault:
     def __post_init__(self) -> None:
         if (self.value is not None) != FAULTS[self.kind]:
             needs = "needs a value" if FAULTS[self.kind] else "has no value"
-            raise ValueError(f"fault: '{self.kind}' {needs}; got {self.value}")
+            raise ValueError(f"'{self.kind}' {needs}; got {self.value}")
         if self.kind in ("noise", "delay") and (self.value or 0.0) < 0:
-            raise ValueError(f"fault: value of '{self.kind}' is out of range; got {self.value}")
+            raise ValueError(f"value of '{self.kind}' must not be negative; got {self.value}")
 
 
 @schema(kw_only=True)

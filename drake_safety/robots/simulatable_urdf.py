@@ -235,7 +235,8 @@ def _converted(
             f"`pip install '{error.needs}'` and write the folder again"
         )
     except ValueError as error:
-        reason, name = f"{kind} meshes that cannot be read are left out", str(error)
+        reason = f"{kind} meshes that cannot be read are left out"
+        name = str(error) if name in str(error) else f"{name}: {error}"
     lost.setdefault(reason, []).append(name)
     return None
 

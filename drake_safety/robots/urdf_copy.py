@@ -165,8 +165,10 @@ class UrdfCopy:
             if shape.get("name", "").startswith(f"{link_name}_hull_"):
                 link.remove(shape)
         self.hulls[link_name] = hulls
+        if not hulls:
+            self.lost_links.add(link_name)
         for index in range(len(hulls)):
-            name = f"{link_name}_hull_{index}"
+            name = _hull_name(link_name, index)
             geometry = ET.SubElement(ET.SubElement(link, "collision", name=name), "geometry")
             mesh = ET.SubElement(geometry, "mesh", filename=f"meshes/{name}.obj")
             ET.SubElement(mesh, f"{{{_DRAKE}}}declare_convex")
@@ -191,7 +193,7 @@ class UrdfCopy:
         tree.write(path, encoding="utf-8", xml_declaration=True)
         for link, hulls in self.hulls.items():
             for index, hull in enumerate(hulls):
-                target = path.parent / f"meshes/{link}_hull_{index}.obj"
+                target = path.parent / f"meshes/{_hull_name(link, index)}.obj"
                 target.parent.mkdir(parents=True, exist_ok=True)
                 hull.export(target, include_normals=False, header=None)
         for name, mesh in self.meshes.items():
@@ -232,6 +234,10 @@ def read_urdf(path: Path) -> UrdfCopy:
                 "number that is not negative"
             )
     return UrdfCopy(source=path, root=root)
+
+
+def _hull_name(link: str, index: int) -> str:
+    return f"{link}_hull_{index}"
 
 
 def _remove(element: ET.Element, tag: str) -> None:
