@@ -246,7 +246,7 @@ def test_features_that_do_not_fit_are_refused_where_they_are_used(assessment, he
         ("horizon", 12, 40, "'lip' is 10"),
         ("horizon", 10, 2, "needs more than 90 segments"),
         ("discount", 1.1, 40, "discount"),
-        ("paper.loss", "sharp", 40, r"loss\n .* 'squared' or 'norm' .*input_value='sharp'"),
+        ("paper.loss", "sharp", 40, "'paper.loss' must be 'squared' or 'norm'; got 'sharp'"),
         ("adaptation.count", "sharp", 40, "count"),
     ],
 )

@@ -81,9 +81,7 @@ def nearest_accepted_goal(
         return None
     box = require(loop, HasGoals).target_box
     near = _Search(loop, assessment, goal, box, stricter, resolution_m)
-    descends = method == "gradient" or (
-        method == "both" and assessment.embedding_.has_safety_head
-    )
+    descends = method == "gradient" or (method == "both" and assessment.embedding_.has_safety_head)
     best = near.descend() if descends else None
     if method != "gradient":
         best = near.search(best, rng, num_candidates)

@@ -28,6 +28,7 @@ _UP_AXIS = re.compile(r"<up_axis>\s*(\w+)")  # In a COLLADA file.
 _X_ZY = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # From y up to z up.
 _VERSION = b"4"  # Version of the conversion, part of the cache's keys.
 _THINNEST_M = 1e-3  # Edge of the box around a flat mesh.
+_FLAT_M = 1e-6  # Extent below which points lie in a plane.
 
 
 def cache_folder() -> Path:
@@ -98,10 +99,10 @@ def convex_hull(points: np.ndarray) -> trimesh.Trimesh:
     directions = creation.icosphere(subdivisions=1).vertices
     try:
         corners = convex.convex_hull(points).vertices
-        hull = convex.convex_hull(corners[np.unique(np.argmax(corners @ directions.T, axis=0))])
-        if hull.volume > _THINNEST_M**3:  # Otherwise flat: trimesh joggles such points.
-            return hull
-    except QhullError:
+        corners = corners[np.unique(np.argmax(corners @ directions.T, axis=0))]
+        if np.linalg.matrix_rank(corners - corners.mean(axis=0), tol=_FLAT_M) == 3:
+            return convex.convex_hull(corners)
+    except QhullError:  # Of flat ones; trimesh joggles others.
         pass
     low, high = points.min(axis=0), points.max(axis=0)
     half = 0.5 * np.maximum(high - low, _THINNEST_M)
