@@ -6,17 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from drake_safety.evaluation.embedding_figure import (
-    add_colour_bar,
-    draw_cells,
-    draw_grid,
-    safety_colours,
-)
+from drake_safety.evaluation.embedding_figure import draw_grid, draw_values
 from drake_safety.evaluation.figure_style import (
     INK,
     SAFE_COLOUR,
@@ -25,7 +19,7 @@ from drake_safety.evaluation.figure_style import (
     new_figure,
 )
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, UNSAFE
+from drake_safety.learning.beliefs import UNCERTAINTY, safe_share
 from drake_safety.learning.discrepancy import DiscrepancyFunction
 from drake_safety.learning.feedback import EpisodePair, FeedbackSegments, feedback_segments
 
@@ -60,16 +54,10 @@ def adaptation_figure(
         )
     ramp = LinearSegmentedColormap.from_list("discrepancy", ["#fbfbfc", "#e0a3b8", "#7a1742"])
 
-    def draw(axes: Axes, value: np.ndarray, hatched: np.ndarray, ramp: Colormap, what: str) -> None:
-        shade = ScalarMappable(Normalize(0.0, 1.0), ramp)
-        draw_cells(axes, prior.grid_, shade.to_rgba(value), hatched)
-        add_colour_bar(fig, axes, shade, what)
-
     def draw_beliefs(axes: Axes, one: SafetyAssessment, title: str) -> np.ndarray:
         cells = one.beliefs_[0]
-        known = cells[:, SAFE] + cells[:, UNSAFE]
-        share = np.divide(cells[:, SAFE], known, out=np.zeros_like(known), where=known > 0.0)
-        draw(axes, share, cells[:, UNCERTAINTY] >= 1.0, safety_colours(), "safe share")
+        share, is_empty = safe_share(cells), cells[:, UNCERTAINTY] >= 1.0
+        draw_values(fig, axes, prior.grid_, share, is_empty, "safe share")
         axes.set_title(title)
         return share
 
@@ -88,11 +76,9 @@ def adaptation_figure(
             mean, deviation = (
                 DiscrepancyFunction().fit(points, difference).predict(prior.grid_.centres)
             )
-            draw(lower, mean, deviation > settings.gate, ramp, "|λ actual - λ nominal|")
+            is_unused, label = deviation > settings.gate, "|λ actual - λ nominal|"
+            draw_values(fig, lower, prior.grid_, mean, is_unused, label, ramp=ramp)
             lower.set(title="Discrepancy m(y)", xlabel=f"hatched: σ > {settings.gate:g}, not used")
-        for axes in panels.ravel():
-            half = prior.grid_.half_width
-            axes.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
     return fig
 
 

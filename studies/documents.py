@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ _TEMPLATES = Path(__file__).with_name("templates")
 _KINDS = "results|summary|readings|converged|shifts|monitor|anomalies|walking"
 _OPEN = rf"<!-- (?P<kind>{_KINDS}): (?P<name>[\w-]+) -->\n"
 _BLOCK = re.compile(rf"(?P<start>{_OPEN}).*?(?P<end><!-- end -->)", re.DOTALL)
+_MODES = re.compile(r"^(sharpened|paper)\b")
 _FORMATS = {
     "share": {},
     "plain": {"digits": 2},
@@ -58,7 +59,7 @@ def render(kind: str, results: Results, **more: Any) -> str:
         loader=FileSystemLoader(_TEMPLATES), trim_blocks=True, lstrip_blocks=True
     )
     environment.filters |= {name: _column("", "", name).text for name in _FORMATS}
-    environment.filters["gain"] = _gain
+    environment.filters |= {"gain": _gain, "markdown": markdown, "narrow": narrow}
     environment.filters["today"] = partial(today, results)
     environment.globals |= {
         "r": results,
@@ -108,11 +109,29 @@ def _table(
         if any(key in results for key in keys):
             cells.append(Row(label, label, [results.get(key) for key in keys]))
     shown = [i for i in range(len(made)) if any(row.estimates[i] for row in cells)]
-    return Table(
-        corner=corner,
-        columns=[made[i] for i in shown],
-        rows=[Row(row.key, row.label, [row.estimates[i] for i in shown]) for row in cells],
-    ).to_markdown()
+    return markdown(_with_columns(Table(corner=corner, columns=made, rows=cells), shown))
+
+
+def markdown(table: Table) -> str:
+    """A table as Markdown, estimates with their intervals; a missing one is empty."""
+    lines = [[table.corner, *(column.title for column in table.columns)]]
+    for row in table.rows:
+        cells = zip(table.columns, row.estimates, strict=True)
+        texts = ("" if one is None else column.text(one) for column, one in cells)
+        lines.append([_MODES.sub(r"`\1`", row.label), *texts])
+    head, *rows = ("| " + " | ".join(line) + " |" for line in lines)
+    ruler = "|" + "---|" * (1 + len(table.columns))
+    return "\n".join([head, ruler, *rows]).replace("|  |", "| |").replace("|  |", "| |")
+
+
+def narrow(table: Table, keys: Sequence[str]) -> Table:
+    """A table with some of its columns, in its order."""
+    return _with_columns(table, [i for i, one in enumerate(table.columns) if one.key in keys])
+
+
+def _with_columns(table: Table, shown: Sequence[int]) -> Table:
+    rows = [replace(row, estimates=[row.estimates[i] for i in shown]) for row in table.rows]
+    return replace(table, columns=[table.columns[i] for i in shown], rows=rows)
 
 
 def _gain(loss: Estimate) -> str:

@@ -283,11 +283,14 @@ def junk(motions: Sequence[Episode], seed: int) -> dict[str, MotionSet]:
     return found
 
 
-def baseline_estimates(judged: JudgedShift) -> dict[str, Estimate]:
+def baseline_estimates(
+    judged: JudgedShift, promise: Calibration | None = None
+) -> dict[str, Estimate]:
     """What the documentation compares beside `shift_estimates`.
 
     Args:
         judged: The verdicts; "gamma" is Γ.
+        promise: Γ's promise for plans, if there is one.
 
     Returns:
         Of each method the confident error at k = 0 and the AUC of the rows that Γ knows; what a
@@ -296,16 +299,16 @@ def baseline_estimates(judged: JudgedShift) -> dict[str, Estimate]:
     found = {}
     is_known, is_unsafe = ~np.isnan(judged.probability["gamma"]), judged.is_unsafe
     label = is_unsafe[judged.motion]
+    first = np.unique(judged.motion, return_index=True)[1]
     for name, probability in judged.probability.items():
-        is_wrong = judged.is_wrong(name)[judged.first]
+        is_wrong = judged.is_wrong(name)[first]
         found[f"{name}.first.confident_error"] = proportion(int(is_wrong.sum()), len(is_wrong))
         if 0 < label[is_known].sum() < is_known.sum():
             score = 1.0 - np.nan_to_num(probability[is_known])
             found[f"{name}.known_auc"] = auc(score, label[is_known], judged.motion[is_known])
-    promise = judged.assessment.calibrations_.get(PLAN)
     if promise is None or not is_unsafe.any():
         return found
-    gamma = np.nan_to_num(judged.probability["gamma"][judged.first])
+    gamma = np.nan_to_num(judged.probability["gamma"][first])
     return found | promised(promise, gamma, is_unsafe)
 
 
@@ -348,4 +351,5 @@ def add_all_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -
         changed = run_changed_starts(scenario, num_motions, seed, evaluation.workers)
         return changed | junk(nominal, seed)
 
-    add_shifts(evaluation, num_motions, num_nominal, judges, others, baseline_estimates)
+    more = partial(baseline_estimates, promise=gamma.calibrations_.get(PLAN))
+    add_shifts(evaluation, num_motions, num_nominal, judges, others, more)

@@ -81,6 +81,7 @@ def test_it_says_what_was_learned_from_what_is_promised_and_where_a_baseline_is_
     assert words.count("nothing: drake-safety calibrate chooses thresholds") == 2
     assert "drake-safety evaluate lip --assessment" in words
     assert "AUC: gradient boosting, 0.950 against 0.900 (the intervals overlap)" in words
+    assert whole.page.all("td", "class").count("best") == 9
     assert f"All {len(make_figures())} results" in words
     assert "calibration.plan sharpened miss_rate 0.0250 (0.0006–0.1316) 40" in words
 

@@ -9,6 +9,7 @@ from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.results import Result, Results
 from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
 from report_runs import make_figures
+from studies.documents import markdown, narrow
 
 
 @pytest.mark.parametrize(
@@ -80,7 +81,7 @@ def test_a_table_has_a_row_a_method_and_marks_the_best_in_every_form():
     results = Results(make_figures() | {"episodes.a_minus_b.auc": proportion(1, 2)})
     table = verdict_table(results, "episodes", corner="k = 0")
     assert [row.key for row in table.rows] == ["sharpened", "paper", "gradient_boosting"]
-    assert table.to_markdown().splitlines()[:3] == [
+    assert markdown(table).splitlines()[:3] == [
         "| k = 0 | AUC | safe recall | unsafe recall | Brier |",
         "|---|---|---|---|---|",
         "| `sharpened`" + 4 * " | 0.900 (0.795–0.962)" + " |",
@@ -89,9 +90,8 @@ def test_a_table_has_a_row_a_method_and_marks_the_best_in_every_form():
     assert table.better_baselines()[0] == (
         "AUC: gradient boosting, 0.950 against 0.900 (the intervals overlap)"
     )
-    assert table.to_html().count("<td class=best>") == 4
     assert table.to_rich().row_count == 3
-    assert [column.key for column in table.narrow(["brier", "auc"]).columns] == ["auc", "brier"]
+    assert [column.key for column in narrow(table, ["brier", "auc"]).columns] == ["auc", "brier"]
     titles = [one.title for one in verdict_tables(results)]
     assert "Stored calibrations on fresh motions: before the motion" in titles
 

@@ -13,7 +13,6 @@ from drake_safety.evaluation.shift_study import (
     shift_estimates,
 )
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
-from drake_safety.learning.calibration import PLAN
 from lip_assessments import QUICK, calibration
 from lip_episodes import make_episodes
 from studies.shifts import (
@@ -34,9 +33,7 @@ def training():
 
 @pytest.fixture(scope="module")
 def assessment(training):
-    found = SafetyAssessment(AssessmentParameters(**QUICK)).fit(training)
-    found.calibrations_[PLAN] = calibration(miss_rate=0.1, threshold=0.6, unsafe_below=0.4)
-    return found
+    return SafetyAssessment(AssessmentParameters(**QUICK)).fit(training)
 
 
 @pytest.fixture(scope="module")
@@ -62,32 +59,33 @@ def rows_of(motion):
     return motion.state, motion.desired_preview, motion.features, is_outside
 
 
-def judged(motions, assessment, **others):
-    return JudgedShift({"gamma": told} | others, motions, assessment)
+def judged(motions, **others):
+    return JudgedShift({"gamma": told} | others, motions)
 
 
-@pytest.mark.train
-def test_a_confident_error_is_a_row_called_safe_in_a_motion_that_ends_unsafely(assessment):
+PROMISE = calibration(miss_rate=0.1, threshold=0.6, unsafe_below=0.4)
+
+
+def test_a_confident_error_is_a_row_called_safe_in_a_motion_that_ends_unsafely():
     motions = [
         motion(10, 0.95, is_unsafe=True),  # sure and wrong
         motion(20, 0.95, is_unsafe=False),
         motion(30, CONFIDENT - 0.01, is_unsafe=True),
         motion(40, -1.0, is_unsafe=True),  # don't know
     ]
-    shift = judged(motions, assessment)
+    shift = judged(motions)
     found = shift_estimates(shift)
     assert found["gamma.confident_error"].value == pytest.approx(0.1)
     assert found["gamma.unknown"].value == pytest.approx(0.4)
     assert found["unsafe"].value == 0.75
     assert found["gamma.confident_error"].n == 4
-    beside = baseline_estimates(shift)
+    beside = baseline_estimates(shift, PROMISE)
     assert beside["gamma.first.confident_error"].value == 0.25
     # Of three unsafe plans, two have at least the promise's threshold.
     assert beside["missed"].value == pytest.approx(2 / 3)
 
 
-@pytest.mark.train
-def test_the_ranking_is_that_of_all_rows_and_of_those_that_gamma_knows(assessment):
+def test_the_ranking_is_that_of_all_rows_and_of_those_that_gamma_knows():
     # The only known safe motion lies above both unsafe ones; the unknown ones are safe.
     motions = [
         motion(4, 0.8, is_unsafe=False),
@@ -98,7 +96,7 @@ def test_the_ranking_is_that_of_all_rows_and_of_those_that_gamma_knows(assessmen
     def other(state, preview, features, is_outside):
         return np.where(state[:, 0] < 0.0, 0.9, 1.0 - state[:, 0])
 
-    shift = judged(motions, assessment, other=other)
+    shift = judged(motions, other=other)
     found = shift_estimates(shift) | baseline_estimates(shift)
     assert found["gamma.known_auc"].value == 1.0
     assert found["gamma.auc"].value == pytest.approx(0.5)
@@ -106,14 +104,13 @@ def test_the_ranking_is_that_of_all_rows_and_of_those_that_gamma_knows(assessmen
     assert found["other.auc"].value == pytest.approx(0.5)
 
 
-@pytest.mark.train
-def test_a_threshold_that_follows_outcomes_misses_less_and_accepts_less(assessment):
+def test_a_threshold_that_follows_outcomes_misses_less_and_accepts_less():
     rng = np.random.default_rng(0)
     is_unsafe = rng.random(400) < 0.5
     # Under this shift unsafe plans look as safe as the threshold, and a little more.
     probability = np.where(is_unsafe, rng.uniform(0.5, 0.9, 400), rng.uniform(0.7, 1.0, 400))
     motions = [motion(1, p, is_unsafe=bool(u)) for p, u in zip(probability, is_unsafe, strict=True)]
-    found = baseline_estimates(judged(motions, assessment))
+    found = baseline_estimates(judged(motions), PROMISE)
     assert found["fixed.missed"].value > 0.6
     assert found["fixed.accepted"].value == 1.0
     assert found["adaptive.missed"].value == pytest.approx(0.1, abs=0.05)
@@ -146,7 +143,7 @@ def test_junk_is_dont_know_and_keeps_what_it_says_it_keeps(assessment, nominal):
     for own, changed in zip(nominal[:20], found["state of another row"], strict=True):
         assert not np.isin(changed.state[:, 0], own.state[:, 0]).any()
     judges = {"gamma": assessment_judge(assessment)}
-    result = shift_estimates(JudgedShift(judges, found["columns shuffled"], assessment))
+    result = shift_estimates(JudgedShift(judges, found["columns shuffled"]))
     assert result["gamma.unknown"].value > 0.9
     assert result["gamma.confident_error"].value < 0.05
 

@@ -91,8 +91,9 @@ def test_stills_are_spread_evenly_and_give_way_to_events():
     assert still_times(time_s) == [0.0, 4.0]
 
 
-def test_a_view_with_more_room_shows_the_robot_smaller(loop, camera, standing):
-    far = StillCamera(loop, standing, view=View(room=2 * loop.view.room), **SIZE)
+def test_a_view_with_more_room_shows_the_robot_smaller(loop, camera, standing, monkeypatch):
+    monkeypatch.setattr(loop, "view", View(room=2 * loop.view.room))
+    far = StillCamera(loop, standing, **SIZE)
     small, large = (np.mean(c.render(standing).max(axis=-1) < 90) for c in (far, camera))
     assert small == pytest.approx(large / 4, rel=0.25)
 

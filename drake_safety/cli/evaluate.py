@@ -27,7 +27,7 @@ from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.evaluation.shift_study import Judge, JudgedShift, MotionSet
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
 from drake_safety.evaluation.tables import Table
-from drake_safety.evaluation.throw_study import TriggerRule, evaluate_throws, trigger_rules
+from drake_safety.evaluation.throw_study import PAPER_THRESHOLD, TriggerRule, evaluate_throws
 from drake_safety.evaluation.verdict_tables import verdict_tables
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
@@ -244,7 +244,9 @@ def add_throws(
 ) -> list[Motion]:
     """Evaluates either mode, and other rules, as triggers of recovery; returns the throws."""
     recovery = evaluation.scenario.parameters.recovery
-    own = trigger_rules(*evaluation.assessments.values(), threshold=recovery.threshold)
+    thresholds = recovery.threshold, PAPER_THRESHOLD
+    modes = zip(evaluation.scorers, thresholds, strict=True)
+    own = [TriggerRule(scorer=scorer, threshold=threshold) for scorer, threshold in modes]
     found, logs = evaluate_throws(
         evaluation.scenario,
         [*own, *rules],
@@ -304,7 +306,7 @@ def add_shifts(
         found |= {f"shifts.{name}.{key}": estimate for key, estimate in of_monitor.items()}
     stages("shifted motions", len(shifts), len(shifts))
     sets |= others(nominal[:num_motions])
-    found |= shift_study.evaluate_shifts(sets, judges, gamma, stages, more)
+    found |= shift_study.evaluate_shifts(sets, judges, stages, more)
     usual = run_motions(
         scenario,
         num_nominal * scenario.episode_duration_s,

@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PatchCollection
-from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
@@ -34,14 +33,19 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
         fig = style.new_figure(14.0, 4.6)
         left, middle, last = fig.subplots(1, 3)
         _draw_segments(fig, left, assessment, episodes)
-        safe, is_empty = cells[:, SAFE], cells[:, UNCERTAINTY] >= 1.0
-        most = max(1.0 - assessment.parameters.initial_uncertainty, safe.max())
-        draw_safety(fig, middle, grid, safe, is_empty, count, label="belief: safe", most=most)
+        most = max(1.0 - assessment.parameters.initial_uncertainty, cells[:, SAFE].max())
+        is_empty = cells[:, UNCERTAINTY] >= 1.0
+        colours = draw_values(
+            fig, middle, grid, cells[:, SAFE], is_empty, "belief: safe", Normalize(0.0, most)
+        )
+        is_bright = colours[:, :3] @ [0.299, 0.587, 0.114] > 0.6
+        ink = np.where(is_empty, style.FAINT_INK, np.where(is_bright, style.INK, "white"))
+        place: dict[str, Any] = {"ha": "center", "va": "center_baseline", "fontsize": 6.5}
+        for i in np.flatnonzero(count):
+            middle.text(*grid.centres[i], _short(count[i]), color=ink[i], **place)
         middle.set_title("Belief of each cell: safe")
-        _draw_causes(fig, last, grid, cells, assessment.info_.constraint_names)
-        for axes in (left, middle, last):
-            half = grid.half_width
-            axes.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
+        middle.set_xlabel("numbers: training segments; hatched: don't know")
+        _draw_causes(last, grid, cells, assessment.info_.constraint_names)
     return fig
 
 
@@ -55,54 +59,36 @@ def _draw_segments(
     segments = segments.take(order)
     found = assessment.predict(segments.state, segments.desired_preview, segments.features)
     draw_grid(axes, assessment.grid_)
-    x, y = found.embedding.T
-    dots = axes.scatter(
-        x,
-        y,
-        c=segments.score,
-        cmap=safety_colours().reversed(),
-        vmin=0.0,
-        vmax=1.0,
-        s=5.0,
-        linewidths=0.0,
-        alpha=0.85,
-        rasterized=True,
-    )
+    shade = ScalarMappable(Normalize(0.0, 1.0), safety_colours().reversed())
+    dots: dict[str, Any] = {"s": 5.0, "linewidths": 0.0, "alpha": 0.85, "rasterized": True}
+    axes.scatter(*found.embedding.T, c=segments.score, cmap=shade.cmap, norm=shade.norm, **dots)
     axes.set_title("Segments in the embedding")
     axes.set_xlabel(f"{len(segments)} segments of {len(episodes)} episodes")
-    bar = add_colour_bar(fig, axes, dots, "unsafety score λ")
-    if bar.solids is not None:
-        bar.solids.set_alpha(1.0)
+    add_colour_bar(fig, axes, shade, "unsafety score λ")
 
 
-def draw_safety(
+def draw_values(
     fig: Figure,
     axes: Axes,
     grid: Grid,
-    safe: np.ndarray,
+    value: np.ndarray,
     is_empty: np.ndarray,
-    count: np.ndarray,
-    *,
     label: str,
-    most: float = 1.0,
-) -> None:
-    """Draws cells coloured by safety (R*R,), with their numbers of training segments (R*R,)."""
-    shade = ScalarMappable(Normalize(0.0, most), safety_colours())
-    colours = shade.to_rgba(safe)
-    draw_cells(axes, grid, colours, is_empty)
-    brightness = colours[:, :3] @ [0.299, 0.587, 0.114]
-    ink = np.where(is_empty, style.FAINT_INK, np.where(brightness > 0.6, style.INK, "white"))
-    place: dict[str, Any] = {"ha": "center", "va": "center_baseline", "fontsize": 6.5}
-    for i in np.flatnonzero(count):
-        x, y = grid.centres[i]
-        axes.text(x, y, _short(count[i]), color=ink[i], **place)
-    axes.set_xlabel("numbers: training segments; hatched: don't know")
+    scale: Normalize | None = None,
+    ramp: Colormap | None = None,
+) -> np.ndarray:
+    """Draws cells coloured by a value (R*R,), with a colour bar; returns the colours (R*R, 4).
+
+    The scale is 0 to 1, and the colours those of safety, by default.
+    """
+    shade = ScalarMappable(scale or Normalize(0.0, 1.0), ramp or safety_colours())
+    colours = shade.to_rgba(value)
+    _draw_cells(axes, grid, colours, is_empty)
     add_colour_bar(fig, axes, shade, label)
+    return colours
 
 
-def _draw_causes(
-    fig: Figure, axes: Axes, grid: Grid, cells: np.ndarray, names: Sequence[str]
-) -> None:
+def _draw_causes(axes: Axes, grid: Grid, cells: np.ndarray, names: Sequence[str]) -> None:
     # The first colour of the series is that of safe.
     series = [*map(to_rgb, style.SERIES_COLOURS)]
     palette = np.array([series[(1 + i) % len(series)] for i in range(len(names))])
@@ -112,7 +98,7 @@ def _draw_causes(
     depth = (cells[:, UNSAFE] / np.where(is_empty, 1.0, 1.0 - cells[:, UNCERTAINTY]))[:, None]
     colours = np.column_stack([1.0 - depth * (1.0 - palette[cause]), np.ones(len(cells))])
     colours[:, :3] *= 0.97
-    draw_cells(axes, grid, colours, is_empty)
+    _draw_cells(axes, grid, colours, is_empty)
     axes.set_title("Most likely cause")
     axes.legend(
         handles=[Patch(color=palette[i], label=style.spoken(n)) for i, n in enumerate(names)],
@@ -125,20 +111,22 @@ def _draw_causes(
 
 
 def draw_grid(axes: Axes, grid: Grid) -> None:
-    """Draws the lines between the cells."""
-    edges = np.linspace(-grid.half_width, grid.half_width, grid.resolution + 1)
-    axes.vlines(edges, edges[0], edges[-1], color="#e3e5e8", linewidth=0.6, zorder=0)
-    axes.hlines(edges, edges[0], edges[-1], color="#e3e5e8", linewidth=0.6, zorder=0)
+    """Draws the lines between the cells, and fits the axes to them."""
+    half = grid.half_width
+    edges = np.linspace(-half, half, grid.resolution + 1)
+    axes.vlines(edges, -half, half, color="#e3e5e8", linewidth=0.6, zorder=0)
+    axes.hlines(edges, -half, half, color="#e3e5e8", linewidth=0.6, zorder=0)
+    axes.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
 
 
-def draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarray) -> None:
+def _draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarray) -> None:
     """Draws squares of given colours, RGBA (R*R, 4); empty ones, (R*R,), are hatched."""
     corners = grid.centres - 0.5 * grid.cell_length
-    squares = [Rectangle((x, y), grid.cell_length, grid.cell_length) for x, y in corners]
-    filled = [square for square, empty in zip(squares, is_empty, strict=True) if not empty]
-    hollow = [square for square, empty in zip(squares, is_empty, strict=True) if empty]
+    squares = np.array([Rectangle(xy, grid.cell_length, grid.cell_length) for xy in corners])
+    hollow, filled = squares[is_empty], squares[~is_empty]
     axes.add_collection(PatchCollection(hollow, fc="#f1f2f4", ec="#dadde1", lw=0.5, hatch="////"))
     axes.add_collection(PatchCollection(filled, fc=colours[~is_empty], ec="white", lw=0.8))
+    draw_grid(axes, grid)
     axes.set_xlabel(f"{len(filled)} of {grid.num_cells} cells hold a belief")
 
 
@@ -149,11 +137,10 @@ def safety_colours() -> Colormap:
     return LinearSegmentedColormap.from_list("safety", stops)
 
 
-def add_colour_bar(fig: Figure, axes: Axes, shade: ScalarMappable, label: str) -> Colorbar:
-    """Adds a colour bar beside a panel."""
+def add_colour_bar(fig: Figure, axes: Any, shade: ScalarMappable, label: str) -> None:
+    """Adds a colour bar beside one or several panels."""
     bar = fig.colorbar(shade, ax=axes, shrink=0.8, pad=0.02, label=label)
     bar.outline.set_visible(False)
-    return bar
 
 
 def _short(count: int) -> str:

@@ -7,8 +7,7 @@ matplotlib are not changed.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +52,8 @@ _STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "legend.fontsize": 9.0,
     "figure.facecolor": "white",
+    "figure.constrained_layout.h_pad": 0.08,
+    "figure.constrained_layout.w_pad": 0.08,
     "savefig.facecolor": "white",
     "svg.hashsalt": "drake_safety",
 }
@@ -72,31 +73,23 @@ _LABELS = {
     "smallest_margin": "smallest margin (true state)",
     "by_cause_probability": "all, by unsafe mass alone",
     "right_cause": "all",
-    **{
-        f"{mode}.{kind}": f"{mode}, {row}"
-        for mode in ("sharpened", "paper")
-        for kind, row in (("plan", "first row"), ("motion", "worst row"))
-    },
 }
 _DPI = 200
 
 
-@contextmanager
-def drawing_style() -> Iterator[None]:
+def drawing_style() -> AbstractContextManager[None]:
     """Applies the style to figures drawn or saved inside the block."""
-    with mpl.rc_context(_STYLE):
-        yield
+    return mpl.rc_context(_STYLE)
 
 
 def new_figure(width: float, height: float) -> Figure:
     """Creates an empty figure without a window; sizes in inches."""
-    fig = Figure(figsize=(width, height), layout="constrained")
-    fig.get_layout_engine().set(w_pad=0.08, h_pad=0.08)  # type: ignore[union-attr, call-arg]
-    return fig
+    return Figure(figsize=(width, height), layout="constrained")
 
 
-def label_threshold(axes: Axes, threshold: float, colour: str) -> None:
-    """Writes a threshold beside its line, outside the axes."""
+def draw_threshold(axes: Axes, threshold: float, colour: str) -> None:
+    """Draws the line of a threshold, with its value beside it, outside the axes."""
+    axes.axhline(threshold, color=colour, linestyle="--", linewidth=1.2)
     axes.annotate(
         f"threshold {threshold:.3g}",
         (1.0, threshold),

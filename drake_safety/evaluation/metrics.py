@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -80,15 +81,12 @@ class Bootstrap:
     def over_values(
         self, statistic: Callable[[np.ndarray], np.ndarray], values: np.ndarray
     ) -> Estimate:
-        """An order statistic of independent values (N,), of which some may be infinite.
-
-        The statistic is that of values sorted along the last axis.
-        """
+        """A statistic along the last axis of independent values (N,), some perhaps infinite."""
         rng = np.random.default_rng(self.seed)
         drawn = values[rng.integers(values.size, size=(self.num_resamples, values.size))]
         # Without interpolation, which would subtract infinities.
-        low, high = np.quantile(statistic(np.sort(drawn, axis=1)), _ENDS, method="nearest")
-        return Estimate(float(statistic(np.sort(values))), float(low), float(high), values.size)
+        low, high = np.quantile(statistic(drawn), _ENDS, method="nearest")
+        return Estimate(float(statistic(values)), float(low), float(high), values.size)
 
 
 _BOOTSTRAP = Bootstrap()
@@ -96,13 +94,7 @@ _MEDIAN_BOOTSTRAP = Bootstrap(num_resamples=2000)
 
 
 def proportion(count: int, n: int) -> Estimate:
-    """The share `count` of `n` independent samples, with its Clopper-Pearson interval.
-
-    Raises:
-        ValueError: `count` is not in 0..n.
-    """
-    if not 0 <= count <= n:
-        raise ValueError(f"proportion: count is {count}, expected 0..{n}")
+    """The share `count` of `n` independent samples, with its Clopper-Pearson interval."""
     from scipy.stats import binomtest
 
     if n == 0:
@@ -119,18 +111,17 @@ def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> E
     Raises:
         ValueError: A value is NaN.
     """
-    values = np.sort(np.asarray(values, dtype=float))
     if np.isnan(values).any():
         raise ValueError(f"median: {np.isnan(values).sum()} of {values.size} values are NaN")
     if values.size == 0:
         return Estimate.exact(math.nan, 0)
-    return bootstrap.over_values(_middle, values)
+    return bootstrap.over_values(partial(np.median, axis=-1), np.sort(values))
 
 
 def quantile(values: np.ndarray, share: float, *, bootstrap: Bootstrap) -> Estimate:
     """A quantile of independent values (N,), some infinite, with its bootstrap interval."""
-    row = min(int(share * values.size), values.size - 1)
-    return bootstrap.over_values(lambda ordered: ordered[..., row], values)
+    statistic = partial(np.quantile, q=share, axis=-1, method="higher")
+    return bootstrap.over_values(statistic, values)
 
 
 def rate_per_hour(count: int, duration_s: float, n: int) -> Estimate:
@@ -143,12 +134,6 @@ def rate_per_hour(count: int, duration_s: float, n: int) -> Estimate:
     low = 0.5 * chi2.ppf(_ENDS[0], 2 * count) if count else 0.0
     high = 0.5 * chi2.ppf(_ENDS[1], 2 * count + 2)
     return Estimate(count / hours, float(low / hours), float(high / hours), n)
-
-
-def _middle(ordered: np.ndarray) -> np.ndarray:
-    """Median along the last axis of sorted values."""
-    size = ordered.shape[-1]
-    return 0.5 * (ordered[..., (size - 1) // 2] + ordered[..., size // 2])
 
 
 def area_under_curve(
@@ -175,7 +160,7 @@ def auc(
 
     If the scores of the classes do not overlap, the bootstrap has no spread and `low` is 1 as well.
     """
-    score, label = _checked("auc", unsafe_score, is_unsafe, episode)
+    score, label = _checked("auc", unsafe_score, is_unsafe)
     rank = _ranks(score)
     return bootstrap.over_episodes(lambda weight: _ranked_area(rank, label, weight), episode)
 
@@ -248,35 +233,30 @@ def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
         raise ValueError(
             f"threshold_at: {num_unsafe} of {len(label)} samples are unsafe; it takes both classes"
         )
-    values, rank = np.unique(score, return_inverse=True)
-    # Per value, the samples of each class at or below it, which are classified safe.
-    below_unsafe = np.cumsum(np.bincount(rank, weights=label, minlength=len(values)))
-    below_safe = np.cumsum(np.bincount(rank, weights=~label, minlength=len(values)))
-    unsafe_recall = 1.0 - np.concatenate([[0.0], below_unsafe]) / num_unsafe
-    safe_recall = np.concatenate([[0.0], below_safe]) / (len(label) - num_unsafe)
-    finite = values[np.isfinite(values)]
+    finite = np.unique(score[np.isfinite(score)])
     if finite.size == 0:
         raise ValueError(f"threshold_at: none of the {len(score)} scores is finite")
     lowest = np.nextafter(finite[0], -math.inf)
     middle = 0.5 * (finite[:-1] + finite[1:])
     # Infinite scores stay above every threshold.
     candidates = np.concatenate([[lowest], middle, [finite[-1]]])
-    unsafe_recall, safe_recall = (r[: len(candidates)] for r in (unsafe_recall, safe_recall))
-    balanced = 0.5 * (unsafe_recall + safe_recall)
+    share_below = [
+        np.searchsorted(np.sort(one), candidates, side="right") / len(one)
+        for one in (score[~label], score[label])
+    ]
+    balanced = 0.5 * (share_below[0] + 1.0 - share_below[1])
     best = np.flatnonzero(balanced >= balanced.max() - 1e-12)
     return float(candidates[best[(len(best) - 1) // 2]])
 
 
 def _checked(
-    who: str, unsafe_score: np.ndarray, is_unsafe: np.ndarray, episode: np.ndarray | None = None
+    who: str, unsafe_score: np.ndarray, is_unsafe: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    score = np.asarray(unsafe_score, dtype=float)
-    label = np.asarray(is_unsafe)
+    score, label = np.asarray(unsafe_score, dtype=float), np.asarray(is_unsafe)
     if label.dtype != bool:
         raise ValueError(f"{who}: labels must be boolean, got {label.dtype}")
-    shapes = [score.shape, label.shape] + ([] if episode is None else [np.shape(episode)])
-    if score.ndim != 1 or len(set(shapes)) != 1:
-        raise ValueError(f"{who}: scores, labels and episodes must be as many, got {shapes}")
+    if score.ndim != 1 or score.shape != label.shape:
+        raise ValueError(f"{who}: as many scores, {score.shape}, as labels expected, {label.shape}")
     return np.where(np.isnan(score), math.inf, score), label
 
 

@@ -44,8 +44,6 @@ def run_monitored(
 
     def simulated(indices: list[int], until_s: float) -> dict[int, Episode]:
         run = partial(make.run, run_motion, seed=seed, until_s=until_s, with_features=True)
-        if num_workers == 1:  # A worker process has none of its own.
-            return {index: run(index) for index in indices}
         found = map_items(run, indices, num_workers=num_workers, batch_size=1)
         return {one.index: one for one in found}
 

@@ -104,15 +104,14 @@ def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
     with style.drawing_style():
         fig = style.new_figure(5.4, 6.6)
         axes = fig.subplots()
-        axes.plot([0, 1], [0, 1], color=style.FAINT_INK, linewidth=0.8)
-        for i, (name, one) in enumerate(curves.items()):
+        axes.axline((0, 0), slope=1, color=style.FAINT_INK, linewidth=0.8)
+        axes.set_prop_cycle(color=style.SERIES_COLOURS, linestyle=style.SERIES_DASHES)
+        for name, one in curves.items():
             value, low, high = np.array([(s.value, s.low, s.high) for s in one.observed]).T
             axes.errorbar(
                 one.expected,
                 value,
                 yerr=np.clip([value - low, high - value], 0.0, None),
-                color=style.SERIES_COLOURS[i % len(style.SERIES_COLOURS)],
-                linestyle=style.SERIES_DASHES[i % len(style.SERIES_DASHES)],
                 marker="o",
                 markersize=5,
                 linewidth=1.4,
@@ -124,10 +123,6 @@ def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
         axes.set_ylabel("share of unsafe ends, 95 % intervals over episodes")
         axes.grid(color="#eceef0", linewidth=0.7)
         # Outside: intervals may be anywhere in the axes.
-        fig.legend(
-            loc="outside lower center",
-            ncols=2,
-            title="expected calibration error",
-            alignment="left",
-        )
+        title = "expected calibration error"
+        fig.legend(loc="outside lower center", ncols=2, title=title, alignment="left")
     return fig

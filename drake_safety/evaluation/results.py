@@ -6,7 +6,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,25 +46,16 @@ class Result(Estimate):
             )
         *rest, metric = _DOT.split(key)
         method = rest.pop() if len(rest) > 1 else ""
-        ends = {name: getattr(estimate, name) for name in ("value", "low", "high", "n")}
-        return cls(**ends, set=".".join(rest), method=method, metric=metric)
+        ends = estimate.value, estimate.low, estimate.high, estimate.n
+        return cls(*ends, set=".".join(rest), method=method, metric=metric)
 
 
-class Results(Mapping[str, Result]):
+class Results(dict[str, Result]):
     """Rows by key "set.method.metric", in their order, and what made them, as JSON types."""
 
     def __init__(self, estimates: Mapping[str, Estimate], entries: Mapping[str, Any] | None = None):
-        self._rows = {key: Result.of(key, estimate) for key, estimate in estimates.items()}
+        super().__init__({key: Result.of(key, one) for key, one in estimates.items()})
         self.entries: dict[str, Any] = dict(entries or {})
-
-    def __getitem__(self, key: str) -> Result:
-        return self._rows[key]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._rows)
-
-    def __len__(self) -> int:
-        return len(self._rows)
 
     def has(self, prefix: str) -> bool:
         """Whether the key of any row begins so."""
@@ -74,12 +65,9 @@ class Results(Mapping[str, Result]):
         self, *, set: str | None = None, method: str | None = None, metric: str | None = None
     ) -> list[Result]:
         """The rows of a set, a method and a metric; None takes all."""
-        wanted = {"set": set, "method": method, "metric": metric}.items()
-        return [
-            row
-            for row in self.values()
-            if all(value is None or getattr(row, name) == value for name, value in wanted)
-        ]
+        wanted = {"set": set, "method": method, "metric": metric}
+        given = {name: value for name, value in wanted.items() if value is not None}
+        return [row for row in self.values() if given.items() <= vars(row).items()]
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Results:

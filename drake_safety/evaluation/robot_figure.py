@@ -33,7 +33,7 @@ _COLOURS: dict[type[Shape], tuple[str, str]] = {
     Ellipsoid: ("ellipsoids", style.SERIES_COLOURS[5]),
     Convex: ("convex hulls", style.FALSE_ALARM_COLOUR),
 }
-_SIZE = (900, 1000)  # Of a still [pixels].
+_SIZE = {"width": 900, "height": 1000}  # Of a still [pixels].
 _VISUAL_SHARE = 0.25  # Of the robot's look in the picture of its shapes.
 
 
@@ -42,9 +42,8 @@ def robot_figure(loop: LeggedLoop) -> Figure:
     context = loop.CreateDefaultContext()
     loop.reset_to(context, None, loop.standing_start())
     positions = loop.plant.GetPositions(loop.plant.GetMyContextFromRoot(context))
-    width, height = _SIZE
-    look = StillCamera(loop, positions, width=width, height=height).render(positions)
-    camera = StillCamera(loop, positions, width=width, height=height)
+    look = StillCamera(loop, positions, **_SIZE).render(positions)
+    camera = StillCamera(loop, positions, **_SIZE)
     kinds = show_shapes(loop, camera.context)
     shapes = camera.render(positions)
     both = np.round(_VISUAL_SHARE * look + (1 - _VISUAL_SHARE) * shapes).astype(np.uint8)

@@ -60,13 +60,11 @@ probabilities (N,), NaN for "don't know"."""
 
 def motions_of(episodes: Episodes) -> list[Episode]:
     """The rows of episodes from the first undisturbed one; those that diverged are left out."""
-    return [rows_from(one, one.first_step) for one in episodes if one.cause != DIVERGED]
-
-
-def rows_from(episode: Episode, first: int) -> Episode:
-    """An episode without its rows before the first given one."""
-    rows = {name: getattr(episode, name)[first:] for name in ("time_s", *RECORDED)}
-    return replace(episode, **rows, first_step=0)
+    motions = []
+    for one in (one for one in episodes if one.cause != DIVERGED):
+        rows = {name: getattr(one, name)[one.first_step :] for name in ("time_s", *RECORDED)}
+        motions.append(replace(one, **rows, first_step=0))
+    return motions
 
 
 def assessment_judge(assessment: SafetyAssessment) -> Judge:
@@ -88,21 +86,14 @@ class JudgedShift:
     Attributes:
         probability: Safety probability of every row by method, NaN for "don't know", (N,).
         motion: Motion of each row, (N,).
-        first: First row of each motion, (M,).
         is_unsafe: Whether each motion ends unsafely, (M,).
-        assessment: Γ, with its promises.
     """
 
-    def __init__(
-        self, judges: Mapping[str, Judge], motions: Sequence[Episode], assessment: SafetyAssessment
-    ):
-        self.assessment = assessment
+    def __init__(self, judges: Mapping[str, Judge], motions: Sequence[Episode]):
         rows = [np.concatenate([getattr(one, name) for one in motions]) for name in SEEN]
         rows.append(np.concatenate([np.any(one.margins < 0.0, axis=1) for one in motions]))
         self.probability = {name: judge(*rows) for name, judge in judges.items()}
-        sizes = [len(one.state) for one in motions]
-        self.motion = np.repeat(np.arange(len(motions)), sizes)
-        self.first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+        self.motion = np.repeat(np.arange(len(motions)), [len(one.state) for one in motions])
         self.is_unsafe = np.array([not one.is_safe for one in motions])
 
     def is_wrong(self, name: str) -> np.ndarray:
@@ -129,7 +120,6 @@ def shift_estimates(judged: JudgedShift) -> dict[str, Estimate]:
 def evaluate_shifts(
     sets: Mapping[str, MotionSet],
     judges: Mapping[str, Judge],
-    assessment: SafetyAssessment,
     progress: StageProgress,
     more: Callable[[JudgedShift], Mapping[str, Estimate]] = lambda judged: {},
 ) -> dict[str, Estimate]:
@@ -140,7 +130,7 @@ def evaluate_shifts(
     found: dict[str, Estimate] = {}
     for i, (name, (_, motions)) in enumerate(sets.items()):
         progress("shifts", i, len(sets))
-        judged = JudgedShift(judges, motions, assessment)
+        judged = JudgedShift(judges, motions)
         of = {**shift_estimates(judged), **more(judged)}
         found |= {f"shifts.{name}.{key}": estimate for key, estimate in of.items()}
     progress("shifts", len(sets), len(sets))

@@ -25,8 +25,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.sensors import CameraInfo
 
-from drake_safety.models import load_robot
-from drake_safety.simulation.legged_loop import LeggedLoop, View
+from drake_safety.simulation.legged_loop import LeggedLoop
 
 _RENDERER = "stills"
 _BACKGROUND = [0.80, 0.84, 0.88]
@@ -44,22 +43,14 @@ class StillCamera:
             of a log, (n_q,).
         width: Width of the stills [pixels].
         height: Their height [pixels].
-        view: View of the camera; that of the task by default.
     """
 
     def __init__(
-        self,
-        loop: LeggedLoop,
-        positions: np.ndarray,
-        *,
-        width: int = 720,
-        height: int = 540,
-        view: View | None = None,
+        self, loop: LeggedLoop, positions: np.ndarray, *, width: int = 720, height: int = 540
     ):
-        plant = self._plant = loop.plant
-        robot = load_robot(loop.scenario.robot)
-        self._instance = plant.GetModelInstanceByName(robot.name)
-        self._base = plant.GetBodyByName(robot.base, self._instance)
+        plant, view = loop.plant, loop.view
+        self._plant, self._instance = plant, loop.robot_instance
+        self._base = plant.GetBodyByName(loop.robot.base, self._instance)
         self.context = loop.CreateDefaultContext()  # The root Context that is rendered.
         self._plant_context = plant.GetMyMutableContextFromRoot(self.context)
         self._pose(positions)
@@ -68,7 +59,6 @@ class StillCamera:
         base = self._base.EvalPoseInWorld(self._plant_context).translation()
         # Only the horizontal motion of the base is followed, so that a fall remains visible.
         self._look_at_height = centre[2]
-        view = loop.view if view is None else view
         self._offset = (centre - base)[:2]
         direction = np.array(
             [
@@ -97,11 +87,7 @@ class StillCamera:
         self._world = scene_graph.world_frame_id()
 
     def render(self, positions: np.ndarray) -> np.ndarray:
-        """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8.
-
-        Raises:
-            ValueError: The positions have another size, or are not finite.
-        """
+        """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8."""
         self._pose(positions)
         base = self._base.EvalPoseInWorld(self._plant_context).translation()
         target = np.append(base[:2] + self._offset, self._look_at_height)
@@ -151,11 +137,7 @@ class StillCamera:
 
 
 def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.ndarray:
-    """All positions (N, n_q) of a plant from the logged states (N, n) of its model instances.
-
-    Raises:
-        ValueError: A model instance with positions is missing, or has another number of them.
-    """
+    """All positions (N, n_q) of a plant from the logged states (N, n) of its model instances."""
     plant = loop.plant
     instances = map(ModelInstanceIndex, range(plant.num_model_instances()))
     moving = {plant.GetModelInstanceName(i): i for i in instances if plant.num_positions(i)}
@@ -165,10 +147,8 @@ def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.nd
         )
     positions = np.zeros((len(next(iter(states.values()))), plant.num_positions()))
     for name, state in states.items():
-        for row, values in zip(positions, state, strict=True):
-            plant.SetPositionsInArray(
-                moving[name], values[: plant.num_positions(moving[name])], row
-            )
+        columns = plant.GetPositionsFromArray(moving[name], np.arange(plant.num_positions()))
+        positions[:, columns.astype(int)] = state[:, : len(columns)]
     return positions
 
 

@@ -1,12 +1,10 @@
-"""Tables of results: a row a method or set, a column a metric, for terminals, Markdown and HTML."""
+"""Tables of results: a row a method or set, a column a metric."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from html import escape
+from dataclasses import dataclass
 
 import rich.table
 
@@ -15,7 +13,6 @@ from drake_safety.evaluation.results import Results
 
 OURS = "sharpened"
 """The method that baselines are compared with."""
-_MODES = re.compile(r"^(sharpened|paper)\b")
 _SCALES = {"%": 100.0, "points": 100.0, "=%": 100.0, "ms": 1000.0}
 
 
@@ -24,8 +21,8 @@ class Column:
     """A column of a table: a metric and how it is written.
 
     Attributes:
-        unit: "", "%", "points" of percent, "ms", "s", "of" for counts out of n, "n" for a number
-            of trials, "/h" for a rate, or "=" and "=%" for values without interval.
+        unit: "", "%", "points" of percent, "ms", "s", "of" for counts out of n, "/h" for a rate, or
+            "=" and "=%" for values without interval.
         better: 1 if larger is better, -1 if smaller is, 0 otherwise.
     """
 
@@ -44,8 +41,6 @@ class Column:
             return f"{count} of {estimate.n}"
         if math.isinf(estimate.value):
             return "never"
-        if self.unit == "n":
-            return f"{estimate.value:.0f}"
         unit = self.unit.removeprefix("=")
         space = "" if unit in ("", "/h", "points") else f" {unit}"
         return f"{_SCALES.get(self.unit, 1.0) * estimate.value:.{self.digits}f}{space}"
@@ -88,12 +83,6 @@ class Table:
     title: str = ""
     meaning: str = ""
 
-    def narrow(self, keys: Sequence[str]) -> Table:
-        """The table with some of its columns, in its order."""
-        shown = [i for i, column in enumerate(self.columns) if column.key in keys]
-        rows = [replace(row, estimates=[row.estimates[i] for i in shown]) for row in self.rows]
-        return replace(self, columns=[self.columns[i] for i in shown], rows=rows)
-
     def best(self, column: int) -> set[int]:
         """Indices of the best rows of a column; empty if there is nothing to compare."""
         sign = self.columns[column].better
@@ -108,21 +97,17 @@ class Table:
 
     def better_baselines(self) -> list[str]:
         """Describes each column in which another row is better than `OURS`."""
-        ours = next((i for i, row in enumerate(self.rows) if row.key == OURS), None)
-        found: list[str] = []
-        if ours is None:
-            return found
-        for number, column in enumerate(self.columns):
-            best, mine = self.best(number), self.rows[ours].estimates[number]
-            if not best or ours in best or mine is None:
+        keys, found = [row.key for row in self.rows], []
+        for number, column in enumerate(self.columns if OURS in keys else ()):
+            ours, best = keys.index(OURS), self.best(number)
+            first = min(best, default=ours)
+            mine, other = (self.rows[i].estimates[number] for i in (ours, first))
+            if ours in best or mine is None or other is None or first == ours:
                 continue
-            first = self.rows[min(best)]
-            other = first.estimates[number]
-            assert other is not None
-            is_clear = (other.low > mine.high) if column.better > 0 else (other.high < mine.low)
+            is_clear = other.low > mine.high if column.better > 0 else other.high < mine.low
             certainty = "beyond both intervals" if is_clear else "the intervals overlap"
             found.append(
-                f"{column.title}: {first.label}, {column.value_text(other)} against "
+                f"{column.title}: {self.rows[first].label}, {column.value_text(other)} against "
                 f"{column.value_text(mine)} ({certainty})"
             )
         return found
@@ -142,31 +127,6 @@ class Table:
             table.add_row(row.label, *map(Column.text, self.columns, row.estimates))
         return table
 
-    def to_markdown(self) -> str:
-        """The table as Markdown, estimates with their intervals; a missing one is empty."""
-        lines = [[self.corner, *(column.title for column in self.columns)]]
-        for row in self.rows:
-            cells = zip(self.columns, row.estimates, strict=True)
-            texts = ("" if one is None else column.text(one) for column, one in cells)
-            lines.append([_MODES.sub(r"`\1`", row.label), *texts])
-        head, *rows = ("| " + " | ".join(line) + " |" for line in lines)
-        ruler = "|" + "---|" * (1 + len(self.columns))
-        return "\n".join([head, ruler, *rows]).replace("|  |", "| |").replace("|  |", "| |")
-
-    def to_html(self) -> str:
-        """The table as an HTML element; the best of a column has the class ``best``."""
-        head = "".join(f'<th scope="col">{escape(column.title)}</th>' for column in self.columns)
-        lines = [f'<table><thead><tr><th scope="col">{escape(self.corner)}</th>{head}</tr></thead>']
-        best = [self.best(number) for number in range(len(self.columns))]
-        for i, row in enumerate(self.rows):
-            cells = "".join(
-                f"<td{' class=best' * (i in best[j])}>{_unbroken(column.value_text(one))} "
-                f"<small>{escape(column.interval_text(one))}</small></td>"
-                for j, (column, one) in enumerate(zip(self.columns, row.estimates, strict=True))
-            )
-            lines.append(f'<tr><th scope="row">{escape(row.label)}</th>{cells}</tr>')
-        return "\n".join([*lines, "</table>"])
-
 
 def rows_of(results: Results, labels: Mapping[str, str], columns: Sequence[Column]) -> list[Row]:
     """Rows of the results by beginning of their keys and label; empty rows are left out."""
@@ -175,7 +135,3 @@ def rows_of(results: Results, labels: Mapping[str, str], columns: Sequence[Colum
         for prefix, label in labels.items()
     ]
     return [row for row in rows if any(row.estimates)]
-
-
-def _unbroken(text: str) -> str:
-    return escape(text).replace(" ", "&nbsp;")

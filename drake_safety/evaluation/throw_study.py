@@ -10,10 +10,9 @@ from functools import partial
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, median, proportion
-from drake_safety.evaluation.scorers import Scorer, assessment_scorer
+from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.files.progress import StageProgress
-from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.throws import VIOLATIONS, run_throws, trigger_time
@@ -28,17 +27,6 @@ class TriggerRule:
 
     scorer: Scorer
     threshold: float
-
-
-def trigger_rules(
-    sharpened: SafetyAssessment, paper: SafetyAssessment, *, threshold: float
-) -> list[TriggerRule]:
-    """The scenario's rule, named "sharpened", and the paper's."""
-    own, printed = assessment_scorer("sharpened", sharpened), assessment_scorer("paper", paper)
-    return [
-        TriggerRule(scorer=own, threshold=threshold),
-        TriggerRule(scorer=printed, threshold=PAPER_THRESHOLD),
-    ]
 
 
 def log_probability(log: Motion, scorer: Scorer, persistence_s: float = 0.0) -> np.ndarray:

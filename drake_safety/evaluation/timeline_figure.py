@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.gridspec import GridSpecBase
 from matplotlib.patches import ConnectionPatch
 from matplotlib.patheffects import withStroke
 
@@ -27,9 +27,7 @@ _AXIS_LABEL_HEIGHT = 0.6
 _LABEL_ROW_HEIGHT, _LETTER_WIDTH, _LABEL_OFFSET = 0.2, 0.066, 0.11  # Of labels above the curve.
 _LOWEST, _HIGHEST = -0.02, 1.05  # Ends of the axis without labels.
 _NUM_LEVELS, _MOST_POINTS = 4, 4000  # Curves of levels, and points of one.
-_LETTERS = "abcdefghijklmnopqrstuvwxyz"
 _Style = Mapping[str, Any]
-_LIMIT: _Style = {"linestyle": (0, (4, 3)), "linewidth": 1.2}
 _BALL: _Style = {"linestyle": (0, (1, 2)), "linewidth": 1.0}
 _TRIGGER: _Style = {"linewidth": 1.2}
 _LEAVING: _Style = {"linestyle": (0, (4, 2)), "linewidth": 1.2}
@@ -41,15 +39,17 @@ _LEGEND: _Style = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Event:
-    """A named instant, with the style of its line, if it has one."""
+    """A named instant, with the style of its line, if it has one, and the place of its name."""
 
     time_s: float
     words: str
     colour: str
     line: _Style | None = None
     is_ball: bool = False
+    row: int = 0  # 0 at the top.
+    is_left: bool = False  # Of the instant.
 
 
 def timeline_figure(
@@ -113,8 +113,7 @@ def timeline_figure(
         events.append(_Event(leave_time_s, "leaves the safe set", style.INK, _LEAVING))
     for start, _ in recovery_intervals_s:
         events.append(_Event(start, "recovery", style.RECOVERY_COLOUR))
-    rows = _label_rows(events, time_s[0], time_s[-1])
-    heights = [_CURVE_HEIGHT + _LABEL_ROW_HEIGHT * (max(rows, default=-1) + 1)]
+    heights = [_CURVE_HEIGHT + _place_names(events, time_s[0], time_s[-1])]
     if belief is not None:
         heights.append(_BELIEF_HEIGHT)
     if margins is not None:
@@ -123,8 +122,7 @@ def timeline_figure(
         fig, pictures, panels = _lay_out(heights, [image for _, image in stills])
         curve_axes, *others = panels
         curve_axes.set_xlim(time_s[0], time_s[-1])
-        curve_axes.axhline(threshold, color=style.UNSAFE_COLOUR, **_LIMIT)
-        style.label_threshold(curve_axes, threshold, style.UNSAFE_COLOUR)
+        style.draw_threshold(curve_axes, threshold, style.UNSAFE_COLOUR)
         curve_axes.step(time_s, probability, where="post", color=style.SAFE_COLOUR, linewidth=2.0)
         curve_axes.set(yticks=[0.0, 0.5, 1.0], ylabel="probability")
         if belief is not None:
@@ -142,19 +140,16 @@ def timeline_figure(
         for instant in trigger_times_s:
             mark: _Style = {"color": style.UNSAFE_COLOUR, "markersize": 8, "zorder": 5}
             curve_axes.plot(instant, threshold, "v", **mark)
-        top = _draw_labels(curve_axes, events, rows, (_LOWEST, _HIGHEST))
-        for axes, letter, (instant, image) in zip(pictures, _LETTERS, stills, strict=False):
+        top = _write_names(curve_axes, events, (_LOWEST, _HIGHEST))
+        for axes, letter, (instant, image) in zip(pictures, ascii_lowercase, stills, strict=False):
             axes.imshow(image, interpolation="antialiased")
-            axes.set(xticks=[], yticks=[])
-            axes.spines[:].set_visible(False)
+            axes.set_axis_off()
             axes.set_title(f"({letter})  {instant:.2f} s", fontsize=10, pad=4)
             row = max(int(np.searchsorted(time_s, instant + 1e-9, side="right")) - 1, 0)
             height = probability[row] if np.isfinite(probability[row]) else 0.0
             _join(fig, axes, curve_axes, (instant, height), top)
-        for panel in panels[:-1]:
-            panel.tick_params(labelbottom=False)
         panels[-1].set_xlabel("time [s]")
-        fig.align_ylabels(panels)
+        curve_axes.figure.align_ylabels(panels)
     return fig
 
 
@@ -166,9 +161,8 @@ def levels_figure(
     firsts = np.arange(0, len(time_s), max(1, len(time_s) // _MOST_POINTS))
     peaks, levels = levels.max(axis=0), np.maximum.reduceat(levels, firsts)
     events = [_Event(float(time_s[one.begin]), one.cause, style.UNSAFE_COLOUR) for one in alarms]
-    rows = _label_rows(events, time_s[0], time_s[-1])
+    heights = [_CURVE_HEIGHT + _place_names(events, time_s[0], time_s[-1])]
     with style.drawing_style():
-        heights = [_CURVE_HEIGHT + _LABEL_ROW_HEIGHT * (max(rows, default=-1) + 1)]
         fig, _, (axes,) = _lay_out(heights, [])
         axes.set(xlim=(time_s[0], time_s[-1]), xlabel="time [s]", ylabel="level")
         for i, state in enumerate(np.argsort(peaks)[: -1 - _NUM_LEVELS : -1].tolist()):
@@ -176,10 +170,10 @@ def levels_figure(
             dashes, name = style.SERIES_DASHES[i], names[state]
             axes.plot(time_s[firsts], levels[:, state], linestyle=dashes, label=name, **line)
         if math.isfinite(limit):
-            axes.axhline(limit, color=style.UNSAFE_COLOUR, **_LIMIT)
+            axes.axhline(limit, color=style.UNSAFE_COLOUR, linestyle="--", linewidth=1.2)
         for one in alarms:
             _span(axes, time_s[one.begin], time_s[one.end - 1], style.UNSAFE_COLOUR, 0.14)
-        _draw_labels(axes, events, rows, (0.0, 1.05 * max(1.0, float(peaks.max()))))
+        _write_names(axes, events, (0.0, 1.05 * max(1.0, float(peaks.max()))))
         axes.legend(**_LEGEND)
     return fig
 
@@ -188,22 +182,17 @@ def _lay_out(
     heights: Sequence[float], images: Sequence[np.ndarray]
 ) -> tuple[Figure, list[Axes], list[Axes]]:
     """Lays out a strip of images, if any, above panels of some heights [inches]."""
-    pictures: list[Axes] = []
-    if images:
-        aspect = max(image.shape[0] / image.shape[1] for image in images)
-        strip_height = min(aspect * _WIDTH / len(images), _MAX_STILL_HEIGHT) + _STILL_TITLE_HEIGHT
-        fig = style.new_figure(_WIDTH, sum(heights) + strip_height + _AXIS_LABEL_HEIGHT)
-        halves = fig.add_gridspec(2, 1, height_ratios=[strip_height, sum(heights)], hspace=0.08)
-        strip = halves[0, 0].subgridspec(1, len(images), wspace=0.03)
-        pictures = [fig.add_subplot(strip[0, i]) for i in range(len(images))]
-        rows: GridSpecBase = halves[1, 0].subgridspec(len(heights), 1, height_ratios=heights)
-    else:
-        fig = style.new_figure(_WIDTH, sum(heights) + _AXIS_LABEL_HEIGHT)
-        rows = fig.add_gridspec(len(heights), 1, height_ratios=heights)
-    panels: list[Axes] = []
-    for i in range(len(heights)):
-        panels.append(fig.add_subplot(rows[i, 0], sharex=panels[0] if panels else None))
-    return fig, pictures, panels
+    rows: Any = {"squeeze": False, "sharex": True, "height_ratios": heights}
+    height = sum(heights)
+    if not images:
+        fig = style.new_figure(_WIDTH, height + _AXIS_LABEL_HEIGHT)
+        return fig, [], fig.subplots(len(heights), **rows)[:, 0].tolist()
+    aspect = max(image.shape[0] / image.shape[1] for image in images)
+    strip = min(aspect * _WIDTH / len(images), _MAX_STILL_HEIGHT) + _STILL_TITLE_HEIGHT
+    fig = style.new_figure(_WIDTH, height + strip + _AXIS_LABEL_HEIGHT)
+    upper, lower = fig.subfigures(2, 1, height_ratios=[strip, height])
+    pictures = upper.subplots(1, len(images), squeeze=False)[0].tolist()
+    return fig, pictures, lower.subplots(len(heights), **rows)[:, 0].tolist()
 
 
 def _draw_belief(axes: Axes, time_s: np.ndarray, belief: np.ndarray) -> None:
@@ -250,46 +239,39 @@ def _span(axes: Axes, start_s: float, end_s: float, colour: str, alpha: float) -
     axes.axvspan(start_s, end_s, color=colour, alpha=alpha, linewidth=0, zorder=0)
 
 
-def _label_rows(labels: Sequence[_Event], start_s: float, end_s: float) -> list[int]:
-    """Assigns labels to rows, 0 at the top, such that none covers another or its instant."""
+def _place_names(events: Sequence[_Event], start_s: float, end_s: float) -> float:
+    """Gives names rows, so that none covers another or its instant; returns the height [inches]."""
     taken: list[list[tuple[float, float]]] = []
-    found = []
-    for label in labels:
-        scale = (end_s - start_s) / (_WIDTH - 2.0)  # Seconds per inch, roughly.
-        length = scale * (len(label.words) * _LETTER_WIDTH + 2 * _LABEL_OFFSET)
-        low = label.time_s - (length if label.time_s + length > end_s else scale * _LABEL_OFFSET)
-        high = max(low + length, label.time_s + scale * _LABEL_OFFSET)
-        row = 0
-        while row < len(taken) and any(low < b and a < high for a, b in taken[row]):
-            row += 1
-        taken += [[]] if row == len(taken) else []
-        taken[row].append((low, high))
-        found.append(row)
-    return found
+    scale = (end_s - start_s) / (_WIDTH - 2.0)  # Seconds per inch, roughly.
+    for event in events:
+        length = scale * (len(event.words) * _LETTER_WIDTH + 2 * _LABEL_OFFSET)
+        event.is_left = event.time_s + length > end_s
+        low = event.time_s - (length if event.is_left else scale * _LABEL_OFFSET)
+        high = max(low + length, event.time_s + scale * _LABEL_OFFSET)
+        is_free = [not any(low < b and a < high for a, b in row) for row in (*taken, [])]
+        event.row = is_free.index(True)
+        taken += [[]] if event.row == len(taken) else []
+        taken[event.row].append((low, high))
+    return _LABEL_ROW_HEIGHT * len(taken)
 
 
-def _draw_labels(
-    axes: Axes, labels: Sequence[_Event], rows: Sequence[int], ends: tuple[float, float]
-) -> float:
-    """Writes labels in rows above an axis with these ends; returns the new upper end."""
+def _write_names(axes: Axes, events: Sequence[_Event], ends: tuple[float, float]) -> float:
+    """Writes names in rows above an axis with these ends; returns the new upper end."""
     row_height = (ends[1] - ends[0]) * _LABEL_ROW_HEIGHT / _CURVE_HEIGHT
-    top = ends[1] + row_height * (max(rows, default=-1) + 1)
+    top = ends[1] + row_height * (max((event.row for event in events), default=-1) + 1)
     axes.set_ylim(ends[0], top)
-    start_s, end_s = axes.get_xlim()
-    for label, row in zip(labels, rows, strict=True):
-        place = (label.time_s, top - (row + 0.5) * row_height)
-        if label.is_ball:
+    for event in events:
+        place = (event.time_s, top - (event.row + 0.5) * row_height)
+        if event.is_ball:
             axes.plot(*place, "o", color=style.BALL_COLOUR, markersize=8, clip_on=False, zorder=5)
-        length = (len(label.words) * _LETTER_WIDTH + _LABEL_OFFSET) / (_WIDTH - 2.0)
-        is_late = label.time_s + length * (end_s - start_s) > end_s
         axes.annotate(
-            label.words,
+            event.words,
             place,
-            xytext=(-7 if is_late else 7, 0),
+            xytext=(-7 if event.is_left else 7, 0),
             textcoords="offset points",
-            ha="right" if is_late else "left",
+            ha="right" if event.is_left else "left",
             va="center",
-            color=label.colour,
+            color=event.colour,
             fontsize=9,
             zorder=6,
             # Lines of events and stills pass behind.

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from drake_safety.evaluation.embedding_figure import safety_colours
+from drake_safety.evaluation.embedding_figure import add_colour_bar, safety_colours
 from drake_safety.evaluation.figure_style import FAINT_INK, INK, drawing_style, new_figure, spoken
 from drake_safety.evaluation.metrics import area_under_curve
 from drake_safety.evaluation.scorers import assessment_scorer
@@ -22,7 +22,7 @@ from drake_safety.learning.seeds import check_unused
 from drake_safety.learning.segments import DIVERGED, Episodes
 
 _OUTSIDE_COLOUR = "#6b7178"
-_HATCH = "////"
+_UNKNOWN, _OUTSIDE = "Γ: don't know", "outside the safe set"
 _DOT = 26.0  # Area of a start's mark [points²].
 
 
@@ -79,23 +79,18 @@ def truth_figure(
     with drawing_style():
         fig = new_figure(9.0, 4.6)
         both = fig.subplots(1, 2, sharex=True, sharey=True)
-        grid = _grid_order(points)
+        grid, legend = _grid_order(points), list[Artist]()
         for axes, title, value in zip(both, titles, (gamma, is_safe.astype(float)), strict=True):
             if grid is None:
-                shade = _draw_points(axes, points, value, ~inside)
+                shade, marks = _draw_points(axes, points, value, ~inside)
             else:
-                shade = _draw_cells(axes, points, value, ~inside, is_safe, grid)
+                shade, marks = _draw_cells(axes, points, value, ~inside, is_safe, grid)
             axes.set(title=title, xlabel=spoken(x) if labels is None else labels[0])
+            legend = legend or marks  # The left panel has more to explain.
         both[0].set_ylabel(spoken(y) if labels is None else labels[1])
-        _add_legend(
-            fig,
-            has_unknown=np.isnan(gamma[inside]).any(),
-            has_outside=not inside.all(),
-            is_grid=grid is not None,
-            has_boundary=not np.isnan(area),
-        )
-        bar = fig.colorbar(shade, ax=both, shrink=0.9, pad=0.02, label="probability of safety")
-        bar.outline.set_visible(False)
+        if legend:
+            fig.legend(handles=legend, loc="outside lower center", ncols=3)
+        add_colour_bar(fig, both, shade, "probability of safety")
     return fig
 
 
@@ -103,27 +98,31 @@ def _grid_order(points: np.ndarray) -> np.ndarray | None:
     """Indices of the points (N, 2) on a full grid, (n_y, n_x); None if they are not on one."""
     # Starts that are set exactly may differ by rounding.
     scale = np.maximum(np.ptp(points, axis=0), 1e-12)
-    (xs, column), (ys, row) = (
-        np.unique(np.round(values, 6), return_inverse=True) for values in (points / scale).T
-    )
-    if len(xs) < 2 or len(ys) < 2 or len(xs) * len(ys) != len(points):
-        return None
-    order = np.full((len(ys), len(xs)), -1)
-    order[row, column] = np.arange(len(points))
-    return None if (order < 0).any() else order
+    rounded = np.round(points / scale, 6)
+    full = np.meshgrid(*map(np.unique, rounded.T))
+    order = np.lexsort(rounded.T)
+    is_full = np.array_equal(rounded[order], np.dstack(full).reshape(-1, 2))
+    return order.reshape(full[0].shape) if is_full and min(full[0].shape) > 1 else None
 
 
 def _draw_points(
     axes: Axes, points: np.ndarray, value: np.ndarray, is_outside: np.ndarray
-) -> ScalarMappable:
-    """Draws a point for each start: coloured, hollow (NaN, "don't know") or grey (outside)."""
-    x, y = points.T
+) -> tuple[ScalarMappable, list[Artist]]:
+    """Draws a point for each start: coloured, hollow (NaN, "don't know") or grey (outside).
+
+    Returns the colours, and what a legend explains.
+    """
     hollow, rows = np.isnan(value) & ~is_outside, ~np.isnan(value) & ~is_outside
-    axes.scatter(x[hollow], y[hollow], s=_DOT, facecolors="white", edgecolors=INK, linewidths=0.6)
-    axes.scatter(x[is_outside], y[is_outside], s=0.6 * _DOT, color=_OUTSIDE_COLOUR, marker="x")
+    ring: dict[str, Any] = {"facecolors": "white", "edgecolors": INK, "linewidths": 0.6}
+    cross: dict[str, Any] = {"color": _OUTSIDE_COLOUR, "marker": "x", "label": _OUTSIDE}
+    marks = {
+        axes.scatter(*points[hollow].T, s=_DOT, label=_UNKNOWN, **ring): hollow,
+        axes.scatter(*points[is_outside].T, s=0.6 * _DOT, **cross): is_outside,
+    }
     edge: dict[str, Any] = {"linewidths": 0.3, "edgecolors": FAINT_INK, "rasterized": True}
     shade: dict[str, Any] = {"cmap": safety_colours(), "vmin": 0.0, "vmax": 1.0}
-    return axes.scatter(x[rows], y[rows], c=value[rows], s=_DOT, **edge, **shade)
+    dots = axes.scatter(*points[rows].T, c=value[rows], s=_DOT, **edge, **shade)
+    return dots, [mark for mark, chosen in marks.items() if chosen.any()]
 
 
 def _draw_cells(
@@ -133,10 +132,16 @@ def _draw_cells(
     is_outside: np.ndarray,
     is_safe: np.ndarray,
     grid: np.ndarray,
-) -> ScalarMappable:
+) -> tuple[ScalarMappable, list[Artist]]:
     """Draws a cell for each start on a grid: coloured, hatched ("don't know") or grey (outside)."""
     place = points[grid[0], 0], points[grid[:, 0], 1]
-    axes.patch.set(facecolor="white", edgecolor=FAINT_INK, hatch=_HATCH)
+    hatched: dict[str, Any] = {"facecolor": "white", "edgecolor": FAINT_INK, "hatch": "////"}
+    axes.patch.set(**hatched)
+    marks: list[Artist] = []
+    if np.isnan(value[~is_outside]).any():
+        marks.append(Patch(label=_UNKNOWN, **hatched))
+    if is_outside.any():
+        marks.append(Patch(label=_OUTSIDE, color=_OUTSIDE_COLOUR))
     style: dict[str, Any] = {"shading": "nearest", "rasterized": True, "vmin": 0.0, "vmax": 1.0}
     inside = np.where(is_outside, np.nan, value)[grid]
     image = axes.pcolormesh(*place, inside, cmap=safety_colours(), **style)
@@ -147,28 +152,5 @@ def _draw_cells(
         # A white edge separates the line from the cells below.
         for colour, width in (("white", 3.4), (INK, 1.6)):
             axes.contour(*place, truth, levels=[0.5], colors=[colour], linewidths=width)
-    return image
-
-
-def _add_legend(
-    fig: Figure, *, has_unknown: bool, has_outside: bool, is_grid: bool, has_boundary: bool
-) -> None:
-    """Adds what the colour bar does not say, below the panels."""
-
-    def mark(label: str, of_cell: dict[str, Any], of_point: dict[str, Any]) -> Artist:
-        if is_grid:
-            return Patch(label=label, **of_cell)
-        return Line2D([], [], linestyle="", label=label, **of_point)
-
-    handles: list[Artist] = []
-    if has_unknown:
-        cell = {"facecolor": "white", "edgecolor": FAINT_INK, "hatch": _HATCH}
-        ring = {"marker": "o", "markerfacecolor": "white", "markeredgecolor": INK}
-        handles.append(mark("Γ: don't know", cell, ring))
-    if has_outside:
-        grey = {"color": _OUTSIDE_COLOUR}
-        handles.append(mark("outside the safe set", grey, {"marker": "x", **grey}))
-    if is_grid and has_boundary:
-        handles.append(Line2D([], [], color=INK, linewidth=1.6, label="boundary by simulation"))
-    if handles:
-        fig.legend(handles=handles, loc="outside lower center", ncols=3)
+        marks.append(Line2D([], [], color=INK, linewidth=1.6, label="boundary by simulation"))
+    return image, marks
