@@ -107,7 +107,7 @@ def test_the_verdict_is_that_of_the_probability(session):
         if not session.cause:
             is_known = session.panel.belief[2] <= 0.65  # Half of it is from empty cells.
             refused = "unsafe" if is_known else "don't know"
-            assert status.state == ("safe" if session.probability >= 0.5 else refused)
+            assert status.state == ("safe" if session.panel.probability >= 0.5 else refused)
             assert status.tone == (status.state if is_known else "plain")
             seen.add(status.state)
     assert {"safe", "unsafe"} <= seen

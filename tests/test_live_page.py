@@ -16,7 +16,7 @@ import urllib.request
 import numpy as np
 import pytest
 
-from drake_safety.live.panel import HISTORY_S, LivePanel
+from drake_safety.live.panel import HISTORY_S, LivePanel, Status
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
@@ -29,7 +29,7 @@ def panel():
     panel.add_button("Stop", "Escape")
     panel.add_button("Throw", "Space")
     panel.add_slider("mass [kg]", 1.0, 5.0, 0.5, 3.0)
-    panel.show("safe: balancing", note="a remark", tone="safe")
+    panel.status = Status("safe: balancing", note="a remark", tone="safe")
     panel.show_belief(0.75, np.array([0.7, 0.1, 0.2]), 0.0)
     return panel
 

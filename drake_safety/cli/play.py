@@ -71,8 +71,8 @@ def play(
         console.say("nothing was simulated")
         return
     console.say(
-        f"real-time factor {pace.realtime_factor:.2f} over {pace.simulated_s:.1f} s simulated; "
-        f"this machine could run it at {pace.possible_factor:.2f}"
+        f"real-time factor {pace.simulated_s / pace.elapsed_s:.2f} over {pace.simulated_s:.1f} s "
+        f"simulated; this machine could run it at {pace.simulated_s / pace.busy_s:.2f}"
     )
 
 

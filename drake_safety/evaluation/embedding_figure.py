@@ -61,7 +61,8 @@ def _draw_segments(
     draw_grid(axes, assessment.grid_)
     shade = ScalarMappable(Normalize(0.0, 1.0), safety_colours().reversed())
     dots: dict[str, Any] = {"s": 5.0, "linewidths": 0.0, "alpha": 0.85, "rasterized": True}
-    axes.scatter(*found.embedding.T, c=segments.score, cmap=shade.cmap, norm=shade.norm, **dots)
+    x, y = found.embedding.T
+    axes.scatter(x, y, c=segments.score, cmap=shade.cmap, vmin=0.0, vmax=1.0, **dots)
     axes.set_title("Segments in the embedding")
     axes.set_xlabel(f"{len(segments)} segments of {len(episodes)} episodes")
     add_colour_bar(fig, axes, shade, "unsafety score λ")

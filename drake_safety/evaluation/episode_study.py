@@ -28,7 +28,6 @@ def evaluate_episodes(
     and for k = 0. Returns the estimates by dotted key, the unsafe score of every test segment by
     scorer, (N,) each, and the test segments.
     """
-    _check(scorers, calibration, test)
     segments = split(test, stride=1, discount=1.0)
     seen = split(calibration, stride=1, discount=1.0)
     # Rows of the test set and of the calibration set, by prefix of the keys.
@@ -39,6 +38,7 @@ def evaluate_episodes(
     estimates: dict[str, Estimate] = {}
     scores = {}
     for scorer in scorers:
+        check_unused(scorer.used, [calibration.info.seed, test.info.seed], f"'{scorer.name}'")
         score, seen_score = scorer.unsafe_score(segments), scorer.unsafe_score(seen)
         scores[scorer.name] = score
         for kind, (rows, seen_rows) in rows_of.items():
@@ -66,13 +66,13 @@ def evaluate_plans(
     Given ones are the unsafe score above which a plan is refused, by scorer. Returns what
     :func:`evaluate_episodes` does, of the first segments, with the outcomes' shares.
     """
-    _check(scorers, calibration, test)
     first, seen = first_segments(test), first_segments(calibration)
     miss_rate = promised_miss_rate(seen.is_unsafe)
     num_unsafe = int(seen.is_unsafe.sum())
     estimates = {"plans.promised_unsafe_recall": Estimate.exact(1.0 - miss_rate, num_unsafe)}
     scores = {}
     for scorer in scorers:
+        check_unused(scorer.used, [calibration.info.seed, test.info.seed], f"'{scorer.name}'")
         threshold = thresholds.get(scorer.name)
         if threshold is None:
             threshold = score_threshold(scorer.unsafe_score(seen), seen.is_unsafe, miss_rate)
@@ -114,8 +114,3 @@ def promised_miss_rate(is_unsafe: np.ndarray) -> float:
             episodes_needed(wanted),
         )
     return max(least, wanted)
-
-
-def _check(scorers: Sequence[Scorer], *sets: Episodes) -> None:
-    for scorer in scorers:
-        check_unused(scorer.used, [one.info.seed for one in sets], f"'{scorer.name}'")

@@ -60,15 +60,8 @@ class StillCamera:
         # Only the horizontal motion of the base is followed, so that a fall remains visible.
         self._look_at_height = centre[2]
         self._offset = (centre - base)[:2]
-        direction = np.array(
-            [
-                math.cos(view.elevation_rad) * math.cos(view.azimuth_rad),
-                math.cos(view.elevation_rad) * math.sin(view.azimuth_rad),
-                math.sin(view.elevation_rad),
-            ]
-        )
         narrow = 0.5 * _FIELD_OF_VIEW_RAD * min(1.0, width / height)
-        self._eye = view.room * radius / math.sin(narrow) * direction
+        self._eye = view.room * radius / math.sin(narrow) * view.direction()
         core = RenderCameraCore(
             _RENDERER,
             CameraInfo(width * _SUPERSAMPLING, height * _SUPERSAMPLING, _FIELD_OF_VIEW_RAD),

@@ -190,7 +190,8 @@ def _lay_out(
     aspect = max(image.shape[0] / image.shape[1] for image in images)
     strip = min(aspect * _WIDTH / len(images), _MAX_STILL_HEIGHT) + _STILL_TITLE_HEIGHT
     fig = style.new_figure(_WIDTH, height + strip + _AXIS_LABEL_HEIGHT)
-    upper, lower = fig.subfigures(2, 1, height_ratios=[strip, height])
+    halves: Any = fig.subfigures(2, 1, height_ratios=[strip, height])
+    upper, lower = halves
     pictures = upper.subplots(1, len(images), squeeze=False)[0].tolist()
     return fig, pictures, lower.subplots(len(heights), **rows)[:, 0].tolist()
 

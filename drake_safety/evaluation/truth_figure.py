@@ -112,16 +112,17 @@ def _draw_points(
 
     Returns the colours, and what a legend explains.
     """
+    x, y = points.T
     hollow, rows = np.isnan(value) & ~is_outside, ~np.isnan(value) & ~is_outside
     ring: dict[str, Any] = {"facecolors": "white", "edgecolors": INK, "linewidths": 0.6}
     cross: dict[str, Any] = {"color": _OUTSIDE_COLOUR, "marker": "x", "label": _OUTSIDE}
     marks = {
-        axes.scatter(*points[hollow].T, s=_DOT, label=_UNKNOWN, **ring): hollow,
-        axes.scatter(*points[is_outside].T, s=0.6 * _DOT, **cross): is_outside,
+        axes.scatter(x[hollow], y[hollow], s=_DOT, label=_UNKNOWN, **ring): hollow,
+        axes.scatter(x[is_outside], y[is_outside], s=0.6 * _DOT, **cross): is_outside,
     }
     edge: dict[str, Any] = {"linewidths": 0.3, "edgecolors": FAINT_INK, "rasterized": True}
     shade: dict[str, Any] = {"cmap": safety_colours(), "vmin": 0.0, "vmax": 1.0}
-    dots = axes.scatter(*points[rows].T, c=value[rows], s=_DOT, **edge, **shade)
+    dots = axes.scatter(x[rows], y[rows], c=value[rows], s=_DOT, **edge, **shade)
     return dots, [mark for mark, chosen in marks.items() if chosen.any()]
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from pydrake.geometry import Meshcat, Rgba
 from pydrake.math import RigidTransform
@@ -36,15 +34,10 @@ class FollowingCamera:
         contacts = loop.kinematics.contact_positions(q)
         self.size_m = float(max(2 * q[6], *np.ptp(contacts, axis=0)))
         self._height_m = 0.7 * float(q[6])
-        view = loop.view
-        level, up = math.cos(view.elevation_rad), math.sin(view.elevation_rad)
-        away = np.array(
-            [level * math.cos(view.azimuth_rad), level * math.sin(view.azimuth_rad), up]
-        )
         for path in _OWN:
             meshcat.SetProperty(path, "visible", False)
         self._draw_grid()
-        meshcat.SetCameraPose(_DISTANCE * self.size_m * away, np.zeros(3))
+        meshcat.SetCameraPose(_DISTANCE * self.size_m * loop.view.direction(), np.zeros(3))
 
     def begin(self, context: Context) -> None:
         """Aims at the robot in a Context of the loop."""

@@ -34,13 +34,14 @@ class Status:
     tone: str = "plain"
 
 
-@dataclass(frozen=True)
+@dataclass
 class Slider:
-    """Range of a slider, and the distance of neighbouring values."""
+    """Range of a slider, the distance of neighbouring values, and where it is."""
 
     low: float
     high: float
     step: float
+    value: float
 
 
 class LivePanel:
@@ -64,7 +65,6 @@ class LivePanel:
         self.belief: tuple[float, ...] = _UNKNOWN
         self.buttons: dict[str, str] = {}
         self.sliders: dict[str, Slider] = {}
-        self._values: dict[str, float] = {}
         self.is_stopped = False
         self._clicks: set[str] = set()
         self._clicking = threading.Lock()
@@ -76,8 +76,7 @@ class LivePanel:
 
     def add_slider(self, name: str, low: float, high: float, step: float, value: float) -> None:
         """Adds a slider."""
-        self.sliders[name] = Slider(low, high, step)
-        self._values[name] = value
+        self.sliders[name] = Slider(low, high, step, value)
 
     def click(self, name: str) -> None:
         """Clicks a button; clicks before the next :meth:`take_click` count as one."""
@@ -95,15 +94,11 @@ class LivePanel:
         """Sets a slider, within its range, to what a page sent; what is no number is ignored."""
         slider = self.sliders[name]
         if isinstance(value, int | float) and math.isfinite(value):
-            self._values[name] = float(min(max(value, slider.low), slider.high))
+            slider.value = float(min(max(value, slider.low), slider.high))
 
     def value(self, name: str) -> float:
         """Value of a slider, within its range."""
-        return self._values[name]
-
-    def show(self, state: str, *, cause: str = "", note: str = "", tone: str = "plain") -> None:
-        """Shows text; see `Status`."""
-        self.status = Status(state, cause, note, tone)
+        return self.sliders[name].value
 
     def show_belief(
         self, probability: float, belief: np.ndarray, time_s: float | None = None
@@ -133,4 +128,4 @@ class LivePanel:
     def stop(self) -> None:
         """Shows that the session has ended."""
         self.is_stopped = True
-        self.show("stopped", note="The simulation has ended.")
+        self.status = Status("stopped", note="The simulation has ended.")

@@ -9,7 +9,8 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from itertools import count, repeat
+from typing import Any, Literal
 
 import numpy as np
 from pydrake.geometry import Meshcat, Rgba, Sphere
@@ -20,7 +21,7 @@ from drake_safety.learning.causes import describe_margin, likely_cause
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import DivergenceError
 from drake_safety.live.following_camera import WORLD, FollowingCamera
-from drake_safety.live.panel import COLOURS, LivePanel
+from drake_safety.live.panel import COLOURS, LivePanel, Status
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.plants.balls import Throw
@@ -74,18 +75,8 @@ class Pace:
     """Simulated time, and the real time that it took with waiting and without, so far [s]."""
 
     simulated_s: float = 0.0
-    busy_s: float = 0.0
     elapsed_s: float = 0.0
-
-    @property
-    def realtime_factor(self) -> float:
-        """Simulated by elapsed real time; 1 if the simulation kept up."""
-        return self.simulated_s / self.elapsed_s if self.elapsed_s > 0 else math.nan
-
-    @property
-    def possible_factor(self) -> float:
-        """Simulated time by the real time spent on it: the largest possible real-time factor."""
-        return self.simulated_s / self.busy_s if self.busy_s > 0 else math.nan
+    busy_s: float = 0.0
 
 
 class LiveSession:
@@ -132,7 +123,7 @@ class LiveSession:
         self.verdict: GoalVerdict | None = None
         self.nearest: GoalVerdict | None = None
         self._goal = np.full(3, np.nan)
-        self._seed, self._num_resets = seed, 0
+        self._seed, self._rngs = seed, map(episode_rng, repeat(seed), count())
         self._end_s = math.inf  # Of the motion.
         self._num_waits = 0  # Ticks for which a failure is still shown.
         self._said, self._said_until_s = "", -math.inf
@@ -140,45 +131,37 @@ class LiveSession:
         self.panel = LivePanel(title=loop.scenario.name, threshold=threshold)
         self.panel.add_button(STOP, "Escape")
         self._actions: dict[str, Callable[[], object]] = {}
-        self._is_commanded = isinstance(loop, FollowsCommands)
-        self._has_goals = isinstance(loop, HasGoals) and not self._is_commanded
-        self._has_balls = isinstance(loop, HasBall) and not isinstance(loop, HasGoals)
-        self._runs_episodes = not (self._is_commanded or self._has_goals or self._has_balls)
-        self._fall_column = (
-            loop.constraint_names.index(loop.fall_name) if isinstance(loop, CanFall) else None
-        )
-        if self._is_commanded:
+        self._use: Literal["commands", "goals", "balls", "episodes"] = "episodes"
+        if isinstance(loop, FollowsCommands):
+            self._use = "commands"
             require(loop, HasGoals, "live session")
             for name, key, entry, sign in STEPS:
                 self._add(name, key, partial(self._step, entry, sign))
             self._add(HALT, "KeyH", partial(self._set_command, np.zeros(3)))
             self._add(GUARD, "KeyG", self._switch_guard)
-        elif self._has_goals:
+        elif isinstance(loop, HasGoals):
+            self._use = "goals"
             self._add(ASK, "KeyA", partial(self._assess, is_thorough=True))
             self._add(GO, "Space", partial(self._go, is_forced=False))
             self._add(FORCE, "", partial(self._go, is_forced=True))
             self._add_target()
-        elif self._has_balls:
+        elif isinstance(loop, HasBall):
+            self._use = "balls"
             self._add(THROW, "Space", self._throw)
             self.panel.add_slider(MASS, 1.0, 5.0, 0.5, 3.0)
             self.panel.add_slider(SPEED, 1.0, 11.0, 0.5, 8.0)
             self.panel.add_slider(DIRECTION, -180.0, 180.0, 15.0, -75.0)
-        if isinstance(loop, CanBePushed) and (self._is_commanded or self._runs_episodes):
+        if isinstance(loop, CanBePushed) and self._use in ("commands", "episodes"):
             self._add(PUSH, "Space", self._push)
         self.panel.add_button(START, "KeyR")
         with self._shows_failure():
             self._start()
 
     @property
-    def probability(self) -> float:
-        """The probability as shown; NaN before the first."""
-        return self.panel.probability
-
-    @property
     def has_fallen(self) -> bool:
         """Whether the robot has fallen; False where nothing can fall."""
-        column = self._fall_column
-        return column is not None and bool(self._eval("margins")[column] < 0)
+        names, margins = self.loop.constraint_names, self._eval("margins")
+        return isinstance(self.loop, CanFall) and margins[names.index(self.loop.fall_name)] < 0
 
     def tick(self) -> bool:
         """Reacts to the controls, advances by one tick, and shows belief and verdict.
@@ -191,7 +174,7 @@ class LiveSession:
             self._num_waits -= 1
             return False
         with self._shows_failure():
-            if is_asked or (self._is_over and not self._has_goals):
+            if is_asked or (self._is_over and self._use != "goals"):
                 self._start()
             self._react()
             if self._is_over:
@@ -201,30 +184,28 @@ class LiveSession:
             self.panel.show_belief(probability, belief, self.context.get_time())
             if self._camera is not None:
                 self._camera.follow(self.context)
-            self._show_status()
-            if self.loop.HasOutputPort("alarm") and self._eval("alarm")[0] > 0.5:
-                cause = self.loop.GetOutputPort("alarm_cause").Eval(self.context)
-                note = f"{self.panel.status.note}; monitor: {cause}".removeprefix("; ")
-                self.panel.status = replace(self.panel.status, note=note)
+            status = self._status()
+            if self._is_on("alarm"):
+                notes = filter(None, [status.note, f"monitor: {self._eval('alarm_cause')}"])
+                status = replace(status, note="; ".join(notes))
+            self.panel.status = status
         return self._num_waits == 0
 
-    def run(self, *, is_paced: bool = True) -> None:
-        """Ticks, in real time or as fast as possible, until Stop is clicked; the panel says so."""
+    def run(self) -> None:
+        """Ticks in real time until Stop is clicked; the panel says so."""
         late_s = 0.0
         try:
             while not self.panel.take_click(STOP):
                 begin = time.perf_counter()
-                was_simulated = self.tick()
-                busy_s = time.perf_counter() - begin
-                if not was_simulated:
+                if not self.tick():
                     time.sleep(BREAK_S)
                     late_s = 0.0
                     continue
-                if is_paced:
-                    # A delay is made up for, up to a few ticks.
-                    spare_s = TICK_S - busy_s - late_s
-                    time.sleep(max(spare_s, 0.0))
-                    late_s = min(max(-spare_s, 0.0), 5 * TICK_S)
+                busy_s = time.perf_counter() - begin
+                # A delay is made up for, up to a few ticks.
+                spare_s = TICK_S - busy_s - late_s
+                time.sleep(max(spare_s, 0.0))
+                late_s = min(max(-spare_s, 0.0), 5 * TICK_S)
                 self.pace.simulated_s += TICK_S
                 self.pace.busy_s += busy_s
                 self.pace.elapsed_s += time.perf_counter() - begin
@@ -235,29 +216,26 @@ class LiveSession:
         self.panel.add_button(name, key)
         self._actions[name] = action
 
-    def _next_rng(self) -> np.random.Generator:
-        self._num_resets += 1
-        return episode_rng(self._seed, self._num_resets - 1)
-
     def _start(self) -> None:
         """Resets the robot, with a Context of default values."""
         loop, end_s = self.loop, math.inf
         self._simulator = Simulator(loop)
         self.context = self._simulator.get_mutable_context()
         self.cause, self._num_waits = "", 0
-        if self._is_commanded:
-            self.command = np.zeros(3)
-            loop.reset_standing(self.context, self.command, self._next_rng())
-            loop.set_guarded(self.context, self.is_guarded)
-        elif self._has_goals:
-            # Shows the posture only; no motion begins.
-            loop.reset_standing(self.context, loop.target_box.mean(axis=0))
-            end_s, self._goal = -math.inf, np.full(3, np.nan)
-        elif self._has_balls:
-            loop.reset_calm(self.context, self._next_rng())
-        else:
-            loop.reset(self.context, self._next_rng())
-            end_s = loop.scenario.episode_duration_s + _SHOWN_S
+        match self._use:
+            case "commands":
+                self.command = np.zeros(3)
+                loop.reset_standing(self.context, self.command, next(self._rngs))
+                loop.set_guarded(self.context, self.is_guarded)
+            case "goals":
+                # Shows the posture only; no motion begins.
+                loop.reset_standing(self.context, loop.target_box.mean(axis=0))
+                end_s, self._goal = -math.inf, np.full(3, np.nan)
+            case "balls":
+                loop.reset_calm(self.context, next(self._rngs))
+            case "episodes":
+                loop.reset(self.context, next(self._rngs))
+                end_s = loop.scenario.episode_duration_s + _SHOWN_S
         self._begin(end_s)
 
     def _begin(self, end_s: float) -> None:
@@ -277,7 +255,7 @@ class LiveSession:
         for name, action in self._actions.items():
             if self.panel.take_click(name):
                 action()
-        if self._has_goals and not np.array_equal(self._slid_goal(), self._goal):
+        if self._use == "goals" and not np.array_equal(self._slid_goal(), self._goal):
             self._assess(is_thorough=False)
 
     @contextlib.contextmanager
@@ -288,50 +266,59 @@ class LiveSession:
         except RuntimeError as error:
             # Drake's solvers raise it, and so does a task whose simulation diverges.
             note = textwrap.shorten(str(error), _NUM_CHARACTERS)
-            self.panel.show("the simulation failed", note=note, tone="unsafe")
+            self.panel.status = Status("the simulation failed", note=note, tone="unsafe")
             self._num_waits = round(_SHOWN_S / BREAK_S)
             self._end_s = -math.inf
 
-    def _show_status(self) -> None:
+    def _status(self) -> Status:
+        """What the robot does after a tick."""
         loop, now_s, margins = self.loop, self.context.get_time(), self._eval("margins")
         if not np.isfinite(margins).all():
             raise DivergenceError(f"a margin is not finite at {now_s:.2f} s")
-        violated = loop.constraint_names[int(np.argmin(margins))] if margins.min() < 0 else ""
-        if violated and not self.cause:
-            self.cause = violated
-            if self._runs_episodes:
-                self._end_s = now_s + _SHOWN_S
+        left = loop.constraint_names[int(np.argmin(margins))] if margins.min() < 0 else ""
+        if self._use == "episodes" and left and not self.cause:
+            self._end_s = now_s + _SHOWN_S
+        self.cause = self.cause or left
+        if self._use == "episodes":
+            left = self.cause  # Until the next start.
         note = self._note()
         if self.has_fallen:
             self._end_s = min(self._end_s, now_s + _SHOWN_S)
-            self.panel.show("fallen", note=note, tone="unsafe")
-        elif self._is_on("recovery_active"):
-            self.panel.show("recovering", cause=self._cause(), note=note, tone="recovery")
-        elif left := (self.cause if self._runs_episodes else violated):
-            name = left.replace("_", " ")
-            self.panel.show(f"left the safe set: {name}", note=note, tone="unsafe")
-        elif self._has_goals:
-            self._show_way()
-        elif self._is_on("guard_active") and self.is_guarded:
+            return Status("fallen", note=note, tone="unsafe")
+        if self._is_on("recovery_active"):
+            return Status("recovering", self._cause(), note, "recovery")
+        if left:
+            return Status(f"left the safe set: {left.replace('_', ' ')}", note=note, tone="unsafe")
+        if self._use == "goals" and self._is_over:
+            miss_m = float(np.linalg.norm(self._eval("output") - self._goal))
+            return Status("there", note=f"{100 * miss_m:.1f} cm off", tone="recovery")
+        if self._use == "goals":
+            return Status("on the way", note=f"the {loop.hand} hand reaches", tone="safe")
+        if self._is_on("guard_active") and self.is_guarded:
             passed = goal_words(loop).value(np.round(self._eval("desired_output"), 2))
-            told = f"{passed}; asked: {note}"
-            self.panel.show("guard: another command", note=told, tone="recovery")
-        else:
-            self._show_by_probability(note)
+            return Status("guard: another command", "", f"{passed}; asked: {note}", "recovery")
+        doing = ": balancing" if self._use == "balls" else ""
+        if self._use == "commands":
+            doing = ": walking" if self.command.any() else ": standing"
+        if self.panel.probability >= self.threshold:
+            return Status(f"safe{doing}", note=note, tone="safe")
+        if is_unknown(self._eval("belief"), self.assessment.parameters.initial_uncertainty):
+            return Status(f"don't know{doing}", note=note)
+        return Status(f"unsafe{doing}", self._cause(), note, "unsafe")
 
     def _note(self) -> str:
         """What was said last, or what a key does."""
-        if self.context.get_time() < self._said_until_s:
+        now_s, duration_s = self.context.get_time(), self.loop.scenario.episode_duration_s
+        if now_s < self._said_until_s:
             note = self._said
-        elif self._is_commanded:
+        elif self._use == "commands":
             note = goal_words(self.loop).value(self.command)
-        elif self._has_goals:
-            note = "R stands it up again"
-        elif self._has_balls:
-            note = "Space throws a ball"
+        elif self._use != "episodes":
+            is_ball = self._use == "balls"
+            note = "Space throws a ball" if is_ball else "R stands it up again"
         elif self.cause:
             note = "the next start follows"
-        elif self.context.get_time() >= (duration_s := self.loop.scenario.episode_duration_s):
+        elif now_s >= duration_s:
             note = f"the episode's {duration_s:g} s have passed; the next start follows"
         else:
             note = "R starts anew"
@@ -339,18 +326,6 @@ class LiveSession:
 
     def _say(self, note: str, seconds: float) -> None:
         self._said, self._said_until_s = note, self.context.get_time() + seconds
-
-    def _show_by_probability(self, note: str) -> None:
-        """Shows "safe", "unsafe" or "don't know", and what the robot does."""
-        doing = ": balancing" if self._has_balls else ""
-        if self._is_commanded:
-            doing = ": walking" if self.command.any() else ": standing"
-        if self.probability >= self.threshold:
-            self.panel.show(f"safe{doing}", note=note, tone="safe")
-        elif is_unknown(self._eval("belief"), self.assessment.parameters.initial_uncertainty):
-            self.panel.show(f"don't know{doing}", note=note)
-        else:
-            self.panel.show(f"unsafe{doing}", cause=self._cause(), note=note, tone="unsafe")
 
     def _cause(self) -> str:
         """The constraint that is most likely to be violated; "" for none."""
@@ -361,7 +336,7 @@ class LiveSession:
             self.assessment.parameters.margin_unit,
         )
 
-    def _eval(self, port: str) -> np.ndarray:
+    def _eval(self, port: str) -> Any:
         return self.loop.GetOutputPort(port).Eval(self.context)
 
     def _is_on(self, port: str) -> bool:
@@ -369,7 +344,7 @@ class LiveSession:
 
     def _push(self) -> None:
         """Begins a random push."""
-        push = self.loop.sample_push(self._next_rng())
+        push = self.loop.sample_push(next(self._rngs))
         start_s = self.context.get_time() + 0.5 * TICK_S
         self.loop.set_push(self.context, replace(push, time_s=start_s))
         self._say(f"pushed with {push.strength_n:.0f} N for {push.duration_s:g} s", 2.0)
@@ -415,7 +390,7 @@ class LiveSession:
         """Starts the motion to a target that is accepted, or forced."""
         verdict = self._assess(is_thorough=not is_forced)
         if verdict.is_accepted or is_forced:
-            self.loop.reset_standing(self.context, verdict.goal, self._next_rng())
+            self.loop.reset_standing(self.context, verdict.goal, next(self._rngs))
             self._begin(self.loop.scenario.episode_duration_s + 1.0)
 
     def _assess(self, *, is_thorough: bool) -> GoalVerdict:
@@ -442,7 +417,7 @@ class LiveSession:
     def _show_verdict(self, verdict: GoalVerdict, *, is_thorough: bool) -> None:
         told = f"probability {verdict.probability:.2f}"
         if verdict.is_accepted:
-            self.panel.show(f"accepted: {told}", note="Space goes there", tone="safe")
+            self.panel.status = Status(f"accepted: {told}", note="Space goes there", tone="safe")
             return
         if verdict.reason:
             told = "don't know"
@@ -456,12 +431,4 @@ class LiveSession:
         elif is_thorough:
             notes.append("nothing near is accepted")
         note = "; ".join(filter(None, notes))
-        self.panel.show(f"refused: {told}", cause=cause, note=note, tone="unsafe")
-
-    def _show_way(self) -> None:
-        if self._is_over:
-            miss_m = float(np.linalg.norm(self._eval("output") - self._goal))
-            self.panel.show("there", note=f"{100 * miss_m:.1f} cm off", tone="recovery")
-        else:
-            note = f"the {self.loop.hand} hand reaches"
-            self.panel.show("on the way", note=note, tone="safe")
+        self.panel.status = Status(f"refused: {told}", cause, note, "unsafe")

@@ -51,6 +51,11 @@ class View:
     room: Positive = 0.95
     """Free space in a picture, by the robot's extent."""
 
+    def direction(self) -> np.ndarray:
+        """Unit vector from the robot to the camera in the world, (3,)."""
+        level = np.array([math.cos(self.azimuth_rad), math.sin(self.azimuth_rad)])
+        return np.append(math.cos(self.elevation_rad) * level, math.sin(self.elevation_rad))
+
     def mirrored(self) -> "View":
         """The view mirrored at the x-z plane."""
         return View(azimuth_rad=-self.azimuth_rad, elevation_rad=self.elevation_rad, room=self.room)
