@@ -64,7 +64,7 @@ def render(kind: str, results: Results, **more: Any) -> str:
     environment.globals |= {
         "r": results,
         "entries": results.entries,
-        "has": results.has,
+        "has": lambda prefix: any(key.startswith(prefix) for key in results),
         "label_of": label_of,
         "table": lambda corner, rows, columns: _table(results, corner, rows, columns),
         "verdicts": lambda set, corner: verdict_table(results, set, corner=corner),

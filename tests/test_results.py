@@ -39,7 +39,6 @@ def test_rows_are_selected_by_set_method_and_metric():
         "segments",
         "episodes",
     ]
-    assert results.has("throws.") and not results.has("plans.")
 
 
 def test_what_is_written_is_read_again_with_six_digits(tmp_path):

@@ -55,9 +55,8 @@ CALM = Scorer(name="calm", probability=lambda state, *_: state[:, 0])
 
 def test_a_rule_in_time_saves_every_throw_and_a_late_one_none(monkeypatch):
     monkeypatch.setattr(throw_study, "run_throws", every_third_falls)
-    found, logs = evaluate_throws(
-        None, [rule("prompt", 0.6), rule("late", 0.6, delay_rows=10)], num_throws=9, seed=1
-    )
+    rules = [rule("prompt", 0.6), rule("late", 0.6, delay_rows=10)]
+    found, logs = evaluate_throws(None, rules, num_throws=9, seed=1, progress=print)
     assert [log.index for log in logs] == list(range(9))
     assert found["throws.falls_without_recovery"].value == 3 / 9
     assert found["throws.prompt.falls_with_recovery"].value == 0.0

@@ -57,10 +57,6 @@ class Results(dict[str, Result]):
         super().__init__({key: Result.of(key, one) for key, one in estimates.items()})
         self.entries: dict[str, Any] = dict(entries or {})
 
-    def has(self, prefix: str) -> bool:
-        """Whether the key of any row begins so."""
-        return any(key.startswith(prefix) for key in self)
-
     def select(
         self, *, set: str | None = None, method: str | None = None, metric: str | None = None
     ) -> list[Result]:

@@ -49,19 +49,17 @@ def evaluate_throws(
     *,
     num_throws: int,
     seed: int,
+    progress: StageProgress,
     persistence_s: float = 0.0,
-    variation: str = "actual",
     num_workers: int | None = None,
-    progress: StageProgress | None = None,
 ) -> tuple[dict[str, Estimate], list[Motion]]:
     """Throws balls at the actual plant and compares the triggers of rules and their outcomes.
 
     "Don't know" triggers when it has lasted ``persistence_s``. Returns the estimates by dotted key,
     and the throws without recovery.
     """
-    report = progress or (lambda stage, done, total: None)
-    throw = partial(run_throws, scenario, seed=seed, variation=variation, num_workers=num_workers)
-    logs = throw(list(range(num_throws)), progress=partial(report, "throws, balancing alone"))
+    throw = partial(run_throws, scenario, seed=seed, variation="actual", num_workers=num_workers)
+    logs = throw(list(range(num_throws)), progress=partial(progress, "throws, balancing alone"))
     triggers = {
         rule.scorer.name: [
             trigger_time(log, log_probability(log, rule.scorer, persistence_s), rule.threshold)
@@ -75,7 +73,7 @@ def evaluate_throws(
     again = throw(
         [index for index, _ in wanted],
         trigger_times_s=[time_s for _, time_s in wanted],
-        progress=partial(report, "throws, with recovery"),
+        progress=partial(progress, "throws, with recovery"),
     )
     simulated = dict(zip(wanted, again, strict=True))
     estimates = _estimates_without_recovery(logs)
