@@ -16,7 +16,7 @@ import urllib.request
 import numpy as np
 import pytest
 
-from drake_safety.live.panel import HISTORY_S, LivePanel, Status
+from drake_safety.live.panel import HISTORY_S, LivePanel, Slider, Status
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
@@ -26,9 +26,8 @@ WITHIN_S = 120
 @pytest.fixture
 def panel():
     panel = LivePanel(title="a robot", threshold=0.3)
-    panel.add_button("Stop", "Escape")
-    panel.add_button("Throw", "Space")
-    panel.add_slider("mass [kg]", 1.0, 5.0, 0.5, 3.0)
+    panel.buttons |= {"Stop": "Escape", "Throw": "Space"}
+    panel.sliders["mass [kg]"] = Slider(1.0, 5.0, 0.5, 3.0)
     panel.status = Status("safe: balancing", note="a remark", tone="safe")
     panel.show_belief(0.75, np.array([0.7, 0.1, 0.2]), 0.0)
     return panel
@@ -62,9 +61,9 @@ def test_a_click_while_the_session_looks_is_not_lost(panel):
 @pytest.mark.parametrize("sent", [-1.0, math.nan, math.inf, 1e308, None, "2", [2.0]])
 def test_what_a_page_sends_stays_within_the_range_of_its_slider(panel, sent):
     panel.set_value("mass [kg]", sent)
-    assert 1.0 <= panel.value("mass [kg]") <= 5.0
+    assert 1.0 <= panel.sliders["mass [kg]"].value <= 5.0
     panel.set_value("mass [kg]", 2)
-    assert panel.value("mass [kg]") == 2.0
+    assert panel.sliders["mass [kg]"].value == 2.0
 
 
 def test_the_curve_is_bounded_and_ends_now(panel):

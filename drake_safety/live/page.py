@@ -139,8 +139,8 @@ def _build_controls(panel: LivePanel) -> Callable[[], None]:
 
     def update() -> None:
         for name, (slider, number) in numbers.items():
-            slider.set_value(panel.value(name))
-            number.set_text(f"{panel.value(name):g}")
+            slider.set_value(panel.sliders[name].value)
+            number.set_text(f"{panel.sliders[name].value:g}")
 
     update()
     return update

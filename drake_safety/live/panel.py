@@ -54,6 +54,7 @@ class LivePanel:
         probability: The probability; NaN before the first.
         belief: (safe, unsafe, don't know), of sum one.
         buttons: Key of each button by its name, as `KeyboardEvent.code`; "" for none.
+        sliders: By name.
         is_stopped: Whether the session has ended.
     """
 
@@ -69,14 +70,6 @@ class LivePanel:
         self._clicks: set[str] = set()
         self._clicking = threading.Lock()
         self._history: deque[tuple[float, float]] = deque()
-
-    def add_button(self, name: str, key: str = "") -> None:
-        """Adds a button."""
-        self.buttons[name] = key
-
-    def add_slider(self, name: str, low: float, high: float, step: float, value: float) -> None:
-        """Adds a slider."""
-        self.sliders[name] = Slider(low, high, step, value)
 
     def click(self, name: str) -> None:
         """Clicks a button; clicks before the next :meth:`take_click` count as one."""
@@ -95,10 +88,6 @@ class LivePanel:
         slider = self.sliders[name]
         if isinstance(value, int | float) and math.isfinite(value):
             slider.value = float(min(max(value, slider.low), slider.high))
-
-    def value(self, name: str) -> float:
-        """Value of a slider, within its range."""
-        return self.sliders[name].value
 
     def show_belief(
         self, probability: float, belief: np.ndarray, time_s: float | None = None

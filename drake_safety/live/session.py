@@ -21,7 +21,7 @@ from drake_safety.learning.causes import describe_margin, likely_cause
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import DivergenceError
 from drake_safety.live.following_camera import WORLD, FollowingCamera
-from drake_safety.live.panel import COLOURS, LivePanel, Status
+from drake_safety.live.panel import COLOURS, LivePanel, Slider, Status
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.plants.balls import Throw
@@ -129,7 +129,7 @@ class LiveSession:
         self._said, self._said_until_s = "", -math.inf
         self._camera = FollowingCamera(loop, meshcat) if isinstance(loop, LeggedLoop) else None
         self.panel = LivePanel(title=loop.scenario.name, threshold=threshold)
-        self.panel.add_button(STOP, "Escape")
+        self.panel.buttons[STOP] = "Escape"
         self._actions: dict[str, Callable[[], object]] = {}
         self._use: Literal["commands", "goals", "balls", "episodes"] = "episodes"
         if isinstance(loop, FollowsCommands):
@@ -148,12 +148,12 @@ class LiveSession:
         elif isinstance(loop, HasBall):
             self._use = "balls"
             self._add(THROW, "Space", self._throw)
-            self.panel.add_slider(MASS, 1.0, 5.0, 0.5, 3.0)
-            self.panel.add_slider(SPEED, 1.0, 11.0, 0.5, 8.0)
-            self.panel.add_slider(DIRECTION, -180.0, 180.0, 15.0, -75.0)
+            self.panel.sliders[MASS] = Slider(1.0, 5.0, 0.5, 3.0)
+            self.panel.sliders[SPEED] = Slider(1.0, 11.0, 0.5, 8.0)
+            self.panel.sliders[DIRECTION] = Slider(-180.0, 180.0, 15.0, -75.0)
         if isinstance(loop, CanBePushed) and self._use in ("commands", "episodes"):
             self._add(PUSH, "Space", self._push)
-        self.panel.add_button(START, "KeyR")
+        self.panel.buttons[START] = "KeyR"
         with self._shows_failure():
             self._start()
 
@@ -213,7 +213,7 @@ class LiveSession:
             self.panel.stop()
 
     def _add(self, name: str, key: str, action: Callable[[], object]) -> None:
-        self.panel.add_button(name, key)
+        self.panel.buttons[name] = key
         self._actions[name] = action
 
     def _start(self) -> None:
@@ -350,7 +350,8 @@ class LiveSession:
         self._say(f"pushed with {push.strength_n:.0f} N for {push.duration_s:g} s", 2.0)
 
     def _throw(self) -> None:
-        mass, speed, direction = map(self.panel.value, (MASS, SPEED, DIRECTION))
+        sliders = self.panel.sliders
+        mass, speed, direction = (sliders[name].value for name in (MASS, SPEED, DIRECTION))
         throw = Throw(mass_kg=mass, speed_m_s=speed, direction_rad=math.radians(direction))
         try:
             self.loop.throw_ball(self.context, throw, _FLIGHT_S)
@@ -378,13 +379,13 @@ class LiveSession:
         box = self.loop.target_box
         start = next(iter(self.loop.named_targets.values()), box.mean(axis=0))
         for name, low, high, value in zip(AXES, *box.tolist(), start, strict=True):
-            self.panel.add_slider(name, low, high, 0.01, value)
+            self.panel.sliders[name] = Slider(low, high, 0.01, value)
         radius_m = 0.03 * (self._camera.size_m if self._camera else _SIZE_M)
         self.meshcat.SetObject(_TARGET, Sphere(radius_m), Rgba(*COLOURS["plain"], 0.8))
         self.meshcat.SetObject(_NEAREST, Sphere(radius_m), Rgba(*COLOURS["safe"], 0.8))
 
     def _slid_goal(self) -> np.ndarray:
-        return np.array([self.panel.value(name) for name in AXES])
+        return np.array([self.panel.sliders[name].value for name in AXES])
 
     def _go(self, *, is_forced: bool) -> None:
         """Starts the motion to a target that is accepted, or forced."""
