@@ -72,24 +72,16 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
 
 
 def _motions(folder: Path) -> list[dict[str, Any]]:
-    """Folders of recorded motions: their events, pictures and the recording."""
+    """Folders of recorded motions: their events, as `run` writes them, pictures and recording."""
     found = {path.parent for name in ("run.json", "recording.html") for path in folder.rglob(name)}
-    return [
-        {
-            "name": one.relative_to(folder).as_posix(),
-            "events": _events(one / "run.json"),
-            "pictures": _pictures(one),
-            "recording": (one / "recording.html").relative_to(folder).as_posix()
-            if (one / "recording.html").is_file()
-            else "",
-        }
-        for one in sorted(found)
-    ]
-
-
-def _events(file: Path) -> dict[str, Any]:
-    """Command, columns and rows as `run` writes them; empty without the file."""
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    motions: list[dict[str, Any]] = []
+    for one in sorted(found):
+        motions.append({"name": one.relative_to(folder).as_posix(), "pictures": _pictures(one)})
+        if (events := one / "run.json").is_file():
+            motions[-1]["events"] = json.loads(events.read_text(encoding="utf-8"))
+        if (recording := one / "recording.html").is_file():
+            motions[-1]["recording"] = recording.relative_to(folder).as_posix()
+    return motions
 
 
 def _pictures(folder: Path) -> list[tuple[str, str]]:

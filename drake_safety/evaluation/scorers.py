@@ -39,10 +39,8 @@ class Scorer:
 def assessment_scorer(name: str, assessment: SafetyAssessment) -> Scorer:
     """The probability of an assessment as a scorer."""
 
-    def probability(
-        state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray
-    ) -> np.ndarray:
-        result = assessment.predict(state, desired_preview, features)
+    def probability(*rows: np.ndarray) -> np.ndarray:
+        result = assessment.predict(*rows)
         unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
         return np.where(unknown, np.nan, result.probability)
 

@@ -71,10 +71,9 @@ def assessment_judge(assessment: SafetyAssessment) -> Judge:
     """Γ as a :class:`SafetyAssessor` with the port ``margins`` gives it, without the monitor."""
     probability_of = assessment_scorer("gamma", assessment).probability
 
-    def judge(
-        state: np.ndarray, preview: np.ndarray, features: np.ndarray, is_outside: np.ndarray
-    ) -> np.ndarray:
-        probability = probability_of(state, preview, features)
+    def judge(*rows: np.ndarray) -> np.ndarray:
+        *seen, is_outside = rows
+        probability = probability_of(*seen)
         return np.where(is_outside & ~np.isnan(probability), 0.0, probability)
 
     return judge
