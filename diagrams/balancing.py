@@ -9,11 +9,9 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.safe_sets import BalanceSafeSet
-from drake_safety.diagrams.balancing_parameters import BalancingParameters, fitted_to_robot
+from drake_safety.diagrams.balancing_parameters import BalancingParameters
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.models import load_robot
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.physics import ENGINES_WITH_BALLS, Scene
 from drake_safety.robots.robot_model import by_pattern
@@ -44,7 +42,6 @@ class Balancing(LeggedLoop):
     """
 
     Parameters = BalancingParameters
-    online_parameters = ("recovery", "demonstration")
     plan_variety = "its parameter 'start' bounds the final heights and durations of plans"
 
     def __init__(
@@ -64,7 +61,7 @@ class Balancing(LeggedLoop):
         builder = DiagramBuilder()
 
         has_ball = parameters.push.share > 0 if ball is None else ball
-        physics = self._add_robot(builder, Scene(has_ball=has_ball), servos=True)
+        physics = self._add_robot(builder, Scene(has_ball=has_ball), servos=True, meshcat=meshcat)
         self.ball = physics.ball
         kinematics = self.kinematics
         measured = self._add_observers(builder)
@@ -131,30 +128,21 @@ class Balancing(LeggedLoop):
             outlook=desired["desired_outlook"],
             servo_command=controller.GetOutputPort("desired_joint_state"),
         )
-        self.monitored_features = [
-            name for name in self.feature_names if name.startswith("servo_load_")
-        ]
-        assessor = self._export_robot(
+        loads = [name for name in self.feature_names if name.startswith("servo_load_")]
+        self.monitored = {"features": loads}
+        del desired["desired_outlook"]
+        assessor = self.export(
             builder,
+            desired,
             period_s=parameters.recovery.assessment_period_s,
-            desired_output=desired["desired_output"],
-            desired_preview=desired["desired_preview"],
             hold=recovery_active,
-            meshcat=meshcat,
         )
         if assessor is not None and recovery:
             for name in ("safety_probability", "belief"):
                 builder.Connect(assessor.GetOutputPort(name), switch.GetInputPort(name))
         elif recovery:
             builder.ExportInput(switch.GetInputPort("safety_probability"), "safety_probability")
-        self.finish(builder)
-
-    @classmethod
-    def complete_parameters(cls, robot: str, stated: dict[str, Any]) -> dict[str, Any]:
-        """Scales defaults to the robot's size if the scenario has ``scale_to_robot``."""
-        if stated.get("scale_to_robot") is not True:
-            return stated
-        return fitted_to_robot(stated, RobotKinematics(load_robot(robot)))
+        builder.BuildInto(self)
 
     @classmethod
     def options_for(cls, purpose: Purpose, scenario: Scenario, variation: str) -> dict[str, Any]:
@@ -277,10 +265,9 @@ class Balancing(LeggedLoop):
         """Samples a ball with its impact at ``time_s`` [s]."""
         return self.scenario.parameters.push.sample(rng, time_s)
 
-    def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
-        """Sets the ball in flight and returns the time of impact [s]."""
+    def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> None:
+        """Sets the ball in flight, which hits the base at rest after ``lead_s`` [s]."""
         if self.ball is None:
             raise ValueError("balancing: built without a ball; pass ball=True to make_loop")
         with self._physics.edited(context) as plant_context:
             self.ball.throw(plant_context, throw, lead_s)
-        return context.get_time() + lead_s

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits
 from drake_safety.files.schema import schema
+from drake_safety.models import load_robot
 from drake_safety.plants.balls import Throw
 from drake_safety.robots.robot_model import by_pattern
 from drake_safety.robots.robot_size import (
@@ -40,6 +41,8 @@ class RecoveryParameters:
 class BalancingParameters:
     """The task's part of the scenario file."""
 
+    online: ClassVar = ("recovery", "demonstration")
+
     scale_to_robot: bool = False
     """Whether defaults are scaled to the robot's standing height, foot spacing and mass; values in
     the file are not. Unscaled, they are those of a robot 0.42 m high, of 25 kg."""
@@ -49,6 +52,13 @@ class BalancingParameters:
     recovery: RecoveryParameters = field(default_factory=RecoveryParameters)
     demonstration: list[Throw] = field(default_factory=list)
     """Balls of ``drake-safety run --push ball``."""
+
+    @classmethod
+    def completed(cls, stated: dict[str, Any], robot: str) -> dict[str, Any]:
+        """Scales defaults to the robot's size if the scenario has ``scale_to_robot``."""
+        if stated.get("scale_to_robot") is not True:
+            return stated
+        return fitted_to_robot(stated, RobotKinematics(load_robot(robot)))
 
 
 _LEAST_TWIST_RAD = 0.2  # Feet that slip at a smaller twist cannot hold the heading.

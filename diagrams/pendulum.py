@@ -207,12 +207,12 @@ class Pendulum(PlannedLoop):
         self.state_names = ["angle", "angle_rate"]
         self.output_names = [f"bob_{axis}" for axis in "xyz"]
         output = observer.GetOutputPort("output")
-        self._export(builder, period_s=period_s, state=state, output=output)
+        self.export(builder, {"state": state, "output": output}, period_s=period_s)
         if meshcat is not None:
             scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
             PendulumGeometry.AddToBuilder(builder, pendulum.get_state_output_port(), scene_graph)
             MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
-        self.finish(builder)
+        builder.BuildInto(self)
 
     def reset(self, context: Context, rng: np.random.Generator) -> int:
         """Samples an angle, a rate and a plan."""
@@ -251,7 +251,7 @@ class Pendulum(PlannedLoop):
         return {name: plane(*angles) for name, angles in ends.items()}
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:
-        parameters, variation = self.scenario.parameters, self.variation
+        parameters, variation = self.scenario.parameters, self._plant_variation
         pendulum_context = self._pendulum.GetMyMutableContextFromRoot(context)
         values = self._pendulum.get_mutable_parameters(pendulum_context)
         values.set_mass(variation.mass_scale * parameters.mass_kg)

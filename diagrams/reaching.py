@@ -52,14 +52,6 @@ class Reaching(LeggedLoop):
     """
 
     Parameters = ReachingParameters
-    online_parameters = (
-        "decorations",
-        "fair",
-        "named_targets",
-        "pushes",
-        "assessment_period_s",
-        "view",
-    )
     plan_variety = "its parameter 'detours' bounds the detours of plans, in training too"
 
     def __init__(
@@ -73,7 +65,6 @@ class Reaching(LeggedLoop):
         exploring: bool = True,
     ):
         super().__init__(scenario, variation, assessment)
-        self.monitor_period_s = scenario.parameters.monitor_period_s
         parameters = scenario.parameters
         robot, kinematics = self.robot, self.kinematics
         if not robot.reaching_frames:
@@ -87,7 +78,7 @@ class Reaching(LeggedLoop):
         builder = DiagramBuilder()
 
         scene = Scene(obstacles=parameters.obstacles, decorations=parameters.decorations)
-        physics = self._add_robot(builder, scene, servos=False)
+        physics = self._add_robot(builder, scene, servos=False, meshcat=meshcat)
         measured = self._add_observers(builder, hand=self.hand, mirror=self.mirror)
         planner = self._add_planner(
             builder, outlook_s=parameters.plan_duration_s, num_outlook=_NUM_OUTLOOK
@@ -132,16 +123,14 @@ class Reaching(LeggedLoop):
         )
         self.angular_constraints = self.safe_set.angular_names
         self._watch(builder, self.safe_set)
-        self.monitored_features = []  # Its controller follows the preview.
-        self._export_robot(
-            builder,
-            period_s=parameters.assessment_period_s,
-            desired_preview=desired_preview,
-            meshcat=meshcat,
-        )
-        builder.ExportOutput(controller.GetOutputPort("solver_status"), "solver_status")
-        builder.ExportOutput(controller.GetOutputPort("num_failures"), "num_controller_failures")
-        self.finish(builder)
+        self.monitored = {"features": []}  # Its controller follows the preview.
+        ports = {
+            "desired_preview": desired_preview,
+            "solver_status": controller.GetOutputPort("solver_status"),
+            "num_controller_failures": controller.GetOutputPort("num_failures"),
+        }
+        self.export(builder, ports, period_s=parameters.assessment_period_s)
+        builder.BuildInto(self)
 
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:

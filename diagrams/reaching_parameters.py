@@ -1,6 +1,7 @@
 """Parameters of the reaching task."""
 
 from dataclasses import field
+from typing import ClassVar
 
 from drake_safety.control.reaching_safe_set import ReachingLimits
 from drake_safety.files.schema import Positive, Triple, schema
@@ -18,6 +19,15 @@ from drake_safety.simulation.reaching_sampling import (
 @schema(kw_only=True)
 class ReachingParameters:
     """The task's part of the scenario file."""
+
+    online: ClassVar = (
+        "decorations",
+        "fair",
+        "named_targets",
+        "pushes",
+        "assessment_period_s",
+        "view",
+    )
 
     hand: str = ""
     """The hand of the training episodes, a reaching frame of the robot; the first one by

@@ -1,6 +1,5 @@
 """Walking: a legged robot follows velocity commands by a trained policy."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import GoalWords
 from drake_safety.simulation.closed_loop import Purpose
 from drake_safety.simulation.episode_start import EpisodeStart
-from drake_safety.simulation.finding import Finding, failed, passed
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.command_guard import CommandGuard
@@ -60,15 +58,6 @@ class Walking(LeggedLoop):
 
     Parameters = WalkingParameters
     angular_constraints = WalkingSafeSet.angular_names
-    online_parameters = (
-        "guard",
-        "recovery",
-        "named_commands",
-        "pushes",
-        "random_pushes",
-        "assessment_period_s",
-        "view",
-    )
     hand = None
     goal_words = GoalWords(
         goal="command", axes=("v_x", "v_y", "ω_z"), units=("m/s", "m/s", "rad/s")
@@ -98,7 +87,7 @@ class Walking(LeggedLoop):
         self.robot = with_policy(self.robot, self.policy, self.kinematics.joint_names)
         self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
         builder = DiagramBuilder()
-        physics = self._add_robot(builder, Scene(), servos=True)
+        physics = self._add_robot(builder, Scene(), servos=True, meshcat=meshcat)
         measured = self._add_observers(builder, is_walking=True)
         planner = self._add_planner(
             builder, outlook_s=scenario.episode_duration_s, num_outlook=_NUM_OUTLOOK
@@ -122,7 +111,6 @@ class Walking(LeggedLoop):
             )
             builder.Connect(desired["desired_output"], guard_system.GetInputPort("command"))
             desired = {name: guard_system.GetOutputPort(name) for name in names}
-            builder.ExportOutput(guard_system.GetOutputPort("is_changed"), "guard_active")
         self._guard = guard_system
         command = desired["desired_output"]
         trigger = None
@@ -145,31 +133,29 @@ class Walking(LeggedLoop):
             controller_features=(controller.GetOutputPort("action_state"), controller.action_names),
             has_stance=False,
         )
-        assessor = self._export_robot(
-            builder,
-            period_s=parameters.assessment_period_s,
-            desired_output=desired["desired_output"],
-            desired_preview=desired["desired_preview"],
-            meshcat=meshcat,
-        )
+        del desired["desired_outlook"]
+        ports = {**desired, "controller_status": controller.GetOutputPort("status")}
         if guard_system is not None:
+            ports["guard_active"] = guard_system.GetOutputPort("is_changed")
             builder.Connect(
                 self._assessor_observer.GetOutputPort("state"), guard_system.GetInputPort("state")
             )
             builder.Connect(self._features, guard_system.GetInputPort("features"))
+        assessor = self.export(builder, ports, period_s=parameters.assessment_period_s)
         if trigger is not None and assessor is not None:
             for name in ("safety_probability", "belief"):
                 builder.Connect(assessor.GetOutputPort(name), trigger.GetInputPort(name))
         elif trigger is not None:
             builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
-        builder.ExportOutput(controller.GetOutputPort("status"), "controller_status")
-        self.monitored_states = [name for name in self.state_names if name != _POSITION]
         # What the policy sees: its last actions, its phase and the command.
-        self.memory_features = tuple(controller.action_names)
-        self.monitored_features = [name for name in self.memory_features if name != _UNCOMMANDED]
+        self.memory_features = controller.action_names
+        self.monitored = {
+            "states": [name for name in self.state_names if name != _POSITION],
+            "features": [name for name in self.memory_features if name != _UNCOMMANDED],
+        }
         self._rehearsal: Walking | None = None
         self._settled: EpisodeStart | None = None
-        self.finish(builder)
+        builder.BuildInto(self)
 
     def _add_recovery(
         self, builder: DiagramBuilder, nominal: OutputPort
@@ -210,20 +196,6 @@ class Walking(LeggedLoop):
         """No pushes in evaluation: commands are judged before the robot walks."""
         del scenario, variation
         return {"disturbed": False} if purpose == "evaluation" else {}
-
-    @classmethod
-    def check_files(cls, scenario: Scenario, kinematics: RobotKinematics) -> Iterator[Finding]:
-        """A finding about the policy: whether its file is complete and fits the robot."""
-        path = policy_file(scenario)
-        try:
-            policy = load_policy(path, kinematics)
-        except ValueError as error:
-            yield failed("policy", str(error), f"correct what the message names, or {path.name}")
-        else:
-            yield passed(
-                "policy",
-                f"{len(policy.joint_names)} joints, {sum(policy.sizes)} entries of observation",
-            )
 
     @property
     def target_box(self) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import field
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydrake.trajectories import PiecewisePolynomial
@@ -136,6 +136,16 @@ class WalkingRecovery:
 @schema(kw_only=True)
 class WalkingParameters:
     """The task's part of the scenario file."""
+
+    online: ClassVar = (
+        "guard",
+        "recovery",
+        "named_commands",
+        "pushes",
+        "random_pushes",
+        "assessment_period_s",
+        "view",
+    )
 
     policy: str = "policy.yaml"
     """Policy file, relative to the folder of the robot's YAML file."""

@@ -107,7 +107,7 @@ def anomalies(
         seen = [Watched(UNPERTURBED, one.index, rows_of(one)) for one in calm if one.is_safe]
         seen += with_faults(seen, num, seeds["perturbed"], detector, names)
         for one in changed:
-            change = drawn_change(loop.kinematics, loop.variation, seeds["perturbed"], one.index)
+            change = drawn_change(loop, seeds["perturbed"], one.index)
             onset, group = round(ONSET_S / detector.step_s), len(calm) + one.index
             seen.append(Watched(kind_of(one.index), group, rows_of(one), onset, change.joints))
         training = [

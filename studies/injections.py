@@ -142,10 +142,9 @@ def kind_of(index: int) -> str:
     return [*PLANTS][index % len(PLANTS)]
 
 
-def drawn_change(
-    kinematics: RobotKinematics, nominal: PlantVariation, seed: int, index: int
-) -> Change:
+def drawn_change(loop: Any, seed: int, index: int) -> Change:
     """Draws the change of an episode; alternatives of a kind are taken in turn."""
+    kinematics, nominal = loop.kinematics, loop.scenario.variation(loop.variation)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index, 1)))
     kind, turn = kind_of(index), index // len(PLANTS)
     limits, joints = PLANTS[kind], rng.permutation(kinematics.joint_names).tolist()
@@ -244,7 +243,7 @@ def run_changed(
 
 
 def _drawn_episode(loop: Any, scenario: Scenario, seed: int, index: int) -> Episode:
-    change, other = drawn_change(loop.kinematics, loop.variation, seed, index), loop
+    change, other = drawn_change(loop, seed, index), loop
     if change.variation is not None:
         shift = PlantShift(kind="plant", variation=change.variation)
         other = shifted_scenario(scenario, "changed", shift).make_loop("changed")

@@ -89,18 +89,9 @@ class CartPole(ClosedLoop):
         builder.Connect(balancer.GetOutputPort("force"), self.cart.get_actuation_input_port())
         if meshcat is not None:
             MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
-        for i in range(1, balancer.num_output_ports()):
-            port = balancer.get_output_port(i)
-            builder.ExportOutput(port, port.get_name())
-        self.add_assessor(
-            builder,
-            period_s=scenario.step_s,
-            **{
-                name: balancer.GetOutputPort(name)
-                for name in ("state", "desired_preview", "features", "margins")
-            },
-        )
-        self.finish(builder)
+        ports = map(balancer.get_output_port, range(1, balancer.num_output_ports()))
+        self.export(builder, {port.get_name(): port for port in ports}, period_s=scenario.step_s)
+        builder.BuildInto(self)
 
     def reset(self, context, rng):
         tilt = self.scenario.parameters.tilt_rad

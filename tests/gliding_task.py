@@ -94,18 +94,9 @@ class Gliding(ClosedLoop):
         self.constraint_names = ["right", "left"]
         builder = DiagramBuilder()
         self.mass = builder.AddSystem(Mass(scenario.parameters, scenario.assessment.horizon))
-        for i in range(self.mass.num_output_ports()):
-            port = self.mass.get_output_port(i)
-            builder.ExportOutput(port, port.get_name())
-        self.add_assessor(
-            builder,
-            period_s=0.04,
-            **{
-                name: self.mass.GetOutputPort(name)
-                for name in ("state", "desired_preview", "features", "margins")
-            },
-        )
-        self.finish(builder)
+        ports = map(self.mass.get_output_port, range(self.mass.num_output_ports()))
+        self.export(builder, {port.get_name(): port for port in ports}, period_s=0.04)
+        builder.BuildInto(self)
 
     def reset(self, context, rng):
         x, v = rng.uniform(-0.3, 0.3), rng.uniform(-1, 1) * self.scenario.parameters.speed_m_s

@@ -100,18 +100,9 @@ class Shuttling(ClosedLoop):
         self.watched_features = {"front_margin": "to_the_front"}
         builder = DiagramBuilder()
         self.shuttle = builder.AddSystem(Shuttle(scenario, SIDES[side]))
-        for i in range(self.shuttle.num_output_ports()):
-            port = self.shuttle.get_output_port(i)
-            builder.ExportOutput(port, port.get_name())
-        self.add_assessor(
-            builder,
-            period_s=0.04,
-            **{
-                name: self.shuttle.GetOutputPort(name)
-                for name in ("state", "desired_preview", "features", "margins")
-            },
-        )
-        self.finish(builder)
+        ports = map(self.shuttle.get_output_port, range(self.shuttle.num_output_ports()))
+        self.export(builder, {port.get_name(): port for port in ports}, period_s=0.04)
+        builder.BuildInto(self)
 
     def _of_this_side(self, box):
         return np.sort(self.shuttle.reflect * box, axis=0)

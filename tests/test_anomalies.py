@@ -160,7 +160,7 @@ def loop():
 def drawn(loop, kind, turn):
     index = len(PLANTS) * turn + list(PLANTS).index(kind)
     assert kind_of(index) == kind
-    return drawn_change(loop.kinematics, loop.variation, 11, index)
+    return drawn_change(loop, 11, index)
 
 
 def test_alternatives_of_a_changed_plant_come_in_turn(loop):

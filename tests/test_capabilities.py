@@ -71,7 +71,6 @@ def test_a_task_that_says_nothing_of_itself_has_the_plain_answers():
     assert loop.angular_constraints == ()
     for purpose in ("evaluation", "paper", "pairs"):
         assert loop.scenario.options_for(purpose, "actual") == {}
-    assert list(loop.check_files(loop.scenario, None)) == []
     assert run_episode(loop).num_controller_failures == 0
 
 

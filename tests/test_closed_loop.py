@@ -1,10 +1,15 @@
 from types import SimpleNamespace
 
 import pytest
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS, REQUIRED_PORTS, ClosedLoop
+from drake_safety.simulation.closed_loop import (
+    ASSESSMENT_PORTS,
+    REQUIRED_PORTS,
+    ClosedLoop,
+    check_ports,
+)
 from gliding_task import Gliding, gliding
 
 ALL_PORTS = REQUIRED_PORTS + ASSESSMENT_PORTS
@@ -20,17 +25,18 @@ class Partial(ClosedLoop):
         source = builder.AddSystem(ConstantVectorSource([0.0]))
         for name in ports:
             builder.ExportOutput(source.get_output_port(), name)
-        self.finish(builder)
+        builder.BuildInto(self)
 
 
 @pytest.mark.parametrize("name", ALL_PORTS)
 def test_a_missing_port_is_named(name):
     ports = REQUIRED_PORTS if name in REQUIRED_PORTS else ALL_PORTS
     assessment = None if name in REQUIRED_PORTS else SimpleNamespace()
-    assert Partial(gliding(), ports, assessment).num_output_ports() == len(ports)
+    with pytest.raises(ValueError, match="'Partial' does not set"):  # Its ports are complete.
+        check_ports(Partial(gliding(), ports, assessment))
     rest = [port for port in ports if port != name]
     with pytest.raises(ValueError, match=rf"'Partial' exports no port \['{name}'\]; it exports"):
-        Partial(gliding(), rest, assessment)
+        check_ports(Partial(gliding(), rest, assessment))
 
 
 def assessment_for(loop, **changes):
@@ -70,3 +76,15 @@ def test_an_assessment_of_another_diagram_is_refused_with_both_sides_named(chang
 def test_a_task_must_say_no_more_than_its_parameters_and_names():
     names = {f"{kind}_names" for kind in ("state", "output", "feature", "constraint")}
     assert set(ClosedLoop.__annotations__) - set(vars(ClosedLoop)) == {"Parameters", *names}
+
+
+def test_a_closed_loop_has_few_members_of_its_own():
+    loop = Partial(gliding(), REQUIRED_PORTS)
+    members = {*vars(ClosedLoop), *ClosedLoop.__annotations__, *vars(loop)} - set(dir(Diagram))
+    assert len([name for name in members if not name.startswith("_")]) <= 14
+
+
+def test_a_task_without_its_ports_is_refused_when_it_is_made(monkeypatch):
+    monkeypatch.setattr(Gliding, "export", lambda *given, **options: None)
+    with pytest.raises(ValueError, match="'Gliding' exports no port"):
+        gliding().make_loop()

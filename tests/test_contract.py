@@ -4,8 +4,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_safety import check_contract
-from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.contract import REQUIRED_PORTS
+from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop, check_ports
 from gliding_task import gliding
 from shuttle_task import shuttling
 
@@ -22,7 +21,7 @@ class Constant(ClosedLoop):
         if names:
             self.state_names = self.output_names = ["x"]
             self.feature_names = self.constraint_names = ["x"]
-        self.finish(builder)
+        builder.BuildInto(self)
 
     def reset(self, context, rng):
         return 0
@@ -40,17 +39,17 @@ def test_a_task_that_keeps_the_contract_has_no_problem(make):
     assert problems(make().make_loop()) == {}
 
 
-def test_a_port_of_another_size_than_its_names_is_refused_when_the_task_is_built():
+def test_a_port_of_another_size_than_its_names_is_refused():
     with pytest.raises(ValueError, match="'state' has size 2, expected 1"):
-        Constant(WHOLE | {"state": 2})
+        check_ports(Constant(WHOLE | {"state": 2}))
     with pytest.raises(ValueError, match="'desired_preview' has size 9, expected 10"):
-        Constant({"desired_preview": 9})
+        check_ports(Constant({"desired_preview": 9}))
 
 
 def test_names_that_are_not_set_are_a_problem_with_a_remedy():
     found = problems(Constant(WHOLE, names=False))
-    assert "does not set ['state_names', 'output_names'" in found["names"].message
-    assert found["names"].remedy
+    assert "does not set ['state_names', 'output_names'" in found["ports"].message
+    assert found["ports"].remedy
 
 
 def test_values_that_are_not_finite_are_named_by_port():

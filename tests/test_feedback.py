@@ -3,13 +3,11 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety import load_scenario
-from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.dataset import completed
 from drake_safety.simulation.feedback import (
     AddFeedbackRecorder,
-    feedback_of_windows,
+    pair_windows,
     run_pairs,
-    run_twins,
     window_start,
 )
 from drake_safety.simulation.rollouts import episode_rng, run_episode
@@ -24,6 +22,16 @@ def quick():
     scenario.assessment.preview_stride = 1
     scenario.parameters.push.share = 0.0
     return scenario
+
+
+def recorded(loop, episode):
+    """A window of the episode with the index 0, and the recorder of another plant."""
+    context, builder = loop.CreateDefaultContext(), DiagramBuilder()
+    loop.reset(context, episode_rng(7, 0))
+    plant_state = loop.GetOutputPort("plant_state").Eval(context)
+    window = RecordedWindow(episode=episode, plant_state=plant_state, start_time_s=3.0)
+    actual = builder.AddSystem(loop.scenario.make_loop("payload"))
+    return window, AddFeedbackRecorder(builder, actual)
 
 
 @pytest.fixture(scope="module")
@@ -58,47 +66,34 @@ def test_pairs_are_kept_and_gone_on_with(kept):
     assert done == [(3, 6), (6, 6)]
     for one, other in zip(pairs.actual, again.actual, strict=True):
         np.testing.assert_array_equal(one.state, other.state)
-    differing, count = again.gap
-    assert 0 <= differing <= count <= 3
-    assert len(again.feedback()) == count
+    assert len(again.feedback()) == len(again.actual) == 3
 
 
 def test_a_recorded_window_gives_the_twin_that_the_episode_would_have(kept):
     _, pairs = kept
     scenario = quick()
     loop = scenario.make_loop("nominal")
-    context = loop.CreateDefaultContext()
-    loop.reset(context, episode_rng(7, 0))
-    episode = pairs.actual[0]
-    plant_state = loop.GetOutputPort("plant_state").Eval(context)
-    window = RecordedWindow(episode=episode, plant_state=plant_state, start_time_s=3.0)
-    twins = run_twins(scenario, [window], num_workers=1)
-    assert isinstance(twins, Episodes)
+    window, recorder = recorded(loop, pairs.actual[0])
+    assert recorder.info.variation == "payload"
+    (feedback,) = pair_windows(scenario, recorder, [window])
+    twin = feedback.twin
     expected = run_episode(loop, 0, seed=7)
-    rows = min(len(twins[0].time_s), len(expected.time_s))
+    rows = min(len(twin.time_s), len(expected.time_s))
     assert rows > 3
     # Not to the bit: the feet stand where q has them, and the plan was seen in samples.
-    np.testing.assert_allclose(twins[0].output[:rows], expected.output[:rows], atol=5e-3)
-    builder = DiagramBuilder()
-    recorder = AddFeedbackRecorder(builder, builder.AddSystem(scenario.make_loop("payload")))
-    assert recorder.info.variation == "payload"
-    (feedback,) = feedback_of_windows(scenario, recorder, [window], run=lambda *given: twins)
+    np.testing.assert_allclose(twin.output[:rows], expected.output[:rows], atol=5e-3)
     assert feedback.info.variation == "payload"
     assert feedback.nominal_hash == pairs.nominal.info.scenario_hash
 
 
 def test_twins_of_one_simulation_share_a_loop_for_pydrake_frees_none(kept, monkeypatch):
-    scenario = quick()
+    scenario, made = quick(), []
     _, pairs = kept
-    loop = scenario.make_loop("nominal")
-    context = loop.CreateDefaultContext()
-    plant_state = loop.GetOutputPort("plant_state").Eval(context)
-    window = RecordedWindow(episode=pairs.actual[0], plant_state=plant_state, start_time_s=0.0)
-    run_twins(scenario, [window], num_workers=1)
-    made = []
+    window, recorder = recorded(scenario.make_loop("nominal"), pairs.actual[0])
+    pair_windows(scenario, recorder, [window])
     monkeypatch.setattr(type(scenario), "make_loop", lambda *given, **options: made.append(given))
-    run_twins(scenario, [window], num_workers=1)
-    run_twins(scenario, [window], num_workers=1)
+    pair_windows(scenario, recorder, [window])
+    pair_windows(scenario, recorder, [window])
     assert not made
 
 

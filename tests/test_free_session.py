@@ -52,10 +52,12 @@ class Pushed(Gliding):
 class FewPorts(Gliding):
     """A task that exports no more of its assessor than it has to."""
 
-    def add_assessor(self, builder, *, period_s, **ports):
-        assessor = AddSafetyAssessor(builder, self.assessment, period_s=period_s, **ports)
-        for name in ASSESSMENT_PORTS:
-            builder.ExportOutput(assessor.GetOutputPort(name), name)
+    def export(self, builder, ports, *, period_s):
+        seen = {name: ports[name] for name in ("state", "desired_preview", "features", "margins")}
+        assessor = AddSafetyAssessor(builder, self.assessment, period_s=period_s, **seen)
+        ports |= {name: assessor.GetOutputPort(name) for name in ASSESSMENT_PORTS}
+        for name, port in ports.items():
+            builder.ExportOutput(port, name)
 
 
 def learned(scenario, num_episodes=30):

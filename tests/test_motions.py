@@ -35,7 +35,7 @@ def test_a_robot_moves_on_in_its_safe_set_by_plans_that_follow_each_other(name):
     np.testing.assert_array_equal(anew.desired_preview, one.desired_preview[:11])
     # Features that no monitor reads are not evaluated.
     assert anew.features.shape == (11, len(loop.feature_names)) and anew.features.any()
-    is_read = loop.monitored_features != []
+    is_read = loop.monitored.get("features") != []
     np.testing.assert_array_equal(one.features[:11], is_read * anew.features)
 
 

@@ -51,10 +51,10 @@ def test_a_network_alone_leaves_what_it_cannot_tell_to_be_asked_for(tmp_path):
     assert (out / "walk.pt").read_bytes() == network.read_bytes()
     scenario = out / "walking.yaml"
     (found,) = problems(scenario)
-    assert found.item == "policy"
+    assert found.item == "diagram"
     for key in ("joints", "default_positions", "observation"):
         assert f"'{key}'" in found.message
-    assert "policy.yaml" in found.remedy
+    assert "policy.yaml" in found.message
     # Done as it says, the check passes, to standing for a second and the contract.
     uncommented(out / "policy.yaml", "joints:", "default_positions:", "action_scale:")
     stated = yaml.safe_load((out / "policy.yaml").read_text())

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +8,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_safety import load_assessment, load_scenario, run_episode
 from drake_safety.learning.assessment import AdaptationParameters
-from drake_safety.learning.segments import Episodes, EpisodesInfo
+from drake_safety.learning.segments import EpisodesInfo
+from drake_safety.simulation import online_adaptation
 from drake_safety.simulation.feedback import AddFeedbackRecorder
 from drake_safety.simulation.online_adaptation import OnlineAdaptation
 from drake_safety.simulation.rollouts import episode_rng
@@ -78,18 +78,22 @@ def run(duration_s, capacity=400, monitor=None, prior=None, watching=None, **set
         adopt=lambda context, adapted: adopted.append((context.get_time(), adapted)),
     )
 
-    def twins(scenario, windows):
-        info = replace(INFO, variation="nominal")
-        return Episodes(info, [window.episode for window in windows])
-
     prior = prior or Prior(**settings)
     adaptation = OnlineAdaptation(
-        None, prior, recorder, assessor, method="paper", run=twins, capacity=capacity
+        None, prior, recorder, assessor, method="paper", capacity=capacity
     )
     simulator = Simulator(diagram)
     if monitor is not None:
         simulator.set_monitor(monitor)
-    adaptation.advance(simulator, duration_s)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(
+            online_adaptation,
+            "pair_windows",
+            lambda scenario, recorder, windows: [
+                SimpleNamespace(actual=w.episode) for w in windows
+            ],
+        )
+        adaptation.advance(simulator, duration_s)
     assert monitor is not None or simulator.get_context().get_time() == duration_s
     return adaptation, adopted
 

@@ -296,8 +296,8 @@ def test_a_strangers_scenario_is_checked_without_running_its_code(tmp_path, monk
     assert all(finding.is_ok for finding in findings)
     assert "stranger:Task, which was not imported" in findings[1].message
     assert "12 joints" in " ".join(finding.message for finding in findings)
-    scenario, parameters = read_scenario(file)
-    assert (scenario.task, parameters) == ("stranger:Task", {})
+    scenario = read_scenario(file)
+    assert (scenario.task, scenario.parameters) == ("stranger:Task", {})
     with pytest.raises(SystemExit, match="code was run"):
         load_scenario(file)
     code = next(f for f in check_scenario("pendulum", num_episodes=0) if f.item == "code")

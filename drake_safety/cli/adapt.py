@@ -111,7 +111,7 @@ def adapt(
                 for who, one in (("before", priors[mode]), ("after", adapted[mode])):
                     found = _judge(one, fresh).items()
                     judged |= {f"{mode}.{who}.{key}": estimate for key, estimate in found}
-    differing, num_pairs = pairs.gap
+    differing, num_pairs = sum(pair.differs for pair in sets), len(sets)
     entries = {
         "scenario_hash": pairs.actual.info.scenario_hash,
         "nominal_hash": pairs.nominal.info.scenario_hash,

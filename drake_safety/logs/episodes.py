@@ -104,7 +104,7 @@ def motions_from_log(
     """
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")
-    if unlogged := set(loop.memory_features).intersection(loop.monitored_features or ()):
+    if unlogged := set(loop.memory_features).intersection(loop.monitored.get("features", ())):
         raise ValueError(
             f"the monitor reads {sorted(unlogged)}, which a log of positions and velocities does "
             "not have: write what the policy observes and commands as sequences of an .npz file"
@@ -238,7 +238,7 @@ def _episode(
     log: RobotLog, loop: LeggedLoop, context: Context, begin_s: float, rows: _Rows
 ) -> Episode:
     length_s = min(rows.duration_s, log.duration_s - begin_s)
-    period_s = loop.monitor_period_s
+    period_s = loop.scenario.watch_period_s
     ticks = period_s * np.arange(int(length_s / period_s + 1e-6) + 1)
     margins = _margins(log, loop, context, begin_s, ticks)
     is_out = (margins < 0).any(axis=1)

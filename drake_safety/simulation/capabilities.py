@@ -119,8 +119,8 @@ class HasBall(Protocol):
     def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
         """Samples a ball with a given time of impact [s]."""
 
-    def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> float:
-        """Sets a ball in flight that hits a robot at rest after ``lead_s`` [s]; returns when.
+    def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> None:
+        """Sets a ball in flight that hits a robot at rest after ``lead_s`` [s].
 
         Raises:
             ValueError: The loop was built without its ball.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
@@ -12,10 +12,6 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import RECORDED
 from drake_safety.systems.safety_assessor import AddSafetyAssessor, SafetyAssessor
-
-if TYPE_CHECKING:
-    from drake_safety.control.kinematics import RobotKinematics
-    from drake_safety.simulation.finding import Finding
 
 REQUIRED_PORTS = (*RECORDED, "safe")
 """Output ports of every task."""
@@ -26,14 +22,7 @@ Purpose = Literal["evaluation", "paper", "pairs"]
 """What a diagram is built for; see :meth:`ClosedLoop.options_for`."""
 
 _MOST_NAMES = 8  # Of a list that an error quotes whole.
-_SIZED_BY = {
-    "state": "state_names",
-    "true_state": "state_names",
-    "output": "output_names",
-    "desired_output": "output_names",
-    "features": "feature_names",
-    "margins": "constraint_names",
-}
+_NAMES = ("state_names", "output_names", "feature_names", "constraint_names")
 
 
 class ClosedLoop(Diagram):
@@ -41,8 +30,8 @@ class ClosedLoop(Diagram):
 
     The contract consists of the output ports below, :meth:`reset`, and the names of the ports'
     entries. Optional features are protocols in :mod:`~drake_safety.simulation.capabilities`, which
-    a task implements by having their members. A subclass connects its systems in ``__init__``,
-    sets the names, calls :meth:`add_assessor`, and finally :meth:`finish`.
+    a task implements by having their members. A subclass sets the names and connects its systems
+    in ``__init__``, calls :meth:`export`, and finally ``builder.BuildInto(self)``.
 
     ====================== ======= ============================================================
     output port            size    meaning
@@ -65,30 +54,23 @@ class ClosedLoop(Diagram):
     which the controller found no command; episodes store its last value.
 
     Attributes:
-        variation_name, variation: The plant variation.
-        monitor_period_s: Sampling period of ``safe`` [s]; the control period by default.
+        variation: Name of the plant variation.
         state_names, output_names, feature_names, constraint_names: Names of the ports' entries.
     """
 
     Parameters: type
-    """Schema of the task's part of the scenario file."""
-
-    online_parameters: tuple[str, ...] = ()
-    """Parameters on which no episode depends; the scenario's hash leaves them out."""
+    """Schema of the task's part of the scenario file, a dataclass. Two things it may have, too:
+    ``online``, names of parameters on which no episode depends, which the scenario's hash leaves
+    out; and ``completed(stated, robot)``, a class method that adds defaults which depend on the
+    robot to the parameters in the file."""
 
     angular_constraints: tuple[str, ...] = ()
     """Constraints whose margins are angles [rad]; the others are lengths [m]."""
 
-    monitored_states: list[str] | None = None
-    """States that the change monitor predicts, such as those that a real robot measures; None for
-    all of them."""
-
-    monitored_features: list[str] | None = None
-    """Features by which it predicts them beside the desired preview, such as what the controller
-    commands; None for all of them."""
-
-    memory_features: tuple[str, ...] = ()
-    """Features that depend on what the controller did before, which a log of the plant lacks."""
+    monitored: Mapping[str, list[str]] = {}
+    """What the change monitor reads, all that is not stated: ``states`` that it predicts, such as
+    those that a real robot measures, and ``features`` by which it predicts them beside the desired
+    preview, such as what the controller commands."""
 
     state_names: list[str]
     output_names: list[str]
@@ -98,17 +80,8 @@ class ClosedLoop(Diagram):
     # `scenario` is a Scenario, whose module imports this one.
     def __init__(self, scenario: Any, variation: str, assessment: SafetyAssessment | None):
         super().__init__()
-        self.scenario = scenario
-        self.variation_name = variation
-        self.variation = scenario.variation(variation)
-        self.assessment = assessment
-        self.monitor_period_s = scenario.control_period_s
-
-    @classmethod
-    def complete_parameters(cls, robot: str, stated: dict[str, Any]) -> dict[str, Any]:
-        """Adds defaults that depend on the robot to the task's parameters in a scenario file."""
-        del robot
-        return stated
+        self.scenario, self.variation, self.assessment = scenario, variation, assessment
+        self._plant_variation = scenario.variation(variation)
 
     @classmethod
     def options_for(cls, purpose: Purpose, scenario: Any, variation: str) -> dict[str, Any]:
@@ -127,15 +100,6 @@ class ClosedLoop(Diagram):
         """Files besides the scenario that determine the plant; part of the hash."""
         del scenario
         return []
-
-    @classmethod
-    def check_files(cls, scenario: Any, kinematics: RobotKinematics) -> Iterable[Finding]:
-        """Findings about the task's own files, which ``check`` checks before the diagram."""
-        del scenario, kinematics
-        return ()
-
-    def remove_visuals(self, context: Context) -> None:
-        """Removes shapes that only pictures need from the Context of a simulation without them."""
 
     def GetMyContextFromRoot(self, root_context: Context) -> Context:
         """Finds this diagram's Context in that of the outermost diagram."""
@@ -166,53 +130,46 @@ class ClosedLoop(Diagram):
         """
         raise TypeError(f"task '{type(self).__name__}' must override reset")
 
-    def add_assessor(
+    def export(
         self,
         builder: DiagramBuilder,
+        ports: Mapping[str, OutputPort],
         *,
         period_s: float,
-        state: OutputPort,
-        desired_preview: OutputPort,
-        features: OutputPort,
-        margins: OutputPort | None,
+        margins: OutputPort | None = None,
         hold: OutputPort | None = None,
     ) -> SafetyAssessor | None:
-        """Adds an assessor, if there is an assessment, and exports its outputs.
+        """Exports output ports by name; adds an assessor and its ports, if there is an assessment.
 
         The names of the ports' entries must have been set. The scenario says what an alarm of the
-        monitor does. The arguments are those of
-        :func:`~drake_safety.systems.safety_assessor.AddSafetyAssessor`.
+        monitor does.
+
+        Args:
+            period_s: Time between two evaluations of the assessment [s].
+            margins: Those by which the assessor sees that the safe set was left; by default the
+                exported ones.
+            hold: See :func:`~drake_safety.systems.safety_assessor.AddSafetyAssessor`.
 
         Raises:
             ValueError: The assessment is that of another diagram.
         """
+        for name, port in ports.items():
+            builder.ExportOutput(port, name)
         if self.assessment is None:
             return None
         self._check_assessment(self.assessment)
         assessor = AddSafetyAssessor(
             builder,
             self.assessment,
-            state=state,
-            desired_preview=desired_preview,
-            features=features,
-            margins=margins,
+            **{name: ports[name] for name in ("state", "desired_preview", "features")},
+            margins=margins or ports["margins"],
             hold=hold,
             period_s=period_s,
             on_alarm=self.scenario.on_alarm,
         )
-        for i in range(assessor.num_output_ports()):
-            port = assessor.get_output_port(i)
+        for port in map(assessor.get_output_port, range(assessor.num_output_ports())):
             builder.ExportOutput(port, port.get_name())
         return assessor
-
-    def finish(self, builder: DiagramBuilder) -> None:
-        """Builds the diagram and checks its ports.
-
-        Raises:
-            ValueError: A required port is missing, or its size is not the number of its names.
-        """
-        builder.BuildInto(self)
-        check_ports(self)
 
     def _check_assessment(self, assessment: SafetyAssessment) -> None:
         info, scenario = assessment.info_, self.scenario
@@ -258,21 +215,31 @@ def require_ports(loop: ClosedLoop, names: Iterable[str], who: str = "") -> None
 
 
 def check_ports(loop: ClosedLoop) -> None:
-    """Checks that the required ports exist; those with names must have as many entries."""
-    who = f"task '{type(loop).__name__}'"
+    """Checks that the required ports exist, and have as many entries as names.
+
+    Raises:
+        ValueError: A port is missing, has no names of its entries, or another size than these.
+    """
+    task = f"task '{type(loop).__name__}'"
     require_ports(loop, REQUIRED_PORTS + (ASSESSMENT_PORTS if loop.assessment else ()))
+    if missing := [name for name in _NAMES if not hasattr(loop, name)]:
+        raise ValueError(f"{task} does not set {missing}, lists of names of the ports' entries")
     ports = port_sizes(loop)
-    sizes = {"safe": 1}
-    for port, attribute in _SIZED_BY.items():
-        names = vars(loop).get(attribute)
-        if names is not None:
-            sizes[port] = len(names)
-    if "output" in sizes:
-        sizes["desired_preview"] = sizes["output"] * loop.scenario.assessment.horizon
+    states, outputs, features, constraints = (len(getattr(loop, name)) for name in _NAMES)
+    sizes = {
+        "state": states,
+        "true_state": states,
+        "output": outputs,
+        "desired_output": outputs,
+        "desired_preview": outputs * loop.scenario.assessment.horizon,
+        "features": features,
+        "margins": constraints,
+        "safe": 1,
+    }
     wrong = [
         f"'{name}' has size {ports[name]}, expected {n}"
         for name, n in sizes.items()
         if ports[name] != n
     ]
     if wrong:
-        raise ValueError(f"{who} has ports whose sizes do not fit their names: {'; '.join(wrong)}")
+        raise ValueError(f"{task} has ports whose sizes do not fit their names: {'; '.join(wrong)}")

@@ -3,15 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop, check_ports
-from drake_safety.simulation.finding import Finding, failed, passed
 
-_NAMES = ("state_names", "output_names", "feature_names", "constraint_names")
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Result of a check.
+
+    Attributes:
+        remedy: How to correct a failure, or what a warning is about; "" if all is well.
+    """
+
+    item: str
+    is_ok: bool
+    message: str
+    remedy: str = ""
+
+    @property
+    def is_warning(self) -> bool:
+        """Whether the check passed, but something should be known or done."""
+        return self.is_ok and bool(self.remedy)
+
+
+def passed(item: str, message: str, remedy: str = "") -> Finding:
+    """A finding of a check that passed; with a warning, if there is a remedy."""
+    return Finding(item=item, is_ok=True, message=message, remedy=remedy)
+
+
+def failed(item: str, message: str, remedy: str) -> Finding:
+    """A finding of a check that failed."""
+    return Finding(item=item, is_ok=False, message=message, remedy=remedy)
 
 
 def check_contract(diagram: ClosedLoop, *, seed: int = 0) -> list[Finding]:
@@ -23,34 +50,16 @@ def check_contract(diagram: ClosedLoop, *, seed: int = 0) -> list[Finding]:
     Returns:
         One finding per check; checks that depend on a failed one are left out.
     """
-    findings = [_names(diagram), _ports(diagram)]
-    if not all(finding.is_ok for finding in findings):
-        return findings
-    return [*findings, *_values(diagram, seed)]
-
-
-def _names(diagram: ClosedLoop) -> Finding:
-    missing = [name for name in _NAMES if name not in vars(diagram)]
-    if missing:
-        return failed(
-            "names",
-            f"task '{type(diagram).__name__}' does not set {missing}",
-            "set them in __init__: lists of the names of the ports' entries",
-        )
-    return passed("names", "states, outputs, features and constraints have names")
-
-
-def _ports(diagram: ClosedLoop) -> Finding:
     try:
         check_ports(diagram)
     except ValueError as error:
-        return failed(
-            "ports",
-            str(error),
-            "call builder.ExportOutput(port, NAME) for each before finish(builder); one name per "
-            "entry; the preview is H·n_z, row-major in time",
+        remedy = (
+            "set the names and export the ports in __init__; one name per entry; the preview is "
+            "H·n_z, row-major in time"
         )
-    return passed("ports", "complete, with the sizes of their names")
+        return [failed("ports", str(error), remedy)]
+    found = passed("ports", "complete, with the sizes of their names")
+    return [found, *_values(diagram, seed)]
 
 
 def _values(diagram: ClosedLoop, seed: int) -> Iterator[Finding]:

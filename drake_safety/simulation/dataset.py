@@ -70,14 +70,13 @@ class EpisodeWriter:
         self._flush_episodes = flush_episodes
         self._flush_seconds = flush_seconds
         self._pending: list[Episode] = []
-        self._is_closed = False
         self._lock = lock_folder(self.path)
         try:
             for left_behind in self.path.glob(".*.tmp"):
                 left_behind.unlink()
             # Before info.json is written: a folder with shards but no info.json is refused.
             self._indices = completed(self.path)
-            open_folder(self.path, info, extra)
+            _open_folder(self.path, info, extra or {})
         except BaseException:
             self._lock.release()
             raise
@@ -86,7 +85,7 @@ class EpisodeWriter:
 
     def append(self, episode: Episode) -> None:
         """Adds one episode; it is on disk after the next flush."""
-        if self._is_closed:
+        if not self._lock.is_locked:
             raise ValueError(f"EpisodeWriter of {self.path} is closed; open it again to append")
         if episode.index in self._indices:
             raise ValueError(f"episode {episode.index} is already in {self.path}; see completed()")
@@ -99,11 +98,8 @@ class EpisodeWriter:
 
     def flush(self) -> None:
         """Writes the pending episodes as one shard."""
-        if self._pending:
-            self._write()
-        self._flushed_s = time.monotonic()
-
-    def _write(self) -> None:
+        if not self._pending:
+            return
         import pyarrow.parquet as pq
 
         table = to_table(self._pending, self.info)
@@ -121,14 +117,13 @@ class EpisodeWriter:
                 write_page_checksum=True,
             )
         self._next_shard += 1
-        self._pending = []
+        self._pending, self._flushed_s = [], time.monotonic()
 
     def close(self) -> None:
         """Writes the pending episodes and unlocks the folder; the writer takes no more."""
         try:
             self.flush()
         finally:
-            self._is_closed = True
             self._lock.release()
 
     def __enter__(self) -> Self:
@@ -136,22 +131,6 @@ class EpisodeWriter:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-
-def open_folder(
-    path: str | os.PathLike[str], info: EpisodesInfo, extra: Mapping[str, Any] | None = None
-) -> None:
-    """Makes the folder of a set, or checks that an existing folder holds the same set."""
-    path = Path(path)
-    path.mkdir(parents=True, exist_ok=True)
-    if (path / _INFO_NAME).exists():
-        stored, known = read_info(path)
-        _check_same_set(path, stored, info)
-        merged = {**known, **(extra or {})}
-        if known != merged:
-            _write_info(path, stored, merged)
-    else:
-        _write_info(path, info, extra or {})
 
 
 def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any]]:
@@ -226,12 +205,16 @@ def load_episodes(path: str | os.PathLike[str]) -> Episodes:
     return Episodes(info, [episodes[index][0] for index in sorted(episodes)])
 
 
-def _write_info(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> None:
-    content = {
-        "schema_version": _SCHEMA_VERSION,
-        "info": dataclasses.asdict(info),
-        "extra": dict(extra),
-    }
+def _open_folder(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> None:
+    """Writes what a set shares, or checks that a folder holds the same set."""
+    known = None
+    if (path / _INFO_NAME).exists():
+        stored, known = read_info(path)
+        _check_same_set(path, stored, info)
+        info, extra = stored, {**known, **extra}
+    if extra == known:
+        return
+    content = {"schema_version": _SCHEMA_VERSION, "info": dataclasses.asdict(info), "extra": extra}
     try:
         text = json.dumps(content, indent=2, ensure_ascii=False)
     except TypeError as error:
@@ -263,11 +246,8 @@ def _check_same_set(path: Path, stored: EpisodesInfo, given: EpisodesInfo) -> No
 def is_same(a: Episode, b: Episode) -> bool:
     """Whether two episodes are the same to the last bit."""
     for field in dataclasses.fields(Episode):
-        left, right = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(left, np.ndarray):
-            # As bytes, NaN equals itself and 0.0 differs from -0.0.
-            if left.shape != right.shape or left.tobytes() != right.tobytes():
-                return False
-        elif left != right:
+        left, right = (np.asarray(getattr(episode, field.name)) for episode in (a, b))
+        # As bytes, NaN equals itself and 0.0 differs from -0.0.
+        if left.shape != right.shape or left.tobytes() != right.tobytes():
             return False
     return True

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _FAILURES = "num_controller_failures"
+_OF_EPISODES = {"is_safe": bool, "cause": str, "first_step": int, _FAILURES: int}
 _SHARD_NAME = re.compile(r"episodes-\d{5,}\.parquet")
 
 
@@ -26,11 +27,11 @@ def to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:
 
     counts = [len(episode.time_s) for episode in episodes]
 
-    def repeat(values: Sequence[Any], dtype: Any) -> np.ndarray:
-        return np.repeat(np.asarray(values, dtype=dtype), counts)
+    def repeated(name: str) -> np.ndarray:
+        return np.repeat([getattr(episode, name) for episode in episodes], counts)
 
     columns: dict[str, Any] = {
-        "episode": repeat([episode.index for episode in episodes], np.int64),
+        "episode": repeated("index"),
         "step": np.concatenate([np.arange(count, dtype=np.int32) for count in counts]),
         "time_s": np.concatenate([np.asarray(e.time_s, dtype=np.float64) for e in episodes]),
     }
@@ -39,12 +40,10 @@ def to_table(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:
         if width:
             rows = [np.asarray(getattr(e, name), dtype=np.float64).reshape(-1) for e in episodes]
             columns[name] = pa.FixedSizeListArray.from_arrays(pa.array(np.concatenate(rows)), width)
-    causes = [episode.cause for episode in episodes]
-    columns["is_safe"] = repeat([episode.is_safe for episode in episodes], np.bool_)
-    columns["cause"] = pa.array(np.repeat(np.asarray(causes, dtype=object), counts), pa.string())
-    columns["first_step"] = repeat([episode.first_step for episode in episodes], np.int32)
-    failures = [episode.num_controller_failures for episode in episodes]
-    columns[_FAILURES] = repeat(failures, np.int32)
+    columns["is_safe"] = repeated("is_safe")
+    columns["cause"] = pa.array(repeated("cause"), pa.string())
+    for name in ("first_step", _FAILURES):
+        columns[name] = pa.array(repeated(name), pa.int32())
     return pa.table(columns)
 
 
@@ -58,24 +57,19 @@ def from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode
         raise ValueError(
             f"{shard} has columns {table.column_names}; expected {[*names, _FAILURES]}"
         )
-    arrays: dict[str, np.ndarray] = {}
-    for name, width in widths.items():
-        if not width:
-            arrays[name] = np.empty((table.num_rows, 0))
-            continue
-        column = table.column(name).combine_chunks()
-        if getattr(column.type, "list_size", None) != width:
-            raise ValueError(f"{shard}: {name} is {column.type}; expected lists of length {width}")
-        arrays[name] = column.flatten().to_numpy().reshape(table.num_rows, width)
-    for name in ["episode", "step", "time_s", "is_safe", "cause", "first_step"]:
-        arrays[name] = table.column(name).to_numpy()
-    failures = np.zeros(table.num_rows, dtype=int)
-    if _FAILURES in table.column_names:
-        failures = table.column(_FAILURES).to_numpy()
-    episode = arrays["episode"]
-    if not len(episode):
+    num_rows = table.num_rows
+    if not num_rows:
         raise ValueError(f"{shard} holds no episodes")
-    bounds = [0, *(np.flatnonzero(np.diff(episode)) + 1), table.num_rows]
+    arrays = {name: np.empty((num_rows, 0)) for name in widths} | {_FAILURES: np.zeros(num_rows)}
+    for name in table.column_names:
+        column, width = table.column(name), widths.get(name)
+        if width and getattr(column.type, "list_size", None) != width:
+            raise ValueError(f"{shard}: {name} is {column.type}; expected lists of length {width}")
+        if width:
+            column = column.combine_chunks().flatten()
+        arrays[name] = column.to_numpy().reshape((num_rows, width) if width else num_rows)
+    episode = arrays["episode"]
+    bounds = [0, *(np.flatnonzero(np.diff(episode)) + 1), num_rows]
     result = []
     for first, last in itertools.pairwise(bounds):
         rows = slice(first, last)
@@ -90,17 +84,10 @@ def from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode
                         f"{shard}: {name} of episode {episode[first]} holds values that are not "
                         f"finite numbers below {LARGEST:g}"
                     )
-        result.append(
-            Episode(
-                index=int(episode[first]),
-                time_s=arrays["time_s"][rows].copy(),
-                **{name: arrays[name][rows].copy() for name in widths},
-                is_safe=bool(arrays["is_safe"][first]),
-                cause=str(arrays["cause"][first]),
-                first_step=int(arrays["first_step"][first]),
-                num_controller_failures=int(failures[first]),
-            )
-        )
+        one: dict[str, Any] = {name: arrays[name][rows].copy() for name in ("time_s", *widths)}
+        for name, kind in _OF_EPISODES.items():
+            one[name] = kind(arrays[name][first])
+        result.append(Episode(index=int(episode[first]), **one))
     return result
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from os import PathLike
@@ -14,15 +14,16 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.files.progress import shown
+from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
 from drake_safety.learning.feedback import EpisodePair, pair_episodes
 from drake_safety.learning.seeds import ADAPTATION, NOT_DRAWN
-from drake_safety.learning.segments import Episode, Episodes
+from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.capabilities import CanStartAnywhere, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import episodes_info, run_episode, run_episodes, worker_loop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.worker_processes import Progress, map_items
+from drake_safety.simulation.worker_processes import Progress
 from drake_safety.systems.feedback_recorder import FeedbackRecorder, RecordedWindow
 
 _TWINS = "nominal"
@@ -39,12 +40,6 @@ class EpisodePairs:
     def feedback(self) -> list[EpisodePair]:
         """The pairs in the order of the episodes, without diverged ones."""
         return pair_episodes(self.actual, self.nominal, nominal_hash=self.nominal_hash)
-
-    @property
-    def gap(self) -> tuple[int, int]:
-        """Number of pairs that end differently, and number of pairs."""
-        pairs = self.feedback()
-        return sum(pair.differs for pair in pairs), len(pairs)
 
 
 def run_pairs(
@@ -108,7 +103,7 @@ def AddFeedbackRecorder(
             episodes_info(loop, seed=NOT_DRAWN),
             num_steps=num_steps or loop.scenario.num_steps,
             plant_state_size=loop.GetOutputPort("plant_state").size(),
-            watch_period_s=loop.scenario.control_period_s,
+            watch_period_s=loop.scenario.watch_period_s,
             capacity=capacity,
         ),
     )
@@ -136,31 +131,6 @@ def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
     return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial.CubicShapePreserving(times, plan.T))
 
 
-def run_twins(
-    scenario: Scenario,
-    windows: Sequence[RecordedWindow],
-    *,
-    seed: int = ADAPTATION.first,
-    num_workers: int | None = None,
-    progress: Progress | bool | None = None,
-) -> Episodes:
-    """Simulates the nominal twins of recorded windows.
-
-    Raises:
-        ValueError: The task cannot begin with a given start.
-    """
-    make = worker_loop(scenario, _TWINS)
-    info = episodes_info(make(), seed)
-    twins = map_items(
-        partial(make.run, _twin, seed=seed),
-        windows,
-        num_workers=num_workers,
-        progress=progress,
-        stage="nominal twins",
-    )
-    return Episodes(info, sorted(twins, key=lambda episode: episode.index))
-
-
 def pair_starts(
     scenario: Scenario,
     actual: Episodes,
@@ -170,10 +140,11 @@ def pair_starts(
 ) -> EpisodePairs:
     """Simulates the nominal twins of episodes with known starts, in this process."""
     loop = worker_loop(scenario, _TWINS)()
-    twins = [
-        run_episode(loop, episode.index, seed=seed, start=start)
-        for episode, start in zip(actual, starts, strict=True)
-    ]
+    with ONE_BLAS_THREAD:
+        twins = [
+            run_episode(loop, episode.index, seed=seed, start=start)
+            for episode, start in zip(actual, starts, strict=True)
+        ]
     return EpisodePairs(
         actual=actual,
         nominal=Episodes(episodes_info(loop, seed), twins),
@@ -181,18 +152,15 @@ def pair_starts(
     )
 
 
-def _twin(loop: ClosedLoop, window: RecordedWindow, *, seed: int) -> Episode:
-    return run_episode(loop, window.episode.index, seed=seed, start=window_start(loop, window))
-
-
-def feedback_of_windows(
-    scenario: Scenario,
-    recorder: FeedbackRecorder,
-    windows: Sequence[RecordedWindow],
-    *,
-    run: Callable[..., Episodes] = run_twins,
-    **options: Any,
+def pair_windows(
+    scenario: Scenario, recorder: FeedbackRecorder, windows: Sequence[RecordedWindow]
 ) -> list[EpisodePair]:
-    """Pairs of recorded windows, whose nominal twins are simulated."""
+    """Pairs of recorded windows and their nominal twins, which are simulated in this process.
+
+    Raises:
+        ValueError: The task cannot begin with a given start.
+    """
+    loop = worker_loop(scenario, _TWINS)()
     actual = Episodes(recorder.info, [window.episode for window in windows])
-    return pair_episodes(actual, run(scenario, windows, **options))
+    starts = [window_start(loop, window) for window in windows]
+    return pair_starts(scenario, actual, starts).feedback()

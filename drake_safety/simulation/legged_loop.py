@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import Adder, ConstantVectorSource, MatrixGain, Multiplexer
+from pydrake.systems.primitives import ConstantVectorSource, MatrixGain, Multiplexer
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
@@ -73,17 +73,21 @@ class LeggedLoop(PlannedLoop):
     """A legged robot that follows a plan and is observed with noise.
 
     A subclass calls in this order: :meth:`_add_robot`, :meth:`_add_observers`,
-    :meth:`_add_planner`, adds its controller, :meth:`_watch`, :meth:`_export_robot`,
-    :meth:`finish`. It extends :meth:`_set_state` by the controller's initial state, and implements
-    :meth:`_output_of`, the output that its plans specify.
+    :meth:`_add_planner`, adds its controller, :meth:`_watch`, :meth:`export`, and
+    ``builder.BuildInto(self)``. It extends :meth:`_set_state` by the controller's initial state,
+    and implements :meth:`_output_of`, the output that its plans specify.
 
     Attributes:
         plant: A MultibodyPlant with the robot, to be read only, whatever engine simulates it.
         watched_features: Features that a conventional monitor thresholds, by quantity; larger
             values are safer.
         rate_features: Features that depend on velocities.
+        memory_features: Features that depend on what the controller did before, which a log of the
+            plant lacks.
         tick_s: Time between two systems that update one after the other [s].
     """
+
+    memory_features: Sequence[str] = ()
 
     view: View = View()
 
@@ -99,29 +103,36 @@ class LeggedLoop(PlannedLoop):
         """The robot's YAML and model file."""
         return robot_files(scenario.robot)
 
-    def _add_robot(self, builder: DiagramBuilder, scene: Scene, *, servos: bool) -> Physics:
-        """Adds the robot and its scene; its joints have position servos or torque inputs."""
+    def _add_robot(
+        self, builder: DiagramBuilder, scene: Scene, *, servos: bool, meshcat: Meshcat | None
+    ) -> Physics:
+        """Adds the robot, its scene and, with Meshcat, a visualiser.
+
+        The joints have position servos or torque inputs.
+        """
         physics = self._physics = add_physics(
             builder,
             self.robot,
-            self.variation,
+            self._plant_variation,
             scene,
             time_step_s=self.scenario.time_step_s,
             servos=servos,
         )
         self.plant, self.robot_instance = physics.plant, physics.instance
-        self.scene_graph = physics.scene_graph
+        self.scene_graph, self._is_shown = physics.scene_graph, meshcat is not None
+        if meshcat is not None:
+            MeshcatVisualizer.AddToBuilder(builder, self.scene_graph, meshcat)
         return physics
 
     def _add_observers(self, builder: DiagramBuilder, **options: Any) -> OutputPort:
         """Adds observers, with options of `StateObserver`; returns the controller's state."""
-        noise = self.variation.observation_noise
+        noise = self._plant_variation.observation_noise
         self._observers = Observers(
             builder, self.kinematics, self._physics.state, self.scenario.control_period_s, **options
         )
         self._observer = self._observers.add("observer", noise)
-        seen_noise = combined(noise, self.variation.input_noise)
-        faults = (self.variation.shift or Shift()).sensor_faults
+        seen_noise = combined(noise, self._plant_variation.input_noise)
+        faults = (self._plant_variation.shift or Shift()).sensor_faults
         if faults:
             self._assessor_observer = self._observers.add_faulty(
                 "assessor_observer", seen_noise, faults
@@ -137,7 +148,7 @@ class LeggedLoop(PlannedLoop):
         self, builder: DiagramBuilder, command: OutputPort, names: Sequence[str]
     ) -> OutputPort:
         """Adds the variation's delay and faults of the command between controller and robot."""
-        shift = self.variation.shift or Shift()
+        shift = self._plant_variation.shift or Shift()
         delay_s, faults = shift.command_delay_s, list(shift.command_faults)
         if delay_s:
             faults.append(Fault(kind="delay", value=delay_s))
@@ -206,18 +217,18 @@ class LeggedLoop(PlannedLoop):
         """Adds commanded minus measured joint positions, to which loads are proportional."""
         names = self.kinematics.joint_names
         measured = self._assessor_observer.GetOutputPort("measured_plant_state")
-        difference = builder.AddNamedSystem("servo_load", Adder(2, len(names)))
-        for i, (name, port, first, sign) in enumerate(
-            (
-                ("commanded_joints", command, 0, 1.0),
-                ("measured_joints", measured, NUM_BASE_POSITIONS, -1.0),
-            )
-        ):
-            joints = np.zeros((len(names), port.size()))
-            joints[:, first : first + len(names)] = sign * np.eye(len(names))
-            part = builder.AddNamedSystem(name, MatrixGain(joints))
-            builder.Connect(port, part.get_input_port())
-            builder.Connect(part.get_output_port(), difference.get_input_port(i))
+        joints = np.eye(len(names))
+        gain = np.zeros((len(names), command.size() + measured.size()))
+        gain[:, : len(names)] = joints
+        first = command.size() + NUM_BASE_POSITIONS
+        gain[:, first : first + len(names)] = -joints
+        both = builder.AddNamedSystem(
+            "command_and_state", Multiplexer([command.size(), measured.size()])
+        )
+        difference = builder.AddNamedSystem("servo_load", MatrixGain(gain))
+        builder.Connect(command, both.get_input_port(0))
+        builder.Connect(measured, both.get_input_port(1))
+        builder.Connect(both.get_output_port(0), difference.get_input_port())
         return difference.get_output_port(), [f"servo_load_{name}" for name in names]
 
     def _add_push_source(self, builder: DiagramBuilder) -> None:
@@ -244,31 +255,18 @@ class LeggedLoop(PlannedLoop):
             duration_s=push.duration_s,
         )
 
-    def _export_robot(
-        self,
-        builder: DiagramBuilder,
-        *,
-        period_s: float,
-        meshcat: Meshcat | None,
-        hold: OutputPort | None = None,
-        **ports: OutputPort,
+    def export(
+        self, builder: DiagramBuilder, ports: Mapping[str, OutputPort], **options: Any
     ) -> SafetyAssessor | None:
-        """Adds the optional assessor and visualiser, and exports ports; see :meth:`_export`."""
-        assessor = self._export(
-            builder,
-            period_s=period_s,
-            hold=hold,
-            state=self._assessor_observer.GetOutputPort("state"),
-            true_state=self._true_observer.GetOutputPort("state"),
-            output=self._observer.GetOutputPort("output"),
-            **ports,
-        )
+        """Exports ports, and those of the robot; see :meth:`PlannedLoop.export`."""
+        of_robot = {
+            "state": self._assessor_observer.GetOutputPort("state"),
+            "true_state": self._true_observer.GetOutputPort("state"),
+            "output": self._observer.GetOutputPort("output"),
+        }
         if self._physics.ball_state is not None:
-            builder.ExportOutput(self._physics.ball_state, "ball_state")
-        self._is_shown = meshcat is not None
-        if meshcat is not None:
-            MeshcatVisualizer.AddToBuilder(builder, self.scene_graph, meshcat)
-        return assessor
+            of_robot["ball_state"] = self._physics.ball_state
+        return super().export(builder, of_robot | dict(ports), **options)
 
     def remove_visuals(self, context: Context) -> None:
         """Removes the visual shapes, unless the diagram has a visualiser."""

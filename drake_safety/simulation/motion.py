@@ -22,6 +22,7 @@ from drake_safety.learning.segments import (
 )
 from drake_safety.simulation.capabilities import CanFall
 from drake_safety.simulation.closed_loop import ClosedLoop, require_ports
+from drake_safety.simulation.legged_loop import LeggedLoop
 
 _LOGGER = logging.getLogger("drake_safety")
 
@@ -201,7 +202,7 @@ def simulate(
     simulator = Simulator(diagram)
     simulator.set_target_realtime_rate(realtime_rate)
     context = simulator.get_mutable_context()
-    if isinstance(diagram, ClosedLoop):
+    if isinstance(diagram, LeggedLoop):
         diagram.remove_visuals(context)
     first_row = start(context)
     is_finite_at_start = np.isfinite(_state(context))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable
 
 import numpy as np
 from pydrake.systems.analysis import Simulator, SimulatorStatus
@@ -14,8 +13,7 @@ from pydrake.systems.framework import Context
 from drake_safety.extras import require_extra
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import EpisodePair
-from drake_safety.learning.segments import Episodes
-from drake_safety.simulation.feedback import feedback_of_windows, run_twins
+from drake_safety.simulation.feedback import pair_windows
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
 from drake_safety.systems.safety_assessor import SafetyAssessor
@@ -40,7 +38,6 @@ class OnlineAdaptation:
 
     Args:
         prior: The assessment before feedback.
-        run: Function that simulates the twins; see `feedback_of_windows`.
         capacity: Largest number of pairs of episodes kept; the oldest are dropped.
 
     Attributes:
@@ -56,14 +53,13 @@ class OnlineAdaptation:
         assessor: SafetyAssessor,
         *,
         method: str | None = None,
-        run: Callable[..., Episodes] = run_twins,
         capacity: int = 400,
     ):
         require_extra("train", "OnlineAdaptation", "sklearn")
         if capacity < 1:
             raise ValueError(f"OnlineAdaptation: capacity is {capacity}, expected >= 1")
         self._scenario, self._prior, self._method = scenario, prior, method
-        self._recorder, self._assessor, self._run = recorder, assessor, run
+        self._recorder, self._assessor = recorder, assessor
         self._capacity, self._num_new = capacity, 0
         # Rows that the monitor sees, and None between motions.
         num_rows = round(_KEPT_MOTION_S / prior.detector_.step_s)
@@ -118,7 +114,7 @@ class OnlineAdaptation:
         windows = self._recorder.take_windows(
             self._recorder.GetMyMutableContextFromRoot(root_context)
         )
-        new = feedback_of_windows(self._scenario, self._recorder, windows, run=self._run)
+        new = pair_windows(self._scenario, self._recorder, windows)
         self.feedback = [*self.feedback, *new][-self._capacity :]
         self._num_new += len(new)
         if self._num_new < self._prior.parameters.adaptation.update_interval:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
+from functools import cached_property
 
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, OutputPort
@@ -21,18 +23,20 @@ class PlannedLoop(ClosedLoop):
     """A closed loop with a planner, a monitor and features of its plan.
 
     A subclass calls in this order: :meth:`_add_planner`, adds its controller,
-    :meth:`_add_safe_set`, sets the names of state and output, :meth:`_export`, :meth:`finish`. It
-    implements :meth:`_set_state`, which sets the plant's state. Episodes can then begin with a
-    given start.
+    :meth:`_add_safe_set`, sets the names of state and output, :meth:`export`, and
+    ``builder.BuildInto(self)``. It implements :meth:`_set_state`, which sets the plant's state.
+    Episodes can then begin with a given start.
     """
 
     def _check_variation(self, *varied: str) -> None:
         """Checks that a variation of a task's own plant changes only the entries ``varied``."""
         for entry in fields(PlantVariation):
-            is_plain = getattr(self.variation, entry.name) == getattr(PlantVariation(), entry.name)
+            is_plain = getattr(self._plant_variation, entry.name) == getattr(
+                PlantVariation(), entry.name
+            )
             if not is_plain and entry.name not in varied:
                 raise ValueError(
-                    f"{type(self).__name__.lower()}: variation '{self.variation_name}' sets "
+                    f"{type(self).__name__.lower()}: variation '{self.variation}' sets "
                     f"{entry.name}; entries of this plant are {list(varied)}"
                 )
 
@@ -92,15 +96,16 @@ class PlannedLoop(ClosedLoop):
         self.feature_names = features.feature_names
         self.constraint_names = self._monitor.constraint_names
 
-    def _export(
+    def export(
         self,
         builder: DiagramBuilder,
+        ports: Mapping[str, OutputPort],
         *,
         period_s: float,
+        margins: OutputPort | None = None,
         hold: OutputPort | None = None,
-        **ports: OutputPort,
     ) -> SafetyAssessor | None:
-        """Adds the assessor, if any, and exports the contract's ports, by default the planner's."""
+        """Exports ports, and those of planner and monitor; see :meth:`ClosedLoop.export`."""
         ports = {
             "true_state": ports["state"],
             "desired_output": self._planner.GetOutputPort("desired_output"),
@@ -111,17 +116,12 @@ class PlannedLoop(ClosedLoop):
             "plant_state": self._plant_state,
             **ports,
         }
-        for name, port in ports.items():
-            builder.ExportOutput(port, name)
-        seen = {name: ports[name] for name in ("state", "desired_preview", "features")}
-        return self.add_assessor(
-            builder, period_s=period_s, margins=self._seen_margins, hold=hold, **seen
-        )
+        margins = margins or self._seen_margins
+        return super().export(builder, ports, period_s=period_s, margins=margins, hold=hold)
 
-    def finish(self, builder: DiagramBuilder) -> None:
-        """Builds the diagram and checks its ports."""
-        super().finish(builder)
-        self._default = self.CreateDefaultContext()
+    @cached_property
+    def _default(self) -> Context:
+        return self.CreateDefaultContext()
 
     def reset_to(
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart

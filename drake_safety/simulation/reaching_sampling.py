@@ -3,7 +3,6 @@
 from dataclasses import field
 
 import numpy as np
-from pydantic import FiniteFloat
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
@@ -98,15 +97,9 @@ class FairTargets:
     Bounds default to those of the target box.
     """
 
-    x_m: list[FiniteFloat] = field(default_factory=list)
-    y_m: list[FiniteFloat] = field(default_factory=list)
-    z_m: list[FiniteFloat] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        for name in ("x_m", "y_m", "z_m"):
-            bounds = getattr(self, name)
-            if bounds and (len(bounds) != 2 or not bounds[0] < bounds[1]):
-                raise ValueError(f"{name} must be [lowest, highest] or empty; got {bounds}")
+    x_m: Interval | None = None
+    y_m: Interval | None = None
+    z_m: Interval | None = None
 
     def box(self, target: TargetSampling) -> np.ndarray:
         """Lowest and highest corner, (2, 3) [m]."""

@@ -67,14 +67,14 @@ def episodes_info(
 ) -> EpisodesInfo:
     """Metadata common to all episodes of a loop; its options are part of the set's hash."""
     scenario = loop.scenario
-    scenario_hash = scenario.simulation_hash(loop.variation_name)
+    scenario_hash = scenario.simulation_hash(loop.variation)
     if loop_options:
         text = f"{scenario_hash} {sorted(loop_options.items())}"
         scenario_hash = hashlib.sha256(text.encode()).hexdigest()
     return EpisodesInfo(
         scenario=scenario.name,
         scenario_hash=scenario_hash,
-        variation=loop.variation_name,
+        variation=loop.variation,
         seed=seed,
         step_s=scenario.step_s,
         horizon=scenario.assessment.horizon,
@@ -82,11 +82,11 @@ def episodes_info(
         state_names=list(loop.state_names),
         output_names=list(loop.output_names),
         feature_names=list(loop.feature_names),
-        versions=installed_versions("drake", "numpy", loop.variation.engine),
+        versions=installed_versions("drake", "numpy", scenario.variation(loop.variation).engine),
         num_steps=scenario.num_steps,
         preview_stride=scenario.assessment.preview_stride,
-        monitored_states=loop.monitored_states,
-        monitored_features=loop.monitored_features,
+        monitored_states=loop.monitored.get("states"),
+        monitored_features=loop.monitored.get("features"),
     )
 
 
@@ -146,7 +146,7 @@ def run_episode(
         (*RECORDED, *counted),
         duration_s=scenario.episode_duration_s,
         step_s=scenario.step_s,
-        watch_period_s=loop.monitor_period_s,
+        watch_period_s=scenario.watch_period_s,
         after_leaving_s=0.0,
         may_fail=True,
         index=index,
@@ -284,14 +284,14 @@ def run_motion(
         return math.ceil(loop.reset(context, rng) * scenario.step_s / step_s)
 
     # Features may cost more than the simulation.
-    left_out = "features" if loop.monitored_features == [] and not with_features else ""
+    left_out = "features" if loop.monitored.get("features") == [] and not with_features else ""
     return simulate(
         loop,
         begin,
         [name for name in RECORDED if name != left_out],
         duration_s=min(piece_s, until_s),
         step_s=step_s,
-        watch_period_s=loop.monitor_period_s,
+        watch_period_s=scenario.watch_period_s,
         after_leaving_s=0.0,
         may_fail=True,
         index=index,

@@ -61,17 +61,16 @@ class StartSampling:
         if error.any():
             error = error * rng.uniform(-1, 1, 3)
         X_WB = X_WS @ RigidTransform(RotationMatrix(rotation), start + error)
-        joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
         w_WB = rng.normal(size=3) * self.angular_velocity_std_rad_s
         v_WB = rng.normal(size=3) * self.velocity_std_m_s
-        v = resting_feet(kinematics, X_WB, joints, np.concatenate([w_WB, v_WB]))
-        joints = joints + rng.normal(size=kinematics.num_joints) * self.joint_std_rad
+        offsets = rng.normal(size=kinematics.num_joints) * self.joint_std_rad
         goal = np.append(
             kinematics.nominal_base_offset + rng.uniform(-1, 1, 2) * self.target_offset_m,
             _between(rng, self.target_height_m),
         )
         plan = interpolate(start, goal, _between(rng, self.plan_duration_s))
-        return _start(kinematics, X_WB, joints, v, p_WC, plan)
+        V_WB = np.concatenate([w_WB, v_WB])
+        return _start(kinematics, X_WB, p_WC, plan, V_WB, joint_offsets=offsets)
 
 
 @schema(kw_only=True)
@@ -125,12 +124,10 @@ def calm_start(
     plan = interpolate(start, goal, duration_s, start_time_s=-elapsed_s)
     p_WC = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
     X_WB = RigidTransform(plan.value(0.0).ravel())
-    joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
     V_WB = np.zeros(NUM_BASE_VELOCITIES)
     if elapsed_s < duration_s:
         V_WB[3:] = plan.MakeDerivative().value(0.0).ravel()
-    v = resting_feet(kinematics, X_WB, joints, V_WB)
-    return _start(kinematics, X_WB, joints, v, p_WC, plan)
+    return _start(kinematics, X_WB, p_WC, plan, V_WB)
 
 
 _RESTS_S = (0.2, 1.0)  # Shortest and longest rest between two motions.
@@ -169,9 +166,7 @@ def undisturbed_start(
     plan = pieces[0]
     for piece in pieces[1:]:
         plan.ConcatenateInTime(piece)
-    joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
-    v = np.zeros(kinematics.num_velocities)
-    return _start(kinematics, X_WB, joints, v, p_WC, plan)
+    return _start(kinematics, X_WB, p_WC, plan)
 
 
 def _rest(point: np.ndarray, start_s: float, end_s: float) -> PiecewisePolynomial:
@@ -198,13 +193,20 @@ def resting_feet(
 def _start(
     kinematics: RobotKinematics,
     X_WB: RigidTransform,
-    joints: np.ndarray,
-    v: np.ndarray,
     p_WC: np.ndarray,
     plan: PiecewisePolynomial,
+    V_WB: np.ndarray | None = None,
+    *,
+    joint_offsets: np.ndarray | None = None,
 ) -> EpisodeStart:
-    joints = np.clip(joints, *kinematics.position_limits.T)
-    q = kinematics.positions_at(X_WB, joints)
+    """A start on given contacts, by default at rest."""
+    joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
+    v = np.zeros(kinematics.num_velocities)
+    if V_WB is not None:
+        v = resting_feet(kinematics, X_WB, joints, V_WB)
+    if joint_offsets is not None:
+        joints = joints + joint_offsets
+    q = kinematics.positions_at(X_WB, np.clip(joints, *kinematics.position_limits.T))
     return EpisodeStart(q=q, v=v, plan=plan, foot_positions=p_WC)
 
 

@@ -1,12 +1,10 @@
 """Scenarios: YAML files that combine a robot and a task."""
 
-import contextlib
 import hashlib
 import importlib
 import inspect
 import math
 import sys
-from collections.abc import Iterator
 from dataclasses import field
 from importlib.resources import files
 from pathlib import Path
@@ -20,7 +18,7 @@ from drake_safety.files.reading import did_you_mean, parse_yaml, reading
 from drake_safety.files.schema import Positive, load_typed, schema
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.simulation.closed_loop import ClosedLoop, Purpose
+from drake_safety.simulation.closed_loop import ClosedLoop, Purpose, check_ports
 from drake_safety.systems.safety_assessor import OnAlarm
 
 if TYPE_CHECKING:
@@ -87,6 +85,11 @@ class Scenario:
         return periods * self.control_period_s
 
     @property
+    def watch_period_s(self) -> float:
+        """Sampling period of the safe set [s]: the task's ``monitor_period_s``, if it has one."""
+        return getattr(self.parameters, "monitor_period_s", self.control_period_s)
+
+    @property
     def num_steps(self) -> int:
         """Rows after the first one of a whole episode."""
         return round(self.episode_duration_s / self.step_s)
@@ -132,13 +135,16 @@ class Scenario:
             **options: Options of the task, such as ``recovery=False``.
 
         Raises:
-            ValueError: Unknown variation or option, or an assessment of another diagram.
+            ValueError: Unknown variation or option, an assessment of another diagram, or a diagram
+                without the ports of a ClosedLoop.
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
         _check_options(task, options)
         if _takes(task, "meshcat"):
             options["meshcat"] = meshcat
-        return task(self, variation, assessment=assessment, **options)
+        loop: ClosedLoop = task(self, variation, assessment=assessment, **options)
+        check_ports(loop)
+        return loop
 
     def options_for(self, purpose: Purpose, variation: str = "nominal") -> dict[str, Any]:
         """The task's options for a purpose; see :meth:`ClosedLoop.options_for`."""
@@ -192,7 +198,7 @@ class Scenario:
         # The robot's files are hashed; their folder is irrelevant.
         text["robot"] = Path(self.robot).name
         task = self.task_class()
-        for name in task.online_parameters:
+        for name in getattr(task.Parameters, "online", ()):
             text["parameters"].pop(name, None)
         digest = hashlib.sha256(yaml.safe_dump(text, sort_keys=True).encode())
         for path in task.model_files(self):
@@ -234,28 +240,20 @@ def _file_beside(module_name: str, folder: str) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
-@contextlib.contextmanager
-def _searched(folder: str) -> Iterator[None]:
-    """Lets modules of a folder be imported while the block runs, after all others."""
-    if folder in sys.path:
-        yield
-        return
-    sys.path.append(folder)
-    importlib.invalidate_caches()
-    try:
-        yield
-    finally:
-        if folder in sys.path:
-            sys.path.remove(folder)
-
-
 def _imported(module_name: str, scenario_name: str, folder: str) -> ModuleType:
     """A task's module, which may stand beside the scenario's file."""
     file = _file_beside(module_name, folder)
     if file is None:
         return importlib.import_module(module_name)
-    with _searched(folder):
+    is_searched = folder in sys.path
+    if not is_searched:
+        sys.path.append(folder)  # After all others.
+    importlib.invalidate_caches()
+    try:
         module = importlib.import_module(module_name)
+    finally:
+        if not is_searched:
+            sys.path.remove(folder)
     found = getattr(module, "__file__", None)
     if found is None or Path(found).resolve() != file.resolve():
         raise ValueError(
@@ -328,11 +326,10 @@ def load_scenario(name: str | Path) -> Scenario:
         return parse_scenario(text, name=path.stem, folder=folder, task_folder=str(folder))
 
 
-def read_scenario(name: str | Path) -> tuple[Scenario, Any]:
+def read_scenario(name: str | Path) -> Scenario:
     """Reads a scenario's file without importing its task, so that no code of a stranger runs.
 
-    Returns:
-        The scenario without parameters, and the task's parameters as they stand in the file.
+    Its parameters are those that stand in the file, unchecked.
 
     Raises:
         ValueError: See :func:`load_scenario`.
@@ -365,17 +362,17 @@ def parse_scenario(text: str, *, name: str, folder: Path, task_folder: str = "")
     Raises:
         ValueError: See :func:`load_scenario`.
     """
-    scenario, parameters = _parsed(text, name, folder)
+    scenario = _parsed(text, name, folder)
     scenario.folder = task_folder
-    task = scenario.task_class()
-    if isinstance(parameters, dict):
-        parameters = task.complete_parameters(scenario.robot, parameters)
-    scenario.parameters = load_typed(task.Parameters, parameters, f"scenario '{name}', parameters")
+    schema, stated = scenario.task_class().Parameters, scenario.parameters
+    if isinstance(stated, dict) and hasattr(schema, "completed"):
+        stated = schema.completed(stated, scenario.robot)
+    scenario.parameters = load_typed(schema, stated, f"scenario '{name}', parameters")
     return scenario
 
 
-def _parsed(text: str, name: str, folder: Path) -> tuple[Scenario, Any]:
-    """The scenario without parameters, and these as they stand in the text."""
+def _parsed(text: str, name: str, folder: Path) -> Scenario:
+    """The scenario with the parameters that stand in the text."""
     raw = parse_yaml(text, f"scenario '{name}'")
     if not isinstance(raw, dict) or "task" not in raw:
         raise ValueError(
@@ -386,4 +383,5 @@ def _parsed(text: str, name: str, folder: Path) -> tuple[Scenario, Any]:
     scenario = load_typed(Scenario, raw | {"name": name}, f"scenario '{name}'")
     if Path(scenario.robot).suffix in (".yaml", ".yml"):
         scenario.robot = str((folder / scenario.robot).resolve())
-    return scenario, parameters
+    scenario.parameters = parameters
+    return scenario

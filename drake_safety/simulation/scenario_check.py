@@ -22,8 +22,7 @@ from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.robots.urdf_copy import read_urdf
 from drake_safety.simulation.capabilities import HasBall
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.contract import check_contract
-from drake_safety.simulation.finding import Finding, failed, passed, warned
+from drake_safety.simulation.contract import Finding, check_contract, failed, passed
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
@@ -59,7 +58,6 @@ def check_scenario(
     scenario = yield from _guarded("scenario", _scenario, name, is_imported)
     if scenario is None:
         return
-    kinematics = None
     if scenario.robot:
         robot = yield from _guarded("robot.yaml", _robot, scenario)
         if robot is None:
@@ -72,12 +70,6 @@ def check_scenario(
         yield from _guarded("collision shapes", _collisions, robot)
     if not is_imported:
         return
-    if kinematics is not None:
-        check_files = scenario.task_class().check_files
-        own = list(_guarded("files of the task", check_files, scenario, kinematics))
-        yield from own
-        if not all(finding.is_ok for finding in own):
-            return
     loop = yield from _guarded("diagram", _diagram, scenario)
     if loop is None:
         return
@@ -118,7 +110,7 @@ def _scenario(name: str | Path, is_imported: bool) -> Generator[Finding, None, S
         file = getattr(sys.modules[task.__module__], "__file__", None)
         yield passed("code", f"the scenario runs {scenario.task}, {file}")
     else:
-        scenario, _ = read_scenario(name)
+        scenario = read_scenario(name)
         yield passed("scenario", f"'{scenario.name}' fits the schema, but for its parameters")
         yield passed(
             "code",
@@ -249,21 +241,17 @@ def _motors(kinematics: RobotKinematics) -> _Check:
             )
     q = kinematics.standing_positions()
     torques = kinematics.gravity_torques(q, np.ones(kinematics.num_contacts, dtype=bool))
-    needs = {
-        name: abs(torque)
-        for name, torque in zip(kinematics.joint_names, torques, strict=True)
-        if name in limits
-    }
-    shares = [torque / limits[name] for name, torque in needs.items()]
+    needs = dict(zip(kinematics.joint_names, np.abs(torques), strict=True))
+    shares = {name: need / limits[name] for name, need in needs.items() if name in limits}
     weak = [
-        f"{name} needs {torque:.1f} of {limits[name]:.1f} N·m"
-        for name, torque in needs.items()
-        if torque > limits[name]
+        f"{name} needs {needs[name]:.1f} of {limits[name]:.1f} N·m"
+        for name, share in shares.items()
+        if share > 1
     ]
     yield _judged(
         "effort against gravity",
         not weak,
-        f"{100 * max(shares, default=0):.0f} % at most",
+        f"{100 * max(shares.values(), default=0):.0f} % at most",
         "; ".join(weak),
         "check the effort limits' unit [N·m], the masses [kg], or straighten the legs",
     )
@@ -283,7 +271,7 @@ def _collisions(robot: RobotModel) -> _Check:
     if not bare:
         yield passed("collision shapes", "every link that lost its meshes has a shape")
         return
-    yield warned(
+    yield passed(
         "collision shapes",
         f"{len(bare)} links have none, as their meshes were left out; everything passes through "
         f"{', '.join(bare)}",

@@ -49,10 +49,11 @@ class Violations:
     _PENETRATION_M = 5e-3
 
     def __init__(self, loop: LeggedLoop):
-        if loop.variation.engine != "drake":
+        engine = loop.scenario.variation(loop.variation).engine
+        if engine != "drake":
             raise ValueError(
                 "throws: contacts and efforts are read from Drake's plant; variation "
-                f"'{loop.variation_name}' is simulated by engine '{loop.variation.engine}'"
+                f"'{loop.variation}' is simulated by engine '{engine}'"
             )
         self._loop = loop
         plant = loop.plant
