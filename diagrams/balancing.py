@@ -198,11 +198,6 @@ class Balancing(LeggedLoop):
         feet = self._controller.foot_positions(controller_context).copy()
         return replace(super().start_of(context), foot_positions=feet)
 
-    def _begin(self, context: Context, rng: np.random.Generator, start: EpisodeStart) -> None:
-        self._enter(context, start)
-        self._observers.reseed(context, rng)
-        self.start_control(context)
-
     def set_plan(self, context: Context, plan: PiecewisePolynomial) -> None:
         """Sets the plan and keeps the state; see `PlannedLoop.set_plan`."""
         super().set_plan(context, plan)

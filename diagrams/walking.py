@@ -248,17 +248,15 @@ class Walking(LeggedLoop):
         if is_offset and self._is_disturbed:
             v = sampling.offset_velocities(v, offset_rng)
             q = self._above_ground(sampling.offset_positions(q, offset_rng))
-        self._enter(context, replace(start, q=q, v=v, plan=plan))
-        self._observers.reseed(context, rng)
+        self._begin(context, rng, replace(start, q=q, v=v, plan=plan))
         return 0
 
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
         """Starts where the policy has settled at a command of zero, with a constant command."""
-        self._enter(context, replace(self.settled_start(), plan=self.command_plan(goal)))
-        self._observers.reseed(context, rng)
-        self._observers.silence(context)
+        start = replace(self.settled_start(), plan=self.command_plan(goal))
+        self._begin(context, rng, start, is_silent=True)
 
     def reset_undisturbed(
         self, context: Context, rng: np.random.Generator, duration_s: float

@@ -11,6 +11,7 @@ import pytest
 
 from cart_episodes import assert_identical, make_episode, make_info
 from drake_safety.learning.segments import Episode
+from drake_safety.simulation import dataset
 from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes, read_info
 
 pytestmark = pytest.mark.train
@@ -18,11 +19,13 @@ pd = pytest.importorskip("pandas")
 pq = pytest.importorskip("pyarrow.parquet")
 
 
-def write(path, episodes, info=None, **options):
-    """Episodes, or indices of made-up ones."""
-    with EpisodeWriter(path, info or make_info(), **options) as writer:
-        for one in episodes:
-            writer.append(make_episode(one) if isinstance(one, int) else one)
+def write(path, episodes, info=None, shard=64):
+    """Episodes, or indices of made-up ones, so many a shard."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "FLUSH_EPISODES", shard)
+        with EpisodeWriter(path, info or make_info()) as writer:
+            for one in episodes:
+                writer.append(make_episode(one) if isinstance(one, int) else one)
 
 
 def names_in(path):
@@ -30,7 +33,7 @@ def names_in(path):
 
 
 def test_episodes_come_back_bit_for_bit_and_sorted_by_index(tmp_path):
-    write(tmp_path, [3, 0, 2, 1], flush_episodes=3)
+    write(tmp_path, [3, 0, 2, 1], shard=3)
     episodes = load_episodes(tmp_path)
     assert [episode.index for episode in episodes] == [0, 1, 2, 3]
     assert_identical(episodes, map(make_episode, range(4)))
@@ -65,7 +68,7 @@ def test_loaded_arrays_can_be_written_to(tmp_path):
 
 
 def test_pandas_reads_one_row_per_episode_and_step(tmp_path):
-    write(tmp_path, [1, 0], flush_episodes=1)
+    write(tmp_path, [1, 0], shard=1)
     frame = pd.read_parquet(sorted(tmp_path.glob("episodes-*.parquet")))
     fields = {field.name for field in dataclasses.fields(Episode)} - {"index"}
     assert set(frame.columns) == fields | {"episode", "step"}
@@ -101,8 +104,9 @@ def test_extra_that_json_cannot_hold_is_refused_and_leaves_nothing(tmp_path):
     assert names_in(tmp_path) == []
 
 
-def test_a_shard_is_written_after_every_flush_episodes(tmp_path):
-    writer = EpisodeWriter(tmp_path, make_info(), flush_episodes=2)
+def test_a_shard_is_written_after_a_number_of_episodes(tmp_path, monkeypatch):
+    monkeypatch.setattr(dataset, "FLUSH_EPISODES", 2)
+    writer = EpisodeWriter(tmp_path, make_info())
     for index, shards in enumerate([0, 1, 1, 2]):
         writer.append(make_episode(index))
         assert len(names_in(tmp_path)) == 1 + shards
@@ -110,8 +114,9 @@ def test_a_shard_is_written_after_every_flush_episodes(tmp_path):
     assert completed(tmp_path) == {0, 1, 2, 3}
 
 
-def test_an_episode_is_written_at_once_if_the_last_shard_is_old(tmp_path):
-    with EpisodeWriter(tmp_path, make_info(), flush_seconds=0.2) as writer:
+def test_an_episode_is_written_at_once_if_the_last_shard_is_old(tmp_path, monkeypatch):
+    monkeypatch.setattr(dataset, "FLUSH_S", 0.2)
+    with EpisodeWriter(tmp_path, make_info()) as writer:
         writer.append(make_episode(0))
         assert completed(tmp_path) == set()
         time.sleep(0.2)
@@ -153,7 +158,7 @@ def test_a_run_goes_on_where_it_ended(tmp_path):
 
 
 def test_a_removed_shard_is_not_overwritten_but_followed(tmp_path):
-    write(tmp_path, range(3), flush_episodes=1)
+    write(tmp_path, range(3), shard=1)
     (tmp_path / "episodes-00001.parquet").unlink()
     write(tmp_path, [1])
     assert names_in(tmp_path)[-2:] == ["episodes-00003.parquet", "info.json"]
@@ -216,7 +221,7 @@ def test_an_index_is_accepted_once(tmp_path):
 
 
 def test_equal_episodes_in_two_shards_are_taken_once(tmp_path):
-    write(tmp_path, [0, 1], flush_episodes=1)
+    write(tmp_path, [0, 1], shard=1)
     shard = tmp_path / "episodes-00000.parquet"
     (tmp_path / "episodes-00002.parquet").write_bytes(shard.read_bytes())
     assert [episode.index for episode in load_episodes(tmp_path)] == [0, 1]

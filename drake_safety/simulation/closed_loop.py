@@ -206,11 +206,11 @@ def port_sizes(diagram: Diagram) -> dict[str, int]:
     return {port.get_name(): port.size() for port in ports}
 
 
-def require_ports(loop: ClosedLoop, names: Iterable[str], who: str = "") -> None:
-    """Checks that a loop has output ports."""
-    missing = [name for name in names if not loop.HasOutputPort(name)]
+def require_ports(diagram: Diagram, names: Iterable[str], who: str = "") -> None:
+    """Checks that a task's diagram, or another one, has output ports."""
+    missing = [name for name in names if not diagram.HasOutputPort(name)]
     if missing:
-        task, ports = type(loop).__name__, list(port_sizes(loop))
+        task, ports = type(diagram).__name__, list(port_sizes(diagram))
         raise ValueError(f"{who}task '{task}' exports no port {missing}; it exports {ports}")
 
 

@@ -32,6 +32,10 @@ from drake_safety.simulation.episode_shards import (
     to_table,
 )
 
+FLUSH_EPISODES = 64
+"""Number of pending episodes that are written as a shard."""
+FLUSH_S = 10.0
+"""Age of the last shard at which the next episode is written at once, with those pending [s]."""
 _SCHEMA_VERSION = 1
 _INFO_NAME = "info.json"
 _LOGGER = logging.getLogger("drake_safety")
@@ -47,9 +51,6 @@ class EpisodeWriter:
     Args:
         extra: Further content of ``info.json``, as JSON types (the command, the scenario's text,
             ...). In a folder that is continued, it replaces entries of the same names.
-        flush_episodes: Number of pending episodes that are written as a shard.
-        flush_seconds: Time since the last shard after which the next episode is written at once,
-            with those that are pending [s].
 
     Raises:
         ValueError: The folder holds another set of episodes, or something else, or has a writer.
@@ -60,15 +61,10 @@ class EpisodeWriter:
         path: str | os.PathLike[str],
         info: EpisodesInfo,
         extra: Mapping[str, Any] | None = None,
-        *,
-        flush_episodes: int = 64,
-        flush_seconds: float = 10.0,
     ) -> None:
         require_extra("train", f"episodes in {path}", "pyarrow")
         self.path = Path(path)
         self.info = info
-        self._flush_episodes = flush_episodes
-        self._flush_seconds = flush_seconds
         self._pending: list[Episode] = []
         self._lock = lock_folder(self.path)
         try:
@@ -93,7 +89,7 @@ class EpisodeWriter:
         self._pending.append(episode)
         self._indices.add(episode.index)
         age_s = time.monotonic() - self._flushed_s
-        if len(self._pending) >= self._flush_episodes or age_s >= self._flush_seconds:
+        if len(self._pending) >= FLUSH_EPISODES or age_s >= FLUSH_S:
             self.flush()
 
     def flush(self) -> None:

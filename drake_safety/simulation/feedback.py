@@ -93,18 +93,15 @@ def run_pairs(
     )
 
 
-def AddFeedbackRecorder(
-    builder: DiagramBuilder, loop: ClosedLoop, *, num_steps: int | None = None, capacity: int = 400
-) -> FeedbackRecorder:
+def AddFeedbackRecorder(builder: DiagramBuilder, loop: ClosedLoop) -> FeedbackRecorder:
     """Adds a recorder named ``feedback_recorder`` to a diagram, and connects it to a loop."""
     recorder = builder.AddNamedSystem(
         "feedback_recorder",
         FeedbackRecorder(
             episodes_info(loop, seed=NOT_DRAWN),
-            num_steps=num_steps or loop.scenario.num_steps,
+            num_steps=loop.scenario.num_steps,
             plant_state_size=loop.GetOutputPort("plant_state").size(),
             watch_period_s=loop.scenario.watch_period_s,
-            capacity=capacity,
         ),
     )
     for i in range(recorder.num_input_ports()):

@@ -277,9 +277,20 @@ class LeggedLoop(PlannedLoop):
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
     ) -> None:
         """Sets the robot's state and plan; see `CanStartAnywhere`."""
-        self._enter(context, start.of_robot(self.kinematics))
+        self._begin(context, rng, start.of_robot(self.kinematics), is_silent=rng is None)
+
+    def _begin(
+        self,
+        context: Context,
+        rng: np.random.Generator | None,
+        start: EpisodeStart,
+        *,
+        is_silent: bool = False,
+    ) -> None:
+        """Begins at a start with noise of a generator, initially none if it is silent."""
+        self._enter(context, start)
         self._observers.reseed(context, rng)
-        if rng is None:
+        if is_silent:
             self._observers.silence(context)
         self.start_control(context)
 

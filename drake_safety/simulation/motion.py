@@ -103,11 +103,15 @@ class Recorder:
 
     Args:
         names: Ports to record; a mapping from recorded names to those of ports renames them.
+
+    Raises:
+        ValueError: The diagram has no such port.
     """
 
     def __init__(self, diagram: Diagram, names: Iterable[str] | Mapping[str, str] = RECORDED):
-        named = names if isinstance(names, Mapping) else {name: name for name in names}
-        self._ports = {name: diagram.GetOutputPort(port) for name, port in named.items()}
+        self.names = names if isinstance(names, Mapping) else {name: name for name in names}
+        require_ports(diagram, self.names.values())
+        self._ports = {name: diagram.GetOutputPort(port) for name, port in self.names.items()}
         self._rows: list[dict[str, np.ndarray]] = []
         self._times: list[float] = []
 
@@ -185,18 +189,16 @@ def simulate(
         who: What is simulated, for messages.
 
     Raises:
-        ValueError: A closed loop has no such port.
+        ValueError: The diagram has no such port.
         EpisodeError: A system raised an error, which is its cause, or the simulation failed, before
             the first row or where it may not.
     """
-    logged = dict(ports) if isinstance(ports, Mapping) else {name: name for name in ports}
     if isinstance(diagram, ClosedLoop):
-        require_ports(diagram, logged.values())
         constraint_names = constraint_names or diagram.constraint_names
     names = list(constraint_names or ())
-    recorder = Recorder(diagram, logged)
-    margins_port = diagram.GetOutputPort(logged.get("margins", "margins"))
-    safe = logged.get("safe", "safe")
+    recorder = Recorder(diagram, ports)
+    margins_port = diagram.GetOutputPort(recorder.names.get("margins", "margins"))
+    safe = recorder.names.get("safe", "safe")
     safe_port = diagram.GetOutputPort(safe) if diagram.HasOutputPort(safe) else None
     fall = names.index(diagram.fall_name) if isinstance(diagram, CanFall) else None
     simulator = Simulator(diagram)

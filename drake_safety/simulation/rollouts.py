@@ -337,10 +337,13 @@ def run_episodes(
         # The hash of a folder's set does not cover goals.
         raise ValueError("run_episodes: episodes with goals are not kept; leave out 'path'")
     make = worker_loop(scenario, variation, **loop_options)
-    run = partial(make.run, run_episode, seed=seed, is_standing=is_standing)
     if goals is not None:
         goals = _checked_goals(make(), goals, num_episodes)
-        run = partial(make.run, _run_to_own_goal, goals, seed=seed, is_standing=is_standing)
+
+    def run(index: int) -> Episode:
+        goal = None if goals is None else goals[index]
+        return run_episode(make(), index, seed=seed, goal=goal, is_standing=is_standing)
+
     return collect_episodes(
         episodes_info(make(), seed, loop_options),
         num_episodes,
@@ -350,10 +353,6 @@ def run_episodes(
         progress=progress,
         extra=extra,
     )
-
-
-def _run_to_own_goal(loop: ClosedLoop, goals: np.ndarray, index: int, **options: Any) -> Episode:
-    return run_episode(loop, index, goal=goals[index], **options)
 
 
 def collect_episodes(

@@ -102,20 +102,14 @@ def _judged(item: str, is_ok: bool, message: str, problem: str, remedy: str) -> 
 
 
 def _scenario(name: str | Path, is_imported: bool) -> Generator[Finding, None, Scenario | None]:
-    scenario: Scenario
+    scenario: Scenario = load_scenario(name) if is_imported else read_scenario(name)
+    what, where = ", but for its parameters", "which was not imported; read it before you do"
     if is_imported:
-        scenario = load_scenario(name)
         task = scenario.task_class()
-        yield passed("scenario", f"'{scenario.name}' fits the schema of {task.__name__}")
-        file = getattr(sys.modules[task.__module__], "__file__", None)
-        yield passed("code", f"the scenario runs {scenario.task}, {file}")
-    else:
-        scenario = read_scenario(name)
-        yield passed("scenario", f"'{scenario.name}' fits the schema, but for its parameters")
-        yield passed(
-            "code",
-            f"the scenario runs {scenario.task}, which was not imported; read it before you do",
-        )
+        what = f" of {task.__name__}"
+        where = f"{getattr(sys.modules[task.__module__], '__file__', None)}"
+    yield passed("scenario", f"'{scenario.name}' fits the schema{what}")
+    yield passed("code", f"the scenario runs {scenario.task}, {where}")
     if "nominal" not in scenario.variations:
         yield failed(
             "plants",
