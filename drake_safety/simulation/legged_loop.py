@@ -133,12 +133,7 @@ class LeggedLoop(PlannedLoop):
         self._observer = self._observers.add("observer", noise)
         seen_noise = combined(noise, self._plant_variation.input_noise)
         faults = (self._plant_variation.shift or Shift()).sensor_faults
-        if faults:
-            self._assessor_observer = self._observers.add_faulty(
-                "assessor_observer", seen_noise, faults
-            )
-        else:
-            self._assessor_observer = self._observers.add("assessor_observer", seen_noise)
+        self._assessor_observer = self._observers.add("assessor_observer", seen_noise, faults)
         self._true_observer = self._observers.add("true_observer", ObservationNoise())
         self.state_names = self._assessor_observer.state_names
         self.output_names = self._assessor_observer.output_names

@@ -40,8 +40,15 @@ class Observers:
         self._sources: list[RandomSource] = []
         self._faults: list[SensorFaults] = []
 
-    def add(self, name: str, noise: ObservationNoise) -> StateObserver:
-        """Returns the observer of a noise level, and adds it if there is none yet."""
+    def add(
+        self, name: str, noise: ObservationNoise, faults: Sequence[Fault] = ()
+    ) -> StateObserver:
+        """Returns the observer of a noise level, and adds it if there is none yet.
+
+        One whose measurement has faults is always added.
+        """
+        if faults:
+            return self._add_faulty(name, noise, faults)
         key = (noise.position, noise.velocity)
         if key in self._observers:
             return self._observers[key]
@@ -60,10 +67,9 @@ class Observers:
         self._observers[key] = observer
         return observer
 
-    def add_faulty(
+    def _add_faulty(
         self, name: str, noise: ObservationNoise, faults: Sequence[Fault]
     ) -> StateObserver:
-        """Adds an observer whose measurement has faults."""
         measured = self.add(f"{name}_measurement", noise).GetOutputPort("measured_plant_state")
         names = self._kinematics.plant.GetStateNames(add_model_instance_prefix=False)
         faulty = add_faults(

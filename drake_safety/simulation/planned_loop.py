@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, OutputPort
@@ -97,13 +98,7 @@ class PlannedLoop(ClosedLoop):
         self.constraint_names = self._monitor.constraint_names
 
     def export(
-        self,
-        builder: DiagramBuilder,
-        ports: Mapping[str, OutputPort],
-        *,
-        period_s: float,
-        margins: OutputPort | None = None,
-        hold: OutputPort | None = None,
+        self, builder: DiagramBuilder, ports: Mapping[str, OutputPort], **options: Any
     ) -> SafetyAssessor | None:
         """Exports ports, and those of planner and monitor; see :meth:`ClosedLoop.export`."""
         ports = {
@@ -116,8 +111,7 @@ class PlannedLoop(ClosedLoop):
             "plant_state": self._plant_state,
             **ports,
         }
-        margins = margins or self._seen_margins
-        return super().export(builder, ports, period_s=period_s, margins=margins, hold=hold)
+        return super().export(builder, ports, margins=self._seen_margins, **options)
 
     @cached_property
     def _default(self) -> Context:

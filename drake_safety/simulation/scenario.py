@@ -139,9 +139,7 @@ class Scenario:
                 without the ports of a ClosedLoop.
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
-        _check_options(task, options)
-        if _takes(task, "meshcat"):
-            options["meshcat"] = meshcat
+        options = _accepted(task, options, meshcat)
         loop: ClosedLoop = task(self, variation, assessment=assessment, **options)
         check_ports(loop)
         return loop
@@ -206,22 +204,21 @@ class Scenario:
         return digest.hexdigest()
 
 
-def _takes(task: type[ClosedLoop], name: str) -> bool:
-    """Whether a task's constructor takes an argument."""
-    parameters = inspect.signature(task).parameters
-    return name in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-
-
-def _check_options(task: type[ClosedLoop], options: dict[str, Any]) -> None:
-    unknown = [name for name in options if not _takes(task, name)]
+def _accepted(
+    task: type[ClosedLoop], options: dict[str, Any], meshcat: "Meshcat | None"
+) -> dict[str, Any]:
+    """The options of a task's constructor, Meshcat among them if it takes it."""
+    known = inspect.signature(task).parameters
+    takes_all = any(p.kind is p.VAR_KEYWORD for p in known.values())
+    unknown = [name for name in options if not takes_all and name not in known]
     if unknown:
         # Arguments of make_loop itself.
-        common = ("scenario", "variation", "assessment", "meshcat")
-        known = [name for name in inspect.signature(task).parameters if name not in common]
+        own = [n for n in known if n not in ("scenario", "variation", "assessment", "meshcat")]
         raise ValueError(
-            f"task '{task.__name__}' has no options {unknown}{did_you_mean(unknown[0], known)}; it "
-            f"has {known}"
+            f"task '{task.__name__}' has no options {unknown}{did_you_mean(unknown[0], own)}; it "
+            f"has {own}"
         )
+    return options | ({"meshcat": meshcat} if takes_all or "meshcat" in known else {})
 
 
 def _unpickled(task: str, name: str, folder: str) -> Scenario:

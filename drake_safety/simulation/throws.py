@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -189,21 +188,19 @@ def run_throws(
     """
     times = [math.nan] * len(indices) if trigger_times_s is None else trigger_times_s
     make = worker_loop(scenario, variation, ball=True, recovery=trigger_times_s is not None)
+
+    def throw(item: tuple[int, tuple[int, float]]) -> tuple[int, Motion]:
+        place, (index, trigger_time_s) = item
+        return place, run_throw(make(), index, seed=seed, trigger_time_s=trigger_time_s)
+
     logs = map_items(
-        partial(make.run, _throw_at, seed=seed),
+        throw,
         enumerate(zip(indices, times, strict=True)),
         num_workers=num_workers,
         progress=progress,
         stage="throws",
     )
     return [log for _, log in sorted(logs, key=lambda found: found[0])]
-
-
-def _throw_at(
-    loop: ClosedLoop, item: tuple[int, tuple[int, float]], *, seed: int
-) -> tuple[int, Motion]:
-    place, (index, trigger_time_s) = item
-    return place, run_throw(loop, index, seed=seed, trigger_time_s=trigger_time_s)
 
 
 def trigger_time(log: Motion, probability: np.ndarray, threshold: float) -> float:
