@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ VIOLATIONS = ("legs_collide", "joint_position", "joint_velocity", "joint_effort"
 """Physically implausible states; see :class:`Violations`."""
 _FLIGHT_S = 0.1  # From the ball's release to its impact.
 _EARLIEST_S, _LATEST_S = 0.4, 1.2  # Impact of a random ball.
+_LOW_S = 0.02  # For which the probability that triggers is low.
 _AFTER_S = 2.5  # From the first impact to the end.
 _PORTS = ("state", "desired_preview", "features", "margins", "plant_state")
 
@@ -131,37 +133,34 @@ def run_throw(
     impact_s = min((throw.time_s for throw in throws), default=math.inf)
     if duration_s is None:
         duration_s = _AFTER_S + (impact_s if throws else _LATEST_S)
-    has_recovery = loop.HasOutputPort("recovery_active")
-    is_triggered_here = loop.HasInputPort("safety_probability")
+    recovery = filter(loop.HasOutputPort, ["recovery_active"])
     violations, rows = Violations(loop), []
-    has_triggered = False
+
+    def set_probability(context: Context, value: float) -> None:
+        if loop.HasInputPort("safety_probability"):
+            loop.GetInputPort("safety_probability").FixValue(context, [value])
 
     def start(context: Context) -> None:
         thrown.reset_calm(context, episode_rng(seed, index))
-        if is_triggered_here:
-            loop.GetInputPort("safety_probability").FixValue(context, [1.0])
+        set_probability(context, 1.0)
 
     def release(throw: Throw) -> tuple[float, Callable[[Context], object]]:
         release_s = max(throw.time_s - _FLIGHT_S, 0.0)
         lead_s = throw.time_s - release_s
         return release_s, lambda context: thrown.throw_ball(context, throw, lead_s)
 
-    def each_row(context: Context, time_s: float) -> None:
-        nonlocal has_triggered
-        rows.append(violations(context))
-        if is_triggered_here and time_s >= trigger_time_s - 1e-9:
-            # One low value suffices: the trigger latches.
-            value = 1.0 if has_triggered else 0.0
-            loop.GetInputPort("safety_probability").FixValue(context, [value])
-            has_triggered = True
-
+    events = [release(throw) for throw in throws]
+    if not math.isnan(trigger_time_s):
+        # One low value suffices: the trigger latches.
+        events.append((trigger_time_s, partial(set_probability, value=0.0)))
+        events.append((trigger_time_s + _LOW_S, partial(set_probability, value=1.0)))
     motion = simulate(
         loop,
         start,
-        (*_PORTS, *ports, *(["recovery_active"] if has_recovery else [])),
+        (*_PORTS, *ports, *recovery),
         duration_s=duration_s,
-        events=map(release, throws),
-        each_row=each_row,
+        events=events,
+        each_row=lambda context, time_s: rows.append(violations(context)),
         index=index,
         who=f"throw {index} of '{loop.scenario.name}' (seed {seed})",
         **options,
