@@ -122,15 +122,10 @@ class Balancing(LeggedLoop):
         physics.connect_servos(builder, kinematics.joint_names, command)
 
         safe_set = BalanceSafeSet(kinematics, parameters.safe_set)
-        self._watch(
-            builder,
-            safe_set,
-            outlook=desired["desired_outlook"],
-            servo_command=controller.GetOutputPort("desired_joint_state"),
-        )
-        loads = [name for name in self.feature_names if name.startswith("servo_load_")]
-        self.monitored = {"features": loads}
-        del desired["desired_outlook"]
+        gravity = self._add_gravity(builder)
+        loads = self._add_servo_load(builder, controller.GetOutputPort("desired_joint_state"))
+        self._watch(builder, safe_set, gravity, loads, outlook=desired.pop("desired_outlook"))
+        self.monitored = {"features": loads[1]}
         assessor = self.export(
             builder,
             desired,

@@ -129,11 +129,9 @@ class Walking(LeggedLoop):
         self._watch(
             builder,
             safe_set,
-            outlook=desired["desired_outlook"],
-            controller_features=(controller.GetOutputPort("action_state"), controller.action_names),
-            has_stance=False,
+            (controller.GetOutputPort("action_state"), controller.action_names),
+            outlook=desired.pop("desired_outlook"),
         )
-        del desired["desired_outlook"]
         ports = {**desired, "controller_status": controller.GetOutputPort("status")}
         if guard_system is not None:
             ports["guard_active"] = guard_system.GetOutputPort("is_changed")

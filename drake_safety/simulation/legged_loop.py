@@ -162,13 +162,10 @@ class LeggedLoop(PlannedLoop):
         self,
         builder: DiagramBuilder,
         safe_set: LeggedSafeSet,
-        *,
+        *features: tuple[OutputPort, list[str]],
         outlook: OutputPort | None = None,
-        servo_command: OutputPort | None = None,
-        controller_features: tuple[OutputPort, list[str]] | None = None,
-        has_stance: bool = True,
     ) -> None:
-        """Adds monitor and features: the safe set's, gravity, servo loads, the controller's."""
+        """Adds monitor and features: the safe set's, and others with their names."""
         self.fall_name = safe_set.fall_name
         self.watched_features = safe_set.watched_features
         self.rate_features = safe_set.rate_features
@@ -180,17 +177,11 @@ class LeggedLoop(PlannedLoop):
             seen_state=self._assessor_observer.GetOutputPort("measured_plant_state"),
             outlook=outlook,
         )
-        parts = [(self._features, self.feature_names)]
-        if has_stance:
-            parts.append(self._add_gravity(builder))
-        if servo_command is not None:
-            parts.append(self._add_servo_load(builder, servo_command))
-        if controller_features is not None:
-            parts.append(controller_features)
-        features = builder.AddNamedSystem("features", Multiplexer([p.size() for p, _ in parts]))
+        parts = [(self._features, self.feature_names), *features]
+        joined = builder.AddNamedSystem("features", Multiplexer([p.size() for p, _ in parts]))
         for i, (port, _) in enumerate(parts):
-            builder.Connect(port, features.get_input_port(i))
-        self._features = features.get_output_port(0)
+            builder.Connect(port, joined.get_input_port(i))
+        self._features = joined.get_output_port(0)
         self.feature_names = [name for _, names in parts for name in names]
 
     def _add_gravity(self, builder: DiagramBuilder) -> tuple[OutputPort, list[str]]:

@@ -15,7 +15,7 @@ from pydrake.systems.analysis import Simulator
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
-from drake_safety.files.progress import StageProgress
+from drake_safety.files.progress import StageProgress, ignore
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.models import load_robot, robot_files
 from drake_safety.robots.robot_model import RobotModel, by_pattern
@@ -42,7 +42,7 @@ def check_scenario(
     num_episodes: int = 16,
     seed: int = 0,
     is_imported: bool = True,
-    progress: StageProgress | None = None,
+    progress: StageProgress = ignore,
 ) -> Iterator[Finding]:
     """Checks a scenario item by item, the cheap ones first.
 
@@ -54,7 +54,6 @@ def check_scenario(
         is_imported: Whether the scenario's task is imported, which runs its code. If not, only the
             files are checked.
     """
-    report: StageProgress = progress or (lambda stage, done, total: None)
     scenario = yield from _guarded("scenario", _scenario, name, is_imported)
     if scenario is None:
         return
@@ -76,12 +75,12 @@ def check_scenario(
     if isinstance(loop, LeggedLoop):
         yield from _guarded("contact spheres", _contacts, loop)
         yield from _guarded("shape of the base", _target, loop)
-        report(_STANDS, 0, 1)
+        progress(_STANDS, 0, 1)
         yield from _guarded(_STANDS, _stands, loop)
-        report(_STANDS, 1, 1)
+        progress(_STANDS, 1, 1)
     yield from _guarded("contract", check_contract, loop, seed=seed)
     if num_episodes:
-        yield from _guarded("episodes", _episodes, loop, num_episodes, seed, report)
+        yield from _guarded("episodes", _episodes, loop, num_episodes, seed, progress)
 
 
 def _guarded(
