@@ -1,3 +1,5 @@
+from dataclasses import fields
+
 import numpy as np
 import pytest
 
@@ -36,6 +38,19 @@ def test_a_task_of_the_package_has_what_it_says_and_no_more(name):
     assert [finding for finding in check_contract(loop) if not finding.is_ok] == []
     assert CanFall not in HAS[name] or loop.fall_name in loop.constraint_names
     assert not any(loop.HasOutputPort(port) for port in ASSESSMENT_PORTS)
+
+
+@pytest.mark.parametrize("name", HAS)
+def test_what_the_hash_of_a_task_leaves_out_are_parameters_that_it_has(name):
+    parameters = load_scenario(name).parameters
+    assert set(getattr(parameters, "online", ())) <= {one.name for one in fields(parameters)}
+
+
+def test_the_safe_set_is_sampled_by_the_control_period_unless_the_task_has_another():
+    assert gliding().watch_period_s == gliding().control_period_s
+    reaching = load_scenario("atlas_reaching")
+    reaching.parameters.monitor_period_s = 0.05
+    assert reaching.watch_period_s == 0.05 > reaching.control_period_s
 
 
 def test_a_task_is_asked_for_what_it_has_and_is_handed_back():
