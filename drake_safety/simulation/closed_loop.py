@@ -59,18 +59,18 @@ class ClosedLoop(Diagram):
     """
 
     Parameters: type
-    """Schema of the task's part of the scenario file, a dataclass. Two things it may have, too:
-    ``online``, names of parameters on which no episode depends, which the scenario's hash leaves
-    out; and ``completed(stated, robot)``, a class method that adds defaults which depend on the
-    robot to the parameters in the file."""
+    """Schema of the task's part of the scenario file, a dataclass. It may also have ``online``,
+    names of parameters on which no episode depends, which the scenario's hash leaves out, and a
+    class method ``completed(stated, robot)``, which adds defaults that depend on the robot to the
+    parameters in the file."""
 
     angular_constraints: tuple[str, ...] = ()
     """Constraints whose margins are angles [rad]; the others are lengths [m]."""
 
     monitored: Mapping[str, list[str]] = {}
-    """What the change monitor reads, all that is not stated: ``states`` that it predicts, such as
-    those that a real robot measures, and ``features`` by which it predicts them beside the desired
-    preview, such as what the controller commands."""
+    """What the change monitor reads: ``states`` that it predicts, such as those that a real robot
+    measures, and ``features`` by which it predicts them beside the desired preview, such as what
+    the controller commands; without one of the two, all states or all features."""
 
     state_names: list[str]
     output_names: list[str]
