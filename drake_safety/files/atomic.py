@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import glob
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
+from filelock import BaseFileLock, FileLock, Timeout
 
 
 @contextlib.contextmanager
 def replacing(final: Path) -> Iterator[Path]:
     """A temporary file beside a final one, renamed to it on success and removed on any exception.
-
-    What a process that no longer runs left of the same file is removed.
 
     Args:
         final: Path of the complete file.
@@ -28,32 +23,18 @@ def replacing(final: Path) -> Iterator[Path]:
     # Readers of folders (pyarrow, pandas) skip names that start with a dot.
     temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
     try:
-        for left in final.parent.glob(f".{glob.escape(final.name)}.*.tmp"):
-            process = left.name.split(".")[-2]
-            if process.isdigit() and not _is_running(int(process)):
-                left.unlink(missing_ok=True)
         yield temporary
         # The bytes reach the disk before the name does.
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         temporary.replace(final)
     except OSError as error:
-        why = str(error) if error.errno is None else os.strerror(error.errno)
         raise OSError(
-            f"{final} cannot be written: {why}; what had been written before is kept"
+            f"{final} cannot be written: {error.strerror or error}; what had been written before "
+            "is kept"
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _is_running(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except (OverflowError, ProcessLookupError):
-        return False
-    except PermissionError:
-        pass
-    return True
 
 
 def lock_folder(path: Path) -> BaseFileLock:
@@ -62,8 +43,6 @@ def lock_folder(path: Path) -> BaseFileLock:
     Raises:
         ValueError: It is locked.
     """
-    from filelock import FileLock, Timeout
-
     path.mkdir(parents=True, exist_ok=True)
     lock = FileLock(path / ".lock", thread_local=False)
     try:

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from contextlib import contextmanager, nullcontext
+from typing import Any, TypeVar
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
-LINE_PERIOD_S = 10.0
-"""Longest time without a line where there are no bars [s]."""
+from rich import progress as columns
+from rich.console import Console
 
 StageProgress = Callable[[str, int, int], Any]
 """Called with the name of a stage, the number done and the number wanted."""
@@ -21,18 +18,15 @@ _Report = TypeVar("_Report", bound=Callable[..., Any])
 
 @contextmanager
 def open_stages(
-    console: Console | None = None, *, period_s: float = LINE_PERIOD_S
+    console: Console | None = None, *, period_s: float = 10.0
 ) -> Iterator[StageProgress]:
     """Shows stages while the block runs: bars on a terminal and in a notebook, lines elsewhere.
 
     Args:
         console: Where it prints; standard error by default.
-        period_s: Time between two lines [s].
+        period_s: Longest time between two lines [s].
     """
-    import rich.console
-    from rich import progress as columns
-
-    console = console or rich.console.Console(stderr=True)
+    console = console or Console(stderr=True)
     # A log file that is told to have colours is no terminal either.
     is_live = console.is_jupyter or (console.is_interactive and console.file.isatty())
     numbers = [
@@ -50,6 +44,7 @@ def open_stages(
         speed_estimate_period=24 * 3600.0,
     )
     tasks: dict[str, columns.TaskID] = {}
+    is_over = threading.Event()
 
     def report(stage: str, done: int, total: int) -> None:
         if stage not in tasks:
@@ -58,17 +53,18 @@ def open_stages(
         task = bars.tasks[tasks[stage]]
         was_finished = task.finished
         bars.update(task.id, completed=done, total=total)
-        if task.finished and not was_finished and not is_live:
+        if task.finished and not was_finished:
             print_task(task)
-
-    def print_line(*words: str) -> None:
-        console.print(*words, highlight=False, markup=False, soft_wrap=True)
 
     def print_task(task: columns.Task) -> None:
         print_line(f"{task.description}:", *(str(column(task)) for column in numbers))
 
+    def print_line(*words: str) -> None:
+        if not is_live:
+            console.print(*words, highlight=False, markup=False, soft_wrap=True)
+
     def tick() -> None:
-        while not is_over.wait(period_s):
+        while not is_over.wait(None if is_live else period_s):
             unfinished = [task for task in bars.tasks if not task.finished]
             for task in unfinished:
                 print_task(task)
@@ -76,18 +72,14 @@ def open_stages(
                 after = f", after '{bars.tasks[-1].description}'" if bars.tasks else ""
                 print_line(f"still working{after}")
 
-    is_over = threading.Event()
-    if is_live:
-        with bars:
-            yield report
-        return
     ticking = threading.Thread(target=tick, name="progress", daemon=True)
     ticking.start()
-    try:
-        yield report
-    finally:
-        is_over.set()
-        ticking.join()
+    with bars:
+        try:
+            yield report
+        finally:
+            is_over.set()
+            ticking.join()
 
 
 @contextmanager
@@ -100,13 +92,8 @@ def shown(
         progress: A callback, True to show the progress while the block runs, or None or False.
         of_stages: Makes the callback that shows it.
     """
-    if not isinstance(progress, bool):
-        yield progress
-    elif not progress:
-        yield None
-    else:
-        with open_stages() as stages:
-            yield of_stages(stages)
+    with open_stages() if progress is True else nullcontext() as stages:
+        yield of_stages(stages) if stages else progress or None
 
 
 def ignore(*done: object) -> None:
@@ -115,6 +102,5 @@ def ignore(*done: object) -> None:
 
 def stage_of(progress: StageProgress | None, name: str) -> Callable[[float], None]:
     """Returns the callback of one stage, which takes the fraction done."""
-    if progress is None:
-        return ignore
-    return lambda done: progress(name, round(100 * done), 100)
+    report = progress or ignore
+    return lambda done: report(name, round(100 * done), 100)

@@ -29,28 +29,17 @@ def reading(
     """
     try:
         yield
-    except OSError as error:
-        if error.filename is not None or not isinstance(error, errors):
+    except Exception as error:
+        is_of_system = isinstance(error, OSError) and error.filename is not None
+        is_own = type(error).__module__.startswith("drake_safety.")  # Such as a missing extra.
+        if is_of_system or is_own or not isinstance(error, errors):
             raise
-        raise ValueError(_message(path, what, error)) from error
-    except errors as error:
-        if type(error).__module__.startswith("drake_safety."):
-            raise  # Not about the file, such as a missing extra.
-        if type(error) is ValueError and str(path) in str(error):
-            if len(str(error)) <= _LONGEST_MESSAGE:
-                raise
-            raise ValueError(shortened(str(error))) from error
-        raise ValueError(_message(path, what, error)) from error
-
-
-def _message(path: Path, what: str, error: Exception) -> str:
-    name = f"{what} '{path}'" if what else str(path)
-    if isinstance(error, RecursionError):
-        return f"{name} is nested too deeply"
-    if isinstance(error, UnicodeDecodeError):
-        return f"{name} is not UTF-8 text: {error}"
-    text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-    return f"{name}: {shortened(text)}"
+        text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        if isinstance(error, RecursionError):
+            text = "it is nested too deeply"
+        if type(error) is not ValueError or str(path) not in text:
+            text = f"{what} '{path}': {text}" if what else f"{path}: {text}"
+        raise ValueError(shortened(text)) from error
 
 
 def shortened(text: str) -> str:
@@ -88,28 +77,19 @@ def parse_yaml(text: str, who: str, loader: type[yaml.SafeLoader] = YamlLoader) 
     """Parses a YAML document of plain values; deep nesting and many aliases are refused."""
     try:
         value = yaml.load(text, Loader=loader)
-        _num_values(value, {})
     except yaml.YAMLError as error:
         raise ValueError(f"{who} is not YAML: {shortened(str(error))}") from error
     except RecursionError:
         raise ValueError(f"{who} is not YAML that can be read: it is nested too deeply") from None
-    except OverflowError as error:
-        raise ValueError(f"{who} is not YAML that can be read: {error}") from None
+    pending, num_values = [value], 0
+    while pending:
+        one = pending.pop()
+        num_values += 1
+        if num_values > _MOST_VALUES:
+            raise ValueError(
+                f"{who} is not YAML that can be read: with its aliases it has more than "
+                f"{_MOST_VALUES} values"
+            )
+        if isinstance(one, dict | list):
+            pending += [*one, *one.values()] if isinstance(one, dict) else one
     return value
-
-
-def _num_values(value: Any, counted: dict[int, int]) -> int:
-    """Number of values in a document; an alias counts as often as it stands."""
-    if not isinstance(value, dict | list):
-        return 1
-    if id(value) in counted:
-        if not counted[id(value)]:
-            raise OverflowError("an alias contains itself")
-        return counted[id(value)]
-    counted[id(value)] = 0
-    children = [*value, *value.values()] if isinstance(value, dict) else value
-    number = 1 + sum(_num_values(child, counted) for child in children)
-    if number > _MOST_VALUES:
-        raise OverflowError(f"its aliases stand for more than {_MOST_VALUES} values")
-    counted[id(value)] = number
-    return number

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import functools
-import json
 import re
-from dataclasses import MISSING, asdict, fields, is_dataclass
-from enum import Enum
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
-import numpy as np
 import pydantic
 import pydantic.dataclasses
+import pydantic_core
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat
 
 from drake_safety.files.reading import did_you_mean, parse_yaml, reading, shortened
@@ -60,9 +58,7 @@ Triple = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 Bounds = Annotated[Pair[_Value], AfterValidator(_ascending)]
 """Lowest and highest, which may be the same."""
 Interval = Annotated[Pair[FiniteFloat], AfterValidator(_increasing)]
-"""Lowest and highest."""
 Pattern = Annotated[str, AfterValidator(_pattern)]
-"""A regular expression."""
 
 
 def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
@@ -73,10 +69,12 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
     Raises:
         ValueError: A key is unknown, or a value has another type or is out of range.
     """
-    try:
-        text = json.dumps({"value": _completed(schema, raw)}, default=_plain)
-    except TypeError as error:  # A key that is no text.
-        raise ValueError(f"{who}: {error}") from None
+    # Arrays become lists.
+    text = pydantic_core.to_json(
+        {"value": _merged(schema, raw)},
+        inf_nan_mode="constants",
+        fallback=lambda one: getattr(one, "tolist", one.__str__)(),
+    )
     known: Any = schema  # For mypy, the cache wants what can be hashed.
     try:
         document: Any = _document(known).model_validate_json(text, strict=True)
@@ -101,32 +99,17 @@ def _document(schema: Any) -> type[pydantic.BaseModel]:
     return pydantic.create_model("Document", __config__=_NO_OTHER_KEYS, value=(schema, ...))
 
 
-def _completed(schema: Any, raw: Any) -> Any:
-    """What is stated, with the rest of nested defaults that are stated in part."""
-    if not (is_dataclass(schema) and isinstance(raw, dict)):
-        return raw
-    defaults = {
-        one.name: one.default if one.default_factory is MISSING else one.default_factory()
-        for one in fields(schema)
-        if isinstance(raw.get(one.name), dict)
-    }
-    return {key: _merged(defaults.get(key), one) for key, one in raw.items()}
-
-
 def _merged(default: Any, raw: Any) -> Any:
-    """A default value with what is stated, to any depth of dataclasses."""
+    """What is stated, with the rest of defaults that are stated in part, to any depth."""
     if not (is_dataclass(default) and isinstance(raw, dict)):
         return raw
-    stated = {key: _merged(getattr(default, str(key), None), one) for key, one in raw.items()}
-    return {one.name: getattr(default, one.name) for one in fields(default)} | stated
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    if isinstance(value, Enum):
-        return value.value
-    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else str(value)
+    is_class = isinstance(default, type)
+    known = {}
+    for one in fields(default):
+        is_made = is_class and one.default_factory is not MISSING
+        known[one.name] = one.default_factory() if is_made else getattr(default, one.name, None)
+    stated = {key: _merged(known.get(key), one) for key, one in raw.items()}
+    return stated if is_class else known | stated
 
 
 def _message(schema: Any, error: Any) -> str:
