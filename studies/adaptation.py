@@ -12,12 +12,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drake_safety.cli.adapt import fresh_actual_episodes, paired_episodes
+from drake_safety.cli.adapt import ActualPlant
 from drake_safety.cli.console import (
     AssessmentOption,
     ScenarioArgument,
     WorkersOption,
-    print_shipped,
     say,
 )
 from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_folder
@@ -83,7 +82,6 @@ def adaptation(
     feedback are written to ASSESSMENT/adapted-VARIATION.
     """
     learned = assessment_folder(load_scenario(scenario), assessment)
-    print_shipped(learned)
     folder = adapted_folder(learned.out, variation)
     pictures = []
     with open_study(
@@ -102,23 +100,13 @@ def adaptation(
         seeds = [ADAPTATION.seeds(seed + _POOL_STRIDE * i) for i in range(pools)]
         spent = [one for block in seeds for one in block.values()]
         priors = {mode: study.load(mode, spent) for mode in MODES}
-        common = (learned.out, workers, stages)
-        drawn = [
-            paired_episodes(loaded, feedback, variation, block["adaptation"], *common)
-            for block in seeds
-        ]
+        plant = ActualPlant(loaded, variation, learned.out, workers, stages)
+        drawn = [plant.pairs(feedback, block["adaptation"]) for block in seeds]
         sets = [pairs.feedback() for pairs in drawn]
-        fresh = [
-            fresh_actual_episodes(
-                loaded, evaluate, variation, block["evaluation of the adaptation"], *common
-            )
-            for block in seeds
-        ]
+        fresh = [plant.fresh(evaluate, block["evaluation of the adaptation"]) for block in seeds]
         learned_from = {}
         if oracle:
-            learned_from["oracle"] = fresh_actual_episodes(
-                loaded, oracle, variation, seeds[0]["oracle"], *common, what="those of the oracle"
-            )
+            learned_from["oracle"] = plant.fresh(oracle, seeds[0]["oracle"])
         if scratch:
             learned_from |= {
                 f"scratch {n}": drawn[0].actual[:n] for n in _SCRATCH_SIZES if n <= feedback

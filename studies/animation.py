@@ -13,7 +13,7 @@ from PIL import Image
 
 from drake_safety.cli.ask import parse_target
 from drake_safety.cli.console import AssessmentOption, ScenarioArgument, TargetOption, say
-from drake_safety.cli.run import alarm_row, motion_threshold, named_push, parse_pushes
+from drake_safety.cli.run import alarm_times, motion_threshold, named_push, parse_pushes
 from drake_safety.cli.training_folder import (
     MODES,
     assessment_folder,
@@ -72,8 +72,7 @@ def animation(
         log = run_to_goal(loop, goal, push=pushed, ports=(_PORT,), **options)
         states = {loop.robot.name: log["plant_state"]}
         threshold, _ = motion_threshold(gamma, goal_threshold(folder, gamma))
-        alarm = alarm_row(log, threshold)
-        events = [] if alarm is None else [float(log.time_s[alarm])]
+        events = alarm_times(log, threshold)
     probability, positions = log[_PORT][:, 0], stack_positions(loop, states)
     save_animation(loop, log.time_s, positions, probability, threshold, out, events)
     say("animation", out)

@@ -26,7 +26,6 @@ from drake_safety.cli.console import (
     AssessmentOption,
     ScenarioArgument,
     WorkersOption,
-    print_shipped,
 )
 from drake_safety.cli.training_folder import MODES, assessment_folder
 from drake_safety.evaluation.metrics import Estimate, auc, median, share
@@ -82,7 +81,6 @@ def anomalies(
     OUT/anomalies.json.
     """
     learned = assessment_folder(load_scenario(scenario), assessment)
-    print_shipped(learned)
     out, seeds = out or learned.out, ANOMALIES.seeds(seed)
     with open_study(
         "anomalies", scenario, learned.path, seed=seed, workers=workers, out=out

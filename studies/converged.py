@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drake_safety.cli.adapt import paired_episodes
+from drake_safety.cli.adapt import ActualPlant
 from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption
 from drake_safety.evaluation.episode_study import PROMISED_UNSAFE_RECALL
 from drake_safety.evaluation.metrics import Estimate, segment_estimates, threshold_at
@@ -60,9 +60,8 @@ def converged(
             "feedback_pairs": pairs,
         }
         if throws:
-            run = paired_episodes(
-                study.scenario, pairs, "actual", ADAPTATION.first, assessment, workers, stages
-            )
+            plant = ActualPlant(study.scenario, "actual", assessment, workers, stages)
+            run = plant.pairs(pairs, ADAPTATION.first)
             literal = {"before": prior, "converged": prior.adapt(run.feedback(), method="paper")}
             thrown, _ = evaluate_throws(
                 study.scenario,

@@ -16,7 +16,6 @@ from drake_safety.cli.console import (
     AssessmentOption,
     ScenarioArgument,
     WorkersOption,
-    print_shipped,
     say,
 )
 from drake_safety.cli.training_folder import assessment_folder, goal_threshold
@@ -68,7 +67,6 @@ def plan_study(
     ) as study:
         gamma = study.load(mode, [seed])
         rule = goal_threshold(learned.path, gamma)
-        print_shipped(learned)
         say(f"threshold {rule.threshold:.3f}, {rule.origin}")
         trials = run_trials(
             study.scenario,

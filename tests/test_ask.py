@@ -13,7 +13,7 @@ import pytest
 import command_line
 from drake_safety.cli import join_targets
 from drake_safety.cli.ask import parse_target
-from drake_safety.cli.run import alarm_row, named_push
+from drake_safety.cli.run import alarm_times, named_push
 from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file, goal_threshold
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
@@ -322,14 +322,14 @@ def test_a_push_is_one_that_the_scenario_names(loop):
 
 
 @pytest.mark.parametrize(
-    ("gamma", "row"),
+    ("gamma", "rows"),
     [
-        ([0.9, 0.6, 0.4, 0.8], 2),
-        ([0.9, 0.5, 0.7], None),
-        ([0.4, 0.9, 0.3], None),
-        ([0.9, np.nan, 0.3], 1),
+        ([0.9, 0.6, 0.4, 0.8], [2]),
+        ([0.9, 0.5, 0.7], []),
+        ([0.4, 0.9, 0.3], []),
+        ([0.9, np.nan, 0.3], [1]),
     ],
 )
-def test_the_alarm_is_the_first_fall_of_a_gamma_that_was_accepted(gamma, row):
+def test_the_alarm_is_the_first_fall_of_a_gamma_that_was_accepted(gamma, rows):
     motion = Motion(time_s=np.arange(len(gamma)), ports={"safety_probability": np.array([gamma]).T})
-    assert alarm_row(motion, 0.5) == row
+    assert alarm_times(motion, 0.5) == rows

@@ -7,12 +7,13 @@ imported.
 
 from __future__ import annotations
 
-import ast
+import itertools
 import logging
 import os
+import re
 import signal
 import sys
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -82,17 +83,13 @@ class _Command(TyperCommand):
 
 def join_targets(args: Sequence[str]) -> list[str]:
     """Joins the numbers of a target or command: an option has a fixed number of words."""
-    joined: list[str] = []
     words = list(args)
-    while words:
-        word = words.pop(0)
-        if word in ("--target", "--command") and words:
-            numbers = [words.pop(0)]
-            while words and len(numbers) < 3 and is_number(numbers[-1]) and is_number(words[0]):
-                numbers.append(words.pop(0))
-            word = f"{word}={' '.join(numbers)}"
-        joined.append(word)
-    return joined
+    for i, word in enumerate(words):  # Which become fewer.
+        if word in ("--target", "--command") and words[i + 1 :]:
+            numbers = list(itertools.takewhile(is_number, words[i + 1 : i + 4]))
+            end = i + 1 + max(len(numbers), 1)
+            words[i:end] = [f"{word}={' '.join(words[i + 1 : end])}"]
+    return words
 
 
 def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
@@ -105,23 +102,18 @@ def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     app.callback()(_common)
-    is_listed = not any(name in called for name in COMMANDS)
     for name, (module, *_) in COMMANDS.items():
         function: Any = _not_called
-        line = _line(module, name) if is_listed else None
         if name in called:
             function = getattr(import_module(f"drake_safety.cli.{module}"), name)
-            line = (function.__doc__ or "").splitlines()[0]
-        app.command(name, cls=_Command, short_help=line)(function)
+        app.command(name, cls=_Command, short_help=_line(module, name))(function)
     return app
 
 
 def _line(module: str, name: str) -> str:
     """First line of a command's help, whose module is not imported."""
     source = (Path(__file__).parent / f"{module}.py").read_text(encoding="utf-8")
-    functions = (one for one in ast.parse(source).body if isinstance(one, ast.FunctionDef))
-    documented = next(one for one in functions if one.name == name)
-    return (ast.get_docstring(documented) or "").splitlines()[0]
+    return re.findall(rf'^def {name}\(.*?"""(.*?)(?:"""|\n)', source, re.M | re.S)[0]
 
 
 def _not_called(scenario: console.ScenarioArgument) -> None:
@@ -159,18 +151,13 @@ def _common(
 
 def main() -> None:
     """Runs the command."""
-    resumed = {name: one.resumed for name, one in COMMANDS.items() if one.resumed is not None}
-    run_app(make_app(_called()), "drake-safety", resumed)
+    run_app(make_app(_called()), "drake-safety")
 
 
-def run_app(commands: typer.Typer, program: str, resumed: Mapping[str, str] | None = None) -> None:
+def run_app(commands: typer.Typer, program: str) -> None:
     """Runs a command; user errors are printed as one line, with --debug as a traceback.
 
     SIGTERM stops it as Ctrl-C does.
-
-    Args:
-        program: Name of the program.
-        resumed: Commands that can be continued after Ctrl-C, and the option that does so or "".
     """
     handler = RichHandler(console=console.console, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
@@ -183,9 +170,9 @@ def run_app(commands: typer.Typer, program: str, resumed: Mapping[str, str] | No
         sys.exit(code)
     except (typer.Abort, KeyboardInterrupt):
         console.say("stopped; finished episodes are kept")
-        option = (resumed or {}).get(next(iter(arguments), ""))
-        if option is not None:
-            console.say("continue with:", console.command_line(program, option))
+        command = COMMANDS.get(arguments[0]) if arguments else None
+        if command is not None and command.resumed is not None:
+            console.say("continue with:", console.command_line(program, command.resumed))
         sys.exit(_STOPPED)
     except Exception as error:
         if isinstance(error, (ValueError, OSError, EpisodeError)) and _DEBUG not in sys.argv:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from typer import Option
 
@@ -14,7 +14,8 @@ from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.metrics import Estimate, segment_estimates
 from drake_safety.evaluation.results import Results
-from drake_safety.evaluation.tables import Column, Table, rows_of
+from drake_safety.evaluation.tables import Column
+from drake_safety.evaluation.verdict_tables import verdict_table
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import ADAPTATION, MOTION
@@ -27,7 +28,6 @@ from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
 _COLUMNS = [Column(key, key) for key in ("brier", "auc", "unsafe_recall", "safe_recall")]
-_UNCHANGED = "unchanged"
 _MOST_CUTS = 3  # Printed of a log.
 _MOTION_S = 240.0  # Undisturbed motion of a simulated actual plant, for the monitor.
 _THRESHOLD = 0.5  # Safety probability below which a segment is classified unsafe.
@@ -79,12 +79,11 @@ def adapt(
     if len({one.resolve() for one in logs}) < len(logs):
         raise ValueError(f"adapt: logs must differ; got {', '.join(map(str, logs))}")
     name = logs[0].stem if logs else variation
-    console.print_shipped(learned)
     folder = out or folders.adapted_folder(learned.out, name)
-    judged: dict[str, Estimate] = {}
     folders.check_writable(folder)
+    judged: dict[str, Estimate] = {}
     with console.open_stages() as stages:
-        simulated = (learned.out, workers, stages)
+        plant = ActualPlant(loaded, variation, learned.out, workers, stages)
         if log_map is not None:
             pieces = log_pieces(loaded, logs, log_map, is_strict=strict)
             actual, starts = cut_log(pieces, loaded)
@@ -92,25 +91,20 @@ def adapt(
             step_s = priors[MODES[0]].detector_.step_s
             motions = motions_from_log(pieces, loaded, step_s=step_s)
         else:
-            pairs = paired_episodes(loaded, feedback, variation, seed, *simulated)
-            kept = _kept(loaded, variation, seed, learned.out, workers)
-            kept["seed"] = MOTION.seeds()["motion of the actual robot"]
-            kept["path"] /= "motion"
-            progress = partial(stages, "undisturbed actual motion")
-            pairing = loaded.options_for("pairs", variation)
-            motions = run_motions(loaded, _MOTION_S, progress=progress, **kept, **pairing)
+            pairs, motions = plant.pairs(feedback, seed), plant.motion(seed)
         sets = pairs.feedback()
         adapted = {mode: prior.adapt(sets, motions=motions) for mode, prior in priors.items()}
         folder.mkdir(parents=True, exist_ok=True)
         for mode, one in adapted.items():
             one.save(folders.assessment_file(folder, mode))
         if evaluate:
-            seed_of_fresh = seeds["evaluation of the adaptation"]
-            fresh = fresh_actual_episodes(loaded, evaluate, variation, seed_of_fresh, *simulated)
+            fresh = plant.fresh(evaluate, seeds["evaluation of the adaptation"])
             for mode in MODES:
-                for who, one in (("before", priors[mode]), ("after", adapted[mode])):
-                    found = _judge(one, fresh).items()
-                    judged |= {f"{mode}.{who}.{key}": estimate for key, estimate in found}
+                for when, one in (("before", priors[mode]), ("after", adapted[mode])):
+                    segments = split(fresh, stride=1, discount=1.0, shortest=one.settings.shortest)
+                    unsafe = 1.0 - one.predict_rows(segments, fresh.info.variation).probability
+                    found = segment_estimates(segments, unsafe, threshold=1.0 - _THRESHOLD)
+                    judged |= {f"{mode}.{when}.{key}": value for key, value in found.items()}
     differing, num_pairs = sum(pair.differs for pair in sets), len(sets)
     entries = {
         "scenario_hash": pairs.actual.info.scenario_hash,
@@ -125,65 +119,53 @@ def adapt(
     results = Results(judged, console.made_by(loaded.name) | entries)
     results.write(folder / "adaptation.json")
     _print_changes(loaded, adapted, differing, num_pairs, name)
-    if judged:
-        labels = {
-            f"{mode}.{when}": f"{mode}, {when} feedback"
-            for mode in MODES
-            for when in ("before", "after")
-        }
-        rows = rows_of(results, labels, _COLUMNS)
-        n = results[f"{MODES[0]}.before.auc"].n
-        title = f"{n} fresh episodes of '{variation}', recalls at {_THRESHOLD:g}"
-        console.show(Table(corner="", columns=_COLUMNS, rows=rows, title=title).to_rich())
+    for mode in MODES if judged else ():
+        title = f"{mode}, before and after feedback: '{variation}', recalls at {_THRESHOLD:g}"
+        table = verdict_table(results, mode, corner="feedback", kind=(title, "", _COLUMNS))
+        console.show(table.to_rich())
     for mode in adapted:
         console.say("assessment", folders.assessment_file(folder, mode))
     console.say("figures   ", folder / "adaptation.json")
 
 
-def _kept(
-    scenario: Scenario, variation: str, seed: int, folder: Path, workers: int | None
-) -> dict[str, Any]:
-    """Options of simulations of an actual plant that the folder of a training keeps."""
-    path = folder / "feedback" / f"{scenario.simulation_hash(variation)[:12]}-{seed}"
-    return {
-        "variation": variation,
-        "seed": seed,
-        "num_workers": workers,
-        "path": path,
-        "extra": {"command": console.command_line()},
-    }
+class ActualPlant(NamedTuple):
+    """Simulations of an actual plant, which the folder of a training keeps."""
 
+    scenario: Scenario
+    variation: str
+    folder: Path
+    workers: int | None
+    stages: StageProgress
 
-def paired_episodes(
-    scenario: Scenario,
-    num_pairs: int,
-    variation: str,
-    seed: int,
-    folder: Path,
-    workers: int | None,
-    stages: StageProgress,
-) -> EpisodePairs:
-    """Simulates pairs of actual episodes and nominal twins, kept in the folder of the training."""
-    kept = _kept(scenario, variation, seed, folder, workers)
-    progress = partial(stages, "actual episodes and their twins")
-    return run_pairs(scenario, num_pairs, progress=progress, **kept)
+    def pairs(self, num_pairs: int, seed: int) -> EpisodePairs:
+        """Actual episodes and their nominal twins."""
+        kept = self._kept("actual episodes and their twins", seed)
+        return run_pairs(self.scenario, num_pairs, seed=seed, **kept)
 
+    def fresh(self, num_episodes: int, seed: int) -> Episodes:
+        """Other episodes of the actual plant."""
+        kept = self._kept("fresh actual episodes", seed, self.variation)
+        return run_episodes(self.scenario, num_episodes, seed=seed, **kept, **self._pairing)
 
-def fresh_actual_episodes(
-    scenario: Scenario,
-    num_episodes: int,
-    variation: str,
-    seed: int,
-    folder: Path,
-    workers: int | None,
-    stages: StageProgress,
-    what: str = "fresh actual episodes",
-) -> Episodes:
-    """Simulates other episodes of the actual plant, kept in the folder of the training."""
-    kept = _kept(scenario, variation, seed, folder, workers)
-    kept["path"] /= variation
-    pairing = scenario.options_for("pairs", variation)
-    return run_episodes(scenario, num_episodes, progress=partial(stages, what), **kept, **pairing)
+    def motion(self, seed: int) -> Episodes:
+        """Undisturbed motion of the actual plant, beside the pairs of a seed."""
+        kept = self._kept("undisturbed actual motion", seed, "motion")
+        drawn = MOTION.seeds()["motion of the actual robot"]
+        return run_motions(self.scenario, _MOTION_S, seed=drawn, **kept, **self._pairing)
+
+    @property
+    def _pairing(self) -> dict[str, Any]:
+        return self.scenario.options_for("pairs", self.variation)
+
+    def _kept(self, what: str, seed: int, within: str = "") -> dict[str, Any]:
+        hash_ = self.scenario.simulation_hash(self.variation)
+        return {
+            "variation": self.variation,
+            "num_workers": self.workers,
+            "path": self.folder / "feedback" / f"{hash_[:12]}-{seed}" / within,
+            "progress": partial(self.stages, what),
+            "extra": {"command": console.command_line()},
+        }
 
 
 def log_pieces(
@@ -220,20 +202,19 @@ def _print_changes(
     variation: str,
 ) -> None:
     """Prints what has changed; or that pairs that all end alike change nothing, and what does."""
-    changes, methods = {}, {}
+    rows, unchanged = [], []
     for mode, one in adapted.items():
-        changes[mode] = ["-"] * 3
         assert one.adaptation_ is not None
-        methods[mode] = one.adaptation_.method
-        if methods[mode] == "recalibration":
-            change = one.correction_.change
-            is_any = one.correction_.is_any
-            changes[mode] = [f"{value:+.2f}" if is_any else _UNCHANGED for value in change]
+        change = ["-"] * 3
+        if one.adaptation_.method == "recalibration":
+            change = [f"{value:+.2f}" for value in one.correction_.change]
+            if not one.correction_.is_any:
+                change = ["unchanged"] * 3
+                unchanged.append(mode)
+        rows.append((mode, one.adaptation_.method, *change))
     columns = ("mode", "method", "added to the offset", "safety slope", "margin slope")
-    rows = [(mode, methods[mode], *change) for mode, change in changes.items()]
     title = f"Adapted to '{variation}': {differing} of {num_pairs} pairs end differently"
     console.show(console.new_table(*columns, rows=rows, title=title))
-    unchanged = [mode for mode, change in changes.items() if _UNCHANGED in change]
     if differing or not unchanged:
         return
     num_needed = scenario.assessment.adaptation.update_interval
@@ -245,10 +226,3 @@ def _print_changes(
         f"{duration_s:g} s of logs, some of which end otherwise",
         style="yellow",
     )
-
-
-def _judge(assessment: SafetyAssessment, fresh: Episodes) -> dict[str, Estimate]:
-    """Estimates of the probability on every segment of fresh episodes."""
-    segments = split(fresh, stride=1, discount=1.0, shortest=assessment.settings.shortest)
-    result = assessment.predict_rows(segments, fresh.info.variation)
-    return segment_estimates(segments, 1.0 - result.probability, threshold=1.0 - _THRESHOLD)

@@ -42,7 +42,7 @@ def ask(
     """
     if target is None:
         raise ValueError("ask: pass --target, or for a walking robot --command")
-    loaded, folder, gamma = folders.open_assessment(scenario, assessment, mode)
+    loaded, folder, gamma = folders.open_assessment(scenario, assessment, mode, is_told=not as_json)
     loop = loaded.make_loop(assessment=gamma, **console.given(hand=hand, command_s=duration))
     goal, rule = parse_target(loop, target), folders.goal_threshold(folder.path, gamma)
     verdict, nearest = judge_target(loop, goal, rule)
@@ -55,7 +55,6 @@ def ask(
         }
         console.say(json.dumps(answer))
     else:
-        console.print_shipped(folder, gamma)
         print_verdict(loop, verdict, nearest, rule.origin)
     if not verdict.is_accepted:
         raise Exit(1)

@@ -48,7 +48,6 @@ def calibrate(
     """
     loaded = load_scenario(scenario)
     folder = folders.assessment_folder(loaded, assessment)
-    console.print_shipped(folder)
     learned = {
         mode: folders.load_assessment(folder.path, mode)
         for mode in MODES

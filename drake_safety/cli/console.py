@@ -19,9 +19,6 @@ from drake_safety.files import progress
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
-    from drake_safety.cli.training_folder import AssessmentFolder
-    from drake_safety.learning.assessment import SafetyAssessment
-
 
 def _scenario_names(incomplete: str) -> list[str]:
     """The package's scenarios that begin with a word; without Drake, so that a shell is quick."""
@@ -125,14 +122,6 @@ def warn_of_empty_scene(meshcat: Meshcat, task: str) -> None:
     if not meshcat.HasPath("/drake"):
         told = f"warning: task '{task}' draws nothing in Meshcat (nothing is under /drake)"
         say(told, style="yellow")
-
-
-def print_shipped(folder: AssessmentFolder, assessment: SafetyAssessment | None = None) -> None:
-    """Prints which assessment is used by default, and what its monitor promises."""
-    if folder.path != folder.out:
-        say("assessment        comes with the package,", folder.path)
-    if assessment is not None:
-        say(assessment.detector_.describe())
 
 
 def given(**options: Any) -> dict[str, Any]:

@@ -44,7 +44,7 @@ _DEFAULT_THROWS = 600
 _MOST_JUDGED = 1000  # Nominal motions under `--shifts`.
 
 
-@dataclass(kw_only=True)
+@dataclass
 class Evaluation:
     """An evaluation under way: what is judged, where the results go, and what was found.
 
@@ -132,17 +132,16 @@ def evaluate(
     """
     loaded, folder = load_scenario(scenario), out or assessment
     folders.check_writable(assessment, folder)
-    if shifts:
-        with evaluating(loaded, assessment, folder, SHIFTS, seed, workers) as evaluation:
-            add_shifts(evaluation, shifts, episodes)
-        return
-    loop = loaded.make_loop()
+    loop, block = loaded.make_loop(), SHIFTS if shifts else EVALUATION
     if throws is None:
         is_thrown_at = isinstance(loop, HasBall) and not isinstance(loop, HasGoals)
         throws = _DEFAULT_THROWS if is_thrown_at else 0
-    if throws:
+    elif throws:
         require(loop, HasBall, "evaluate: pass --throws 0")
-    with evaluating(loaded, assessment, folder, EVALUATION, seed, workers) as evaluation:
+    with evaluating(loaded, assessment, folder, block, seed, workers) as evaluation:
+        if shifts:
+            add_shifts(evaluation, shifts, episodes)
+            return
         evaluation.entries["calibration_episodes"] = calibration_episodes
         test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
         other = evaluation.fresh("calibration episodes", calibration_episodes, "thresholds")
@@ -172,15 +171,7 @@ def evaluating(
     for gamma in assessments.values():
         folders.check_fresh(gamma, scenario, seeds.values())
     with console.open_stages() as stages:
-        evaluation = Evaluation(
-            scenario=scenario,
-            assessments=assessments,
-            run_folder=run_folder,
-            folder=folder,
-            seeds=seeds,
-            workers=workers,
-            stages=stages,
-        )
+        evaluation = Evaluation(scenario, assessments, run_folder, folder, seeds, workers, stages)
         yield evaluation
     sharpened = assessments[MODES[0]]
     trained = next(one for one in sharpened.used_ if one.purpose == "training")
@@ -278,11 +269,10 @@ def add_shifts(
         more: Further estimates of a shift.
     """
     gamma, paper = evaluation.assessments.values()
-    if judges is None:
-        judges = {
-            "gamma": shift_study.assessment_judge(gamma),
-            "paper": shift_study.assessment_judge(paper),
-        }
+    judges = judges or {
+        "gamma": shift_study.assessment_judge(gamma),
+        "paper": shift_study.assessment_judge(paper),
+    }
     scenario, seed, stages = evaluation.scenario, evaluation.seeds["shifts"], evaluation.stages
     folder, workers = evaluation.run_folder, evaluation.workers
     nominal = shift_study.motions_of(evaluation.fresh("nominal motions", num_nominal, "shifts"))

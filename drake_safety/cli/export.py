@@ -23,10 +23,9 @@ def export(
     It holds the maps, the grid, the beliefs and the correction of the assessment, adapted or not;
     its metadata say what its inputs are and what its thresholds promise.
     """
-    loaded, folder, gamma = folders.open_assessment(scenario, assessment, mode)
+    loaded, _, gamma = folders.open_assessment(scenario, assessment, mode)
     folders.check_fresh(gamma, loaded)
     folders.check_writable(out.parent)
-    console.print_shipped(folder)
     out.parent.mkdir(parents=True, exist_ok=True)
     gamma.to_onnx(out)
     for one in gamma.calibrations_.values():

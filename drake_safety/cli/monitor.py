@@ -48,7 +48,6 @@ def monitor(
     folders.check_fresh(gamma, loaded)
     folder = out or learned.out / "monitor"
     folders.check_writable(folder)
-    console.print_shipped(learned, gamma)
     files = [file for given in log for file in _files(given)]
     found: list[dict[str, Any]] = []
     with console.open_stages() as stages:

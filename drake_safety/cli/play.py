@@ -50,7 +50,6 @@ def play(
         options["guard"], threshold, told = True, loaded.parameters.guard.threshold, ""
     elif isinstance(asked, HasBall) and not isinstance(asked, HasGoals):
         options["ball"], threshold, told = True, loaded.parameters.recovery.threshold, ""
-    console.print_shipped(folder, gamma)
     if told:
         console.say(told)
     page_port = _page_port(host, port)

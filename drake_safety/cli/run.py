@@ -23,7 +23,7 @@ from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.path_figure import path_figure
 from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
 from drake_safety.evaluation.timeline_figure import timeline_figure
-from drake_safety.files.reading import did_you_mean
+from drake_safety.files.reading import did_you_mean, parse_yaml
 from drake_safety.files.schema import load_typed
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.causes import describe_margin, likely_cause
@@ -97,14 +97,11 @@ def run(
     if force and target is None:
         raise ValueError("run: --force goes to a target that Γ refuses: pass that too")
     loaded, learned, gamma = folders.open_assessment(scenario, assessment, mode)
-    options = console.given(hand=hand, recovery=recovery)
-    guarded = console.given(guard=guard or None)
-    console.print_shipped(learned, gamma)
     rule = folders.goal_threshold(learned.path, gamma)
+    options = console.given(hand=hand, recovery=recovery)
     # Check the capabilities of the task before a browser is opened. The verdict is on what is
     # asked, whatever a guard would pass on.
-    asked = options if target is not None else options | guarded
-    loop = loaded.make_loop(variation, assessment=gamma, **asked)
+    loop = loaded.make_loop(variation, assessment=gamma, **options)
     duration_s, simulated = loaded.episode_duration_s, partial(_move, rule=rule)
     if target is not None:
         goal, one_push = parse_target(loop, target), named_push(loop, push or [])
@@ -127,7 +124,8 @@ def run(
     elif push:
         require(loop, HasBall, "run: --push")
     viewer = console.open_viewer(host)
-    loop = loaded.make_loop(variation, assessment=gamma, meshcat=viewer, **options, **guarded)
+    options |= console.given(guard=guard or None)
+    loop = loaded.make_loop(variation, assessment=gamma, meshcat=viewer, **options)
     if meshcat:
         console.say(f"live at {viewer.web_url()}")
         input("Press Enter when the browser shows the robot. ")
@@ -147,6 +145,7 @@ class _Shown(NamedTuple):
     Attributes:
         told: The threshold in words.
         timeline: Further arguments of the timeline.
+        instants: Times of stills, besides `num_stills` others [s]; None for no stills.
         marked: Times marked on the path in the map, by name [s]; without them there is no figure.
     """
 
@@ -155,6 +154,8 @@ class _Shown(NamedTuple):
     threshold: float
     told: str
     timeline: dict[str, Any]
+    instants: Sequence[float] | None = None
+    num_stills: int = 2
     marked: Mapping[str, float] | None = None
 
 
@@ -163,38 +164,29 @@ def _go(
 ) -> _Shown:
     """Moves to a goal, pushed or not."""
     motion = run_to_goal(loop, goal, push=push, ports=_logged_ports(loop), **options)
-    end_s, output = float(motion.time_s[-1]), motion["output"]
+    words, output = goal_words(loop), motion["output"]
     threshold, origin = motion_threshold(loop.assessment, rule)
-    alarm = alarm_row(motion, threshold)
-    words = goal_words(loop)
+    alarms_s = alarm_times(motion, threshold)
+    timeline: dict[str, Any] = {"trigger_times_s": alarms_s}
     instants = [motion.leave_time_s, motion.fall_time_s]
     events: _Events = [(0.0, f"{words.subject} starts")]
     for port, happens in _HAPPENING.items():
         if port in motion.ports and (motion[port] > 0).any():
             events.append((float(motion.time_s[np.argmax(motion[port][:, 0] > 0)]), happens))
     if push is not None:
+        timeline["pushes"] = [push]
         instants += [push.time_s, push.time_s + push.duration_s + _AFTER_PUSH_S]
         told = f"{push.body} is pushed with {push.force_n} N for {push.duration_s:g} s"
         events.append((push.time_s, told))
-    events += _outcome(loop, motion, alarm, threshold)
     place = "" if motion.has_left else ", inside the safe set throughout"
-    if motion.has_fallen:
-        events.append((motion.fall_time_s, "the robot fell"))
-    elif words.is_point:
-        miss = words.distance(output[-1] - goal)
-        events.append((end_s, f"standing{place}; {miss} from the {words.goal}"))
+    if words.is_point:
+        end = f"standing{place}; {words.distance(output[-1] - goal)} from the {words.goal}"
     else:
         reached = np.round(output[len(output) // 2 :].mean(axis=0), 2)
-        told = f"on its feet{place}; mean of the second half {words.value(reached)}"
-        events.append((end_s, told))
+        end = f"on its feet{place}; mean of the second half {words.value(reached)}"
+    events += _outcome(loop, motion, alarms_s, threshold) + _end(motion, end)
     told = f"alarm where the probability is below {threshold:.3f} in any row, {origin}"
-    timeline = {
-        "instants": [instant for instant in instants if instant <= end_s],
-        "num_stills": _NUM_STILLS,
-        "pushes": [] if push is None else [push],
-        "alarm": alarm,
-    }
-    return _Shown(motion, events, threshold, told, timeline)
+    return _Shown(motion, events, threshold, told, timeline, instants, _NUM_STILLS)
 
 
 def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
@@ -207,19 +199,15 @@ def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
     for throw in throws:
         flight = f"{throw.speed_m_s:g} m/s towards {np.degrees(throw.direction_rad):.0f}°"
         events.append((throw.time_s, f"ball of {throw.mass_kg:g} kg at {flight}"))
-    for time_s in triggers:
-        row = int(np.abs(motion.time_s - time_s).argmin())
-        events.append((time_s, f"recovery triggered; {_expected(loop, motion, row)}"))
-    fall = (motion.fall_time_s, "the robot fell")
-    events.append(fall if motion.has_fallen else (float(motion.time_s[-1]), "standing"))
+    events += _expected(loop, motion, triggers, "recovery triggered") + _end(motion, "standing")
     instants = [throw.time_s + after_s for throw in throws for after_s in _AROUND_IMPACT_S]
     instants += [trigger_s + _AFTER_TRIGGER_S for trigger_s in triggers[:1]]
-    timeline = {"instants": instants, "throws": throws, "trigger_times_s": triggers}
     marked = {"start": 0.0} | {f"ball {i}": one.time_s for i, one in enumerate(throws, start=1)}
     marked |= {f"recovery {i}": start_s for i, start_s in enumerate(triggers, start=1)}
     name = loop.scenario.name
     told = f"recovery where the probability is below {threshold:g}, that of scenario '{name}'"
-    return _Shown(motion, events, threshold, told, timeline, marked)
+    timeline = {"throws": throws, "trigger_times_s": triggers, "trigger_label": "trigger"}
+    return _Shown(motion, events, threshold, told, timeline, instants, marked=marked)
 
 
 def _move(loop: ClosedLoop, rule: folders.GoalThreshold, *, seed: int, **options: Any) -> _Shown:
@@ -233,39 +221,42 @@ def _move(loop: ClosedLoop, rule: folders.GoalThreshold, *, seed: int, **options
         who=f"run of '{loop.scenario.name}' (seed {seed})",
         **options,
     )
-    alarm = _first_below(motion, rule.threshold)
+    alarms_s = _times_below(motion, rule.threshold)
     end = "the end" if motion.has_left else "the end, inside the safe set throughout"
     if motion.failure:
         end = f"the simulation failed: {motion.failure}"
-    events: _Events = [
-        (0.0, "the episode starts"),
-        *_outcome(loop, motion, alarm, rule.threshold),
-        (float(motion.time_s[-1]), end),
-    ]
+    outcome = _outcome(loop, motion, alarms_s, rule.threshold)
+    events = [(0.0, "the episode starts"), *outcome, (float(motion.time_s[-1]), end)]
     told = f"{rule.threshold:.3g}, {rule.origin}"
-    return _Shown(motion, events, rule.threshold, told, {"alarm": alarm})
+    return _Shown(motion, events, rule.threshold, told, {"trigger_times_s": alarms_s})
 
 
-def _outcome(loop: Any, motion: Motion, alarm: int | None, threshold: float) -> _Events:
-    """The alarm of a motion, in a row, and where it leaves the safe set."""
-    events: _Events = []
-    if alarm is not None:
-        told = f"probability below {threshold:.3f}; {_expected(loop, motion, alarm)}"
-        events.append((float(motion.time_s[alarm]), told))
-    if motion.has_left:
-        events.append((motion.leave_time_s, f"left the safe set: {motion.cause}"))
+def _outcome(loop: Any, motion: Motion, alarms_s: list[float], threshold: float) -> _Events:
+    """The alarms of a motion, and where it leaves the safe set."""
+    left = [(motion.leave_time_s, f"left the safe set: {motion.cause}")]
+    below = _expected(loop, motion, alarms_s, f"probability below {threshold:.3f}")
+    return below + (left if motion.has_left else [])
+
+
+def _end(motion: Motion, standing: str) -> _Events:
+    """The fall of a robot, or how it stands at the end."""
+    fall = (motion.fall_time_s, "the robot fell")
+    return [fall if motion.has_fallen else (float(motion.time_s[-1]), standing)]
+
+
+def _expected(loop: Any, motion: Motion, times_s: list[float], happens: str) -> _Events:
+    """What happens at given times, with the constraint most likely to be violated then."""
+    names, unit = loop.constraint_names, loop.assessment.parameters.margin_unit
+    events = []
+    for time_s in times_s:
+        row = int(np.abs(motion.time_s - time_s).argmin())
+        margins = motion["predicted_margins"][row]
+        told = cause = likely_cause(names, motion["cause_probability"][row], margins, unit)
+        if cause:
+            margin = margins[names.index(cause)]
+            told = describe_margin(cause, margin, loop.angular_constraints)
+        events.append((time_s, f"{happens}; expected violation: {told or 'unknown'}"))
     return events
-
-
-def _expected(loop: Any, motion: Motion, row: int) -> str:
-    """The constraint most likely to be violated, with its predicted margin if there is one."""
-    names, margins = loop.constraint_names, motion["predicted_margins"][row]
-    unit = loop.assessment.parameters.margin_unit
-    cause = likely_cause(names, motion["cause_probability"][row], margins, unit)
-    if not cause:
-        return "expected violation: unknown"
-    told = describe_margin(cause, margins[names.index(cause)], loop.angular_constraints)
-    return f"expected violation: {told}"
 
 
 def _logged_ports(loop: ClosedLoop) -> tuple[str, ...]:
@@ -274,15 +265,14 @@ def _logged_ports(loop: ClosedLoop) -> tuple[str, ...]:
     return (*of_gamma, *filter(loop.HasOutputPort, ("alarm", "alarm_cause", *_HAPPENING)))
 
 
-def _first_below(motion: Motion, threshold: float) -> int | None:
-    """First row in which the probability is below a threshold or NaN; None for never."""
+def _times_below(motion: Motion, threshold: float) -> list[float]:
     is_below = ~(motion["safety_probability"][:, 0] >= threshold)
-    return int(np.argmax(is_below)) if is_below.any() else None
+    return motion.time_s[is_below][:1].tolist()
 
 
-def alarm_row(motion: Motion, threshold: float) -> int | None:
-    """First row with the probability below the threshold, if it was above at the start, or None."""
-    return _first_below(motion, threshold) or None
+def alarm_times(motion: Motion, threshold: float) -> list[float]:
+    """First time with the probability below the threshold [s]; none if it was so at the start."""
+    return [time_s for time_s in _times_below(motion, threshold) if time_s > motion.time_s[0]]
 
 
 def motion_threshold(gamma: SafetyAssessment, rule: folders.GoalThreshold) -> tuple[float, str]:
@@ -294,31 +284,21 @@ def motion_threshold(gamma: SafetyAssessment, rule: folders.GoalThreshold) -> tu
     return calibration.threshold, calibration.origin
 
 
-def _timeline(
-    loop: ClosedLoop,
-    motion: Motion,
-    threshold: float,
-    *,
-    alarm: int | None = None,
-    instants: Sequence[float] | None = None,
-    num_stills: int = 2,
-    **options: Any,
-) -> Figure:
-    """The probability along a motion; with stills at instants [s], and an alarm in a row."""
-    if alarm is not None:
-        alarms_s = [float(motion.time_s[alarm])]
-        options |= {"trigger_times_s": alarms_s, "trigger_label": "probability falls"}
-    if instants is not None and isinstance(loop, LeggedLoop):
+def _timeline(loop: Any, shown: _Shown) -> Figure:
+    """The probability along a motion, with stills of a robot."""
+    motion, options = shown.motion, {"trigger_label": "probability falls"} | shown.timeline
+    if shown.instants is not None and isinstance(loop, LeggedLoop):
         states = {loop.robot.name: motion["plant_state"]}
         if "ball_state" in motion.ports:
             states["ball"] = motion["ball_state"]
-        times_s = still_times(motion.time_s, instants, num_stills=num_stills)
+        instants = [one for one in shown.instants if one <= motion.time_s[-1]]
+        times_s = still_times(motion.time_s, instants, num_stills=shown.num_stills)
         positions = stack_positions(loop, states)
         options["stills"] = render_stills(loop, motion.time_s, positions, times_s)
     return timeline_figure(
         motion.time_s,
         motion["safety_probability"][:, 0],
-        threshold,
+        shown.threshold,
         leave_time_s=motion.leave_time_s,
         recovery_intervals_s=motion.recovery_intervals_s,
         belief=motion["belief"],
@@ -348,11 +328,10 @@ def event_rows(
 
 def _save(folder: Path, viewer: Meshcat, loop: Any, shown: _Shown) -> None:
     """Writes recording, figures and events, and prints the events and the paths."""
-    motion, threshold = shown.motion, shown.threshold
-    figures = {"timeline": _timeline(loop, motion, threshold, **shown.timeline)}
+    motion, figures = shown.motion, {"timeline": _timeline(loop, shown)}
     if shown.marked is not None:
         curve = (motion.time_s, motion["embedding"], motion["safety_probability"][:, 0])
-        figures["path"] = path_figure(loop.assessment, *curve, threshold, shown.marked)
+        figures["path"] = path_figure(loop.assessment, *curve, shown.threshold, shown.marked)
     viewer.StopRecording()
     viewer.PublishRecording()
     folder.mkdir(parents=True, exist_ok=True)
@@ -393,20 +372,16 @@ def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
         if text == "ball":
             throws += scenario.parameters.demonstration
             continue
-        values = {}
-        for pair in shlex.split(text):
-            key, _, value = pair.partition("=")
-            if key not in _THROW_FIELDS:
-                raise ValueError(
-                    f"--push '{text}': unknown '{key}'"
-                    f"{did_you_mean(key, ['ball', *_THROW_FIELDS])}; give 'ball', or any of "
-                    f"{[f'{key}=NUMBER' for key in _THROW_FIELDS]}"
-                )
-            try:
-                values[_THROW_FIELDS[key]] = float(value)
-            except ValueError:
-                raise ValueError(f"--push '{text}': '{value}' is not a number") from None
-        if "direction_rad" in values:
-            values["direction_rad"] = float(np.radians(values["direction_rad"]))
-        throws.append(load_typed(Throw, values, f"--push '{text}'"))
+        words = dict(pair.partition("=")[::2] for pair in shlex.split(text))
+        if unknown := [key for key in words if key not in _THROW_FIELDS]:
+            raise ValueError(
+                f"--push '{text}': unknown '{unknown[0]}'"
+                f"{did_you_mean(unknown[0], ['ball', *_THROW_FIELDS])}; give 'ball', or any of "
+                f"{[f'{key}=NUMBER' for key in _THROW_FIELDS]}"
+            )
+        values = {_THROW_FIELDS[key]: parse_yaml(word, key) for key, word in words.items()}
+        throw = load_typed(Throw, values, f"--push '{text}'")
+        if "direction" in words:
+            throw.direction_rad = float(np.radians(throw.direction_rad))
+        throws.append(throw)
     return throws

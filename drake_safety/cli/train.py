@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from joblib.externals.loky import ProcessPoolExecutor
-from joblib.externals.loky.process_executor import BrokenProcessPool
 from typer import Option
 
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
-from drake_safety.files.progress import StageProgress, ignore, stage_of
+from drake_safety.files.progress import StageProgress, stage_of
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.seeds import TRAINING
@@ -26,7 +21,6 @@ from drake_safety.learning.segments import training_segments
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
-from drake_safety.simulation.worker_processes import end_with_parent
 
 
 def train(
@@ -87,14 +81,7 @@ def train(
                 progress=partial(stages, "undisturbed motion"),
             )
             detector = ChangeDetector.fit(motions, stage_of(stages, "monitor"))
-        # The modes are independent: the first is trained here, the others in worker processes.
-        with _worker_processes(len(modes) - 1) as submit:
-            beside = {name: submit(_learn, loaded, name, out, detector) for name in modes[1:]}
-            rows = [_learn(loaded, modes[0], out, detector, stages)]
-            for name, result in beside.items():
-                stages(name, 0, 1)
-                rows.append(result.result())
-                stages(name, 1, 1)
+        rows = [_learn(loaded, name, out, detector, stages) for name in modes]
     console.show(console.new_table("mode", "segments", "unsafe episodes", "CPU time", rows=rows))
     console.say(folders.load_assessment(out, modes[0]).detector_.describe())
     for folder in sets:
@@ -103,45 +90,22 @@ def train(
         console.say("assessment", folders.assessment_file(out, name))
 
 
-@contextlib.contextmanager
-def _worker_processes(num_workers: int) -> Iterator[Callable[..., Any]]:
-    """Yields a function that submits calls to workers, which end on an error or Ctrl-C."""
-    executor = ProcessPoolExecutor(
-        max_workers=max(num_workers, 1), initializer=end_with_parent, initargs=(os.getpid(),)
-    )
-    try:
-        yield executor.submit
-    except BrokenProcessPool:
-        raise ChildProcessError(
-            "the process that learned a mode was killed, by the system if memory ran out; the "
-            "episodes are kept: train again with --resume"
-        ) from None
-    except BaseException:
-        executor.shutdown(wait=False, kill_workers=True)
-        raise
-    executor.shutdown()
-
-
 def _learn(
-    scenario: Scenario,
-    mode: str,
-    out: Path,
-    detector: ChangeDetector | None,
-    stages: StageProgress = ignore,
+    scenario: Scenario, mode: str, out: Path, detector: ChangeDetector | None, stages: StageProgress
 ) -> tuple[str, str, str, str]:
     """Trains and saves one mode; returns its row of the table.
 
     Without a detector, one is learned from the episodes.
     """
     started = time.process_time()
-    scenario.assessment.mode = mode  # type: ignore[assignment]  # Checked before.
+    parameters = replace(scenario.assessment, mode=mode)
     data = load_episodes(folders.episodes_folder(out, mode))
     # Γ is that of the scenario's diagram, whatever the options of its training episodes.
     data.info = replace(data.info, scenario_hash=scenario.simulation_hash())
-    assessment = SafetyAssessment(scenario.assessment).fit(
+    assessment = SafetyAssessment(parameters).fit(
         data, lambda stage, *done: stages(f"{mode}: {stage}", *done), detector=detector
     )
     assessment.save(folders.assessment_file(out, mode))
     unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
-    num_segments = len(training_segments(data, scenario.assessment))
+    num_segments = len(training_segments(data, parameters))
     return mode, f"{num_segments}", unsafe, f"{time.process_time() - started:.0f} s"

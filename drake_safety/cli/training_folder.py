@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from drake_safety.assessments import assessed_scenarios, shipped_folder
+from drake_safety.cli import console
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.rollouts import run_episodes
@@ -92,15 +93,23 @@ def assessment_file(folder: Path, mode: str) -> Path:
 
 
 def open_assessment(
-    scenario: str, given: Path | None, mode: str = MODES[0]
+    scenario: str, given: Path | None, mode: str = MODES[0], *, is_told: bool = True
 ) -> tuple[Scenario, AssessmentFolder, SafetyAssessment]:
-    """Loads a scenario, and the assessment of a mode from the given or the shipped folder."""
+    """Loads a scenario, and the assessment of a mode from the given or the shipped folder.
+
+    Prints which assessment is used by default, and what its monitor promises, if that is told.
+    """
     loaded = load_scenario(scenario)
-    folder = assessment_folder(loaded, given)
-    return loaded, folder, load_assessment(folder.path, mode)
+    folder = assessment_folder(loaded, given, is_told=is_told)
+    assessment = load_assessment(folder.path, mode)
+    if is_told:
+        console.say(assessment.detector_.describe())
+    return loaded, folder, assessment
 
 
-def assessment_folder(scenario: Scenario, given: Path | None) -> AssessmentFolder:
+def assessment_folder(
+    scenario: Scenario, given: Path | None, *, is_told: bool = True
+) -> AssessmentFolder:
     """The given folder, or by default that of the shipped assessments of this very scenario."""
     if given is not None:
         return AssessmentFolder(given, given)
@@ -117,6 +126,8 @@ def assessment_folder(scenario: Scenario, given: Path | None) -> AssessmentFolde
             f"the assessment of '{scenario.name}' that comes with the package was learned from a "
             f"scenario with hash {learned[:12]}, this one has {own[:12]}: {advice}"
         )
+    if is_told:
+        console.say("assessment        comes with the package,", shipped)
     # A separate folder, so that no training is overwritten.
     return AssessmentFolder(shipped, Path("runs") / f"{scenario.name}-shipped")
 

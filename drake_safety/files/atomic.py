@@ -29,9 +29,9 @@ def replacing(final: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(final)
     except OSError as error:
+        why = os.strerror(error.errno) if error.errno else error
         raise OSError(
-            f"{final} cannot be written: {error.strerror or error}; what had been written before "
-            "is kept"
+            f"{final} cannot be written: {why}; what had been written before is kept"
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
