@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_safety.cli.training_folder import episodes_folder, training_options
+from drake_safety.cli.training_folder import episodes_folder
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.simulation.scenario import load_scenario
 from lip_assessments import QUICK
@@ -16,8 +16,7 @@ from studies.readings import Reading, readings_of
 )
 def test_the_papers_mode_learns_from_episodes_without_disturbances(name, options, tmp_path):
     scenario = load_scenario(name)
-    assert training_options(scenario, "paper") == options
-    assert training_options(scenario, "sharpened") == {}
+    assert scenario.options_for("paper") == options
     scenario.make_loop(**options)
     assert episodes_folder(tmp_path, "paper") == tmp_path / "episodes"
     (tmp_path / "episodes_paper").mkdir()

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Container, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import typer
 from rich.logging import RichHandler
@@ -27,36 +27,24 @@ from drake_safety.extras import require_extra
 from drake_safety.files.reading import is_number
 from drake_safety.learning.segments import EpisodeError, installed_versions
 
-
-class Entry(NamedTuple):
-    """A command: its module, and the extra that it needs, said before it does anything.
-
-    Attributes:
-        resumed: Option with which the same line continues it after Ctrl-C; None where nothing is
-            kept.
-    """
-
-    module: str
-    extra: str = ""
-    resumed: str | None = None
-
-
-# In the order in which the help lists them.
 COMMANDS = {
-    "scenarios": Entry("prepare"),
-    "new": Entry("prepare"),
-    "check": Entry("prepare"),
-    "train": Entry("train", "train", "--resume"),
-    "calibrate": Entry("calibrate", "train", ""),
-    "ask": Entry("ask"),
-    "run": Entry("run"),
-    "play": Entry("play", "live"),
-    "evaluate": Entry("evaluate", "train", ""),
-    "adapt": Entry("adapt", "train", ""),
-    "monitor": Entry("monitor"),
-    "export": Entry("export"),
-    "report": Entry("report", "report"),
+    "scenarios": ("prepare", ""),
+    "new": ("prepare", ""),
+    "check": ("prepare", ""),
+    "train": ("train", "train"),
+    "calibrate": ("calibrate", "train"),
+    "ask": ("ask", ""),
+    "run": ("run", ""),
+    "play": ("play", "live"),
+    "evaluate": ("evaluate", "train"),
+    "adapt": ("adapt", "train"),
+    "monitor": ("monitor", ""),
+    "export": ("export", ""),
+    "report": ("report", "report"),
 }
+"""In the order of the help: module, and the extra that it needs, said before it does anything."""
+_RESUMED = {"train": "--resume", "calibrate": "", "evaluate": "", "adapt": ""}
+"""Commands that the same line continues after Ctrl-C, and the option that does so."""
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.
 
@@ -70,8 +58,9 @@ class _Command(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Runs the command."""
-        if extra := COMMANDS[self.name or ""].extra:
-            require_extra(extra, self.name or "")
+        name = self.name or ""
+        if extra := COMMANDS[name][1]:
+            require_extra(extra, name)
         address = ctx.params.get("cluster")
         if address is None:
             return super().invoke(ctx)
@@ -102,7 +91,7 @@ def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     app.callback()(_common)
-    for name, (module, *_) in COMMANDS.items():
+    for name, (module, _) in COMMANDS.items():
         function: Any = _not_called
         if name in called:
             function = getattr(import_module(f"drake_safety.cli.{module}"), name)
@@ -170,9 +159,8 @@ def run_app(commands: typer.Typer, program: str) -> None:
         sys.exit(code)
     except (typer.Abort, KeyboardInterrupt):
         console.say("stopped; finished episodes are kept")
-        command = COMMANDS.get(arguments[0]) if arguments else None
-        if command is not None and command.resumed is not None:
-            console.say("continue with:", console.command_line(program, command.resumed))
+        if (name := next(iter(arguments), "")) in _RESUMED:
+            console.say("continue with:", console.command_line(program, _RESUMED[name]))
         sys.exit(_STOPPED)
     except Exception as error:
         if isinstance(error, (ValueError, OSError, EpisodeError)) and _DEBUG not in sys.argv:

@@ -105,20 +105,20 @@ def adapt(
                     unsafe = 1.0 - one.predict_rows(segments, fresh.info.variation).probability
                     found = segment_estimates(segments, unsafe, threshold=1.0 - _THRESHOLD)
                     judged |= {f"{mode}.{when}.{key}": value for key, value in found.items()}
-    differing, num_pairs = sum(pair.differs for pair in sets), len(sets)
+    gap = sum(pair.differs for pair in sets), len(sets)
     entries = {
         "scenario_hash": pairs.actual.info.scenario_hash,
         "nominal_hash": pairs.nominal.info.scenario_hash,
         "variation": name,
         "logs": [str(one) for one in logs],
         "seed": seed,
-        "feedback_sets": num_pairs,
-        "differing_pairs": differing,
+        "feedback_sets": gap[1],
+        "differing_pairs": gap[0],
         "change": {mode: one.correction_.change.tolist() for mode, one in adapted.items()},
     }
     results = Results(judged, console.made_by(loaded.name) | entries)
     results.write(folder / "adaptation.json")
-    _print_changes(loaded, adapted, differing, num_pairs, name)
+    _print_changes(loaded, adapted, gap, name)
     for mode in MODES if judged else ():
         title = f"{mode}, before and after feedback: '{variation}', recalls at {_THRESHOLD:g}"
         table = verdict_table(results, mode, corner="feedback", kind=(title, "", _COLUMNS))
@@ -145,21 +145,17 @@ class ActualPlant(NamedTuple):
     def fresh(self, num_episodes: int, seed: int) -> Episodes:
         """Other episodes of the actual plant."""
         kept = self._kept("fresh actual episodes", seed, self.variation)
-        return run_episodes(self.scenario, num_episodes, seed=seed, **kept, **self._pairing)
+        return run_episodes(self.scenario, num_episodes, seed=seed, **kept)
 
     def motion(self, seed: int) -> Episodes:
         """Undisturbed motion of the actual plant, beside the pairs of a seed."""
         kept = self._kept("undisturbed actual motion", seed, "motion")
         drawn = MOTION.seeds()["motion of the actual robot"]
-        return run_motions(self.scenario, _MOTION_S, seed=drawn, **kept, **self._pairing)
-
-    @property
-    def _pairing(self) -> dict[str, Any]:
-        return self.scenario.options_for("pairs", self.variation)
+        return run_motions(self.scenario, _MOTION_S, seed=drawn, **kept)
 
     def _kept(self, what: str, seed: int, within: str = "") -> dict[str, Any]:
         hash_ = self.scenario.simulation_hash(self.variation)
-        return {
+        return self.scenario.options_for("pairs", self.variation) | {
             "variation": self.variation,
             "num_workers": self.workers,
             "path": self.folder / "feedback" / f"{hash_[:12]}-{seed}" / within,
@@ -179,30 +175,26 @@ def log_pieces(
     for log in logs:
         found = read_pieces(log, log_map, robot)
         pieces += found.pieces
-        if not found.cuts:
-            continue
-        console.say(
-            f"log '{log}' is cut where values are missing and at gaps: "
-            f"{100 * found.kept_share:.1f} % of {found.duration_s:.1f} s are kept, in "
-            f"{len(found.pieces)} pieces",
-            *found.cuts[:_MOST_CUTS],
-            sep="\n",
-            style="yellow",
-        )
-        if num_more := len(found.cuts[_MOST_CUTS:]):
-            console.say(f"... and {num_more} more; --strict refuses such a log", style="yellow")
+        cuts = found.cuts[:_MOST_CUTS]
+        if num_more := len(found.cuts) - len(cuts):
+            cuts.append(f"... and {num_more} more; --strict refuses such a log")
+        if cuts:
+            console.say(
+                f"log '{log}' is cut where values are missing and at gaps: "
+                f"{100 * found.kept_share:.1f} % of {found.duration_s:.1f} s are kept, in "
+                f"{len(found.pieces)} pieces",
+                *cuts,
+                sep="\n",
+                style="yellow",
+            )
     return pieces
 
 
 def _print_changes(
-    scenario: Scenario,
-    adapted: Mapping[str, SafetyAssessment],
-    differing: int,
-    num_pairs: int,
-    variation: str,
+    scenario: Scenario, adapted: Mapping[str, SafetyAssessment], gap: tuple[int, int], name: str
 ) -> None:
     """Prints what has changed; or that pairs that all end alike change nothing, and what does."""
-    rows, unchanged = [], []
+    (differing, num_pairs), rows, unchanged = gap, [], []
     for mode, one in adapted.items():
         assert one.adaptation_ is not None
         change = ["-"] * 3
@@ -213,7 +205,7 @@ def _print_changes(
                 unchanged.append(mode)
         rows.append((mode, one.adaptation_.method, *change))
     columns = ("mode", "method", "added to the offset", "safety slope", "margin slope")
-    title = f"Adapted to '{variation}': {differing} of {num_pairs} pairs end differently"
+    title = f"Adapted to '{name}': {differing} of {num_pairs} pairs end differently"
     console.show(console.new_table(*columns, rows=rows, title=title))
     if differing or not unchanged:
         return

@@ -81,14 +81,12 @@ def judge_target(
     loop: Any, goal: np.ndarray, rule: folders.GoalThreshold
 ) -> tuple[GoalVerdict, GoalVerdict | None]:
     """The verdict on a target and, for a refusal, on the nearest one accepted with reserve."""
-    limits = {"threshold": rule.threshold, "unsafe_below": rule.unsafe_below}
-    verdict = assess_goal(loop, loop.assessment, goal, **limits)
+    gamma, threshold = loop.assessment, rule.threshold
+    verdict = assess_goal(loop, gamma, goal, threshold=threshold, unsafe_below=rule.unsafe_below)
     if verdict.is_accepted:
         return verdict, None
     rng = np.random.default_rng(_SEARCH_SEED)
-    return verdict, nearest_accepted_goal(
-        loop, loop.assessment, goal, threshold=rule.threshold, rng=rng
-    )
+    return verdict, nearest_accepted_goal(loop, gamma, goal, threshold=threshold, rng=rng)
 
 
 def print_verdict(

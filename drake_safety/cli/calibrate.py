@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 from typer import Option
 
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
+from drake_safety.evaluation.figure_style import label_of
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.calibration import KINDS, episode_scores
 from drake_safety.learning.calibration import calibrate as choose
@@ -60,46 +61,42 @@ def calibrate(
         gamma.check_unused(seed, purpose="calibration")
     folders.check_writable(folder.out)
     with console.open_stages() as stages:
-        fresh = folders.run_fresh_episodes(
-            loaded,
-            folder.out,
-            episodes,
-            seed,
+        progress, options = (
             partial(stages, "calibration episodes"),
-            workers,
-            plant,
-            **loaded.options_for("pairs", plant),
+            loaded.options_for("pairs", plant),
+        )
+        fresh = folders.run_fresh_episodes(
+            loaded, folder.out, episodes, seed, progress, workers, plant, **options
         )
     segments = split(fresh, stride=1, discount=1.0, shortest=1)
-    common: dict[str, Any] = {
-        "miss_rate": miss_rate,
-        "false_alarm_rate": false_alarm_rate,
-        "confidence": confidence,
-        "seed": seed,
-        "scenario_hash": loaded.simulation_hash(plant),
-        "variation": plant,
-    }
+    promised = partial(
+        choose,
+        miss_rate=miss_rate,
+        false_alarm_rate=false_alarm_rate,
+        confidence=confidence,
+        seed=seed,
+        scenario_hash=loaded.simulation_hash(plant),
+        variation=plant,
+    )
     found = {}
     for mode, gamma in learned.items():
         score = assessment_scorer(mode, gamma).unsafe_score(segments)
-        scores = {kind: episode_scores(segments, score, kind) for kind in KINDS}
-        found[mode] = [choose(*scores[kind], kind=kind, **common) for kind in KINDS]
+        found[mode] = [promised(*episode_scores(segments, score, k), kind=k) for k in KINDS]
     for mode, gamma in learned.items():
         gamma.adopt_calibrations(found[mode], fresh.info, len(fresh))
         gamma.save(folders.assessment_file(folder.out, mode))
     rows = [
         (
-            mode,
-            {"plan": "first row", "motion": "worst row"}[one.kind],
+            label_of(f"{mode}.{one.kind}"),
             f"{one.threshold:.4f}",
             f"{one.unsafe_below:.4f}",
             f"{one.num_missed} of {one.num_unsafe}",
             f"{one.num_accepted} of {one.num_safe}",
         )
-        for mode in found
-        for one in found[mode]
+        for mode, both in found.items()
+        for one in both
     ]
-    columns = ("mode", "score", "safe from probability", "unsafe below", "misses", "safe recall")
+    columns = ("score", "safe from probability", "unsafe below", "misses", "safe recall")
     title = f"Promised: {found[MODES[0]][0].promise}"
     console.show(console.new_table(*columns, rows=rows, title=title))
     for mode in learned:

@@ -80,14 +80,6 @@ ClusterOption = Annotated[
 ]
 LOOPBACK = "127.0.0.1"
 """Address that only this machine reaches."""
-HostOption = Annotated[
-    str,
-    Option(
-        "--host",
-        help="Address that serves the page; 0.0.0.0 for every one of this machine. Whoever reaches "
-        "it can use the controls: there is no password.",
-    ),
-]
 
 # Square brackets are units here, not markup. Output to a file has no width of its own.
 console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
@@ -106,7 +98,7 @@ def new_table(*columns: str, rows: Iterable[Iterable[str]] = (), title: str | No
     return table
 
 
-def open_viewer(host: str, port: int | None = None, *, has_rate: bool = True) -> Meshcat:
+def open_viewer(host: str = LOOPBACK, port: int | None = None, *, has_rate: bool = True) -> Meshcat:
     """Starts a Meshcat server, by default at a free port, with or without the real-time rate."""
     from pydrake.geometry import Meshcat, MeshcatParams
 

@@ -52,7 +52,6 @@ class Evaluation:
         assessments: Γ by mode.
         seeds: Seeds of fresh simulations by purpose.
         estimates: By dotted key.
-        pictures: Files of the figures.
         entries: What the file says besides estimates.
     """
 
@@ -64,7 +63,6 @@ class Evaluation:
     workers: int | None
     stages: StageProgress
     estimates: dict[str, Estimate] = field(default_factory=dict)
-    pictures: list[Path] = field(default_factory=list)
     entries: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -80,21 +78,17 @@ class Evaluation:
 
     def fresh(self, what: str, number: int, purpose: str, **options: str) -> Episodes:
         """Fresh nominal episodes, kept in the run's folder."""
+        progress, seed = partial(self.stages, what), self.seeds[purpose]
         return folders.run_fresh_episodes(
-            self.scenario,
-            self.run_folder,
-            number,
-            self.seeds[purpose],
-            partial(self.stages, what),
-            self.workers,
-            **options,
+            self.scenario, self.run_folder, number, seed, progress, self.workers, **options
         )
 
     def add(self, estimates: Mapping[str, Estimate], **figures: Figure) -> None:
-        """Adds results, and figures by name, which are written."""
+        """Adds results, and writes figures by name."""
         self.estimates |= estimates
         for name, figure in figures.items():
-            self.pictures += save(figure, self.folder / name)
+            for picture in save(figure, self.folder / name):
+                console.say("picture", picture)
 
 
 def evaluate(
@@ -175,13 +169,13 @@ def evaluating(
         yield evaluation
     sharpened = assessments[MODES[0]]
     trained = next(one for one in sharpened.used_ if one.purpose == "training")
-    files = {mode: folders.assessment_file(run_folder, mode) for mode in MODES}
+    hashes = {mode: file_hash(folders.assessment_file(run_folder, mode)) for mode in MODES}
     made = console.made_by(scenario.name, program) | {
         "scenario_hash": sharpened.info_.scenario_hash,
         "seed": next(iter(seeds.values())),
         "training_seed": trained.seed,
         "training_episodes": trained.num_episodes,
-        "assessment_sha256": {mode: file_hash(file) for mode, file in files.items()},
+        "assessment_sha256": hashes,
     }
     results = Results(evaluation.estimates, made | evaluation.entries)
     file = folder / ("shifts.json" if block is SHIFTS else "evaluation.json")
@@ -190,8 +184,6 @@ def evaluating(
         console.show(table.to_rich())
     console.say(sharpened.detector_.describe())
     console.say("figures", file)
-    for picture in evaluation.pictures:
-        console.say("picture", picture)
 
 
 def add_verdicts(
@@ -305,7 +297,7 @@ def add_shifts(
         path=folders.fresh_episodes_folder(folder, "motion", FRESH_MOTION.first, {}),
         progress=partial(stages, "undisturbed nominal motion"),
     )
-    alarms = monitor_study.false_alarms(usual, gamma.detector_)
-    found["shifts.nominal.monitor.false_alarms_per_hour"] = alarms
+    key = "shifts.nominal.monitor.false_alarms_per_hour"
+    found[key] = monitor_study.false_alarms(usual, gamma.detector_)
     evaluation.add(found, shifts=shift_study.shifts_figure(found))
     evaluation.entries["kinds"] = {name: kind for name, (kind, _) in sets.items()}

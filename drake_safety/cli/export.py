@@ -23,8 +23,7 @@ def export(
     It holds the maps, the grid, the beliefs and the correction of the assessment, adapted or not;
     its metadata say what its inputs are and what its thresholds promise.
     """
-    loaded, _, gamma = folders.open_assessment(scenario, assessment, mode)
-    folders.check_fresh(gamma, loaded)
+    *_, gamma = folders.open_assessment(scenario, assessment, mode)
     folders.check_writable(out.parent)
     out.parent.mkdir(parents=True, exist_ok=True)
     gamma.to_onnx(out)

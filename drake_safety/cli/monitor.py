@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from rich.table import Table
 from typer import Option
 
 from drake_safety.cli import console
@@ -45,7 +44,6 @@ def monitor(
     Writes monitor.json and a picture of each log, or sequence of an .npz file.
     """
     loaded, learned, gamma = folders.open_assessment(scenario, assessment)
-    folders.check_fresh(gamma, loaded)
     folder = out or learned.out / "monitor"
     folders.check_writable(folder)
     files = [file for given in log for file in _files(given)]
@@ -58,7 +56,7 @@ def monitor(
             stages("logs", i + 1, len(files))
     entries = {"monitor": gamma.detector_.describe(), "logs": found}
     Results({}, console.made_by(loaded.name) | entries).write(folder / "monitor.json")
-    console.show(_table(found))
+    _show(found)
     console.say("figures ", folder / "monitor.json")
     console.say("pictures", folder)
 
@@ -118,7 +116,8 @@ def _judged(motions: Sequence[Motion], gamma: SafetyAssessment, picture: Path) -
     }
 
 
-def _table(found: Sequence[Mapping[str, Any]]) -> Table:
+def _show(found: Sequence[Mapping[str, Any]]) -> None:
+    """Prints a row an alarm, and one for a log without any."""
     rows = []
     for one in found:
         number = "" if one["sequence"] is None else f" [{one['sequence']}]"
@@ -133,4 +132,4 @@ def _table(found: Sequence[Mapping[str, Any]]) -> Table:
             rows.append([*head, *cells, alarm["cause"]])
             head = ["", ""]
     columns = ("log", "until [s]", "alarm [s]", "ends [s]", "largest level", "cause")
-    return console.new_table(*columns, rows=rows)
+    console.show(console.new_table(*columns, rows=rows))

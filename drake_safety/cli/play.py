@@ -30,7 +30,13 @@ def play(
         int | None,
         Option(help="Of the page; the scene's is the next one. Free ones from 7000 on by default."),
     ] = None,
-    host: console.HostOption = console.LOOPBACK,
+    host: Annotated[
+        str,
+        Option(
+            help="Address that serves the page; 0.0.0.0 for every one of this machine. Whoever "
+            "reaches it can use the controls: there is no password."
+        ),
+    ] = console.LOOPBACK,
 ) -> None:
     """Simulate a task on a page in the browser, in real time, until Stop or Ctrl-C.
 

@@ -88,7 +88,6 @@ def run(
         ),
     ] = None,
     meshcat: Annotated[bool, Option("--meshcat", help="Show it live, in real time.")] = False,
-    host: console.HostOption = console.LOOPBACK,
 ) -> None:
     """Simulate once with Γ in the loop; write a recording, a timeline and the events.
 
@@ -123,7 +122,7 @@ def run(
         simulated = partial(_throw, throws=parse_pushes(loaded, push or []))
     elif push:
         require(loop, HasBall, "run: --push")
-    viewer = console.open_viewer(host)
+    viewer = console.open_viewer()
     options |= console.given(guard=guard or None)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=viewer, **options)
     if meshcat:
@@ -233,9 +232,10 @@ def _move(loop: ClosedLoop, rule: folders.GoalThreshold, *, seed: int, **options
 
 def _outcome(loop: Any, motion: Motion, alarms_s: list[float], threshold: float) -> _Events:
     """The alarms of a motion, and where it leaves the safe set."""
-    left = [(motion.leave_time_s, f"left the safe set: {motion.cause}")]
-    below = _expected(loop, motion, alarms_s, f"probability below {threshold:.3f}")
-    return below + (left if motion.has_left else [])
+    events = _expected(loop, motion, alarms_s, f"probability below {threshold:.3f}")
+    if motion.has_left:
+        events.append((motion.leave_time_s, f"left the safe set: {motion.cause}"))
+    return events
 
 
 def _end(motion: Motion, standing: str) -> _Events:
@@ -278,10 +278,10 @@ def alarm_times(motion: Motion, threshold: float) -> list[float]:
 def motion_threshold(gamma: SafetyAssessment, rule: folders.GoalThreshold) -> tuple[float, str]:
     """Threshold of alarms during a motion, and its origin."""
     # A motion has many rows: its promise has its own threshold.
-    calibration = gamma.calibrations_.get("motion")
-    if calibration is None:
-        return rule.threshold, "that of the verdict"
-    return calibration.threshold, calibration.origin
+    promise = gamma.calibrations_.get("motion")
+    return (
+        (promise.threshold, promise.origin) if promise else (rule.threshold, "that of the verdict")
+    )
 
 
 def _timeline(loop: Any, shown: _Shown) -> Figure:

@@ -50,7 +50,7 @@ def train(
     # Folders of episodes and the options of their diagram; modes may share one.
     sets = {}
     for name in modes:
-        options = folders.training_options(loaded, name)
+        options = {} if name == MODES[0] else loaded.options_for("paper")
         sets[out / (f"episodes_{name}" if options else "episodes")] = options
     for folder in sets:
         if not resume and folder.exists() and (kept := completed(folder)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from drake_safety.assessments import assessed_scenarios, shipped_folder
 from drake_safety.cli import console
@@ -43,11 +43,6 @@ def episodes_folder(folder: Path, mode: str = MODES[0]) -> Path:
     """Folder of the training episodes of a mode: the paper's may have its own."""
     own = folder / f"episodes_{mode}"
     return own if own.is_dir() else folder / "episodes"
-
-
-def training_options(scenario: Scenario, mode: str) -> dict[str, Any]:
-    """Options of the diagram for a mode's training episodes, besides the defaults."""
-    return {} if mode == MODES[0] else scenario.options_for("paper")
 
 
 def fresh_episodes_folder(
@@ -102,6 +97,7 @@ def open_assessment(
     loaded = load_scenario(scenario)
     folder = assessment_folder(loaded, given, is_told=is_told)
     assessment = load_assessment(folder.path, mode)
+    check_fresh(assessment, loaded)
     if is_told:
         console.say(assessment.detector_.describe())
     return loaded, folder, assessment
