@@ -220,7 +220,7 @@ def test_pushes_are_the_scenarios_own_balls_or_described_in_degrees(scenario):
         ("bal", r"unknown 'bal' \(did you mean 'ball'\?\); give 'ball', or any of"),
         ("colour=3", r"unknown 'colour'; give 'ball', or any of \['time=NUMBER', 'mass=NUMBER'"),
         ("mass=heavy", "push 'mass=heavy': 'mass_kg' must be a valid number; got 'heavy'"),
-        ("mass=-1", "push 'mass=-1': 'mass_kg' must be greater than 0; got -1.0"),
+        ("mass=-1", "push 'mass=-1': 'mass_kg' must be greater than 0; got -1$"),
     ],
 )
 def test_a_push_that_cannot_be_is_refused(scenario, push, message):

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 def _scenario_names(incomplete: str) -> list[str]:
     """The package's scenarios that begin with a word; without Drake, so that a shell is quick."""
-    names = (file.name for file in files("drake_safety.diagrams").iterdir())
-    found = (name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))
-    return sorted(name for name in found if name.startswith(incomplete))
+    found = (Path(file.name) for file in files("drake_safety.diagrams").iterdir())
+    names = (one.stem for one in found if one.suffix == ".yaml")
+    return sorted(name for name in names if name.startswith(incomplete))
 
 
 ScenarioArgument = Annotated[
@@ -37,17 +37,15 @@ ScenarioArgument = Annotated[
 AssessmentOption = Annotated[
     Path | None,
     Option(
-        "--assessment",
         help="Folder that `train` wrote; by default the assessment that comes with the package.",
         file_okay=False,
     ),
 ]
 TrainingOption = Annotated[
-    Path,
-    Option("--assessment", help="Folder that `train` wrote, with its episodes.", file_okay=False),
+    Path, Option(help="Folder that `train` wrote, with its episodes.", file_okay=False)
 ]
-ModeOption = Annotated[str, Option("--mode", help="'sharpened' or 'paper'.")]
-VariationOption = Annotated[str, Option("--variation", help="Variation of the plant.")]
+ModeOption = Annotated[str, Option(help="'sharpened' or 'paper'.")]
+VariationOption = Annotated[str, Option(help="Variation of the plant.")]
 TargetOption = Annotated[
     str | None,
     Option(
@@ -57,23 +55,15 @@ TargetOption = Annotated[
         help="Target in the world [m], or command, v_x v_y [m/s] and yaw rate [rad/s]; or a name.",
     ),
 ]
-HandOption = Annotated[
-    str | None, Option("--hand", help="Reaching hand; the trained one by default.")
-]
+HandOption = Annotated[str | None, Option(help="Reaching hand; the trained one by default.")]
 RecoveryOption = Annotated[
     bool | None,
-    Option(
-        "--recovery/--no-recovery",
-        help="Whether Γ triggers recovery; by default in balancing, not in walking.",
-    ),
+    Option(help="Whether Γ triggers recovery; by default in balancing, not in walking."),
 ]
-WorkersOption = Annotated[
-    int | None, Option("--workers", help="Worker processes; one a core by default.")
-]
+WorkersOption = Annotated[int | None, Option(help="Worker processes; one a core by default.")]
 ClusterOption = Annotated[
     str | None,
     Option(
-        "--cluster",
         help="Address of dask's scheduler, such as tcp://10.0.0.1:8786, whose workers simulate in "
         "place of this machine's; without --workers.",
     ),

@@ -279,9 +279,9 @@ def motion_threshold(gamma: SafetyAssessment, rule: folders.GoalThreshold) -> tu
     """Threshold of alarms during a motion, and its origin."""
     # A motion has many rows: its promise has its own threshold.
     promise = gamma.calibrations_.get("motion")
-    return (
-        (promise.threshold, promise.origin) if promise else (rule.threshold, "that of the verdict")
-    )
+    if promise is None:
+        return rule.threshold, "that of the verdict"
+    return promise.threshold, promise.origin
 
 
 def _timeline(loop: Any, shown: _Shown) -> Figure:
