@@ -98,7 +98,7 @@ def _learn(
     Without a detector, one is learned from the episodes.
     """
     started = time.process_time()
-    parameters = replace(scenario.assessment, mode=mode)
+    parameters = replace(scenario.assessment, mode=mode)  # type: ignore[arg-type]  # Checked.
     data = load_episodes(folders.episodes_folder(out, mode))
     # Γ is that of the scenario's diagram, whatever the options of its training episodes.
     data.info = replace(data.info, scenario_hash=scenario.simulation_hash())

@@ -93,7 +93,7 @@ def shown(
         of_stages: Makes the callback that shows it.
     """
     with open_stages() if progress is True else nullcontext() as stages:
-        yield of_stages(stages) if stages else progress or None
+        yield of_stages(stages) if stages else None if isinstance(progress, bool) else progress
 
 
 def ignore(*done: object) -> None:

@@ -13,7 +13,6 @@ import yaml
 
 _LONGEST_MESSAGE = 500  # Characters, without the name of the file.
 _MOST_VALUES = 200_000  # Of a YAML document, with every alias written out.
-_LIKENESS = 0.7  # Of a name and one that may have been meant, in [0, 1].
 
 
 @contextmanager
@@ -58,7 +57,7 @@ def is_number(value: Any) -> bool:
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """`` (did you mean 'x'?)`` for an error message, or "" if no known name is like it."""
-    near = difflib.get_close_matches(str(name), [str(one) for one in known], n=1, cutoff=_LIKENESS)
+    near = difflib.get_close_matches(str(name), [str(one) for one in known], n=1, cutoff=0.7)
     return f" (did you mean '{near[0]}'?)" if near else ""
 
 
@@ -86,10 +85,7 @@ def parse_yaml(text: str, who: str, loader: type[yaml.SafeLoader] = YamlLoader) 
         one = pending.pop()
         num_values += 1
         if num_values > _MOST_VALUES:
-            raise ValueError(
-                f"{who} is not YAML that can be read: with its aliases it has more than "
-                f"{_MOST_VALUES} values"
-            )
+            raise ValueError(f"{who} has more than {_MOST_VALUES} values with its aliases")
         if isinstance(one, dict | list):
             pending += [*one, *one.values()] if isinstance(one, dict) else one
     return value

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import functools
+import json
 import re
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, asdict, fields, is_dataclass
+from enum import Enum
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
 import pydantic
 import pydantic.dataclasses
-import pydantic_core
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat
 
 from drake_safety.files.reading import did_you_mean, parse_yaml, reading, shortened
@@ -69,12 +70,10 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
     Raises:
         ValueError: A key is unknown, or a value has another type or is out of range.
     """
-    # Arrays become lists.
-    text = pydantic_core.to_json(
-        {"value": _merged(schema, raw)},
-        inf_nan_mode="constants",
-        fallback=lambda one: getattr(one, "tolist", one.__str__)(),
-    )
+    try:
+        text = json.dumps({"value": _merged(schema, raw)}, default=_plain)
+    except TypeError as error:  # A key that is no text.
+        raise ValueError(f"{who}: {error}") from None
     known: Any = schema  # For mypy, the cache wants what can be hashed.
     try:
         document: Any = _document(known).model_validate_json(text, strict=True)
@@ -106,10 +105,14 @@ def _merged(default: Any, raw: Any) -> Any:
     is_class = isinstance(default, type)
     known = {}
     for one in fields(default):
-        is_made = is_class and one.default_factory is not MISSING
-        known[one.name] = one.default_factory() if is_made else getattr(default, one.name, None)
+        factory = one.default_factory if is_class else MISSING
+        known[one.name] = getattr(default, one.name, None) if factory is MISSING else factory()
     stated = {key: _merged(known.get(key), one) for key, one in raw.items()}
-    return stated if is_class else known | stated
+    return stated if is_class else asdict(default) | stated
+
+
+def _plain(value: Any) -> Any:
+    return value.value if isinstance(value, Enum) else getattr(value, "tolist", value.__str__)()
 
 
 def _message(schema: Any, error: Any) -> str:
