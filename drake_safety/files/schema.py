@@ -102,13 +102,12 @@ def _merged(default: Any, raw: Any) -> Any:
     """What is stated, with the rest of defaults that are stated in part, to any depth."""
     if not (is_dataclass(default) and isinstance(raw, dict)):
         return raw
-    is_class = isinstance(default, type)
     known = {}
     for one in fields(default):
-        factory = one.default_factory if is_class else MISSING
+        factory = one.default_factory if isinstance(default, type) else MISSING
         known[one.name] = getattr(default, one.name, None) if factory is MISSING else factory()
     stated = {key: _merged(known.get(key), one) for key, one in raw.items()}
-    return stated if is_class else asdict(default) | stated
+    return stated if isinstance(default, type) else asdict(default) | stated
 
 
 def _plain(value: Any) -> Any:
