@@ -61,10 +61,8 @@ def calibrate(
         gamma.check_unused(seed, purpose="calibration")
     folders.check_writable(folder.out)
     with console.open_stages() as stages:
-        progress, options = (
-            partial(stages, "calibration episodes"),
-            loaded.options_for("pairs", plant),
-        )
+        progress = partial(stages, "calibration episodes")
+        options = loaded.options_for("pairs", plant)
         fresh = folders.run_fresh_episodes(
             loaded, folder.out, episodes, seed, progress, workers, plant, **options
         )

@@ -92,7 +92,7 @@ def open_assessment(
 ) -> tuple[Scenario, AssessmentFolder, SafetyAssessment]:
     """Loads a scenario, and the assessment of a mode from the given or the shipped folder.
 
-    Prints which assessment is used by default, and what its monitor promises, if that is told.
+    Prints what is used by default, and what its monitor promises, if `is_told`.
     """
     loaded = load_scenario(scenario)
     folder = assessment_folder(loaded, given, is_told=is_told)
