@@ -44,7 +44,7 @@ EXTRAS = {
     "cluster": ("drake_safety/simulation/cluster",),
     "live": ("drake_safety/live/page",),
     "logs": ("drake_safety/logs/",),
-    "mujoco": ("drake_safety/plants/mujoco",),
+    "mujoco": ("drake_safety/plants/mujoco", "drake_safety/robots/mjcf.py"),
     "onnx": ("drake_safety/learning/onnx_graph.py",),
     "report": ("drake_safety/evaluation/report.py",),
     "robots": ("drake_safety/robots/",),
@@ -67,7 +67,7 @@ ONLY_IN = {
     ),
     "tslearn": ("drake_safety/learning/distance.py",),
     "dtaidistance": ("drake_safety/learning/distance.py",),
-    "mujoco": ("drake_safety/plants/mujoco_model.py",),
+    "mujoco": ("drake_safety/plants/mujoco_model.py", "drake_safety/robots/mjcf.py"),
 }
 PICKLING = {"pickle", "cPickle", "dill", "shelve", "marshal"}
 PICKLING_CALLS = {"torch.save", "torch.load", "joblib.dump", "joblib.load", "pd.read_pickle"}

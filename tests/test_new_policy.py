@@ -21,7 +21,7 @@ TERMS = ["projected_gravity", "velocity_commands", "joint_pos_rel", "last_action
 def new(folder, policy, *more):
     write_hexapod(folder)
     urdf, out = folder / "hexapod.urdf", folder / "walker"
-    words = ["new", "walker", "--urdf", str(urdf), "--out", str(out), "--task", "walking"]
+    words = ["new", "walker", "--model", str(urdf), "--out", str(out), "--task", "walking"]
     result = CliRunner().invoke(make_app(), [*words, "--policy", str(policy), *more])
     return out, result
 
@@ -135,7 +135,7 @@ def test_new_refuses_a_policy_before_it_writes_anything(tmp_path):
         out, result = new(tmp_path, tmp_path / policy)
         assert result.exit_code != 0 and not out.exists()
     write_hexapod(tmp_path)
-    words = ["new", "walker", "--urdf", str(tmp_path / "hexapod.urdf")]
+    words = ["new", "walker", "--model", str(tmp_path / "hexapod.urdf")]
     result = CliRunner().invoke(make_app(), [*words, "--task", "walking"])
     assert result.exit_code != 0
     with pytest.raises(ValueError, match=r"is neither a deploy\.yaml"):

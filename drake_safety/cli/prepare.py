@@ -39,7 +39,7 @@ def scenarios() -> None:
 
 def new(
     name: Annotated[str, Argument(help="Name of the robot, and of its folder.")],
-    urdf: Annotated[Path, Option(help="Its URDF.", dir_okay=False)],
+    model: Annotated[Path, Option(help="Its URDF or MJCF.", dir_okay=False)],
     task: Annotated[str, Option(help="'balancing', 'reaching' or 'walking'.")] = "balancing",
     policy: Annotated[
         Path | None,
@@ -60,9 +60,9 @@ def new(
     ] = None,
     out: Annotated[Path | None, Option(help="Folder to write; NAME by default.")] = None,
 ) -> None:
-    """Write the folder of a robot and a first scenario from a URDF, for review.
+    """Write the folder of a robot and a first scenario from a URDF or an MJCF, for review.
 
-    Values that a URDF does not have are marked ASK in the files, with their units.
+    Values that the file does not have are marked ASK in the files, with their units.
     """
     if (task == "walking") != (policy is not None):
         raise ValueError(
@@ -73,7 +73,7 @@ def new(
     template = None if policy is None else survey_policy(policy, _names(motors))
     moved = () if template is None else template.joints or None
     written = write_robot(
-        name, urdf, task, out or Path(name), feet=_names(feet) or None, moved=moved
+        name, model, task, out or Path(name), feet=_names(feet) or None, moved=moved
     )
     files, asked, sizes = written.files, written.asked, written.sizes
     if template is not None:
@@ -81,6 +81,7 @@ def new(
         files, asked = [*files[:-1], *more, files[-1]], [*asked, *unknown]
     mass, height = f"{sizes.mass_kg:.1f} kg", f"{sizes.height_m:.3f} m"
     console.say(f"{name}: {mass}, its base '{sizes.base}' stands {height} high")
+    console.say(f"posture {written.posture_source}")
     for path in files:
         console.say("wrote", path)
     if written.num_hulls:
@@ -88,7 +89,7 @@ def new(
             f"{written.num_hulls} convex hulls replace collision meshes that Drake does not read. "
             f"Look at them: drake-safety check {written.files[-1]} --picture FILE"
         )
-    for what in written.copy.left_out:
+    for what in (*written.copy.warnings, *written.copy.left_out):
         console.say(f"note  {what}", style="yellow")
     if written.bare:
         console.say(

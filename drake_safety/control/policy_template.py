@@ -13,6 +13,8 @@ import yaml
 from drake_safety.control.foreign_policy import converted_policy
 from drake_safety.control.policy_network import PolicyNetwork, load_network
 from drake_safety.control.policy_terms import registered_terms
+from drake_safety.files.reading import yaml_text
+from drake_safety.robots.robot_model import as_pattern
 
 _NETWORKS = (".onnx", ".pt", ".jit")
 
@@ -55,7 +57,7 @@ class PolicyTemplate:
             lines.append(f"# {line}  # ASK {what}")
             asked.append(f"policy.yaml: {what}")
 
-        names = f"joints: [{', '.join(robot_joints)}]"
+        names = f"joints: [{', '.join(map(yaml_text, robot_joints))}]"
         missing = [name for name in self.joints if name not in robot_joints]
         if missing:
             found.pop("joints", None)
@@ -63,7 +65,8 @@ class PolicyTemplate:
         elif not self.joints:
             ask(names, "the joints that the network moves, in its order")
         if not metadata.default_positions and "default_positions" not in found:
-            values = ", ".join(f"{name}: {value:g}" for name, value in posture.items() if value)
+            keys = {yaml_text(as_pattern(name)): value for name, value in posture.items() if value}
+            values = ", ".join(f"{key}: {value:g}" for key, value in keys.items())
             ask(f"default_positions: {{{values}}}", "joint positions at zero action [rad]")
         if not metadata.action_scale and "action_scale" not in found:
             ask("action_scale: {.*: 0.25}", "joint positions per unit of action [rad]")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import json
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -70,6 +71,13 @@ YamlLoader.add_implicit_resolver(
     re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
     [*"-+.0123456789"],
 )
+
+
+def yaml_text(text: str) -> str:
+    """Returns a text as a YAML scalar, quoted where YAML would read anything else."""
+    if re.fullmatch(r"[\w./-]+", text) and yaml.load(text, Loader=YamlLoader) == text:
+        return text
+    return json.dumps(text, ensure_ascii=False)
 
 
 def parse_yaml(text: str, who: str, loader: type[yaml.SafeLoader] = YamlLoader) -> Any:

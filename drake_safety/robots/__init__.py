@@ -1,1 +1,1 @@
-"""Robot descriptions: ``robot.yaml``, model files, meshes, postures, and new robots from a URDF."""
+"""Robot descriptions: ``robot.yaml``, model files, meshes, postures, and new robots."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import (
@@ -23,7 +24,7 @@ from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
 from drake_safety.robots.model_files import model_file, package_parser
 from drake_safety.robots.robot_model import CollisionShape, RobotModel, by_pattern
-from drake_safety.robots.urdf_copy import read_urdf
+from drake_safety.robots.urdf_copy import UrdfCopy, read_urdf
 
 _logger = logging.getLogger("drake_safety")
 _SHAPE_FRICTION = 0.2  # Of all shapes but the feet.
@@ -41,7 +42,7 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
             urdf.drop_collisions()
         if plant.geometry_source_is_registered():
             urdf.convert_visual_meshes()
-    with _quiet_about(robot):
+    with _quiet_about(robot), _named_conditions(path, urdf):
         if urdf is not None and urdf.is_changed:
             urdf.anchor_meshes()
             (instance,) = parser.AddModelsFromString(urdf.text(), "urdf")
@@ -51,6 +52,18 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
             (instance,) = parser.AddModels(str(path))
     plant.RenameModelInstance(instance, robot.name)
     return instance
+
+
+@contextmanager
+def _named_conditions(path: Path, urdf: UrdfCopy | None) -> Iterator[None]:
+    """Where a condition of Drake's C++ fails, pydrake raises SystemExit: names file and links."""
+    try:
+        yield
+    except SystemExit as error:
+        shapes = [] if urdf is None else [words for _, _, words in urdf.empty_shapes()]
+        raise ValueError(
+            "; ".join([f"Drake cannot build '{path}'", *shapes, f"{error}"])
+        ) from error
 
 
 @contextmanager

@@ -242,6 +242,11 @@ def load_robot_file(path: str | Path) -> RobotModel:
     return robot
 
 
+def as_pattern(name: str) -> str:
+    """Returns a regular expression that matches a name alone, and is the name where it can be."""
+    return re.sub(r"[.^$*+?{}\[\]\\|()]", r"\\\g<0>", name)
+
+
 def by_pattern(
     patterns: dict[str, _Value], name: str, what: str, robot_name: str, kind: str = "joint"
 ) -> _Value | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from drake_safety.files.reading import yaml_text
 from drake_safety.robots.robot_size import BALANCING_REFERENCE, RobotSize
 
 
@@ -120,7 +121,7 @@ control_period_s: 0.02
 parameters:
   policy: policy.yaml
   safe_set:  # ASK the least heights of bodies that must not touch the ground [m]
-    clearance_m: {{{sizes.base}: {0.35 * h:.2g}}}
+    clearance_m: {{{yaml_text(sizes.base)}: {0.35 * h:.2g}}}
   commands: {{reach: 3.0}}  # beyond the ranges of training, so that some episodes are unsafe
 """
 

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.extras import MissingExtraError
 from drake_safety.robots.meshes import SHOWN_FORMATS, convex_hull, mesh_points, shown_mesh
 from drake_safety.robots.model_files import model_file
-from drake_safety.robots.urdf_copy import UrdfCopy, number, read_urdf
+from drake_safety.robots.urdf_copy import UrdfCopy, number, pose_of, read_urdf
 
 if TYPE_CHECKING:
     import trimesh
@@ -25,6 +24,9 @@ _IGNORED = ("calibration", "safety_controller")
 """Elements of a joint that Drake ignores with a warning."""
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ROWS, _COLUMNS = np.triu_indices(3)
+_ROUNDING = 1e-6  # Of the digits of moments of inertia.
+_NOISE = 1e-12  # Of moments of inertia that should be zero [kg·m²].
+_WATER_KG_M3 = 1000.0  # Density of the ball in place of a body whose inertia is negative.
 
 
 def simulatable_copy(path: Path) -> UrdfCopy:
@@ -43,6 +45,8 @@ def simulatable_copy(path: Path) -> UrdfCopy:
         for element in [part for part in joint if part.tag in _IGNORED]:
             joint.remove(element)
     copy.free_fixed_joints()
+    copy.drop_world()
+    _drop_zeros(copy)
     _drop_transmissions(copy)
     _drop_friction(copy)
     _fix_inertias(copy)
@@ -61,6 +65,21 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     for name, of_link in hulls.items():
         copy.set_hulls(name, of_link)
     return copy
+
+
+def _drop_zeros(copy: UrdfCopy) -> None:
+    """Removes shapes without extent, and speed limits of zero, at which no joint would move."""
+    for link, shape, words in copy.empty_shapes():
+        link.remove(shape)
+        copy.warn(f"{words}: it is left out")
+    joints = [one for one in copy.root.findall("joint") if one.get("type") != "fixed"]
+    limits = {joint.get("name"): joint.find("limit") for joint in joints}
+    zeros = {name: limit for name, limit in limits.items() if number(limit, "velocity") == 0}
+    for limit in zeros.values():
+        if limit is not None:
+            del limit.attrib["velocity"]
+    if zeros:
+        copy.warn(f'velocity="0" of joints {list(zeros)} is read as no limit')
 
 
 def _drop_transmissions(copy: UrdfCopy) -> None:
@@ -106,13 +125,21 @@ def _fix_inertias(copy: UrdfCopy) -> None:
         moments = np.zeros((3, 3))
         moments[_ROWS, _COLUMNS] = np.nan_to_num([number(inertia, key) for key in _MOMENTS])
         moments[_COLUMNS, _ROWS] = moments[_ROWS, _COLUMNS]
-        principal = np.linalg.eigvalsh(moments)
+        values, axes = np.linalg.eigh(moments)
+        mass, lowest = number(inertial.find("mass"), "value"), moments.diagonal().min()
+        tell = copy.notes.append
         # Flat and thin bodies are allowed.
-        if principal[0] < 1e-6 * principal[2] and np.triu(moments, 1).any():
+        if lowest < -max(_ROUNDING * values[2], _NOISE):
+            radius_m = (0.75 * mass / (np.pi * _WATER_KG_M3)) ** (1 / 3)
+            changed, tell = 0.4 * mass * radius_m**2 * np.eye(3), copy.warn
+            how = (
+                f"{lowest:g} is replaced by {changed[0, 0]:.3g} kg·m² about all axes, as of a ball "
+            )
+            how += "of water of its mass"
+        elif values[0] < _ROUNDING * values[2] and np.triu(moments, 1).any():
             changed, how = np.diag(np.diag(moments)), "its products of inertia are set to zero"
-        elif 0 < principal[0] and principal[2] > (1 + 1e-6) * (principal[0] + principal[1]):
+        elif values[1] > 0 and values[2] > (1 + _ROUNDING) * (values[0] + values[1]):
             # The moments of any body satisfy the triangle inequality.
-            values, axes = np.linalg.eigh(moments)
             values[2] = 0.999 * (values[0] + values[1])  # Digits are rounded.
             changed = axes @ np.diag(values) @ axes.T
             how = "its largest moment is reduced to the sum of the others"
@@ -121,7 +148,7 @@ def _fix_inertias(copy: UrdfCopy) -> None:
         for key, row, column in zip(_MOMENTS, _ROWS, _COLUMNS, strict=True):
             if changed[row, column] != moments[row, column]:
                 inertia.set(key, f"{changed[row, column]:.9g}")
-        copy.notes.append(f"link '{link.get('name')}' has an impossible inertia; {how}")
+        tell(f"link '{link.get('name')}' has an impossible inertia; {how}")
 
 
 def _tell_materials_apart(copy: UrdfCopy) -> None:
@@ -190,7 +217,7 @@ def _gather_collision_meshes(
             link.remove(shape)
             hull = _converted("collision", url, file, partial(_hull, shape, mesh), lost)
             if file is None or hull is None:
-                copy.lost_links.add(name)
+                copy.lost_links.setdefault(name, []).append(url)
             else:
                 hulls.setdefault(name, []).append(hull)
                 replaced.append(file.name)
@@ -204,14 +231,8 @@ def _gather_collision_meshes(
 
 def _hull(shape: ET.Element, mesh: ET.Element, file: Path) -> trimesh.Trimesh:
     """The convex hull of a collision mesh in the link's frame."""
-    origin = shape.find("origin")
-    xyz, rpy = (
-        [float(word) for word in ("" if origin is None else origin.get(key, "")).split()]
-        or [0.0, 0.0, 0.0]
-        for key in ("xyz", "rpy")
-    )
     scale = [float(word) for word in mesh.get("scale", "1 1 1").split()]
-    X_LM = RigidTransform(RollPitchYaw(rpy), xyz)
+    X_LM = pose_of(shape)
     return convex_hull((X_LM @ (mesh_points(file) * scale).T).T)
 
 

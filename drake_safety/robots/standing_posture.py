@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
+
 import numpy as np
 from pydrake.math import RotationMatrix
 
@@ -11,12 +14,54 @@ from drake_safety.robots.urdf_survey import Limb, Survey
 _SHARES = (0.8, 0.75, 0.85, 0.7, 0.65, 0.9, 0.6, 0.55, 0.5, 0.45, 0.4, 0.95)
 _SPREAD_SHARES = (0.45, 0.5, 0.4, 0.55, 0.35, 0.3, 0.6)
 _TOLERANCE_M = 1e-3
+_LEVEL_M = 2e-3  # As `check` demands.
 _CENTRAL = 0.5  # Share of the feet's polygon, from its centre, in which the centre of mass is.
 _NUM_SHIFTS = 3  # Of the feet under the centre of mass.
 _STOP_RAD = 0.05  # Distance of the posture from joint stops.
 _NUM_GUESSES = 10
 _ENOUGH = 5  # Number of solutions to choose from.
 _FREE_RAD = 2.5  # Range of a joint without stops.
+
+
+def standing_posture(
+    survey: Survey, legs: list[Limb], keyframes: Mapping[str, Mapping[str, float]]
+) -> tuple[dict[str, float], str]:
+    """Takes a standing posture from the model file's keyframes, or solves for one.
+
+    Keyframes called home or stand come first. In a keyframe in which the robot stands, all joints
+    are within their stops, not all joints of legs at zero, all contact points at the same height,
+    and the centre of mass is amid them. Without one, joints of no leg are as in the first.
+
+    Args:
+        keyframes: Joint positions by the keyframe's name [rad].
+
+    Returns:
+        Positions of all joints by name [rad], and where they come from.
+    """
+    names = sorted(keyframes, key=lambda name: not re.search("home|stand", name.lower()))
+    for name in names:
+        posture = {joint: round(keyframes[name][joint], 4) for joint in survey.posture()}
+        if _stands(survey, legs, posture):
+            return posture, f"keyframe '{name}'"
+    source = "solved: feet under the hips"
+    if names:
+        in_legs = {joint for leg in legs for joint in leg.joints}
+        keyframe = keyframes[names[0]].items()
+        survey.rest_joints({joint: q for joint, q in keyframe if joint not in in_legs})
+        source += f", as it stands in no keyframe; other joints as in keyframe '{names[0]}'"
+    return solve_standing_posture(survey, legs), source
+
+
+def _stands(survey: Survey, legs: list[Limb], posture: dict[str, float]) -> bool:
+    survey.set_joints(posture)
+    points = np.concatenate([survey.positions(leg) - [0, 0, leg.radius_m] for leg in legs])
+    low, high = points.min(axis=0), points.max(axis=0)
+    center = survey.center_of_mass()[:2]
+    is_within = all(survey.limits[j][0] <= q <= survey.limits[j][1] for j, q in posture.items())
+    is_bent = any(posture[joint] for leg in legs for joint in leg.joints)
+    is_level = bool(high[2] - low[2] <= _LEVEL_M)
+    is_balanced = bool(np.all((low[:2] < center) & (center < high[:2])))
+    return is_within and is_bent and is_level and is_balanced
 
 
 def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]:

@@ -6,12 +6,14 @@ import math
 import re
 import shutil
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable
+import zlib
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.robots.meshes import is_shown, shown_mesh
 from drake_safety.robots.model_files import model_file
@@ -22,6 +24,9 @@ if TYPE_CHECKING:
 _DRAKE = "http://drake.mit.edu"
 _PREFIX = re.compile(rb"""(xmlns:drake\s*=\s*)["'][^"']*["']""")
 ET.register_namespace("drake", _DRAKE)
+_SIZES = ("size", "radius", "length", "scale")
+"""Attributes of shapes."""
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 @dataclass(kw_only=True)
@@ -30,8 +35,9 @@ class UrdfCopy:
 
     Attributes:
         notes: Descriptions of the changes, one sentence each.
+        warnings: Those of them that the user should see at once.
         left_out: Notes about meshes that were removed.
-        lost_links: Links of removed collision meshes.
+        lost_links: Links of removed collision meshes, and their files.
         joint_friction: Removed dry friction by joint [N·m].
         meshes: Meshes of the copy: name relative to the copy -> original file.
         hulls: Convex hulls in place of collision meshes, by link, in its frame [m].
@@ -40,8 +46,9 @@ class UrdfCopy:
     source: Path
     root: ET.Element
     notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    lost_links: set[str] = field(default_factory=set)
+    lost_links: dict[str, list[str]] = field(default_factory=dict)
     joint_friction: dict[str, float] = field(default_factory=dict)
     meshes: dict[str, Path] = field(default_factory=dict)
     hulls: dict[str, list[trimesh.Trimesh]] = field(default_factory=dict)
@@ -52,6 +59,11 @@ class UrdfCopy:
     def text(self) -> str:
         """Returns the edited URDF."""
         return ET.tostring(self.root, encoding="unicode")
+
+    def warn(self, note: str) -> None:
+        """Adds a note that the user should see at once."""
+        self.notes.append(note)
+        self.warnings.append(note)
 
     @property
     def is_changed(self) -> bool:
@@ -77,6 +89,46 @@ class UrdfCopy:
             for joint in self.root.findall("joint")
             if joint.get("type") in ("revolute", "continuous", "prismatic")
         }
+
+    def empty_shapes(self) -> list[tuple[ET.Element, ET.Element, str]]:
+        """Returns shapes without extent: link, shape, and both in words."""
+        found = []
+        for link in self.root.findall("link"):
+            for shape in (*link.findall("visual"), *link.findall("collision")):
+                for part in shape.findall("geometry/*"):
+                    stated = {key: part.get(key, "") for key in _SIZES if key in part.attrib}
+                    sizes = [float(word) for word in _NUMBER.findall(" ".join(stated.values()))]
+                    # Meshes may be mirrored by a negative scale.
+                    if 0.0 in sizes or ("scale" not in stated and min(sizes, default=0.0) < 0):
+                        words = ", ".join(f"{key} {text}" for key, text in stated.items())
+                        kind, name = part.tag.rpartition("}")[2], link.get("name")
+                        words = f"the {shape.tag} of link '{name}' is a {kind} of {words}"
+                        found.append((link, shape, words))
+        return found
+
+    def drop_world(self) -> None:
+        """Removes a root link 'world', and root links under which the robot floats."""
+        joints = self.root.findall("joint")
+        carried = {_end(joint, "child").get("link") for joint in joints}
+        for link in self.root.findall("link"):
+            below = [one for one in joints if _end(one, "parent").get("link") == link.get("name")]
+            kinds = {joint.get("type") for joint in below}
+            is_world = link.get("name") == "world" and kinds == {"fixed"}
+            if link.get("name") not in carried and (is_world or kinds & {"floating", "planar"}):
+                for element in (link, *below):
+                    self.root.remove(element)
+                self.warn(f"the root link '{link.get('name')}' is left out, as the base floats")
+
+    def add_root(self, name: str, below: str, pose: RigidTransform) -> str:
+        """Adds a massless root link at a pose in the present one; returns its name, not taken."""
+        while any(element.get("name") in (name, f"{name}_fixed") for element in self.root):
+            name += "_"
+        ET.SubElement(self.root, "link", name=name)
+        joint = ET.SubElement(self.root, "joint", name=f"{name}_fixed", type="fixed")
+        ET.SubElement(joint, "parent", link=name)
+        ET.SubElement(joint, "child", link=below)
+        set_pose(joint, pose.inverse())
+        return name
 
     def free_fixed_joints(self) -> None:
         """Removes <mimic> from fixed joints, where Drake rejects it."""
@@ -127,12 +179,16 @@ class UrdfCopy:
             if "://" not in url:
                 mesh.set("filename", (self.source.parent / url).resolve().as_uri())
 
-    def fix_joints(self, names: Iterable[str]) -> None:
-        """Fixes joints at zero."""
-        fixed = set(names)
+    def fix_joints(self, poses: Mapping[str, RigidTransform | None]) -> None:
+        """Fixes joints at zero, or at the pose of the child in the parent."""
+        fixed = set(poses)
         for joint in self.root.findall("joint"):
             if joint.get("name") in fixed:
+                pose = poses[joint.get("name", "")]
+                if pose is not None:
+                    set_pose(joint, pose)
                 joint.set("type", "fixed")
+                _remove(joint, "mimic")
         for transmission in self.root.findall("transmission"):
             driven = transmission.find("joint")
             if driven is not None and driven.get("name") in fixed:
@@ -166,11 +222,11 @@ class UrdfCopy:
                 link.remove(shape)
         self.hulls[link_name] = hulls
         if not hulls:
-            self.lost_links.add(link_name)
+            self.lost_links.setdefault(link_name, [])
         for index in range(len(hulls)):
             name = _hull_name(link_name, index)
             geometry = ET.SubElement(ET.SubElement(link, "collision", name=name), "geometry")
-            mesh = ET.SubElement(geometry, "mesh", filename=f"meshes/{name}.obj")
+            mesh = ET.SubElement(geometry, "mesh", filename=_hull_file(link_name, index))
             ET.SubElement(mesh, f"{{{_DRAKE}}}declare_convex")
 
     def ignore_collisions(self, pairs: Iterable[tuple[str, str]]) -> None:
@@ -193,7 +249,7 @@ class UrdfCopy:
         tree.write(path, encoding="utf-8", xml_declaration=True)
         for link, hulls in self.hulls.items():
             for index, hull in enumerate(hulls):
-                target = path.parent / f"meshes/{_hull_name(link, index)}.obj"
+                target = path.parent / _hull_file(link, index)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 hull.export(target, include_normals=False, header=None)
         for name, mesh in self.meshes.items():
@@ -233,11 +289,64 @@ def read_urdf(path: Path) -> UrdfCopy:
                 f"'{path}': link '{link.get('name')}' has a mass of {mass:g} kg, expected a finite "
                 "number that is not negative"
             )
+    for joint in root.findall("joint"):
+        _require_limits(path, joint)
     return UrdfCopy(source=path, root=root)
+
+
+def _require_limits(path: Path, joint: ET.Element) -> None:
+    limit = joint.find("limit")
+    low, high = number(limit, "lower"), number(limit, "upper")
+    wrong = [key for key in ("effort", "velocity") if number(limit, key) < 0]
+    if low > high and joint.get("type") in ("revolute", "prismatic"):
+        wrong = ["lower", "upper"]
+    if limit is not None and wrong and joint.get("type") != "fixed":
+        stated = " ".join(f'{key}="{limit.get(key)}"' for key in wrong)
+        raise ValueError(
+            f"'{path}': joint '{joint.get('name')}' has {stated}; expected lower below upper, and "
+            "positive limits of effort and velocity"
+        )
+
+
+def _end(joint: ET.Element, tag: str) -> ET.Element:
+    element = joint.find(tag)
+    if element is None:
+        raise ValueError(f"joint '{joint.get('name')}' of the URDF has no <{tag} link=...>")
+    return element
+
+
+def pose_of(element: ET.Element) -> RigidTransform:
+    """Returns the pose of an element's <origin>."""
+    origin = element.find("origin")
+    xyz, rpy = (
+        [float(word) for word in ("" if origin is None else origin.get(key, "")).split()]
+        or [0.0, 0.0, 0.0]
+        for key in ("xyz", "rpy")
+    )
+    return RigidTransform(RollPitchYaw(rpy), xyz)
+
+
+def set_pose(element: ET.Element, pose: RigidTransform) -> None:
+    """Sets an element's <origin>."""
+    origin = element.find("origin")
+    if origin is None:
+        origin = ET.SubElement(element, "origin")
+    for key, values in (
+        ("xyz", pose.translation()),
+        ("rpy", pose.rotation().ToRollPitchYaw().vector()),
+    ):
+        origin.set(key, " ".join(f"{value:.9g}" for value in values))
 
 
 def _hull_name(link: str, index: int) -> str:
     return f"{link}_hull_{index}"
+
+
+def _hull_file(link: str, index: int) -> str:
+    """Names are data: what is no part of a file's name is replaced, and told apart by a hash."""
+    plain = re.sub(r"[^\w.-]", "_", link)
+    mark = "" if plain == link else f"_{zlib.crc32(link.encode()):08x}"
+    return f"meshes/{_hull_name(plain + mark, index)}.obj"
 
 
 def _remove(element: ET.Element, tag: str) -> None:

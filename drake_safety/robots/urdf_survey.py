@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Capsule, Cylinder, GeometryId, Sphere
+from pydrake.geometry import Box, Capsule, Cylinder, GeometryId, Obb, Shape, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.multibody.tree import Joint
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.multibody.tree import Joint, ModelInstanceIndex, RevoluteJoint
+from pydrake.systems.framework import Context, DiagramBuilder
 
+from drake_safety.robots.joint_drives import JointDrives
 from drake_safety.robots.model_files import package_parser
 
+WITHOUT_STOPS_RAD = 4 * math.pi
+"""Range of a joint from which it may turn a wheel."""
 _CORNER_RADIUS_M = 0.005  # Radius of spheres at the corners of a flat foot.
 _GUESSED_RADIUS_M = 0.02
 _STOP_RAD = 0.05  # Distance from a stop of a joint that cannot be at zero.
+_ROUND = 0.15  # Of a wheel's radius, by which it may be out of round.
+_MATTERS = 1e-4  # Moment of inertia that matters, by the robot's mass times extent squared.
+_POINT = 0.005  # Least radius of gyration, by the robot's extent.
+_FLAT_M = 1e-3  # Height over a sole's lowest part within which other parts touch as well.
 _LEVEL_M = 0.005  # Height over the lowest sphere within which others count as contacts.
 
 
@@ -54,19 +63,27 @@ class _Shape:
     def lowest_m(self) -> float:
         return float(self.centers[:, 2].min()) - self.radius_m
 
+    def is_beside(self, foot: _Shape) -> bool:
+        """Whether it touches the ground as a foot does, and is part of its body."""
+        is_alike = not self.is_sphere and abs(self.radius_m - foot.radius_m) < 1e-6
+        return self.body == foot.body and is_alike and self.lowest_m < foot.lowest_m + _FLAT_M
+
 
 class Survey:
     """A URDF in a plant, with the base at the world's origin and all joints at or near zero."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, source: Path | None = None, drives: JointDrives | None = None):
+        source = source or path
         builder = DiagramBuilder()
         plant: MultibodyPlant
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         try:
             (self.instance,) = package_parser(plant).AddModels(str(path))
             plant.Finalize()
-        except (RuntimeError, ValueError) as error:
-            raise ValueError(f"Drake cannot read '{path}': {error}") from error
+        # Where a condition of Drake's C++ fails, pydrake raises SystemExit.
+        except (RuntimeError, ValueError, SystemExit) as error:
+            reason = re.sub(rf"{re.escape(str(path))}:\d+: ", "", str(error))
+            raise ValueError(f"Drake cannot read '{source}': {reason}") from error
         self.plant, self._scene_graph = plant, scene_graph
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
@@ -78,14 +95,14 @@ class Survey:
         ]
         if len(floating) != 1:
             raise ValueError(
-                f"'{path}' must have exactly one floating body, its base; got "
+                f"'{source}' must have exactly one floating body, its base; got "
                 f"{floating or 'none'}. Remove a link 'world' and its joint"
             )
         (self.base,) = floating
         joints = [plant.get_joint(i) for i in plant.GetJointIndices(self.instance)]
         odd = [j.name() for j in joints if 1 < j.num_velocities() < 6]
         if odd:
-            raise ValueError(f"'{path}': joints {odd} have more than one degree of freedom")
+            raise ValueError(f"'{source}': joints {odd} have more than one degree of freedom")
         self.joints: list[Joint] = sorted(
             (j for j in joints if j.num_velocities() == 1), key=lambda j: j.position_start()
         )
@@ -97,6 +114,10 @@ class Survey:
         self._neutral = plant.GetPositions(self.context)
         for name, (low, high) in self.limits.items():
             self._neutral[self._index[name]] = _near_zero(low, high)
+        if drives is not None:
+            neutral = {name: self._neutral[index] for name, index in self._index.items()}
+            for name, value in drives.coupled(neutral).items():
+                self._neutral[self._index[name]] = value
         self._above = {joint.child_body().name(): joint for joint in joints}
         self.set_joints({})
         self.total_mass = plant.CalcTotalMass(self.context, [self.instance])
@@ -107,6 +128,11 @@ class Survey:
         for name, value in values.items():
             q[self._index[name]] = value
         self.plant.SetPositions(self.context, q)
+
+    def rest_joints(self, values: dict[str, float]) -> None:
+        """Sets the positions [rad] of joints that are not set otherwise, within their limits."""
+        for name in self._index.keys() & values.keys():
+            self._neutral[self._index[name]] = np.clip(values[name], *self.limits[name])
 
     def posture(self) -> dict[str, float]:
         """Returns the present joint positions by name [rad]."""
@@ -136,6 +162,23 @@ class Survey:
         frame = self.plant.GetJointByName(joint, self.instance).frame_on_child()
         return frame.CalcPoseInWorld(self.context).translation()
 
+    def joint_pose(self, joint: Joint) -> RigidTransform:
+        """Returns the present pose of a joint's child in its parent."""
+        return self.pose(joint.parent_body().name()).inverse() @ self.pose(
+            joint.child_body().name()
+        )
+
+    def joint_axis(self, joint: str) -> np.ndarray:
+        """Returns the direction of a joint's axis in the base's frame, (3,)."""
+        one = self.plant.GetJointByName(joint, self.instance)
+        axis = one.revolute_axis() if isinstance(one, RevoluteJoint) else one.translation_axis()
+        R_BJ = one.frame_on_parent().CalcPoseInWorld(self.context).rotation()
+        return R_BJ.matrix() @ axis
+
+    def extent(self) -> float:
+        """Returns the diagonal of the box around the origins of all bodies [m]."""
+        return extent(self.plant, self.context, self.instance)
+
     def positions(self, limb: Limb) -> np.ndarray:
         """Returns a limb's contact points in the base's frame, (n, 3) [m]."""
         return (self.pose(limb.body) @ limb.points.T).T
@@ -164,11 +207,15 @@ class Survey:
             for name in self.welded(body)
         )
 
+    def limbs(self) -> list[Limb]:
+        """Returns the limbs of two joints or more."""
+        return [self._leg(group) for group in self.leaves() if len(self.chain(group[0])) >= 2]
+
     def legs(self, feet: list[str] | None = None) -> list[Limb]:
         """Returns the limbs that reach lowest, or those that end in the given links."""
         groups = self.leaves()
         if feet is None:
-            lowest = [self._lowest(group) for group in groups]
+            lowest = [self.lowest(group) for group in groups]
             floor = min(lowest, default=0.0)
             # Hanging arms end well above the ground.
             groups = [
@@ -220,6 +267,55 @@ class Survey:
             found.append(Limb(body=body, joints=[name for name in shared if name not in others]))
         return found
 
+    def wheels(self, legs: list[Limb]) -> list[str]:
+        """Returns joints without stops that turn a round body at a leg's end.
+
+        Such legs touch by a sphere as large as the wheel, unless they have one of their own.
+        """
+        found = []
+        for limb in legs:
+            low, high = self.limits[limb.joints[-1]]
+            wheel = self._wheel(limb) if high - low > WITHOUT_STOPS_RAD else None
+            if wheel is not None:
+                found.append(limb.joints[-1])
+                if not limb.is_own_shape:
+                    limb.points, limb.radius_m = wheel
+        return found
+
+    def _wheel(self, limb: Limb) -> tuple[np.ndarray, float] | None:
+        """Centre (1, 3) and radius of what touches the ground, if round about the last joint."""
+        axis, origin = self.joint_axis(limb.joints[-1]), self.joint_origin(limb.joints[-1])
+        group = self.welded(limb.body)
+        lowest = self.lowest(group)
+        for name, shape, box in self._boxes(group):
+            X_WO = self.pose(name) @ box.pose()
+            along = np.abs(X_WO.rotation().matrix().T @ axis)
+            across = np.delete(box.half_width(), np.argmax(along))
+            radius, center = float(across.max()), X_WO.translation()
+            is_low = center[2] - 1.5 * radius < lowest
+            is_turned = along.max() > 0.95 or isinstance(shape, Sphere)
+            offset = max(np.ptp(across), np.linalg.norm(np.cross(axis, center - origin)))
+            if is_low and is_turned and not isinstance(shape, Box) and offset < _ROUND * radius:
+                return (self.pose(limb.body).inverse() @ center)[None], radius
+        return None
+
+    def oversized(self) -> dict[str, float]:
+        """Returns links with a collision shape beyond ten times the robot's extent; sizes [m]."""
+        names = [self.plant.get_body(i).name() for i in self.plant.GetBodyIndices(self.instance)]
+        sizes = {name: 2 * max(box.half_width()) for name, _, box in self._boxes(names)}
+        return {name: size for name, size in sizes.items() if size > 10 * self.extent()}
+
+    def _boxes(self, bodies: list[str]) -> Iterator[tuple[str, Shape, Obb]]:
+        """The collision shapes of bodies: body, shape and box around it, in the body's frame."""
+        inspector = self._scene_graph.model_inspector()
+        for name in bodies:
+            body = self.plant.GetBodyByName(name, self.instance)
+            for geometry in self.plant.GetCollisionGeometriesForBody(body):
+                box = inspector.GetObbInGeometryFrame(geometry)
+                if box is not None:
+                    X_BO = inspector.GetPoseInFrame(geometry) @ box.pose()
+                    yield name, inspector.GetShape(geometry), Obb(X_BO, box.half_width())
+
     def overlaps(self) -> set[tuple[str, str]]:
         """Returns pairs of links that overlap in the present posture."""
         query = self._scene_graph.get_query_output_port().Eval(
@@ -236,7 +332,8 @@ class Survey:
             found.add((one, other))
         return found
 
-    def _lowest(self, group: list[str]) -> float:
+    def lowest(self, group: list[str]) -> float:
+        """Returns the height of bodies' lowest point over the base [m]."""
         lowest = [shape.lowest_m for shape in self._shapes(group)]
         return min(lowest or [float(self.pose(name).translation()[2]) for name in group])
 
@@ -262,8 +359,10 @@ class Survey:
                 ]
             )
         else:
-            heights = foot.centers[:, 2]
-            centers = foot.centers[heights < heights.min() + _LEVEL_M + foot.radius_m]
+            # A sole may be several shapes.
+            centers = np.concatenate([one.centers for one in shapes if one.is_beside(foot)])
+            heights = centers[:, 2]
+            centers = centers[heights < heights.min() + _LEVEL_M + foot.radius_m]
         return Limb(
             body=foot.body,
             joints=joints,
@@ -283,6 +382,9 @@ class Survey:
                 X_WG = self.pose(name) @ inspector.GetPoseInFrame(geometry)
                 if isinstance(shape, Sphere):
                     found.append(_Shape(name, X_WG.translation()[None], shape.radius(), True))
+                elif isinstance(shape, Cylinder) and _is_plate(X_WG, shape):
+                    half = np.array([*2 * [math.sqrt(0.5) * shape.radius()], shape.length() / 2])
+                    found.append(_Shape(name, *_corners(X_WG, half)))
                 elif isinstance(shape, Capsule | Cylinder):
                     radius = shape.radius()
                     half = shape.length() / 2 - (0 if isinstance(shape, Capsule) else radius)
@@ -306,8 +408,47 @@ def _near_zero(low: float, high: float) -> float:
     return low + room if low > 0.0 else high - room
 
 
+def _is_plate(X_WG: RigidTransform, shape: Cylinder) -> bool:
+    """Whether a cylinder is flat and lies on the ground, as a sole does."""
+    return shape.length() < 2 * shape.radius() and abs(X_WG.rotation().matrix()[2, 2]) > 0.7
+
+
+def extent(plant: MultibodyPlant, context: Context, instance: ModelInstanceIndex) -> float:
+    """Returns the diagonal of the box around the origins of a model's bodies [m]."""
+    bodies = map(plant.get_body, plant.GetBodyIndices(instance))
+    origins = [body.EvalPoseInWorld(context).translation() for body in bodies]
+    return float(np.linalg.norm(np.ptp(origins, axis=0)))
+
+
+def odd_inertias(plant: MultibodyPlant, context: Context, instance: ModelInstanceIndex) -> str:
+    """Names links with an inertia that no body of a robot of this size has; "" if there is none.
+
+    The radius of gyration √(I/m) is beyond the robot's extent, or a heavy link's is below 1/200.
+    """
+    size, total = extent(plant, context, instance), plant.CalcTotalMass(context, [instance])
+    found = []
+    for body in map(plant.get_body, plant.GetBodyIndices(instance)):
+        M_BBo = body.default_spatial_inertia()
+        if not (mass := M_BBo.get_mass()) > 0:
+            continue
+        G_BBcm = M_BBo.get_unit_inertia().ShiftToCenterOfMass(M_BBo.get_com())
+        radius = math.sqrt(max(*G_BBcm.CalcPrincipalMomentsOfInertia(), 0.0))
+        is_large = radius > size and mass * radius**2 > _MATTERS * total * size**2
+        if is_large or (radius < _POINT * size and mass > 0.01 * total):
+            found.append(
+                f"'{body.name()}' {mass * radius**2:.3g} kg·m² at {mass:.3g} kg, a radius of "
+                f"gyration of {radius:.2g} m"
+            )
+    if not found:
+        return ""
+    return (
+        f"{len(found)} links have inertias that no body of a robot of {size:.2g} m has (kg·mm² or "
+        f"g·mm² instead of kg·m²?): {'; '.join(found[:4])}{' ...' * (len(found) > 4)}"
+    )
+
+
 def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]:
-    """Spheres that replace a box: at its corners, or one below a small box."""
+    """Spheres that replace a box: at its lower corners, or one below a small box."""
     down = X_WG.rotation().matrix().T @ [0.0, 0.0, -1.0]
     axis = int(np.argmax(np.abs(down)))
     # A sole that is longer is flat.
@@ -316,6 +457,9 @@ def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]
         point = np.zeros(3)
         point[axis] = math.copysign(half[axis] - min(radius, half[axis]), down[axis])
         return (X_WG @ point)[None], radius
-    inner = half - _CORNER_RADIUS_M
+    inner = np.maximum(half - _CORNER_RADIUS_M, 0.0)
+    # A thin sole's spheres rise above it.
+    inner[axis] = half[axis] - _CORNER_RADIUS_M
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    signs = signs[signs[:, axis] * down[axis] > 0]
     return (X_WG @ (signs * inner).T).T, _CORNER_RADIUS_M

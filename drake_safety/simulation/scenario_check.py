@@ -18,8 +18,11 @@ from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polyg
 from drake_safety.files.progress import StageProgress, ignore
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.models import load_robot, robot_files
+from drake_safety.robots.joint_drives import read_drives
+from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.robots.urdf_copy import read_urdf
+from drake_safety.robots.urdf_survey import WITHOUT_STOPS_RAD, Limb, Survey, odd_inertias
 from drake_safety.simulation.capabilities import HasBall
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed
@@ -66,6 +69,7 @@ def check_scenario(
             return
         yield from _guarded("standing posture", _posture, kinematics)
         yield from _guarded("motors", _motors, kinematics)
+        yield from _guarded("model file", _model_file, kinematics)
         yield from _guarded("collision shapes", _collisions, robot)
     if not is_imported:
         return
@@ -248,6 +252,34 @@ def _motors(kinematics: RobotKinematics) -> _Check:
         "; ".join(weak),
         "check the effort limits' unit [N·m], the masses [kg], or straighten the legs",
     )
+
+
+def _model_file(kinematics: RobotKinematics) -> _Check:
+    """Checks couplings, wheels and inertias; nothing is said of what is in order."""
+    robot, plant = kinematics.robot, kinematics.plant
+    path = model_file(robot.urdf, robot.source_dir, robot.requires)
+    mimics = read_drives(read_urdf(path).root).mimics if path.suffix == ".urdf" else {}
+    coupled = [name for foot in robot.feet.values() for name in foot.joints if name in mimics]
+    if coupled:
+        yield failed(
+            "joints of legs",
+            f"{coupled} follow others by <mimic>, but servos move every joint by itself",
+            f"remove <mimic> from {path.name} if each has a motor of its own",
+        )
+    free = np.ptp(kinematics.position_limits, axis=1) > WITHOUT_STOPS_RAD
+    endless = {name for name, is_free in zip(kinematics.joint_names, free, strict=True) if is_free}
+    legs = [Limb(body=foot.body, joints=foot.joints) for foot in robot.feet.values()]
+    legs = [limb for limb in legs if limb.joints and limb.joints[-1] in endless]
+    if legs and (wheels := Survey(path).wheels(legs)):
+        yield warned(
+            "wheels",
+            f"joints {wheels} turn wheels, and position servos hold them",
+            "judge by this scenario only a robot whose wheels are braked",
+        )
+    kinematics.set_positions(kinematics.standing_positions())
+    instance = plant.GetModelInstanceByName(robot.name)
+    if odd := odd_inertias(plant, kinematics.context, instance):
+        yield warned("inertias", odd, f"correct <inertia> of these links [kg·m²] in {path.name}")
 
 
 def _collisions(robot: RobotModel) -> _Check:

@@ -1,0 +1,329 @@
+"""Writes the robot of an MJCF, MuJoCo's format, as a URDF, and keeps what a URDF cannot hold."""
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import combinations_with_replacement
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis, Quaternion
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from drake_safety.extras import require_extra
+
+_NUM_SHOWN_GROUPS = 3  # MuJoCo shows geoms of the groups 0 to 2.
+_GREY = [0.5, 0.5, 0.5, 1.0]  # MuJoCo's colour of a geom that states none.
+_STL = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
+
+
+@dataclass(kw_only=True)
+class ModelFacts:
+    """What a model file says of a robot beyond a URDF, by the names of its joints and bodies.
+
+    Attributes:
+        gains: Stiffness and damping of position servos [N·m/rad, N·m·s/rad].
+        rotor_inertia: Inertia of the rotors as the joints feel it [kg·m²].
+        postures: Joint positions [rad] by keyframe.
+        friction: Centre (3,) [m] and friction coefficient [1] of each collision shape, by body.
+        apart: Pairs of bodies that do not collide.
+        left_out: What is left out, a note each.
+    """
+
+    gains: dict[str, tuple[float, float]] = field(default_factory=dict)
+    rotor_inertia: dict[str, float] = field(default_factory=dict)
+    postures: dict[str, dict[str, float]] = field(default_factory=dict)
+    friction: dict[str, list[tuple[np.ndarray, float]]] = field(default_factory=dict)
+    apart: list[tuple[str, str]] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+
+def is_mjcf(path: Path) -> bool:
+    """Whether the root element of a file is ``<mujoco>``."""
+    try:
+        return ET.parse(path).getroot().tag == "mujoco"
+    except (ET.ParseError, OSError):
+        return False
+
+
+def mjcf_to_urdf(path: Path, target: Path) -> ModelFacts:
+    """Writes the robot of an MJCF as a URDF, with its meshes as STL in folders beside it.
+
+    MuJoCo compiles the file, which resolves classes, includes, units, and inertias of shapes. The
+    robot is the tree of bodies with the most joints. Links and joints have the names, frames and
+    zero positions of bodies and joints. Joints with actuators get transmissions, and those that a
+    linear equality couples a <mimic>. Geoms of the groups 0 to 2 are visuals, those that can touch
+    others are collision shapes.
+
+    Raises:
+        MissingExtraError: MuJoCo is not installed.
+        ValueError: MuJoCo cannot read the file, or the robot has ball joints, loops, or a base that
+            moves by other joints than a free one.
+    """
+    require_extra("mujoco", f"'{path}' is MJCF")
+    import mujoco
+
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compiler.fusestatic = False  # Keeps the names of welded bodies.
+        robot = _Robot(mujoco, spec.compile(), target.parent)
+    except ValueError as error:
+        raise ValueError(f"MJCF '{path}': {error}") from error
+    drake = {"xmlns:drake": "http://drake.mit.edu"}
+    urdf = _tag("robot", *robot.parts, name=target.stem, **drake)
+    target.write_text(urdf, encoding="utf-8")
+    return robot.facts
+
+
+class _Robot:
+    """The URDF of the robot in a compiled model; its bodies and joints are names by index."""
+
+    def __init__(self, mujoco: Any, model: Any, folder: Path):
+        self.mujoco, self.model, self.folder = mujoco, model, folder
+        self.facts, self.parts = ModelFacts(), list[str]()
+        trees = Counter(model.body_rootid[model.jnt_bodyid].tolist()).most_common()
+        if not trees:
+            raise ValueError("it has no joint")
+        (base, _), *others = trees
+        self.bodies = self._names("body", np.flatnonzero(model.body_rootid == base).tolist())
+        ids = [j for j in range(model.njnt) if model.jnt_bodyid[j] in self.bodies]
+        free = [j for j in ids if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
+        self.joints = self._names("joint", [j for j in ids if j not in free])
+        for j, name in self.joints.items():
+            if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL or model.jnt_bodyid[j] == base:
+                raise ValueError(
+                    f"joint '{name}' is a ball joint or moves the base '{self.bodies[base]}'; "
+                    "expected a base with a free joint, and joints that turn or slide"
+                )
+        self._note("moving bodies beside the robot are left out", "body", [i for i, _ in others])
+        if not free:
+            self._note("the base is fixed to the world there, and floats here", "body", [base])
+        self._note("tendons are left out", "tendon", range(model.ntendon))
+        self.damping = {j: float(model.dof_damping[model.jnt_dofadr[j]]) for j in self.joints}
+        self.efforts: dict[int, float] = {}
+        self.mimics: dict[int, str] = {}
+        self._read_actuators()
+        self._read_constraints()
+        for body in self.bodies:
+            if body != base:
+                self._add_joints(body)
+            self._add_link(body)
+        for signature in model.exclude_signature.tolist():
+            one, other = divmod(signature, 1 << 16)
+            if {one, other} <= self.bodies.keys():
+                self.facts.apart.append((self.bodies[one], self.bodies[other]))
+        for key in range(model.nkey):
+            q = {name: self._position(model.key_qpos[key], j) for j, name in self.joints.items()}
+            self.facts.postures[model.key(key).name or str(key)] = q
+
+    def _names(self, kind: str, ids: Iterable[int]) -> dict[int, str]:
+        return {i: getattr(self.model, kind)(i).name or f"{kind}_{i}" for i in ids}
+
+    def _note(self, what: str, kind: str, ids: Iterable[int]) -> None:
+        if names := self._names(kind, ids).values():
+            self.facts.left_out.append(f"{what}: {', '.join(names)}")
+
+    def _position(self, qpos: np.ndarray, joint: int) -> float:
+        return float(qpos[self.model.jnt_qposadr[joint]])
+
+    def _read_actuators(self) -> None:
+        model, mujoco = self.model, self.mujoco
+        gains = {j: np.zeros(2) for j in self.joints}
+        armature = {j: float(model.dof_armature[model.jnt_dofadr[j]]) for j in self.joints}
+        others: dict[int, int] = {}  # Joints of actuators that are no motors.
+        for i, kind in enumerate(model.actuator_trntype.tolist()):
+            one, j = model.actuator(i), int(model.actuator_trnid[i, 0])
+            if kind not in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+                others[i] = -1
+                continue
+            if j not in self.joints:
+                continue
+            gear, limit, bias = abs(float(one.gear[0])), math.inf, one.biastype[0]
+            if one.forcelimited[0]:
+                limit = float(np.abs(one.forcerange).max())
+            is_fixed = one.gaintype[0] == mujoco.mjtGain.mjGAIN_FIXED
+            if is_fixed and bias == mujoco.mjtBias.mjBIAS_NONE:
+                if one.ctrllimited[0]:
+                    limit = min(limit, float(np.abs(one.gainprm[0] * one.ctrlrange).max()))
+            else:
+                others[i] = j
+                is_integrated = one.dyntype[0] == mujoco.mjtDyn.mjDYN_INTEGRATOR
+                if bias == mujoco.mjtBias.mjBIAS_AFFINE and not is_integrated:
+                    # A servo may be two actuators, of position and of velocity.
+                    gains[j] -= gear**2 * one.biasprm[1:3]
+            self.efforts[j] = self.efforts.get(j, 0.0) + gear * limit
+            armature[j] += gear**2 * float(model.actuator_armature[i])
+            self.damping[j] += gear**2 * float(model.actuator_damping[i])
+        odd = [i for i, j in others.items() if j < 0 or gains[j][0] <= 0]
+        what = "actuators that are neither motors nor position servos of a joint have no gains"
+        self._note(what, "actuator", odd)
+        for j, name in self.joints.items():
+            if j in self.efforts and model.jnt_actfrclimited[j]:
+                most = float(np.abs(model.jnt_actfrcrange[j]).max())
+                self.efforts[j] = min(self.efforts[j], most)
+            if gains[j][0] > 0:
+                self.facts.gains[name] = float(gains[j][0]), float(gains[j][1])
+            if armature[j] > 0:
+                self.facts.rotor_inertia[name] = armature[j]
+
+    def _read_constraints(self) -> None:
+        """Finds joints that others drive; refuses loops."""
+        model, kinds = self.model, self.mujoco.mjtEq
+        left_out = []
+        for i in np.flatnonzero(model.eq_active0).tolist():
+            kind, one, other = model.eq_type[i], int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
+            constant, slope, *higher = model.eq_data[i, :5].tolist()
+            if kind == kinds.mjEQ_CONNECT or kind == kinds.mjEQ_WELD:
+                if model.eq_objtype[i] == self.mujoco.mjtObj.mjOBJ_SITE:
+                    one, other = model.site_bodyid[[one, other]].tolist()
+                if {one, other} <= self.bodies.keys():
+                    raise ValueError(
+                        f"a constraint connects bodies '{self.bodies[one]}' and "
+                        f"'{self.bodies[other]}' to a loop; expected a tree of bodies"
+                    )
+            if kind == kinds.mjEQ_JOINT and {one, other} <= self.joints.keys() and not any(higher):
+                offset = self._position(model.qpos0, one) + constant
+                offset -= slope * self._position(model.qpos0, other)
+                driver = self.joints[other]
+                self.mimics[one] = _tag("mimic", joint=driver, multiplier=slope, offset=offset)
+            else:
+                left_out.append(i)
+        self._note("constraints are left out", "equality", left_out)
+
+    def _add_link(self, body: int) -> None:
+        model, inside = self.model, []
+        if model.body_mass[body] > 0:
+            X_BI = _pose(model.body_ipos[body], model.body_iquat[body])
+            R_BI = X_BI.rotation().matrix()
+            moments = R_BI @ np.diag(model.body_inertia[body]) @ R_BI.T
+            pairs = combinations_with_replacement(range(3), 2)
+            inertia = {f"i{'xyz'[i]}{'xyz'[j]}": moments[i, j] for i, j in pairs}
+            mass = _tag("mass", value=model.body_mass[body])
+            origin = _origin(RigidTransform(X_BI.translation()))
+            inside.append(_tag("inertial", origin, mass, _tag("inertia", **inertia)))
+        first = int(model.body_geomadr[body])
+        for geom in range(first, first + int(model.body_geomnum[body])):
+            inside += self._shapes(geom, self.bodies[body])
+        self.parts.append(_tag("link", *inside, name=self.bodies[body]))
+
+    def _shapes(self, geom: int, body: str) -> list[str]:
+        """A geom as visual, as collision shape, or both."""
+        model, size = self.model, self.model.geom_size[geom]
+        radius, length = size[0], 2.0 * size[1]
+        kind = self.mujoco.mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_").lower()
+        known = {
+            "sphere": lambda: _tag("sphere", radius=radius),
+            "box": lambda: _tag("box", size=2.0 * size),
+            "cylinder": lambda: _tag("cylinder", radius=radius, length=length),
+            "capsule": lambda: _tag("drake:capsule", radius=radius, length=length),
+            "ellipsoid": lambda: _tag("drake:ellipsoid", a=size[0], b=size[1], c=size[2]),
+            "mesh": lambda: _tag("mesh", filename=self._mesh(int(model.geom_dataid[geom]))),
+        }
+        if kind not in known:
+            self._note(f"shapes of type {kind} are left out", "geom", [geom])
+            return []
+        origin = _origin(_pose(model.geom_pos[geom], model.geom_quat[geom]))
+        shape = _tag("geometry", known[kind]())
+        shapes = []
+        if model.geom_group[geom] < _NUM_SHOWN_GROUPS:
+            rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
+            if material >= 0 and np.allclose(rgba, _GREY):
+                rgba = model.mat_rgba[material]
+            colour = _tag("material", _tag("color", rgba=rgba), name=f"rgba {_text(rgba)}")
+            shapes.append(_tag("visual", origin, shape, colour))
+        paired = geom in model.pair_geom1 or geom in model.pair_geom2
+        if model.geom_contype[geom] or model.geom_conaffinity[geom] or paired:
+            shapes.append(_tag("collision", origin, shape))
+            mu = float(model.geom_friction[geom, 0])
+            self.facts.friction.setdefault(body, []).append((model.geom_pos[geom], mu))
+        return shapes
+
+    def _mesh(self, mesh: int) -> str:
+        """Writes a mesh as STL, in the frame that MuJoCo gives it; returns its relative path."""
+        model = self.model
+        first, start = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+        facets = np.zeros(model.mesh_facenum[mesh], _STL)
+        facets["corners"] = model.mesh_vert[first + model.mesh_face[start : start + len(facets)]]
+        # A folder each, as different names may become the same.
+        name = re.sub(r"[^\w.-]", "_", model.mesh(mesh).name) or "mesh"
+        file = self.folder / str(mesh) / f"{name}.stl"
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(bytes(80) + len(facets).to_bytes(4, "little") + facets.tobytes())
+        return f"{mesh}/{file.name}"
+
+    def _add_joints(self, body: int) -> None:
+        """Adds a body's joints, with links between them and to one that is not at its origin."""
+        model, name = self.model, self.bodies[body]
+        parent = self.bodies[int(model.body_parentid[body])]
+        X_PB = _pose(model.body_pos[body], model.body_quat[body])
+        joints = [j for j in self.joints if model.jnt_bodyid[j] == body]
+        for j in joints:
+            joint, anchor, axis = self.joints[j], model.jnt_pos[j], model.jnt_axis[j]
+            child = name if j == joints[-1] and not anchor.any() else f"{joint}_frame"
+            if child != name:
+                self.parts.append(_tag("link", name=child))
+            limit: dict[str, float] = {}
+            if model.jnt_limited[j]:
+                limit["lower"], limit["upper"] = model.jnt_range[j]
+            # Bodies are drawn at the joint's reference, which need not be zero.
+            q = self._position(model.qpos0, j)
+            if model.jnt_type[j] == self.mujoco.mjtJoint.mjJNT_SLIDE:
+                kind, X_AJ = "prismatic", RigidTransform(-q * axis)
+            else:
+                kind = "revolute" if limit else "continuous"
+                X_AJ = RigidTransform(AngleAxis(-q, axis), np.zeros(3))
+            if math.isfinite(self.efforts.get(j, math.inf)):
+                limit["effort"] = self.efforts[j]
+            spring = float(model.jnt_stiffness[j])  # Drake ignores it; `new` does not.
+            friction = model.dof_frictionloss[model.jnt_dofadr[j]]
+            inside = [
+                _tag("axis", xyz=axis),
+                _tag("limit", **limit) if limit else "",
+                _tag("dynamics", damping=self.damping[j], friction=friction, stiffness=spring),
+                self.mimics.get(j, ""),
+            ]
+            X_PJ = X_PB @ RigidTransform(anchor) @ X_AJ
+            self._add_joint(joint, kind, parent, child, X_PJ, *inside)
+            if j in self.efforts:
+                inside = [
+                    _tag("type", "transmission_interface/SimpleTransmission"),
+                    _tag("joint", name=joint),
+                    _tag("actuator", name=f"{joint}_motor"),
+                ]
+                self.parts.append(_tag("transmission", *inside, name=f"{joint}_transmission"))
+            parent, X_PB = child, RigidTransform(-anchor)
+        if parent != name:
+            self._add_joint(f"{name}_fixed", "fixed", parent, name, X_PB)
+
+    def _add_joint(
+        self, name: str, kind: str, parent: str, child: str, X_PJ: RigidTransform, *inside: str
+    ) -> None:
+        links = _tag("parent", link=parent), _tag("child", link=child)
+        self.parts.append(_tag("joint", _origin(X_PJ), *links, *inside, name=name, type=kind))
+
+
+def _pose(position: np.ndarray, quaternion: np.ndarray) -> RigidTransform:
+    return RigidTransform(Quaternion(quaternion / np.linalg.norm(quaternion)), position)
+
+
+def _origin(X: RigidTransform) -> str:
+    return _tag("origin", xyz=X.translation(), rpy=RollPitchYaw(X.rotation()).vector())
+
+
+def _tag(tag: str, *inside: str, **attributes: Any) -> str:
+    """An element of the URDF; attributes are text, a number or several."""
+    words = (f" {key}={quoteattr(_text(value))}" for key, value in attributes.items())
+    return f"<{tag}{''.join(words)}>{''.join(inside)}</{tag}>"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    return " ".join(f"{number:.9g}" for number in np.atleast_1d(value))
