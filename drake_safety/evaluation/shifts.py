@@ -12,7 +12,7 @@ import numpy as np
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS
 from drake_safety.robots.robot import ObservationNoise, Payload, PlantVariation
-from drake_safety.robots.robot_model import by_pattern
+from drake_safety.robots.robot_model import as_pattern, by_pattern
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 from drake_safety.robots.shift import Fault, JointShift, Shift
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -54,6 +54,7 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     torques = np.abs(kinematics.gravity_torques(q, is_stance))
     loaded = int(np.argmax(torques))
     joint = kinematics.joint_names[loaded]
+    key = as_pattern(joint)
     foot = kinematics.foot_names[0]
     plant = kinematics.plant
     motors = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
@@ -63,14 +64,14 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     lasting = {
         "slope": Shift(slope_rad=math.radians(10.0)),
         "side_force": Shift(base_force_n=[0.0, 0.1 * mass_kg * GRAVITY_M_S2, 0.0]),
-        "weak_joint": Shift(joints={joint: JointShift(effort_scale=weak_scale)}),
-        "locked_joint": Shift(joints={joint: JointShift(is_locked=True)}),
+        "weak_joint": Shift(joints={key: JointShift(effort_scale=weak_scale)}),
+        "locked_joint": Shift(joints={key: JointShift(is_locked=True)}),
         "late_command": Shift(command_delay_s=late_s),
         "hole": Shift(holes_m={foot: 0.07 * kinematics.standing_height}),
     }
     if by_pattern(robot.joint_gains, joint, "gains", robot.name) is not None:
-        lasting["soft_joint"] = Shift(joints={joint: JointShift(stiffness_scale=0.5)})
-    names = plant.GetStateNames(add_model_instance_prefix=False)
+        lasting["soft_joint"] = Shift(joints={key: JointShift(stiffness_scale=0.5)})
+    names = [as_pattern(name) for name in plant.GetStateNames(add_model_instance_prefix=False)]
     n_q, period_s = kinematics.num_positions, scenario.control_period_s
     positions, velocities = names[NUM_BASE_POSITIONS:n_q], names[n_q:]
     faults = {
