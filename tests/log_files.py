@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from cart_episodes import ARRAYS
 from drake_safety import load_scenario
+from drake_safety.logs.conversion import angular_velocities, rates
 from drake_safety.logs.robot_log import RobotLog
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.motion import simulate
@@ -76,6 +77,63 @@ def record(loop, index=0, **goal):
 @functools.cache
 def recorded(index=0):
     return record(balancing_loop(), index)
+
+
+@functools.cache
+def walked(speed_m_s=0.4, turn_rad_s=0.3, duration_s=2.0, rate_hz=200):
+    """A trot in the world's direction of 1 rad, whose stance feet do not move, with a rocking base.
+
+    Velocities are the derivatives of the positions.
+    """
+    kinematics = balancing_loop().kinematics
+    time_s = np.arange(int(duration_s * rate_hz)) / rate_hz
+
+    def heading(at_s):
+        yaw = 1.0 + turn_rad_s * at_s
+        x = speed_m_s / turn_rad_s * np.stack([np.sin(yaw), -np.cos(yaw)], axis=-1)
+        return yaw, x
+
+    def print_of(foot, at_s):
+        yaw, x = heading(at_s)
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        point = x + turn @ (kinematics.nominal_contacts[foot] - kinematics.nominal_base_offset)
+        return np.array([*point, kinematics.foot_radii[foot]])
+
+    half_s, standing = 0.25, kinematics.standing_positions()
+    joints, rows = standing[7:].copy(), []
+    for now in time_s:
+        yaw, x = heading(now)
+        rocking = 0.08 * np.sin(2 * np.pi * np.array([2.0, 2.5]) * now)
+        height = 0.96 * kinematics.standing_height + 0.01 * np.sin(12.0 * now)
+        R_WB = Rotation.from_euler("ZYX", [yaw, *rocking])
+        q = np.concatenate([R_WB.as_quat(scalar_first=True), x, [height], joints])
+        targets = []
+        for foot in range(kinematics.num_contacts):
+            number, share = divmod(now / half_s + (foot in (0, 3)), 2)
+            # In even halves of its period a foot stands, in odd ones it swings.
+            last = print_of(foot, half_s * (2 * number + 0.5 - (foot in (0, 3))))
+            after = print_of(foot, half_s * (2 * number + 2.5 - (foot in (0, 3))))
+            swing = np.clip(share - 1.0, 0.0, 1.0)
+            lift = [0.0, 0.0, 0.06 * np.sin(np.pi * swing)]
+            targets.append(last + (3 - 2 * swing) * swing**2 * (after - last) + lift)
+        for _ in range(6):
+            p_WC, J = kinematics.contact_positions_and_jacobian(q)
+            q[7:] += np.linalg.solve(J[:, 6:], (np.array(targets) - p_WC).ravel())
+        joints = q[7:].copy()
+        rows.append(q)
+    q = np.array(rows)
+    turns = Rotation.from_quat(q[:, :4], scalar_first=True)
+    v = np.hstack([angular_velocities(time_s, turns), rates(time_s, q[:, 4:])])
+    feet = np.tile(print_of(0, 0.0), (len(q), kinematics.num_contacts))
+    return RobotLog(
+        path="walked",
+        robot=balancing_loop().robot.name,
+        time_s=time_s,
+        q=q,
+        v=v,
+        desired_output=q[:, 4:7],
+        foot_positions=feet,
+    )
 
 
 def stamps_ns(log):
@@ -149,17 +207,21 @@ def map_text(kind):
     return TABLE_MAP if kind in ("csv", "parquet") else MESSAGE_MAP
 
 
-def write(log, joints, kind, folder):
-    """Writes a log in one of the `FORMATS`; returns its path."""
+def write(log, joints, kind, folder, **how):
+    """Writes a log in one of the `FORMATS`; returns its path.
+
+    In messages `change` gives, for a message of joints and its number, those to be written instead,
+    each with a delay [ns]; `chunk_size` is that of an MCAP file.
+    """
     path = folder / {"ros1": "run.bag", "ros2": "run_ros2"}.get(kind, f"run.{kind}")
     if kind == "csv":
         frame_of(log, joints).to_csv(path, index=False)
     elif kind == "parquet":
         frame_of(log, joints).to_parquet(path)
     elif kind == "mcap":
-        _write_mcap(log, joints, path)
+        _write_mcap(log, joints, path, **how)
     else:
-        _write_bag(log, joints, path, kind)
+        _write_bag(log, joints, path, kind, **how)
     return path
 
 
@@ -211,7 +273,21 @@ def messages(log, joints, store, array=np.ascontiguousarray):
         yield "/feet", stamp, of("sensor_msgs/JointState", header, [], feet, none, none)
 
 
-def _write_bag(log, joints, path, kind):
+def changed(found, change):
+    """Messages in which those of joints are replaced; their headers say the delay too."""
+    number = 0
+    for topic, stamp, message in found:
+        if topic != "/joint_states" or change is None:
+            yield topic, stamp, message
+            continue
+        for other, delay in change(message, number):
+            time = divmod(stamp + delay, 1_000_000_000)
+            header = dataclasses.replace(message.header, stamp=type(message.header.stamp)(*time))
+            yield topic, stamp + delay, dataclasses.replace(other, header=header)
+        number += 1
+
+
+def _write_bag(log, joints, path, kind, change=None, chunk_size=None):
     from rosbags import rosbag1, rosbag2
 
     store = _typestore(ros1=kind == "ros1")
@@ -222,22 +298,22 @@ def _write_bag(log, joints, path, kind):
             topic: writer.add_connection(topic, name, typestore=store)
             for topic, name in TYPES.items()
         }
-        for topic, stamp, message in messages(log, joints, store):
+        for topic, stamp, message in changed(messages(log, joints, store), change):
             writer.write(topics[topic], stamp, serialize(message, TYPES[topic]))
 
 
-def _write_mcap(log, joints, path):
+def _write_mcap(log, joints, path, change=None, chunk_size=1 << 20):
     from mcap_ros2.writer import Writer
 
     store = _typestore()
-    with path.open("wb") as file, Writer(file) as writer:
+    with path.open("wb") as file, Writer(file, chunk_size) as writer:
         schemas = {
             topic: writer.register_msgdef(
                 name.replace("/msg/", "/"), store.generate_msgdef(name, ros_version=2)[0]
             )
             for topic, name in TYPES.items()
         }
-        for topic, stamp, message in messages(log, joints, store, array=list):
+        for topic, stamp, message in changed(messages(log, joints, store, array=list), change):
             writer.write_message(topic, schemas[topic], message, stamp, stamp)
 
 

@@ -180,7 +180,7 @@ def log_pieces(
             cuts.append(f"... and {num_more} more; --strict refuses such a log")
         if cuts:
             console.say(
-                f"log '{log}' is cut where values are missing and at gaps: "
+                f"log '{log}' is cut where values are missing and at gaps, or resampled: "
                 f"{100 * found.kept_share:.1f} % of {found.duration_s:.1f} s are kept, in "
                 f"{len(found.pieces)} pieces",
                 *cuts,

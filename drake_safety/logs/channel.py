@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,8 @@ class Channel:
         time_unit: Unit of ``time``.
         columns: The requested columns by name, (N,) floats each.
         row_name: Name of a row: "line", "row" or "message".
+        rows: Numbers of the rows in the file, (N,).
+        units: Units that a table's header gives columns, such as ``deg/s`` of "gyro_x [deg/s]".
     """
 
     path: Path
@@ -32,11 +34,12 @@ class Channel:
     time_name: str
     columns: dict[str, np.ndarray]
     row_name: str
-    first_row: int
+    rows: np.ndarray
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def where(self, row: int, column: str = "") -> str:
         """Describes the location of a row, and of a column if given."""
-        text = f"log '{self.path}', {self.row_name} {self.first_row + row}"
+        text = f"log '{self.path}', {self.row_name} {self.rows[row]}"
         if self.topic:
             text += f" of topic '{self.topic}'"
         return f"{text}, column '{column}'" if column else text
@@ -49,14 +52,22 @@ class Channel:
         """Returns the time between consecutive rows, (N - 1,) [s]."""
         return np.diff(self.time) / TIME_UNITS[self.time_unit]
 
+    def select(
+        self, rows: slice | np.ndarray, columns: Mapping[str, np.ndarray] | None = None
+    ) -> Channel:
+        """Returns some of the rows, of all columns or of given ones, (N,) each."""
+        columns = self.columns if columns is None else columns
+        values = {name: value[rows] for name, value in columns.items()}
+        return replace(self, time=self.time[rows], columns=values, rows=self.rows[rows])
+
     def table(self, names: Iterable[str]) -> np.ndarray:
         """Returns columns as an array, (N, n)."""
         return np.stack([self.columns[name] for name in names], axis=1)
 
 
-def listed(names: Iterable[str]) -> str:
-    """Formats names for a message, at most the first 40."""
+def listed(names: Iterable[str], many: int = _MANY) -> str:
+    """Formats names for a message, at most the first 40 or as many as given."""
     names = list(names)
-    if len(names) <= _MANY:
+    if len(names) <= many:
         return str(names)
-    return f"{names[:_MANY]} and {len(names) - _MANY} more"
+    return f"{names[:many]} and {len(names) - many} more"

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.observation import quaternion_of
 from drake_safety.learning.segments import LARGEST
 from drake_safety.logs.channel import Channel
-from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, ORDERS, TIME_UNITS, LogMap
+from drake_safety.logs.log_map import QUANTITIES, TIME_UNITS, LogMap
 
 MIN_ROWS = 3
 """Least number of rows, for derivatives."""
@@ -22,20 +21,8 @@ _MAX_TILT_RAD = math.radians(60.0)
 _FOOT_SHARE = 0.2  # Largest height of the lowest foot, relative to the standing height.
 _FAR_RAD = 0.3  # Largest excess over a joint stop by servo errors and encoder offsets.
 _REACH_SHARE = 3.0  # Largest distance of z* from the base, relative to the standing height.
-_RATE_FACTOR = 20.0  # Confusing degrees and radians gives 57, millimetres and metres 1000.
-_SLIP_M = 0.004  # Largest apparent slip of stance feet.
-_SLIP_FACTOR = 3.0
-_MOVING = 1.0  # Lower velocities are not compared with derivatives.
 
-
-def check_time(channel: Channel, max_gap_s: float) -> None:
-    """Checks that time is finite, increasing, in plausible units and without gaps."""
-    check_clock(channel)
-    for row in rows_after_gaps(channel, max_gap_s).tolist():
-        raise ValueError(
-            f"{channel.where(row, channel.time_name)}: a gap of {channel.steps_s()[row - 1]:g} s "
-            f"before it, expected at most {max_gap_s:g} s ('max_gap_s' of the map)"
-        )
+_UNITS = {"m": "m", "meter": "m", "mm": "mm", "rad": "rad", "deg": "deg", "°": "deg"}
 
 
 def rows_after_gaps(channel: Channel, max_gap_s: float) -> np.ndarray:
@@ -50,7 +37,8 @@ def check_clock(channel: Channel) -> None:
     if len(time) < MIN_ROWS:
         of = f" of topic '{channel.topic}'" if channel.topic else ""
         raise ValueError(
-            f"log '{channel.path}'{of} has {len(time)} rows, expected at least {MIN_ROWS}"
+            f"log '{channel.path}'{of} has {len(time)} rows with a value and a time of their own, "
+            f"expected at least {MIN_ROWS}"
         )
     if not np.isfinite(time).all():
         row = int(np.argmin(np.isfinite(time)))
@@ -73,19 +61,6 @@ def check_clock(channel: Channel) -> None:
         )
 
 
-def check_finite(channel: Channel) -> None:
-    """Checks that all values exist, are finite and of a size that quantities in SI units have."""
-    bad = bad_values(channel)
-    rows = {name: int(np.argmax(is_bad)) for name, is_bad in bad.items() if is_bad.any()}
-    if rows:
-        name = min(rows, key=lambda key: rows[key])
-        row = rows[name]
-        raise ValueError(
-            f"{channel.where(row, name)}: the value is {channel.columns[name][row]}, expected a "
-            f"finite number below {LARGEST:g}"
-        )
-
-
 def bad_values(channel: Channel) -> dict[str, np.ndarray]:
     """Returns which values are missing, not finite or absurdly large, (N,) by column."""
     return {name: ~(np.abs(values) < LARGEST) for name, values in channel.columns.items()}
@@ -103,65 +78,8 @@ def check_norms(channel: Channel, names: list[str]) -> None:
         )
 
 
-def check_first_row(
-    kinematics: RobotKinematics,
-    log_map: LogMap,
-    positions: Callable[[LogMap], np.ndarray],
-    where: str,
-) -> None:
-    """Checks that the robot stands on the ground in the first row, from its positions by map.
-
-    A wrong order of the quaternion tilts it; wrong units lift its feet off the ground or move
-    joints beyond their stops. The error suggests changes of the map that pass the check.
-    """
-    wrong = _implausible(kinematics, positions(log_map))
-    if not wrong:
-        return
-    likely = []
-    for part, name, values in (
-        ("base_orientation", "order", ORDERS),
-        ("joint_positions", "unit", ANGLE_UNITS),
-        ("base_position", "unit", LENGTH_UNITS),
-    ):
-        for value in values:
-            other = copy.deepcopy(log_map)
-            setattr(getattr(other, part), name, value)
-            if other != log_map and not _implausible(kinematics, positions(other)):
-                likely.append(f"'{part}.{name}' is {value}")
-    hint = f"; it would stand if {' or '.join(likely)}" if likely else ""
-    raise ValueError(
-        f"{where}: robot '{kinematics.robot.name}' does not stand on the ground z = 0 at the "
-        f"start: {wrong}{hint}"
-    )
-
-
-def check_stillness(
-    kinematics: RobotKinematics,
-    log_map: LogMap,
-    positions: Callable[[LogMap], np.ndarray],
-    where: str,
-) -> None:
-    """Checks that feet at positions (N, n_q) slip no less with the other order of the quaternion.
-
-    Reading x y z w as w x y z turns an upright robot by half a turn about the vertical: it stands,
-    but the feet seem to slip twice as far as the base moves.
-    """
-    other = copy.deepcopy(log_map)
-    order = log_map.base_orientation.order
-    other.base_orientation.order = "xyzw" if order == "wxyz" else "wxyz"
-    slips = []
-    for read_by in (log_map, other):
-        feet = np.array([kinematics.contact_positions(q) for q in positions(read_by)])
-        slips.append(float(np.sqrt(np.mean((feet - feet.mean(axis=0)) ** 2))))
-    if slips[0] > _SLIP_M and slips[0] > _SLIP_FACTOR * slips[1]:
-        raise ValueError(
-            f"{where}: the feet of robot '{kinematics.robot.name}' slide by {slips[0]:.3g} m, but "
-            f"only by {slips[1]:.3g} m if 'base_orientation.order' is "
-            f"{other.base_orientation.order}, which is more plausible"
-        )
-
-
-def _implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:
+def implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:
+    """Returns why a robot at positions (n_q,) does not stand on the ground z = 0, or ""."""
     excess = _beyond_limits(kinematics, q[None, 7:])[0]
     joint = int(np.argmax(excess))
     if excess[joint] > _FAR_RAD:
@@ -187,6 +105,20 @@ def _beyond_limits(kinematics: RobotKinematics, joints: np.ndarray) -> np.ndarra
     return np.maximum(low - joints, joints - high)
 
 
+def check_units(log_map: LogMap, channels: Mapping[str, Channel], joints: list[str]) -> None:
+    """Checks the map's units against those that a table's header gives, as "gyro_x [deg/s]"."""
+    for name in QUANTITIES:
+        part = getattr(log_map, name)
+        for column in part.names(joints) if hasattr(part, "unit") else ():
+            given = channels[part.topic].units.get(column, "")
+            unit = _UNITS.get(given.lower().split("/")[0].strip())
+            if unit not in (None, part.unit):
+                raise ValueError(
+                    f"log '{channels[part.topic].path}': the header gives column '{column}' the "
+                    f"unit '{given}', but '{name}.unit' of the map is {part.unit}: write {unit}"
+                )
+
+
 def check_limits(
     kinematics: RobotKinematics, joints: np.ndarray, channel: Channel, names: list[str]
 ) -> None:
@@ -200,24 +132,6 @@ def check_limits(
         raise ValueError(
             f"{channel.where(row, names[joint])}: joint '{kinematics.joint_names[joint]}' is at "
             f"{joints[row, joint]:.3g} rad, far beyond its stops {low:.3g} and {high:.3g}"
-        )
-
-
-def check_rates(
-    logged: np.ndarray, derived: np.ndarray, channel: Channel, names: list[str], unit: str
-) -> None:
-    """Checks that velocities (N, n) are not far larger than the derivatives of positions (M, n)."""
-    with np.errstate(over="ignore"):  # An infinite size is implausible too.
-        size = np.sqrt(np.mean(logged**2, axis=0))
-        expected = np.sqrt(np.mean(derived**2, axis=0))
-    is_far = (size > _MOVING) & (size > _RATE_FACTOR * expected)
-    if is_far.any():
-        column = int(np.argmax(is_far))
-        row = int(np.argmax(np.abs(logged[:, column])))
-        raise ValueError(
-            f"{channel.where(row, names[column])}: velocities are {size[column]:.3g} on average, "
-            f"but the derivatives of positions {expected[column]:.3g}: check the unit, {unit} per "
-            "second, and that of time"
         )
 
 

@@ -3,43 +3,81 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from drake_safety.logs.channel import Channel
-from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, LogMap, Position, Velocity
+from drake_safety.logs.log_map import VELOCITIES, LogMap, si_units
 
 
-def points(position: Position, channels: Mapping[str, Channel]) -> np.ndarray:
-    """Returns points in the world at their topic's times, (N, 3 n) [m]."""
-    table = channels[position.topic].table(position.columns)
-    return LENGTH_UNITS[position.unit] * table
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Source:
+    """The quantities of a log in SI units, at their own rows and at any time.
 
+    Attributes:
+        joints: Names of the joints in the robot's order.
+        origin: First instant of the log, on its clock.
+        channels: Columns of every quantity that is in the map, by its field of the map.
+    """
 
-def base_rotations(log_map: LogMap, channels: Mapping[str, Channel]) -> Rotation:
-    """Returns orientations of the base at their topic's times, (N,)."""
-    orientation = log_map.base_orientation
-    table = channels[orientation.topic].table(orientation.columns)
-    return Rotation.from_quat(table, scalar_first=orientation.order == "wxyz")
+    log_map: LogMap
+    joints: list[str]
+    origin: float | int
+    channels: Mapping[str, Channel]
 
+    @cached_property
+    def times(self) -> dict[str, np.ndarray]:
+        """Times of every quantity since the origin [s]."""
+        return {name: one.seconds_since(self.origin) for name, one in self.channels.items()}
 
-def joint_table(
-    log_map: LogMap, channels: Mapping[str, Channel], joints: list[str], name: str
-) -> np.ndarray:
-    """Returns joint positions or velocities in the robot's order, (N, n_j) [rad, rad/s]."""
-    mapped = getattr(log_map, name)
-    table = channels[mapped.topic].table([mapped.column(joint) for joint in joints])
-    return ANGLE_UNITS[mapped.unit] * table
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last time that all quantities cover [s]."""
+        times = self.times.values()
+        return float(max(one[0] for one in times)), float(min(one[-1] for one in times))
 
+    def table(self, name: str) -> np.ndarray:
+        """Returns a quantity's columns in the unit m or rad, per second, (N, n)."""
+        part = getattr(self.log_map, name)
+        return si_units(part) * self.channels[name].table(part.names(self.joints))
 
-def base_velocities(
-    velocity: Velocity, channels: Mapping[str, Channel], rotations: Rotation
-) -> np.ndarray:
-    """Returns a velocity of the base along the world's axes, (N, 3) [m/s or rad/s]."""
-    units = LENGTH_UNITS | ANGLE_UNITS
-    table = units[velocity.unit] * channels[velocity.topic].table(velocity.columns)
-    return table if velocity.frame == "world" else rotations.apply(table)
+    def at(self, name: str, at_s: np.ndarray) -> np.ndarray:
+        """Returns a quantity's columns at times (M,) [s], linearly, (M, n)."""
+        return values_at(self.times[name], self.table(name), at_s)
+
+    @cached_property
+    def rotations(self) -> Rotation:
+        """Orientations of the base, (N,)."""
+        is_first = self.log_map.base_orientation.order == "wxyz"
+        return Rotation.from_quat(self.table("base_orientation"), scalar_first=is_first)
+
+    def rotations_at(self, at_s: np.ndarray) -> Rotation:
+        """Returns the orientations of the base at times (M,) [s]."""
+        return rotations_at(self.times["base_orientation"], self.rotations, at_s)
+
+    def positions(self, at_s: np.ndarray) -> np.ndarray:
+        """Returns positions in Drake's order at times (M,) [s], (M, n_q)."""
+        quaternions = self.rotations_at(at_s).as_quat(scalar_first=True)
+        names = ("base_position", "joint_positions")
+        return np.hstack([quaternions, *(self.at(name, at_s) for name in names)])
+
+    def velocities(self, at_s: np.ndarray) -> np.ndarray:
+        """Returns velocities in Drake's order at times (M,) [s], (M, n_v): logged, or derived."""
+        parts = []
+        for name in ("base_angular_velocity", "base_linear_velocity", "joint_velocities"):
+            source = name if name in self.channels else VELOCITIES[name]
+            time_s, table = self.times[source], self.table(source)
+            if source == "base_orientation":
+                table = angular_velocities(time_s, self.rotations)
+            elif source != name:
+                table = rates(time_s, table)
+            elif getattr(getattr(self.log_map, name), "frame", "world") == "body":
+                table = self.rotations_at(time_s).apply(table)
+            parts.append(values_at(time_s, table, at_s))
+        return np.hstack(parts)
 
 
 def rotations_at(time_s: np.ndarray, rotations: Rotation, at_s: np.ndarray) -> Rotation:

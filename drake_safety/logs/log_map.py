@@ -1,8 +1,9 @@
 """LogMap: the schema of a columns.yaml, which maps a log's columns and their units."""
 
+from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 from drake_safety.files.schema import Positive, load_typed_file, schema
 
@@ -16,6 +17,16 @@ LENGTH_UNITS: dict[LengthUnit, float] = {"m": 1.0, "mm": 1e-3}
 """Metres per unit; for velocities, per second."""
 ANGLE_UNITS: dict[AngleUnit, float] = {"rad": 1.0, "deg": 0.017453292519943295}
 """Radians per unit; for rates, per second."""
+VELOCITIES = {
+    "base_linear_velocity": "base_position",
+    "base_angular_velocity": "base_orientation",
+    "joint_velocities": "joint_positions",
+}
+"""Velocities that a log may have, and the positions whose derivatives they are."""
+COMMANDS = ("desired_output", "foot_positions")
+"""What a log may have that is valid until its next value."""
+QUANTITIES = (*VELOCITIES.values(), *VELOCITIES, *COMMANDS)
+"""Fields of a LogMap that name columns."""
 ORDERS = get_args(Order)
 """Orders of a quaternion's columns."""
 _NO_POSITION = (
@@ -46,6 +57,10 @@ class _Columns:
     """Columns, or fields of the messages such as ``pose.pose.position.x``."""
     multiple: ClassVar[int] = 3
     """Of a value's columns."""
+
+    def names(self, joints: Sequence[str]) -> list[str]:
+        """Returns the columns; those of a quantity of joints are in their order."""
+        return self.columns
 
     def __post_init__(self) -> None:
         if len(self.columns) % self.multiple:
@@ -114,6 +129,11 @@ class Joints:
         """Returns the column of a joint; empty if the map has none."""
         return self.columns.get(joint, self.template.replace("{joint}", joint))
 
+    def names(self, joints: Sequence[str]) -> list[str]:
+        """Returns the columns of all joints; none if the map has none."""
+        is_mapped = self.template or self.columns
+        return [self.column(joint) for joint in joints] if is_mapped else []
+
 
 @schema(kw_only=True)
 class LogMap:
@@ -146,6 +166,12 @@ class LogMap:
                 raise ValueError(f"'{name}.columns' must be [x, y, z]; got {columns}")
         if not (self.joint_positions.template or self.joint_positions.columns):
             raise ValueError("'joint_positions' needs a 'template', or 'columns' by joint")
+
+
+def si_units(part: object) -> float:
+    """Returns the SI units, m or rad, per unit of a quantity's columns; 1 if it has no unit."""
+    units: dict[Any, float] = dict(LENGTH_UNITS) | dict(ANGLE_UNITS)
+    return units.get(getattr(part, "unit", ""), 1.0)
 
 
 def load_log_map(path: str | Path) -> LogMap:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import re
+import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -20,39 +24,88 @@ Message = tuple[str, int, Any]
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]|\.")
 
 
-def read_mcap(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) -> dict[str, Channel]:
-    """Reads the wanted fields, by topic, of an MCAP file with ROS 2 messages."""
+def read_mcap(
+    path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime, files: Sequence[Path] = ()
+) -> tuple[dict[str, Channel], str]:
+    """Reads the wanted fields, by topic, of an MCAP file with ROS 2 messages, or of several files.
+
+    Of a file that was cut off the whole chunks are read; the text says how much that is.
+    """
     require_extra("logs", f"log '{path}'", "mcap", "mcap_ros2")
-    from mcap.reader import make_reader
+    from mcap.reader import NonSeekingReader
     from mcap_ros2.decoder import DecoderFactory
 
+    existing: set[str] = set()
+    found: list[tuple[int, DecoderFactory, Any]] = []
+    kept, size = 0, 0
     # A damaged file makes the reader raise errors of any kind.
-    with reading(path, "damaged, or not an MCAP file: log", Exception), path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        summary = reader.get_summary()
-        if summary is None:
-            raise ValueError(f"log '{path}' is cut off: it has no summary")
-        _require_topics(path, wanted, {c.topic for c in summary.channels.values()})
-        messages = (
-            (channel.topic, message.log_time, decoded)
-            for _, channel, message, decoded in reader.iter_decoded_messages(
-                topics=list(wanted), log_time_order=True
-            )
+    what = "damaged ('mcap recover' may mend it), or not an MCAP file: log"
+    with reading(path, what, Exception):
+        for one in files or [path]:
+            factory, end = DecoderFactory(), 0
+            with one.open("rb") as file:
+                reader = NonSeekingReader(file, validate_crcs=True)
+                try:
+                    for record in reader.iter_messages(log_time_order=False):
+                        existing.add(record[1].topic)
+                        if record[1].topic in wanted:
+                            found.append((record[2].log_time, factory, record))
+                        end = file.tell()
+                    end = one.stat().st_size
+                except Exception:
+                    if not end:
+                        raise
+            kept, size = kept + end, size + one.stat().st_size
+        _require_topics(path, wanted, existing)
+        messages = map(_decoded, sorted(found, key=lambda one: one[0]))
+        cut = f"log '{path}' is cut off: its whole chunks are read, {kept / size:.0%} of its bytes"
+        return _channels(path, messages, wanted, time), cut if kept < size else ""
+
+
+def _decoded(found: tuple[int, Any, Any]) -> Message:
+    stamp, factory, (schema, channel, message) = found
+    decode = factory.decoder_for(channel.message_encoding, schema)
+    if decode is None:
+        raise ValueError(
+            f"messages of topic '{channel.topic}' are encoded as '{channel.message_encoding}', "
+            "expected ROS 2's 'cdr'"
         )
-        return _channels(path, messages, wanted, time)
+    return channel.topic, stamp, decode(message.data)
 
 
-def read_bag(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) -> dict[str, Channel]:
-    """Reads the wanted fields, by topic, of a ROS 1 bag (a file) or a ROS 2 bag (a folder)."""
+def read_bag(
+    path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime
+) -> tuple[dict[str, Channel], str]:
+    """Reads the wanted fields, by topic, of a ROS 1 bag (a file) or a ROS 2 bag (a folder).
+
+    Of a ROS 2 bag that was cut off what is left is read; the text says how much that is.
+    """
     require_extra("logs", f"log '{path}'", "rosbags")
+    hint = ", cut off ('rosbag reindex' mends it)" if path.suffix == ".bag" else ""
+    # A damaged bag makes the reader raise errors of any kind.
+    with reading(path, f"damaged{hint}, or not a ROS bag: log", Exception):
+        try:
+            return _read_bags(path, [path], wanted, time), ""
+        except Exception:
+            chunked, files = (sorted(path.glob(f"*.{kind}")) for kind in ("mcap", "db3"))
+            if chunked:
+                return read_mcap(path, wanted, time, chunked)
+            if not files:
+                raise
+            with TemporaryDirectory() as folder:
+                copies = [Path(folder) / one.name for one in files]
+                share = np.mean([_recover(*both) for both in zip(files, copies, strict=True)])
+                channels = _read_bags(path, copies, wanted, time)
+            return channels, f"log '{path}' is cut off: {share:.0%} of its bytes are left"
+
+
+def _read_bags(
+    path: Path, files: Sequence[Path], wanted: Mapping[str, Sequence[str]], time: LogTime
+) -> dict[str, Channel]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    # A damaged bag makes the reader raise errors of any kind.
-    with (
-        reading(path, "damaged, or not a ROS bag: log", Exception),
-        AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader,
-    ):
+    with AnyReader(files, default_typestore=get_typestore(Stores.LATEST)) as reader:
         connections = [c for c in reader.connections if c.topic in wanted]
         _require_topics(path, wanted, {c.topic for c in reader.connections})
         messages = (
@@ -60,6 +113,25 @@ def read_bag(path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime) -> 
             for connection, stamp, raw in reader.messages(connections=connections)
         )
         return _channels(path, messages, wanted, time)
+
+
+def _recover(source: Path, target: Path) -> float:
+    """Copies an SQLite file up to the first row that is lost; returns the share of its bytes."""
+    data, uri = source.read_bytes(), f"{source.resolve().as_uri()}?mode=ro"
+    size = int.from_bytes(data[16:18], "big") * int.from_bytes(data[28:32], "big")
+    with (
+        contextlib.closing(sqlite3.connect(uri, uri=True)) as old,
+        contextlib.closing(sqlite3.connect(target)) as new,
+    ):
+        old.execute("PRAGMA writable_schema=ON")  # Else a file that lacks pages is not opened.
+        tables = "SELECT name, sql FROM sqlite_master WHERE type = 'table'"
+        for name, statement in old.execute(tables).fetchall():
+            with contextlib.suppress(sqlite3.DatabaseError):
+                new.execute(statement)
+                for row in old.execute(f'SELECT * FROM "{name}"'):
+                    new.execute(f'INSERT INTO "{name}" VALUES ({",".join("?" * len(row))})', row)
+        new.commit()
+    return min(len(data) / max(size, 1), 1.0)
 
 
 def _require_topics(path: Path, wanted: Mapping[str, Sequence[str]], existing: set[str]) -> None:
@@ -79,30 +151,47 @@ def _require_topics(path: Path, wanted: Mapping[str, Sequence[str]], existing: s
 def _channels(
     path: Path, messages: Iterator[Message], wanted: Mapping[str, Sequence[str]], time: LogTime
 ) -> dict[str, Channel]:
-    fields = {topic: [field_of(name) for name in names] for topic, names in wanted.items()}
+    fields = {topic: {name: field_of(name) for name in names} for topic, names in wanted.items()}
     stamp_of = field_of(time.column) if time.column else None
     stamps: dict[str, list[float | int]] = {topic: [] for topic in wanted}
     rows: dict[str, list[list[float]]] = {topic: [] for topic in wanted}
+    numbers: dict[str, list[int]] = {topic: [] for topic in wanted}
+    counts = dict.fromkeys(wanted, 0)
+    failed: dict[tuple[str, str], ValueError] = {}
     is_stamp = not time.column
-    for topic, recorded_ns, message in messages:
-        names = wanted[topic]
-        name = time.column
+
+    def read(topic: str, name: str, field: Callable[[Any], Any], message: Any) -> float | int:
+        """A number, or NaN if the message lacks it: others may have it."""
+        nonlocal is_stamp
         try:
-            if stamp_of is None:
-                stamps[topic].append(recorded_ns)
-            else:
-                stamp = stamp_of(message)
-                is_stamp = hasattr(stamp, "nanosec") or hasattr(stamp, "nsec")
-                stamps[topic].append(_nanoseconds(stamp) if is_stamp else _number(stamp))
-            row = []
-            for name, field in zip(names, fields[topic], strict=True):  # noqa: B007 (the error names it)
-                row.append(float(_number(field(message))))
-            rows[topic].append(row)
+            value = field(message)
+            is_stamp = is_stamp or hasattr(value, "nanosec") or hasattr(value, "nsec")
+            return _number(value)
         except (LookupError, TypeError) as error:
-            raise ValueError(
-                f"log '{path}', message {len(rows[topic])} of topic '{topic}': cannot read "
-                f"'{name}': {error}"
-            ) from error
+            failed.setdefault(
+                (topic, name),
+                ValueError(
+                    f"log '{path}', message {counts[topic]} of topic '{topic}': cannot read "
+                    f"'{name}': {error}"
+                ),
+            )
+            return math.nan
+
+    for topic, recorded_ns, message in messages:
+        row = [float(read(topic, name, one, message)) for name, one in fields[topic].items()]
+        stamp = recorded_ns if stamp_of is None else read(topic, time.column, stamp_of, message)
+        if not all(map(math.isnan, row)):  # Such as the joints of another part of the robot.
+            stamps[topic].append(stamp)
+            rows[topic].append(row)
+            numbers[topic].append(counts[topic])
+        counts[topic] += 1
+    tables = {
+        topic: np.array(rows[topic], dtype=float).reshape(-1, len(names))
+        for topic, names in wanted.items()
+    }
+    for (topic, name), error in failed.items():
+        if name == time.column or np.isnan(tables[topic][:, wanted[topic].index(name)]).all():
+            raise error
     return {
         topic: Channel(
             path=path,
@@ -110,9 +199,9 @@ def _channels(
             time=np.array(stamps[topic]),
             time_unit="ns" if is_stamp else time.unit,
             time_name=time.column or "time of recording",
-            columns=dict(zip(names, np.array(rows[topic]).reshape(-1, len(names)).T, strict=True)),
+            columns=dict(zip(names, tables[topic].T, strict=True)),
             row_name="message",
-            first_row=0,
+            rows=np.array(numbers[topic], dtype=int),
         )
         for topic, names in wanted.items()
     }
@@ -157,13 +246,11 @@ def _place(owner: Any, name: str) -> int:
     return names.index(name)
 
 
-def _nanoseconds(stamp: Any) -> int:
-    if hasattr(stamp, "nanosec"):
-        return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nsec)
-
-
 def _number(value: Any) -> float | int:
+    """A number; a ROS stamp in nanoseconds."""
+    for name in ("nanosec", "nsec"):
+        if hasattr(value, name):
+            return int(value.sec) * 1_000_000_000 + int(getattr(value, name))
     if isinstance(value, np.number):
         return value.item()
     if isinstance(value, int | float):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -15,26 +15,32 @@ from drake_safety.logs.channel import Channel
 def cut_channels(
     channels: Mapping[str, Channel], max_gap_s: float
 ) -> tuple[list[dict[str, Channel]], list[str]]:
-    """Cuts tables or topics where a value is missing or a gap in time is longer than ``max_gap_s``.
+    """Cuts quantities where a value is missing or a gap in time is longer than ``max_gap_s``.
 
     Returns the channels of each piece in order of time, whose common time is covered by all without
     a cut, and the reasons of the cuts.
     """
-    pieces: list[dict[str, Channel]] = [{}]
+    pieces: list[tuple[float, float, dict[str, slice]]] = [(-math.inf, math.inf, {})]
     reasons: list[str] = []
-    origin = min(channel.time[0] for channel in channels.values())
-    for topic, channel in channels.items():
+    origin = min((one.time[0] for one in channels.values() if len(one.time)), default=0)
+    for name, channel in channels.items():
         checks.check_clock(channel)
         rows, found = _unbroken(channel, max_gap_s)
         reasons += found
-        parts = [_part(channel, part) for part in rows]
-        pieces = [
-            joined
-            for piece in pieces
-            for part in parts
-            if _overlap_s(joined := {**piece, topic: part}, origin) > 0.0
-        ]
-    return pieces, reasons
+        time_s = channel.seconds_since(origin)
+        parts = [(float(time_s[one.start]), float(time_s[one.stop - 1]), one) for one in rows]
+        joined, i, k = [], 0, 0
+        while i < len(pieces) and k < len(parts):
+            (begin, end, piece), (first, last, part) = pieces[i], parts[k]
+            if min(end, last) > max(begin, first):
+                joined.append((max(begin, first), min(end, last), {**piece, name: part}))
+            i, k = (i + 1, k) if end < last else (i, k + 1)
+        pieces = joined
+    found_pieces = [
+        {name: channels[name].select(rows) for name, rows in piece.items()}
+        for _, _, piece in pieces
+    ]
+    return found_pieces, list(dict.fromkeys(reasons))
 
 
 def _unbroken(channel: Channel, max_gap_s: float) -> tuple[list[slice], list[str]]:
@@ -49,7 +55,8 @@ def _unbroken(channel: Channel, max_gap_s: float) -> tuple[list[slice], list[str
     steps = channel.steps_s()
     after_gap = checks.rows_after_gaps(channel, max_gap_s)
     reasons += [
-        f"{channel.where(row, channel.time_name)}: a gap of {steps[row - 1]:g} s before it"
+        f"{channel.where(row, channel.time_name)}: a gap of {steps[row - 1]:g} s before it, "
+        f"expected at most {max_gap_s:g} s ('max_gap_s' of the map)"
         for row in after_gap.tolist()
     ]
     begins = ~is_bad & is_bad_before
@@ -61,17 +68,3 @@ def _unbroken(channel: Channel, max_gap_s: float) -> tuple[list[slice], list[str
         ends = np.flatnonzero(is_bad[start:stop])
         found.append(slice(int(start), int(start + ends[0] if len(ends) else stop)))
     return [one for one in found if one.stop - one.start >= checks.MIN_ROWS], reasons
-
-
-def _part(channel: Channel, rows: slice) -> Channel:
-    return replace(
-        channel,
-        time=channel.time[rows],
-        columns={name: values[rows] for name, values in channel.columns.items()},
-        first_row=channel.first_row + rows.start,
-    )
-
-
-def _overlap_s(channels: Mapping[str, Channel], origin: float) -> float:
-    spans = [channel.seconds_since(origin)[[0, -1]] for channel in channels.values()]
-    return float(min(span[1] for span in spans) - max(span[0] for span in spans))

@@ -1,0 +1,205 @@
+"""What a log says twice and its map reads in two ways is refused, and honest noise is not."""
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drake_safety.logs.robot_log import read_log, read_pieces
+from log_files import SAFE, TABLE_MAP, UNSAFE, balancing_loop, frame_of, recorded, walked
+
+pytestmark = pytest.mark.train
+ROBOT = balancing_loop().robot
+JOINTS = balancing_loop().kinematics.joint_names
+QUATERNION = [f"quat_{a}" for a in "xyzw"]
+LINEAR, GYRO = ([f"{name}_{a}" for a in "xyz"] for name in ("velocity", "gyro"))
+RATES = [f"{joint}_vel" for joint in JOINTS]
+
+
+def read(frame, folder, *changes, reader=read_log):
+    text = TABLE_MAP
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "columns.yaml").write_text(text)
+    frame.to_csv(folder / "run.csv", index=False)
+    return reader(folder / "run.csv", folder / "columns.yaml", ROBOT)
+
+
+def times(columns, *factors):
+    return lambda frame: frame.assign(
+        **{
+            name: frame[name] * np.resize(factors, len(columns))[i]
+            for i, name in enumerate(columns)
+        }
+    )
+
+
+def turns_of(frame):
+    return Rotation.from_quat(np.array(frame[QUATERNION]))
+
+
+def oriented(change):
+    """A log whose quaternion a sensor that is mounted otherwise would write."""
+
+    def spoil(frame):
+        turns = change(turns_of(frame))
+        return frame.assign(**dict(zip(QUATERNION, turns.as_quat().T, strict=True)))
+
+    return spoil
+
+
+def in_world(columns):
+    def spoil(frame):
+        turned = turns_of(frame).apply(np.array(frame[columns]))
+        return frame.assign(**dict(zip(columns, turned.T, strict=True)))
+
+    return spoil
+
+
+def exchanged(one, other):
+    return lambda frame: frame.assign(**{one: frame[other], other: frame[one]})
+
+
+def about(axis, angle):
+    return Rotation.from_rotvec(np.deg2rad(angle) * np.eye(3)["xyz".index(axis)])
+
+
+WORLD, BODY = "velocity_z], frame: body", "velocity_z]"
+CONTRADICTIONS = {
+    # What the velocity of the base is.
+    "in the world": (in_world(LINEAR), [], r"linear_velocity', columns .* by 0\.48 m/s.*, but by "
+                     r"0\.00 m/s if 'base_linear_velocity.frame' is world"),
+    "in the base": (lambda f: f, [(WORLD, BODY)], "if 'base_linear_velocity.frame' is body"),
+    "millimetres": (times(LINEAR, 1e3), [], "if 'base_linear_velocity.unit' is mm"),
+    "backwards": (times(LINEAR, -1), [], "if its sign is reversed"),
+    "x forwards, z down": (times(LINEAR, 1, -1, -1), [], r"by 180° about \[-?1.0, 0.0, 0.0\] in"
+                           " the body"),
+    "sensor turned": (exchanged("velocity_x", "velocity_y"), [], "or the base's, are turned by"),
+    "noise alone": (lambda f: f.assign(**{n: np.resize([0.7, -0.6, 0.5, -0.8], len(f)) for n in
+                                          LINEAR}), [], "no other frame, sign or unit agrees"),
+    "a command": (lambda f: f.assign(velocity_x=-2.0), [], "no other frame, sign or unit agrees"),
+    # What the gyroscope measures.
+    "gyro in degrees": (lambda f: f, [("unit: deg, frame", "unit: rad, frame")],
+                        "if 'base_angular_velocity.unit' is deg"),
+    "gyro in radians": (times(GYRO, np.pi / 180), [], "if 'base_angular_velocity.unit' is rad"),
+    "gyro in the world": (in_world(GYRO), [], "if 'base_angular_velocity.frame' is world"),
+    "gyro reversed": (times(GYRO, -1), [], "if its sign is reversed"),
+    "gyro upside down": (times(GYRO, 1, -1, -1), [], r"turned by 180° about \[-?1.0, 0.0, 0.0\]"),
+    "gyro turned": (lambda f: f.assign(gyro_x=f.gyro_y, gyro_y=-f.gyro_x), [],
+                    r"turned by 90° about \[-?0.0, -?0.0, 1.0\] .* in the body"),
+    # What the joints' velocities are.
+    "joints in degrees": (times(RATES, 180 / np.pi), [], "if 'joint_velocities.unit' is deg"),
+    "motors": (times(RATES, 6.33), [], "is multiplied by 0.158: a gear ratio"),
+    "one reversed": (times(RATES, *[1] * 4, -1, *[1] * 7), [],
+                     rf"columns \['{RATES[4]}'\].*if its sign is reversed"),
+    "two exchanged": (exchanged(RATES[1], RATES[4]), [], f"it is of joint '{JOINTS[4]}'"),
+    "one is zero": (times(RATES, *[1] * 4, 0, *[1] * 7), [], rf"'{RATES[4]}'.*no other frame"),
+    # Another clock.
+    "half as fast": (lambda f: f.assign(stamp=2 * f.stamp), [], "by 0.5: .*the rate of time"),
+    # What the orientation is, by feet that slide.
+    "inverse": (oriented(lambda R: R.inv()), [], "slide .*_orientation' is the inverse"),
+    "sensor turned by 90°": (oriented(lambda R: R * about("z", 90)),
+                             [], r"slide by .* turned on the base by 90° about \[0.0, 0.0, 1.0\]"),
+    "sensor backwards": (oriented(lambda R: R * about("z", 180)), [],
+                         r"slide by .* turned on the base by 180° about \[0.0, 0.0, 1.0\]"),
+    "another north": (oriented(lambda R: about("z", 57) * R), [],
+                      "slide by .*_orientation' is turned by 60° about the vertical"),
+    "order": (lambda f: f, [("order: xyzw", "order: wxyz")], "'base_orientation.order' is xyzw"),
+    "upside down": (oriented(lambda R: R * about("x", 180)), [],
+                    r"does not stand .* turned on the base by 180° about \[1.0, 0.0, 0.0\]"),
+    "on its side": (oriented(lambda R: R * about("y", -90)), [],
+                    r"does not stand .* turned on the base by 90° about \[0.0, -1.0, 0.0\]"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", CONTRADICTIONS)
+def test_a_contradiction_names_the_columns_the_reading_that_fits_and_by_how_much(what, tmp_path):
+    spoil, changes, message = CONTRADICTIONS[what]
+    with pytest.raises(ValueError, match=message):
+        read(spoil(frame_of(walked(), JOINTS)), tmp_path, *changes)
+
+
+def noisy(frame, rng):
+    """What encoders, an inertial measurement unit and a state estimator make of a motion."""
+
+    def add(columns, size):
+        values = frame[columns].to_numpy()
+        drift = np.cumsum(rng.normal(size=values.shape), axis=0) / np.sqrt(len(values))
+        frame[columns] = values + size * (rng.normal(size=values.shape) + drift)
+
+    frame = frame.copy()
+    add([f"base_{a}" for a in "xyz"], 2.0)  # mm
+    add(LINEAR, 0.06)
+    add(GYRO, 3.0)  # deg/s
+    add([f"{joint}_pos" for joint in JOINTS], 0.1)  # deg
+    add(RATES, 0.2)
+    turns = turns_of(frame)
+    tilts = Rotation.from_rotvec(0.005 * rng.normal(size=(len(frame), 3)))
+    frame[QUATERNION] = (turns * tilts).as_quat() * rng.choice([-1, 1], (len(frame), 1))
+    late = 4 if len(frame) > 100 else 0  # Filtered velocities come late.
+    frame[RATES] = frame[RATES].shift(late).bfill()
+    return frame
+
+
+@pytest.mark.parametrize("every", [1, 4, 20], ids=["200 Hz", "50 Hz", "10 Hz"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_noisy_log_is_read(every, seed, tmp_path):
+    frame = noisy(frame_of(walked(), JOINTS), np.random.default_rng(seed))[::every]
+    log = read(frame, tmp_path, ("ns}", "ns}\nmax_gap_s: 0.11"))
+    assert len(log.time_s) == len(frame)
+
+
+@pytest.mark.parametrize("index", [SAFE, UNSAFE, *range(1, 5)])
+def test_a_noisy_log_of_a_robot_that_stands_or_falls_is_read(index, tmp_path):
+    rng = np.random.default_rng(index)
+    read(noisy(frame_of(recorded(index), JOINTS), rng), tmp_path)
+
+
+@pytest.mark.parametrize("spoil, changes, message", [
+    (lambda f: f.rename(columns={"gyro_y": "gyro_y [rad/s]"}), [], "'gyro_y' the unit 'rad/s'"),
+    (lambda f: f.rename(columns={f"{JOINTS[0]}_pos": f"{JOINTS[0]}_pos (rad)"}), [], "write rad"),
+    (lambda f: f.rename(columns={"base_x": "base_x [m]"}), [], "unit' of the map is mm: write m"),
+])  # fmt: skip
+def test_a_unit_in_the_header_that_is_not_the_maps_is_refused(spoil, changes, message, tmp_path):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        read(spoil(frame_of(walked(), JOINTS)), tmp_path, *changes)
+
+
+def test_velocities_that_were_never_filled_in_are_derivatives(tmp_path):
+    frame = times([*LINEAR, *GYRO, *RATES], 0)(frame_of(walked(), JOINTS))
+    found = read(frame, tmp_path, reader=read_pieces)
+    np.testing.assert_allclose(found.pieces[0].v, walked().v, atol=1e-6)
+    assert [re.findall("'(.*?)'", cut)[1] for cut in found.cuts] == [
+        "base_linear_velocity", "base_angular_velocity", "joint_velocities"
+    ]  # fmt: skip
+
+
+HELD = {
+    "all": list(frame_of(walked(), JOINTS).columns)[1:-15],
+    "base": [f"base_{a}" for a in "xyz"],
+}
+
+
+@pytest.mark.parametrize("held", HELD)
+@pytest.mark.parametrize("number", [2, 5, 2.5])
+def test_rows_that_repeat_a_measurement_are_left_out(held, number, tmp_path):
+    frame, columns = frame_of(walked(), JOINTS), HELD[held]
+    rows = (np.floor(np.arange(len(frame)) / number) * number).astype(int)
+    repeated = frame.assign(**{name: frame[name].to_numpy()[rows] for name in columns})
+    found = read(repeated, tmp_path, reader=read_pieces)
+    assert f"changes only at every {number}th row" in found.cuts[0]
+    (log,) = found.pieces
+    # A measurement in between is repeated for the rest of a row.
+    assert abs(len(log.time_s) - len(frame) / number) < 2
+    np.testing.assert_allclose(np.diff(log.q[:, 4]) / np.diff(log.time_s), log.v[1:, 3], atol=0.15)
+    assert read(repeated, tmp_path).piece == 0
+
+
+def test_a_robot_that_stands_still_repeats_itself(tmp_path):
+    frame = frame_of(walked(), JOINTS)
+    frame = times([*LINEAR, *GYRO, *RATES], 0)(frame)
+    still = pd.concat([frame[:1]] * 400).assign(stamp=frame.stamp.to_numpy())
+    assert len(read(still, tmp_path).time_s) == 400
