@@ -87,16 +87,17 @@ def test_a_tick_of_the_policy_beside_its_network(
     policy = loop.policy
     q, v = loop.kinematics.standing_positions(), np.zeros(loop.kinematics.num_velocities)
     action, history = np.zeros(len(policy.joints)), np.full(sum(policy.sizes), np.nan)
+    memory = policy.network.initial_memory
 
     def tick() -> np.ndarray:
         seen = policy.see(q, v, COMMAND, action, policy.initial_phases)
-        return policy.targets(policy.act(policy.observe(seen, history)))
+        return policy.targets(policy.act(policy.observe(seen, history), memory)[0])
 
     observation = policy.observe(policy.see(q, v, COMMAND, action, policy.initial_phases), history)
     count = 200
     started = time.process_time()
     for _ in range(count):
-        policy.network(observation)
+        policy.network(observation, memory)
     network_s = (time.process_time() - started) / count
     benchmark.pedantic(tick, rounds=50, iterations=20)
     report(

@@ -13,6 +13,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.control.policy import load_policy, network_file, read_policy_file, with_policy
+from drake_safety.control.policy_network import network_files
 from drake_safety.control.walking_safe_set import WalkingSafeSet
 from drake_safety.diagrams.walking_parameters import WalkingParameters, profile
 from drake_safety.learning.assessment import SafetyAssessment
@@ -187,7 +188,8 @@ class Walking(LeggedLoop):
         """The robot's files and those of the policy."""
         of_robot = super().model_files(scenario)
         path = policy_file(scenario)
-        return [*of_robot, path, network_file(read_policy_file(path), str(path.parent))]
+        network = network_file(read_policy_file(path), str(path.parent))
+        return [*of_robot, path, *network_files(network)]
 
     @classmethod
     def options_for(cls, purpose: Purpose, scenario: Scenario, variation: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ MODULES = {
     "report": ("jinja2",),
     "robots": ("trimesh", "collada"),
     "train": ("dtaidistance", "openTSNE", "pyarrow", "sklearn", "torch", "tslearn"),
-    "walking": ("onnxruntime",),
+    "walking": ("onnx", "onnxruntime"),
 }
 """What the library imports of each extra."""
 

@@ -1,6 +1,23 @@
-"""A small network in a file, for tests."""
+"""Small networks in files, for tests, and robots that are made of them."""
 
 import warnings
+
+from typer.testing import CliRunner
+
+from drake_safety.cli import make_app
+from legged_robots import write_hexapod
+
+TERMS = ["projected_gravity", "velocity_commands", "joint_pos_rel", "last_action"]
+"""42 entries of observation of a hexapod."""
+
+
+def new(folder, policy, *more):
+    """`new` of a hexapod that walks by a policy: its folder, and what the command said."""
+    write_hexapod(folder)
+    urdf, out = folder / "hexapod.urdf", folder / "walker"
+    words = ["new", "walker", "--model", str(urdf), "--out", str(out), "--task", "walking"]
+    result = CliRunner().invoke(make_app(), [*words, "--policy", str(policy), *more])
+    return out, result
 
 
 def save_network(path, num_inputs, num_outputs, scale=0.01):
@@ -17,4 +34,133 @@ def save_network(path, num_inputs, num_outputs, scale=0.01):
         # Torch deprecates the format, in which policies are nevertheless published.
         warnings.simplefilter("ignore")
         torch.jit.script(linear).save(str(path))
+    return path
+
+
+def save_script(path, module, seen=None):
+    """Writes a module as TorchScript, after an evaluation of a batch if one is given.
+
+    Returns its path.
+    """
+    import torch
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        script = torch.jit.script(module.eval())
+        if seen is not None:
+            script(seen)
+        script.save(str(path))
+    return path
+
+
+def recurrent_module(kind, num_inputs, num_outputs, *, size=4, scale=1.0, layers=1):
+    """A network of random weights whose memory is in buffers, as exporters of rsl_rl write it.
+
+    Args:
+        kind: "lstm", "gru", or "replaced": an LSTM whose buffers are replaced, not written to.
+        scale: Of the actions.
+    """
+    import torch
+
+    class Recurrent(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            torch.manual_seed(0)
+            rnn = torch.nn.GRU if kind == "gru" else torch.nn.LSTM
+            self.rnn = rnn(num_inputs, size, layers)
+            self.out = torch.nn.Linear(size, num_outputs)
+            self.scale = float(scale)
+            self.register_buffer("mean", torch.zeros(num_inputs))
+            self.register_buffer("hidden_state", torch.zeros(layers, 1, size))
+            self.register_buffer("cell_state", torch.zeros(layers, 1, size))
+
+    class Lstm(Recurrent):
+        def forward(self, x):
+            memory = (self.hidden_state, self.cell_state)
+            y, (h, c) = self.rnn((x - self.mean).unsqueeze(0), memory)
+            self.hidden_state[:] = h.detach()
+            self.cell_state[:] = c.detach()
+            return self.scale * self.out(y.squeeze(0))
+
+        @torch.jit.export
+        def reset_memory(self):
+            self.hidden_state[:] = 0.0
+            self.cell_state[:] = 0.0
+
+    class Gru(Recurrent):
+        def forward(self, x):
+            y, h = self.rnn((x - self.mean).unsqueeze(0), self.hidden_state)
+            self.hidden_state[:] = h.detach()
+            return self.scale * self.out(y.squeeze(0))
+
+        @torch.jit.export
+        def reset(self):
+            self.hidden_state[:] = 0.0
+
+    class Replaced(Recurrent):
+        def forward(self, x):
+            y, (h, c) = self.rnn(x.unsqueeze(0), (self.hidden_state, self.cell_state))
+            self.hidden_state = h
+            self.cell_state = c
+            return self.scale * self.out(y.squeeze(0))
+
+    return {"lstm": Lstm, "gru": Gru, "replaced": Replaced}[kind]()
+
+
+def save_onnx(
+    path, num_inputs, num_outputs, *, size=4, memory=(), shape=None, metadata=None, files=()
+):
+    """Writes an ONNX network of random weights: an LSTM, a GRU or, without memory, a matrix.
+
+    Args:
+        memory: Pairs of names of the memory's inputs and outputs: two for an LSTM, one for a GRU.
+        shape: Of the observation; (1, num_inputs) by default.
+        metadata: Entries of the file's metadata.
+        files: Paths, from the file's folder, of files for the first weights.
+
+    Returns:
+        The path.
+    """
+    import numpy as np
+    import onnx
+    from onnx import TensorProto, external_data_helper, helper, numpy_helper
+
+    rng = np.random.default_rng(0)
+    gates = {0: 0, 1: 3, 2: 4}[len(memory)] * size
+    width = size if memory else num_inputs
+    shapes = {"out": (width, num_outputs)}
+    if memory:
+        shapes |= {"W": (1, gates, num_inputs), "R": (1, gates, size), "B": (1, 2 * gates)}
+    weights = {name: rng.normal(0, 0.5, s).astype(np.float32) for name, s in shapes.items()}
+    weights |= {"sequence": np.array([1, 1, num_inputs]), "row": np.array([1, width])}
+    nodes, last = [], "obs"
+    if memory:
+        nodes.append(helper.make_node("Reshape", ["obs", "sequence"], ["x"]))
+        given = ["x", "W", "R", "B", "", *(name for name, _ in memory)]
+        kind = "LSTM" if len(memory) == 2 else "GRU"
+        found = ["", *(name for _, name in memory)]
+        nodes.append(helper.make_node(kind, given, found, hidden_size=size))
+        last = memory[0][1]
+    nodes.append(helper.make_node("Reshape", [last, "row"], ["y"]))
+    nodes.append(helper.make_node("MatMul", ["y", "out"], ["actions"]))
+
+    def tensor(name, shape):
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
+
+    observation = tensor("obs", shape or [1, num_inputs])
+    inner = [1, 1, size]
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [observation, *(tensor(name, inner) for name, _ in memory)],
+        [tensor("actions", [1, num_outputs]), *(tensor(name, inner) for _, name in memory)],
+        [numpy_helper.from_array(value, name) for name, value in weights.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    for key, value in (metadata or {}).items():
+        model.metadata_props.append(onnx.StringStringEntryProto(key=key, value=value))
+    for name, weight in zip(files, model.graph.initializer, strict=False):
+        external_data_helper.set_external_data(weight, name)
+        (path.parent / name).parent.mkdir(parents=True, exist_ok=True)
+    onnx.save(model, str(path))
     return path

@@ -156,8 +156,29 @@ def test_history_of_whole_observations_is_the_oldest_first(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda c: c.update(stiffness=20.0, damping=2.0), {"stiffness": [20.0, 20.0]}),
+        (lambda c: c.update(stiffness={"hip": 5.0, "[kt].*": 7.0}), {"stiffness": [5.0, 7.0]}),
+        (lambda c: action(c, scale=0.3), {"action_scale": [0.3, 0.3]}),
+        (lambda c: action(c, scale={"h.*": 0.1, "k.*": 0.2}), {"action_scale": [0.1, 0.2]}),
+        (
+            lambda c: c.update(default_joint_pos={"knee": -0.2, "hip": 0.1}),
+            {"default_positions": [0.1, -0.2]},
+        ),
+    ],
+)
+def test_numbers_may_be_one_for_all_or_by_regular_expression(tmp_path, change, expected):
+    found = converted_policy(deploy(tmp_path, change), MOTORS)
+    assert found["joints"] == ["hip", "knee"]
+    found["stiffness"] = {name: gains["stiffness"] for name, gains in found["gains"].items()}
+    assert {key: list(found[key].values()) for key in expected} == expected
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
+        (lambda c: c.update(stiffness={"hip": 1.0}), r"finite numbers; got \[None, None, 1.0\]"),
         (lambda c: c.update(stiffness=[1.0]), "'stiffness' must have an entry for each motor, up"),
         (lambda c: c.update(default_joint_pos=[0.0] * 3), "must have 2 entries; got 3"),
         (lambda c: c.update(camera={}), r"unknown keys \['camera'\]; known are"),

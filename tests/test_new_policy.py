@@ -1,29 +1,26 @@
 """`new --task walking`: from a URDF and a policy's files to a robot that can be checked."""
 
+import math
+
 import pytest
 import yaml
 from typer.testing import CliRunner
 
 from drake_safety.cli import make_app
-from drake_safety.control.policy_network import PolicyMetadata, PolicyNetwork
+from drake_safety.control.policy import PolicyParameters
+from drake_safety.control.policy_metadata import PolicyMetadata, read_metadata
+from drake_safety.control.policy_network import PolicyNetwork, load_network
 from drake_safety.control.policy_template import PolicyTemplate, survey_policy
+from drake_safety.files.schema import load_typed
+from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.scenario_check import check_scenario
 from legged_robots import write_hexapod
-from policy_networks import save_network
+from policy_networks import TERMS, new, save_network, save_onnx
 
 SWINGS = [f"swing_{i}" for i in range(6)]
 LEGS = [name for i in range(6) for name in (f"swing_{i}", f"lift_{i}", f"knee_{i}")]
 POSTURE = [value for _ in range(6) for value in (0.0, -0.4, 1.6)]
 ORDER = [*range(0, 18, 3), *range(1, 18, 3), *range(2, 18, 3)]  # Of the network.
-TERMS = ["projected_gravity", "velocity_commands", "joint_pos_rel", "last_action"]
-
-
-def new(folder, policy, *more):
-    write_hexapod(folder)
-    urdf, out = folder / "hexapod.urdf", folder / "walker"
-    words = ["new", "walker", "--model", str(urdf), "--out", str(out), "--task", "walking"]
-    result = CliRunner().invoke(make_app(), [*words, "--policy", str(policy), *more])
-    return out, result
 
 
 def problems(scenario):
@@ -113,10 +110,10 @@ def test_joints_that_a_policy_moves_are_not_fixed(tmp_path):
 def test_metadata_of_a_network_are_not_asked_for(tmp_path):
     metadata = PolicyMetadata(
         joints=["a", "b"],
-        stiffness=[1.0, 2.0],
-        damping=[0.1, 0.2],
-        action_scale=[0.25, 0.25],
-        default_positions=[0.0, 0.1],
+        stiffness={"a": 1.0, "b": 2.0},
+        damping={".*": 0.1},
+        action_scale={".*": 0.25},
+        default_positions={"a": 0.0, "b": 0.1},
         command={"lin_vel_x": [-0.5, 1], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-1, 1]},
     )
     network = PolicyNetwork(tmp_path / "p.onnx", lambda batch: batch, (45, 2), metadata)
@@ -127,6 +124,45 @@ def test_metadata_of_a_network_are_not_asked_for(tmp_path):
     assert stated["command"] == {"lowest": [-0.5, -0.3, -1.0], "highest": [1.0, 0.3, 1.0]}
     text, asked = PolicyTemplate(network=network).yaml(["c", "d"], {})
     assert "['a', 'b'] are none of them" in asked[0]
+
+
+@pytest.mark.parametrize(
+    ("said", "asked_for"),
+    [
+        ({}, ["scale and history of the terms"]),
+        ({"observation_history_lengths": "1,2"}, ["scale of the terms"]),
+        ({"observation_terms_scale": "1,2", "observation_history_lengths": "1,2"}, []),
+        ({"observation_history_lengths": "2"}, ["scale and history", "metadata 'history' must be"]),
+    ],
+)
+def test_observations_that_a_network_names_are_stated(tmp_path, said, asked_for):
+    raw = {"observation_names": "base_ang_vel,actions"} | said
+    network = PolicyNetwork(tmp_path / "p.onnx", list, (45, 2), read_metadata(raw))
+    text, asked = PolicyTemplate(network=network).yaml(["a", "b"], {})
+    terms = load_typed(PolicyParameters, yaml.safe_load(text), "policy").observation
+    assert [term.name for term in terms] == ["base_ang_vel", "last_action"]
+    assert [term.history for term in terms] == [1, 2 if "1,2" in said.values() else 1]
+    assert all(term.clip == math.inf for term in terms)
+    found = [one for one in asked if "of the terms" in one or "metadata" in one]
+    assert len(found) == len(asked_for)
+    for one, words in zip(found, asked_for, strict=True):
+        assert words in one
+
+
+@pytest.mark.train
+def test_a_policy_is_copied_whole(tmp_path):
+    files = ["policy.onnx.data", "weights/R"]
+    path = save_onnx(tmp_path / "policy.onnx", 42, 18, memory=[("h_in", "h_out")], files=files)
+    out, result = new(tmp_path, path)
+    assert result.exit_code == 0, result.output
+    for name in (path.name, *files):
+        assert (out / name).read_bytes() == (tmp_path / name).read_bytes()
+    assert load_network(out / path.name).widths == (42, 18)
+    scenario = load_scenario(out / "walking.yaml")
+    assert {out / name for name in files} < set(scenario.task_class().model_files(scenario))
+    (tmp_path / files[1]).unlink()
+    with pytest.raises(ValueError, match="there is no weights/R"):
+        survey_policy(path)
 
 
 def test_new_refuses_a_policy_before_it_writes_anything(tmp_path):

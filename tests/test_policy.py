@@ -1,7 +1,7 @@
 """Policies as data: observation, action, gait clock, and networks that do not fit."""
 
 import math
-from pathlib import Path
+import re
 
 import numpy as np
 import pytest
@@ -17,10 +17,11 @@ from drake_safety.control.policy import (
     network_file,
     observation_term,
 )
-from drake_safety.control.policy_network import _read_metadata, load_network
+from drake_safety.control.policy_metadata import read_metadata
+from drake_safety.control.policy_network import load_network, network_files
 from drake_safety.extras import MissingExtraError
 from drake_safety.robots.robot_model import JointGains
-from policy_networks import save_network
+from policy_networks import save_network, save_onnx
 
 JOINTS = ["hip", "knee", "tail"]  # The robot's; the policy moves two, in another order.
 TERMS = ["base_ang_vel", "projected_gravity", "velocity_commands", "joint_pos_rel", "last_action"]
@@ -184,6 +185,31 @@ def test_a_policy_of_a_missing_package_says_how_to_install_it():
         network_file(stated)
 
 
+WEIGHTS = ["policy.onnx.data", "weights/W", "weights/more/R"]
+
+
+@pytest.mark.train
+def test_weights_in_other_files_are_files_of_the_network(tmp_path):
+    path = save_onnx(tmp_path / "policy.onnx", 4, 2, memory=[("h_in", "h_out")], files=WEIGHTS)
+    assert set(network_files(path)) == {path, *(tmp_path / name for name in WEIGHTS)}
+    load_network(path)
+    assert network_files(tmp_path / "other.pt") == [tmp_path / "other.pt"]
+    (tmp_path / WEIGHTS[1]).unlink()
+    for read in (network_files, load_network):
+        with pytest.raises(ValueError, match=r"are in .*'weights/W', .* there is no weights/W$"):
+            read(path)
+
+
+@pytest.mark.train
+def test_weights_outside_the_folder_of_the_network_are_refused(tmp_path):
+    (tmp_path / "inner").mkdir()
+    path = save_onnx(tmp_path / "inner" / "p.onnx", 4, 2, files=["data"])
+    path.write_bytes(path.read_bytes().replace(b"\x04data", b"\x04../x"))
+    (tmp_path / "x").write_bytes(b"0" * 100)
+    with pytest.raises(ValueError, match=r"there is no \.\./x"):
+        network_files(path)
+
+
 @pytest.mark.train
 def test_a_term_of_ones_own_is_one_function(tmp_path):
     observation_term("test_twice_the_height")(lambda seen: 2.0 * seen.action)
@@ -194,13 +220,91 @@ def test_a_term_of_ones_own_is_one_function(tmp_path):
         observation_term("last_action")(lambda seen: seen.action)
 
 
-def test_metadata_of_both_styles_is_read_and_checked():
-    path = Path("p.onnx")
-    isaac = {"joint_names": "a,b", "joint_stiffness": "20.0,30.0", "action_scale": "0.25,0.5"}
-    metadata = _read_metadata(path, isaac)
-    assert metadata.joints == ["a", "b"]
-    assert (metadata.stiffness, metadata.action_scale) == ([20.0, 30.0], [0.25, 0.5])
-    holosoma = {"dof_names": '["a"]', "kp": "[1.5]", "command_ranges": '{"lin_vel_x": [-1, 1]}'}
-    assert _read_metadata(path, holosoma).command == {"lin_vel_x": [-1, 1]}
-    with pytest.raises(ValueError, match="a number for each of the joints"):
-        _read_metadata(path, {"dof_names": '["a"]', "kp": "[1, 2]"})
+NAMES = "observation_names"
+TWO = {"joint_names": "a,b"}
+
+
+@pytest.mark.parametrize(
+    ("raw", "expected"),
+    [
+        # Isaac Lab and mjlab: words and numbers between commas, Holosoma: JSON; one for all.
+        (TWO | {"joint_stiffness": "20.0,30.0"}, {"stiffness": {"a": 20.0, "b": 30.0}}),
+        ({"dof_names": '["a"]', "kp": "[1.5]"}, {"joints": ["a"], "stiffness": {"a": 1.5}}),
+        (TWO | {"action_scale": "0.25"}, {"action_scale": {".*": 0.25}}),
+        (TWO | {"joint_damping": "{'a.*': 0.5}"}, {"damping": {"a.*": 0.5}}),
+        (TWO | {"default_joint_pos": '{".*": 1}'}, {"default_positions": {".*": 1.0}}),
+        (TWO | {"action_scale": "(0.1, 0.2)"}, {"action_scale": {"a": 0.1, "b": 0.2}}),
+        ({"joint_names": "a+b"}, {"joints": ["a+b"]}),
+        ({"joint_names": "21,22", "kp": "1,2"}, {"joints": ["21", "22"]}),
+        ({"joint_names": "21,22", "kp": "1,2"}, {"stiffness": {"21": 1.0, "22": 2.0}}),
+        ({"joint_names": "a+b,c", "kp": "1,2"}, {"stiffness": {r"a\+b": 1.0, "c": 2.0}}),
+        ({"command_ranges": '{"lin_vel_x": [-1, 1]}'}, {"command": {"lin_vel_x": [-1, 1]}}),
+        (
+            {NAMES: "command,joint_pos,actions,height_scan"},
+            {
+                "observation": [
+                    {"name": name}
+                    for name in ("velocity_commands", "joint_pos_rel", "last_action", "height_scan")
+                ]
+            },
+        ),
+        (
+            {NAMES: "x,y"}
+            | {"observation_terms_scale": "2.000;0.500,4.000"}
+            | {"observation_terms_history_length": "0.000,3.000"}
+            | {"observation_terms_clip": "-inf;inf,-5.000;5.000"},
+            {
+                "observation": [
+                    {"name": "x", "scale": [2.0, 0.5], "clip": math.inf, "history": 1},
+                    {"name": "y", "scale": [4.0], "clip": 20.0, "history": 3},
+                ]
+            },
+        ),
+        (
+            {NAMES: '["x"]', "observation_history_lengths": '{"x": 5}'},
+            {"observation": [{"name": "x", "history": 5}]},
+        ),
+    ],
+)
+def test_metadata_are_read_as_exporters_write_them(raw, expected):
+    metadata = read_metadata(raw)
+    assert {name: getattr(metadata, name) for name in expected} == expected
+    assert metadata.unread == []
+
+
+@pytest.mark.parametrize(
+    ("raw", "message"),
+    [
+        ({"dof_names": '["a"]', "kp": "[1, 2]"}, r"'stiffness' .* the joints \['a'\].* got \[1, 2"),
+        (TWO | {"action_scale": "nan"}, "'action_scale' must be a number for each of the joints"),
+        (TWO | {"action_scale": "{'(': 1}"}, "one for all or by regular expression"),
+        (TWO | {"default_joint_pos": "tensor([1, 2])"}, "'default_positions'"),
+        ({NAMES: "x", "observation_terms_scale": "1,2"}, r"'scale' .* terms \['x'\]"),
+        ({NAMES: "x", "observation_terms_clip": "-1;2"}, r"'clip' .* got \['-1;2'\]"),
+    ],
+)
+def test_metadata_that_do_not_fit_are_told_and_left_out(raw, message):
+    metadata = read_metadata(raw)
+    (told,) = metadata.unread
+    assert re.search(message, told)
+    assert not metadata.action_scale and not metadata.stiffness
+    assert all(term.keys() == {"name"} for term in metadata.observation)
+
+
+@pytest.mark.train
+def test_what_the_metadata_say_is_used_where_nothing_is_stated(tmp_path):
+    said = {"joint_names": "knee,hip", "action_scale": "0.25", "joint_stiffness": "20,30"}
+    said |= {"joint_damping": "0.5", "default_joint_pos": "{'knee': 0.5}"}
+    network = save_onnx(tmp_path / "p.onnx", 13, 2, metadata=said)
+    unstated = {"joints": [], "default_positions": {}, "action_scale": {}, "gains": {}}
+    made = policy(tmp_path, network=str(network), **unstated)
+    assert made.joint_names == ["knee", "hip"]
+    np.testing.assert_allclose(made.action_scale, [0.25, 0.25])
+    np.testing.assert_allclose(made.default_positions, [0.0, 0.5, 0.0])
+    assert made.gains["hip"] == JointGains(stiffness=30.0, damping=0.5)
+    # An entry that does not fit is an error only where nothing else is stated.
+    network = save_onnx(tmp_path / "q.onnx", 13, 2, metadata=said | {"action_scale": "1,2,3"})
+    with pytest.raises(ValueError, match=r"'action_scale' \[rad\] of joints .* got \[1, 2, 3\]"):
+        policy(tmp_path, network=str(network), **unstated)
+    made = policy(tmp_path, network=str(network), **(unstated | {"action_scale": {".*": 0.5}}))
+    np.testing.assert_allclose(made.action_scale, [0.5, 0.5])

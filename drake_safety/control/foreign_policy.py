@@ -11,10 +11,12 @@ from typing import Any
 import yaml
 
 from drake_safety.control.policy import PolicyParameters
+from drake_safety.control.policy_metadata import TERM_NAMES
 from drake_safety.control.policy_network import load_network
 from drake_safety.control.policy_terms import registered_terms
 from drake_safety.files.reading import YamlLoader, parse_yaml, reading
 from drake_safety.files.schema import load_typed
+from drake_safety.robots.robot_model import by_pattern
 
 _THREE = ("base_lin_vel", "base_ang_vel", "projected_gravity", "velocity_commands")
 _PER_JOINT = ("joint_pos_rel", "joint_vel_rel", "last_action")
@@ -26,7 +28,6 @@ _DEPLOY_KEYS = (
 )
 _TERM_KEYS = ("params", "clip", "scale", "history_length", "scale_first")
 _GROUP_SWITCHES = ("use_gym_history", "scale_first")
-_ISAAC_NAMES = {"keyboard_velocity_commands": "velocity_commands"}
 
 _RL_SAR_TERMS = {
     "lin_vel": ("base_lin_vel", "lin_vel_scale"),
@@ -143,9 +144,14 @@ class _Entries:
     def inner(self, key: str) -> _Entries:
         return _Entries(self.get(key), f"{self.who}, {key},")
 
-    def numbers(self, key: str, count: int | None = None) -> list[float]:
-        """``count`` numbers, or one for all; without ``count`` any number of them."""
+    def numbers(self, key: str, count: int | None = None, names: Sequence[str] = ()) -> list[float]:
+        """``count`` numbers, one for all, or by regular expression over names.
+
+        Without ``count`` any number of them.
+        """
         stated = self.get(key)
+        if isinstance(stated, dict) and names:
+            stated = [by_pattern(stated, name, key, self.who) for name in names]
         values = stated if isinstance(stated, list) else [stated] * (count or 1)
         if not all(type(value) in (int, float) and math.isfinite(value) for value in values):
             raise ValueError(f"{self.who}: '{key}' must be finite numbers; got {stated}")
@@ -201,19 +207,23 @@ def _from_unitree(file: _Entries, path: Path, motors: Sequence[str]) -> dict[str
     motor_of = file.indices("joint_ids_map")
     count, last = len(motor_of), max(motor_of, default=0)
     names = motors or (file.texts("joint_names") if "joint_names" in file else [])
-    gains = {key: file.numbers(key) for key in ("stiffness", "damping")}
+    joints = [names[i] for i in motor_of] if len(names) > last else []
+    gains = {
+        key: file.numbers(key, None if isinstance(file.get(key), list) else last + 1, names)
+        for key in ("stiffness", "damping")
+    }
     for what, values in {"names of motors": names, **gains}.items():
         if values and len(values) <= last:
             raise ValueError(
                 f"{path}: '{what}' must have an entry for each motor, up to {last} of "
                 f"joint_ids_map; got {values}"
             )
-    positions = file.numbers("default_joint_pos", count)
+    positions = file.numbers("default_joint_pos", count, joints)
     file.inner("actions").only(["JointPositionAction"])
     action = file.inner("actions").inner("JointPositionAction")
     action.only(["clip", "joint_names", "scale", "offset", "joint_ids"])
     _check_all_joints(action, count)
-    offset = action.numbers("offset", count) if "offset" in action else positions
+    offset = action.numbers("offset", count, joints) if "offset" in action else positions
     if any(abs(one - other) > 1e-6 for one, other in zip(offset, positions, strict=True)):
         raise ValueError(
             f"{action.who}: offset must equal default_joint_pos, from which joints are observed; "
@@ -232,9 +242,9 @@ def _from_unitree(file: _Entries, path: Path, motors: Sequence[str]) -> dict[str
         )
     found = {
         "network": _network(path, _EXPORTED),
-        "joints": [names[i] for i in motor_of] if names else [],
+        "joints": joints,
         "default_positions": positions,
-        "action_scale": action.numbers("scale", count),
+        "action_scale": action.numbers("scale", count, joints),
         "action_clip": math.inf,
         "kp": [gains["stiffness"][i] for i in motor_of],
         "kd": [gains["damping"][i] for i in motor_of],
@@ -276,7 +286,7 @@ def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
             continue
         spec = terms.inner(name)
         spec.only(_TERM_KEYS)
-        entry: dict[str, Any] = {"name": _ISAAC_NAMES.get(name, str(name))}
+        entry: dict[str, Any] = {"name": TERM_NAMES.get(name, str(name))}
         if "scale" in spec:
             scale = spec.raw["scale"]
             size = _width(entry["name"], count) or (len(scale) if isinstance(scale, list) else 1)

@@ -1,10 +1,9 @@
 """Locomotion policies as data: observation terms, actions, gait clock and command limits."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import field, replace
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -18,8 +17,6 @@ from drake_safety.control.policy_terms import observation_term as observation_te
 from drake_safety.files.schema import Count, Pattern, Positive, Triple, load_typed_file, schema
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern
-
-_Value = TypeVar("_Value")
 
 
 @schema(kw_only=True)
@@ -154,23 +151,25 @@ class Policy:
         self.joint_names = list(names)
         self.joints = np.array([joint_names.index(name) for name in names], dtype=int)
 
-        def by_joint(
-            key: str, of_network: Sequence[_Value], joints: list[str]
-        ) -> dict[str, _Value]:
+        def by_joint(key: str, joints: list[str]) -> dict[str, Any]:
             """Values that are stated, else those of the network's metadata."""
-            found = dict(zip(metadata.joints, of_network, strict=False))
-            stated = getattr(parameters, key)
-            for name in joints:
-                value = by_pattern(stated, name, key, robot)
-                if value is not None:
-                    found[name] = value
-            return {name: found[name] for name in joints if name in found}
+            found = {}
+            for source, what in ((metadata, f"{key} of its metadata"), (parameters, key)):
+                for name in joints:
+                    value = by_pattern(getattr(source, key, {}), name, what, robot)
+                    if value is not None:
+                        found[name] = value
+            return found
 
-        positions = by_joint("default_positions", metadata.default_positions, joint_names)
-        scales = by_joint("action_scale", metadata.action_scale, names)
-        pairs = zip(metadata.stiffness, metadata.damping, strict=True)
-        servos = [JointGains(stiffness=p, damping=d) for p, d in pairs]
-        self.gains = by_joint("gains", servos, names)
+        positions = by_joint("default_positions", joint_names)
+        scales = by_joint("action_scale", names)
+        stiffness, damping = by_joint("stiffness", names), by_joint("damping", names)
+        servos = {
+            name: JointGains(stiffness=stiffness[name], damping=damping[name])
+            for name in names
+            if name in stiffness and name in damping
+        }
+        self.gains: dict[str, JointGains] = servos | by_joint("gains", names)
         missing = []
         if not names:
             missing.append(f"'joints' in the network's order; the robot has {joint_names}")
@@ -188,7 +187,9 @@ class Policy:
                 f"registered are {registered_terms()}"
             )
         if missing:
-            raise ValueError(f"{who}: state in policy.yaml {'; '.join(missing)}")
+            raise ValueError(
+                f"{who}: state in policy.yaml {'; '.join([*missing, *metadata.unread])}"
+            )
         self.default_positions = np.array([positions.get(name, 0.0) for name in joint_names])
         self.action_scale = np.array([scales[name] for name in names])
         gait = parameters.gait
@@ -285,10 +286,11 @@ class Policy:
             observation[aged] = history[self._earlier[aged]]
         return observation
 
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Returns the action (n_a,) for a network's input (n_o,)."""
+    def act(self, observation: np.ndarray, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the action (n_a,) for a network's input (n_o,), and its new memory (n_m,)."""
         clip = self.parameters.action_clip
-        return np.clip(self.network(observation), -clip, clip)
+        action, memory = self.network(observation, memory)
+        return np.clip(action, -clip, clip), memory
 
     def targets(self, action: np.ndarray) -> np.ndarray:
         """Returns the set points of all joints of the robot, (n_j,) [rad]."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from typing import Any
 import yaml
 
 from drake_safety.control.foreign_policy import converted_policy
-from drake_safety.control.policy_network import PolicyNetwork, load_network
+from drake_safety.control.policy_network import PolicyNetwork, load_network, network_files
 from drake_safety.control.policy_terms import registered_terms
 from drake_safety.files.reading import yaml_text
 from drake_safety.robots.robot_model import as_pattern
@@ -39,12 +40,16 @@ class PolicyTemplate:
     def write(
         self, folder: Path, robot_joints: list[str], posture: dict[str, float]
     ) -> tuple[list[Path], list[str]]:
-        """Writes ``policy.yaml`` into a robot's folder, and copies the network there."""
-        network, path = folder / self.network.path.name, folder / "policy.yaml"
-        shutil.copyfile(self.network.path, network)
+        """Writes ``policy.yaml`` into a robot's folder, and copies the network's files there."""
         text, asked = self.yaml(robot_joints, posture)
+        written = []
+        for source in network_files(self.network.path):
+            written.append(folder / source.relative_to(self.network.path.parent))
+            written[-1].parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, written[-1])
+        path = folder / "policy.yaml"
         path.write_text(text, encoding="utf-8")
-        return [network, path], asked
+        return [*written, path], asked
 
     def yaml(self, robot_joints: list[str], posture: dict[str, float]) -> tuple[str, list[str]]:
         """Returns the text of ``policy.yaml``, and what the user must supply."""
@@ -70,7 +75,7 @@ class PolicyTemplate:
             ask(f"default_positions: {{{values}}}", "joint positions at zero action [rad]")
         if not metadata.action_scale and "action_scale" not in found:
             ask("action_scale: {.*: 0.25}", "joint positions per unit of action [rad]")
-        if not metadata.stiffness and "gains" not in found:
+        if not (metadata.stiffness and metadata.damping) and "gains" not in found:
             ask(
                 "gains: {.*: {stiffness: 20.0, damping: 0.5}}",
                 "the servos' gains of training [N·m/rad, N·m·s/rad]",
@@ -79,6 +84,17 @@ class PolicyTemplate:
         if "period_s" not in found:
             lines.append("period_s: 0.02  # ASK the time between two actions [s]")
             asked.append("policy.yaml: the time between two actions [s]; 0.02 is assumed")
+        if metadata.observation and "observation" not in found:
+            found["observation"] = [
+                {"name": "", "scale": [1.0], "clip": math.inf, "history": 1} | term
+                for term in metadata.observation
+            ]
+            unstated = [k for k in ("scale", "history") if k not in metadata.observation[0]]
+            if unstated:
+                asked.append(
+                    f"policy.yaml: {' and '.join(unstated)} of the terms of the observation; 1 is "
+                    "assumed, as the network only names them"
+                )
         if "observation" not in found:
             width, _ = self.network.widths
             entries = "" if width is None else f", {width} entries"
@@ -98,6 +114,7 @@ class PolicyTemplate:
             ask(f"gait: {gait}".replace("'", ""), "the period of the gait's clock [s]")
         if "command" not in found:
             lines += self._command(asked)
+        asked += [f"policy.yaml: {what}" for what in metadata.unread]
         head = [
             f"# Written from {self.source}. Commented lines marked ASK have values that it lacks:",
             "# correct them, and delete the sign. docs/walking.md has all keys.",

@@ -26,8 +26,9 @@ class PolicyController(LeafSystem):
         - action_state
         - status
 
-    ``command`` is (v_x, v_y, ω_z) in the base's heading frame [m/s, rad/s]. All outputs are
-    discrete states, so that a cloned Context continues from its phase of the gait.
+    ``command`` is (v_x, v_y, ω_z) in the base's heading frame [m/s, rad/s]. All outputs and the
+    memory of a recurrent network are discrete states, so that a cloned Context continues from its
+    phase of the gait.
     ``action_state`` is the last action (n_a,), its largest change in the last period (1,), sine and
     cosine of the phases (2 n_p,), and the command that the policy followed (3,), which differs from
     the input while the policy's change of command is limited. An action that is not finite is
@@ -51,6 +52,7 @@ class PolicyController(LeafSystem):
         self._phases = self.DeclareDiscreteState(phases if n_p else np.zeros(1))
         self._applied = self.DeclareDiscreteState(3)
         self._history = self.DeclareDiscreteState(np.full(sum(policy.sizes), np.nan))
+        self._memory = self.DeclareDiscreteState(policy.network.initial_memory)
         self._status = self.DeclareDiscreteState([ACTING])
         self.action_names = [
             *(f"action_{name}" for name in policy.joint_names),
@@ -90,10 +92,13 @@ class PolicyController(LeafSystem):
             seen = policy.see(q, v, applied, action, phases)
             history = context.get_discrete_state(self._history).get_value()
             observation = policy.observe(seen, history)
-            found = policy.act(observation)
-            if np.isfinite(found).all():
+            found, memory = policy.act(
+                observation, context.get_discrete_state(self._memory).get_value()
+            )
+            if np.isfinite(found).all() and np.isfinite(memory).all():
                 new, status = found, ACTING
                 discrete_state.set_value(self._history, observation)
+                discrete_state.set_value(self._memory, memory)
         phases = policy.next_phases(phases, applied)
         set_point = np.zeros(2 * len(policy.default_positions))
         set_point[: len(set_point) // 2] = policy.targets(new)

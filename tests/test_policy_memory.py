@@ -1,0 +1,199 @@
+"""Recurrent policies: what they remember is in the Context, and nowhere else."""
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from pydrake.systems.analysis import Simulator
+
+from cart_episodes import assert_identical
+from drake_safety import load_scenario, run_episode, run_episodes
+from drake_safety.control.policy_network import load_network
+from drake_safety.learning.segments import Episodes
+from policy_networks import TERMS, new, recurrent_module, save_network, save_onnx, save_script
+from system_doubles import Bench, controller
+
+pytestmark = pytest.mark.train
+
+N_IN, N_OUT, SIZE = 5, 2, 4
+LSTM = [("h_in", "h_out"), ("c_in", "c_out")]
+OTHER = [("h0", "hn"), ("c0", "cn")]
+
+
+def script(kind, seen=None, **options):
+    return lambda path: save_script(
+        path / "p.pt", recurrent_module(kind, N_IN, N_OUT, size=SIZE, **options), seen
+    )
+
+
+def onnx(**options):
+    return lambda path: save_onnx(path / "p.onnx", N_IN, N_OUT, size=SIZE, **options)
+
+
+def checked(path):
+    network = load_network(path)
+    network.check("policy", N_IN, N_OUT, "terms")
+    return network
+
+
+@pytest.mark.parametrize(
+    ("save", "num_memories"),
+    [
+        (script("lstm"), 2),
+        (script("lstm", layers=2), 4),
+        (script("lstm", seen=torch.ones(1, N_IN)), 2),
+        (script("gru"), 1),
+        (script("replaced"), 2),
+        (lambda path: save_network(path / "p.pt", N_IN, N_OUT), 0),
+        (onnx(), 0),
+        (onnx(memory=LSTM), 2),
+        (onnx(memory=LSTM[:1]), 1),
+        (onnx(memory=OTHER, shape=[1, "time", N_IN]), 2),
+    ],
+)
+def test_a_network_remembers_only_what_it_is_given(tmp_path, save, num_memories):
+    network = checked(save(tmp_path))
+    start = network.initial_memory
+    np.testing.assert_array_equal(start, np.zeros(num_memories * SIZE))
+    seen = np.linspace(-1, 1, N_IN)
+    first, memory = network(seen, start)
+    second, _ = network(seen, memory)
+    assert np.array_equal(first, second) == (num_memories == 0)
+    for _ in range(2):  # From any memory, in any order.
+        np.testing.assert_array_equal(network(seen, memory)[0], second)
+        np.testing.assert_array_equal(network(seen, start)[0], first)
+    np.testing.assert_array_equal(checked(network.path)(seen, start)[0], first)
+
+
+class Hidden(torch.nn.Module):
+    """Its memory is no buffer."""
+
+    def __init__(self):
+        super().__init__()
+        self.sums = [0.0]
+
+    def forward(self, x):
+        self.sums[0] += float(x.abs().sum())
+        return self.sums[0] * x[:, :2]
+
+
+class Grows(torch.nn.Module):
+    """It remembers all that it has seen."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("seen", torch.zeros(0, N_IN))
+
+    def forward(self, x):
+        self.seen = torch.cat([self.seen, x])
+        return self.seen.sum(0, keepdim=True)[:, :2]
+
+
+class Draws(torch.nn.Module):
+    """It explores."""
+
+    def forward(self, x):
+        return torch.randn_like(x[:, :2])
+
+
+class Explicit(torch.nn.Module):
+    """Its memory is an argument."""
+
+    def forward(self, x, hidden):
+        return x[:, :2] + hidden
+
+
+@pytest.mark.parametrize(
+    ("save", "message"),
+    [
+        (
+            lambda path: save_script(path / "p.pt", Hidden()),
+            "a memory that is no buffer of a fixed",
+        ),
+        (lambda path: save_script(path / "p.pt", Grows()), "memory of 0 buffers was set back"),
+        (lambda path: save_script(path / "p.pt", Draws()), "it draws random numbers"),
+        (lambda path: save_script(path / "p.pt", Explicit()), r"inputs \['x', 'hidden'\]; support"),
+        (onnx(memory=[("state", "next")]), r"inputs .*'state \[1, 1, 4\].* pairs .* as h_in and"),
+    ],
+)
+def test_a_memory_of_another_kind_is_refused(tmp_path, save, message):
+    with pytest.raises(ValueError, match=message) as refusal:
+        checked(save(tmp_path))
+    assert "\n" not in str(refusal.value)
+
+
+def counting():
+    """A controller whose network counts its evaluations."""
+    return controller(
+        lambda batch, count: (batch[:, :2] + count, count + 1.0), lambda batch: [np.zeros(1)]
+    )
+
+
+def test_a_cloned_context_continues_alike_and_a_new_one_from_the_start():
+    system = counting()
+    bench = Bench(system, plant_state=np.eye(1, 17), command=[0.2, 0.4, 0.0])
+    bench.advance(0.05)
+    copy = bench.context.Clone()
+    bench.advance(0.06)
+    other = Simulator(system, copy)
+    other.AdvanceTo(0.11)
+    for port in ("desired_joint_state", "action_state"):
+        theirs = system.GetOutputPort(port).Eval(copy)
+        np.testing.assert_array_equal(theirs, bench.get(port))
+    fresh = Bench(system, plant_state=np.eye(1, 17), command=[0.2, 0.4, 0.0])
+    fresh.advance(0.01)
+    np.testing.assert_allclose(fresh.get("action_state")[:2], [0.2, 0.4])  # Of count 0.
+
+
+@pytest.fixture(scope="module", params=["pt", "onnx"])
+def walking(request, tmp_path_factory):
+    """A hexapod that stands by a policy of random weights with a memory."""
+    folder = tmp_path_factory.mktemp("walking")
+    policy = folder / f"policy.{request.param}"
+    if request.param == "onnx":
+        save_onnx(policy, 42, 18, memory=LSTM)
+    else:
+        save_script(policy, recurrent_module("lstm", 42, 18))
+    out, result = new(folder, policy)
+    assert result.exit_code == 0, result.output
+    stated = {
+        "network": policy.name,
+        "joints": [f"{part}_{i}" for i in range(6) for part in ("swing", "lift", "knee")],
+        "default_positions": yaml.safe_load((out / "robot.yaml").read_text())["posture"],
+        "action_scale": {".*": 0.1},
+        "gains": {".*": {"stiffness": 200.0, "damping": 4.0}},
+        "observation": [{"name": name} for name in TERMS],
+    }
+    (out / "policy.yaml").write_text(yaml.safe_dump(stated))
+    scenario = yaml.safe_load((out / "walking.yaml").read_text())
+    scenario |= {"episode_duration_s": 0.4, "assessment": {"horizon": 3}}
+    scenario["parameters"]["start"] = {"walked_s": [0.0, 0.2]}
+    (out / "walking.yaml").write_text(yaml.safe_dump(scenario))
+    return load_scenario(out / "walking.yaml")
+
+
+def test_episodes_are_the_same_for_any_number_of_workers_and_in_any_order(walking):
+    episodes = run_episodes(walking, 5, num_workers=2)
+    loop = walking.make_loop()
+    backwards = [run_episode(loop, index) for index in reversed(range(5))]
+    assert_identical(Episodes(episodes.info, backwards[::-1]), episodes)
+
+
+def test_a_reset_resets_the_memory(walking):
+    loop = walking.make_loop()
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    memory = loop.start_of(context).controller_state
+    loop.reset_to(context, None, loop.standing_start())
+    simulator.Initialize()
+    simulator.AdvanceTo(0.1)
+    start = loop.start_of(context)
+    assert any(np.any(a != b) for a, b in zip(start.controller_state, memory, strict=True))
+    loop.reset_to(context, None, loop.standing_start())
+    for value, first in zip(loop.start_of(context).controller_state, memory, strict=True):
+        np.testing.assert_array_equal(value, first)
+    loop.reset_to(context, None, start)  # The memory of a start is taken over.
+    for value, taken in zip(
+        loop.start_of(context).controller_state, start.controller_state, strict=True
+    ):
+        np.testing.assert_array_equal(value, taken)
