@@ -233,7 +233,8 @@ def run_changed(
     found = collect_episodes(
         info,
         num,
-        partial(make.run, _drawn_episode, scenario, seed),
+        make,
+        partial(_drawn_episode, scenario=scenario, seed=seed),
         num_workers=num_workers,
         path=path,
         progress=progress,
@@ -242,7 +243,7 @@ def run_changed(
     return Episodes(info, [one for one in found if one.num_steps >= least])
 
 
-def _drawn_episode(loop: Any, scenario: Scenario, seed: int, index: int) -> Episode:
+def _drawn_episode(loop: Any, index: int, *, scenario: Scenario, seed: int) -> Episode:
     change, other = drawn_change(loop, seed, index), loop
     if change.variation is not None:
         shift = PlantShift(kind="plant", variation=change.variation)

@@ -57,8 +57,8 @@ def reset_glider(diagram, context, rng):
 
 def record(num_episodes=10, *, make=make_glider, reset=reset_glider, **options):
     defaults = {"duration_s": 1.0, "step_s": STEP_S, "num_workers": 1}
-    ports = {"state": "position_and_speed"}
-    return record_episodes(make, num_episodes, reset=reset, ports=ports, **(defaults | options))
+    defaults |= {"ports": {"state": "position_and_speed"}}
+    return record_episodes(make, num_episodes, reset=reset, **(defaults | options))
 
 
 def test_what_is_left_out_has_its_default():
@@ -125,8 +125,101 @@ def test_episodes_of_what_has_changed_since_are_refused_and_those_kept_are_count
     assert len(completed(tmp_path)) == 6
 
 
+class Keeper(LeafSystem):
+    """A force on a mass by its place, with state that is not in the Context."""
+
+    def __init__(self, kind):
+        super().__init__()
+        self.integral, self.first, self.kind = 0.0, None, kind
+        self.rng = np.random.default_rng(0)
+        self.DeclareVectorInputPort("state", 2)
+        self.DeclareDiscreteState(1)
+        self.DeclarePeriodicDiscreteUpdateEvent(0.1, 0.0, self._update)
+        self.DeclareVectorOutputPort("force", 1, self._force)
+
+    def _update(self, context, discrete_state):
+        x = self.get_input_port().Eval(context)[0]
+        self.integral += x
+        self.first = x if self.first is None else self.first
+        discrete_state.set_value([self.rng.normal()])
+
+    def _force(self, context, output):
+        x = self.get_input_port().Eval(context)[0]
+        drawn = context.get_discrete_state_vector().value()[0]
+        kept = {"none": 0.0, "memory": self.integral, "cache": self.first or 0.0}
+        output.SetFromVector([kept.get(self.kind, drawn) - x])
+
+
+class Follower(LeafSystem):
+    """A mass that follows a force, and what else an episode has."""
+
+    def __init__(self):
+        super().__init__()
+        force = self.DeclareVectorInputPort("force", 1)
+        self.DeclareContinuousState(1, 1, 0)
+        state = {self.all_state_ticket()}
+
+        def read(context):
+            return context.get_continuous_state_vector().CopyToVector()
+
+        ports = {
+            "state": (2, lambda *xv: xv),
+            "output": (1, lambda x, v: [x]),
+            "desired_preview": (5, lambda x, v: np.zeros(5)),
+            "margins": (1, lambda x, v: [5.0 - abs(x)]),
+        }
+        for name, (size, calc) in ports.items():
+            self.DeclareVectorOutputPort(
+                name,
+                size,
+                lambda context, output, calc=calc: output.SetFromVector(calc(*read(context))),
+                state,
+            )
+        self.force, self.read = force, read
+
+    def DoCalcTimeDerivatives(self, context, derivatives):
+        acceleration = self.force.Eval(context)[0]
+        derivatives.get_mutable_vector().SetFromVector([self.read(context)[1], acceleration])
+
+
 @pytest.mark.parametrize("num_workers", [1, 2])
-def test_state_outside_the_context_is_an_error(num_workers):
+@pytest.mark.parametrize("kind", ["none", "memory", "random generator", "cache"])
+def test_state_that_a_system_keeps_in_an_attribute_is_found_and_named(kind, num_workers):
+    def make():
+        builder = DiagramBuilder()
+        # The mass comes first, and differs as soon as the force does.
+        mass = builder.AddNamedSystem("mass", Follower())
+        inner = DiagramBuilder()
+        keeper = inner.AddNamedSystem("keeper", Keeper(kind))
+        inner.ExportInput(keeper.get_input_port(), "state")
+        inner.ExportOutput(keeper.get_output_port(), "force")
+        brain = builder.AddNamedSystem("brain", inner.Build())
+        builder.Connect(mass.GetOutputPort("state"), brain.get_input_port())
+        builder.Connect(brain.get_output_port(), mass.get_input_port())
+        for i in range(mass.num_output_ports()):
+            builder.ExportOutput(mass.get_output_port(i), mass.get_output_port(i).get_name())
+        return builder.Build()
+
+    def reset(diagram, context, rng):
+        mass = diagram.GetSubsystemByName("mass")
+        mass.GetMyMutableContextFromRoot(context).SetContinuousState(rng.uniform(-0.5, 0.5, 2))
+
+    def recorded():
+        return record(8, make=make, reset=reset, num_workers=num_workers, ports={})
+
+    if kind == "none":
+        assert len(recorded()) == 8
+        return
+    with pytest.raises(
+        ValueError, match=r"0 of 'make', .* differs, first at 0(\.\d+)? s in output "
+    ):
+        recorded()
+    with pytest.raises(ValueError, match="port 'force' of system 'brain::keeper': the diagram, or"):
+        recorded()
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_state_that_a_reset_keeps_is_an_error(num_workers):
     def make():
         diagram = make_glider()
         diagram.num_resets = 0
@@ -136,7 +229,7 @@ def test_state_outside_the_context_is_an_error(num_workers):
         diagram.num_resets += 1
         context.SetDiscreteState([0.01 * diagram.num_resets, 0.0])
 
-    with pytest.raises(ValueError, match="0 of 'make', simulated a second time, differs: the diag"):
+    with pytest.raises(ValueError, match="0 of 'make', simulated a second time, differs, first at"):
         record(8, make=make, reset=reset, num_workers=num_workers)
 
 

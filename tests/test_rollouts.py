@@ -14,8 +14,9 @@ from drake_safety.learning.segments import DIVERGED, EpisodeError
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.motion import advance_to
 from drake_safety.simulation.rollouts import episode_rng, worker_loop
+from drake_safety.simulation.scenario_check import check_scenario
 from drake_safety.simulation.worker_processes import map_items
-from gliding_task import gliding
+from gliding_task import SCENARIO, Mass, gliding
 from legged_robots import write_hexapod
 from shuttle_task import BOX, shuttling
 
@@ -301,3 +302,38 @@ def test_what_a_loops_options_make_is_another_set(tmp_path):
         run_episodes(shuttling(), 4, side="left", num_workers=1, path=tmp_path / "right")
     with pytest.raises(ValueError, match="episodes of another set"):
         run_episodes(shuttling(), 4, num_workers=1, path=tmp_path / "right")
+
+
+class Leaking(Mass):
+    """A mass that is faster the more often it has moved, in all episodes."""
+
+    count = 0
+
+    def _update(self, context, discrete_state):
+        super()._update(context, discrete_state)
+        self.count += 1
+        discrete_state[1] += 1e-9 * self.count
+
+
+@pytest.mark.parametrize("is_leaking", [False, True])
+def test_state_outside_the_context_is_found_in_many_episodes_and_by_check(
+    tmp_path, monkeypatch, is_leaking
+):
+    if is_leaking:
+        monkeypatch.setattr("gliding_task.Mass", Leaking)
+    file = tmp_path / "mine.yaml"
+    file.write_text(
+        SCENARIO.replace("robot: none\n", f"parameters: {{speed_m_s: {1.7 + is_leaking}}}\n")
+    )
+    findings = check_scenario(file, num_episodes=3)
+    (found,) = [one for one in findings if one.item == "state outside the Context"]
+    assert found.is_ok == (not is_leaking)
+    if not is_leaking:
+        assert len(run_episodes(load_scenario(file), 64, num_workers=1)) == 64
+        return
+    message = r"differs, first at 0.* s in output port '.*' of system '.*Leaking"
+    assert re.search(message, found.message)
+    with pytest.raises(
+        ValueError, match=f"episode 0 of 'mine', simulated a second time, {message}"
+    ):
+        run_episodes(load_scenario(file), 64, num_workers=1)

@@ -157,6 +157,7 @@ def simulate(
     after_fall_s: float = 0.0,
     events: Iterable[tuple[float, Callable[[Context], object]]] = (),
     each_row: Callable[[Context, float], None] = lambda context, time_s: None,
+    monitor: Callable[[Context], None] | None = None,
     constraint_names: Sequence[str] | None = None,
     may_fail: bool = False,
     realtime_rate: float = 0.0,
@@ -182,6 +183,7 @@ def simulate(
         after_fall_s: Time for which it goes on after a fall [s]; only a :class:`CanFall` falls.
         events: Times [s] and what is done then with the Context.
         each_row: Called with Context and time [s] after each row.
+        monitor: Called with the Context after each step of the simulator.
         constraint_names: Names of the margins; by default the diagram's.
         may_fail: Whether a failure of the simulation is a result, ``Motion.failure``. The motion
             then has the rows that are finite.
@@ -203,6 +205,8 @@ def simulate(
     fall = names.index(diagram.fall_name) if isinstance(diagram, CanFall) else None
     simulator = Simulator(diagram)
     simulator.set_target_realtime_rate(realtime_rate)
+    if monitor is not None:
+        simulator.set_monitor(monitor)
     context = simulator.get_mutable_context()
     if isinstance(diagram, LeggedLoop):
         diagram.remove_visuals(context)

@@ -20,7 +20,6 @@ from drake_safety.learning.segments import (
     installed_versions,
 )
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, port_sizes
-from drake_safety.simulation.dataset import is_same
 from drake_safety.simulation.motion import simulate
 from drake_safety.simulation.rollouts import collect_episodes, episode_rng
 from drake_safety.simulation.worker_processes import MadeOnce, Progress, Sent
@@ -73,10 +72,12 @@ def record_episodes(
 
     A row has the values of the ports at its time; a port that is sampled and held has its last
     sample. Episode i depends on the diagram, the seed and i alone: its arrays are identical for
-    any number of workers.
+    any number of workers. The first one is simulated again after the second: an error names the
+    system whose output differs first.
 
     Args:
-        make_diagram: Builds the diagram; called with ``parameters``, once in each worker.
+        make_diagram: Builds the diagram; called with ``parameters``, once in each worker, and once
+            more for the repetition of the first episode.
         reset: Called with diagram, root Context and generator; samples a start into the Context,
             which is the diagram's default one. It may return the first row whose future is
             undisturbed, if that is not 0.
@@ -134,20 +135,24 @@ def record_episodes(
     return collect_episodes(
         info,
         num_episodes,
-        partial(make.run, _record, Sent(reset), used, period_s, info),
+        make,
+        partial(_record, reset=Sent(reset), ports=used, watch_period_s=period_s, info=info),
         num_workers=num_workers,
         path=path,
         progress=progress,
+        is_repeated=True,
     )
 
 
 def _record(
     diagram: Diagram,
+    index: int,
+    *,
     reset: Reset,
     ports: dict[str, str],
     watch_period_s: float,
     info: EpisodesInfo,
-    index: int,
+    monitor: Callable[[Context], None] | None = None,
 ) -> Episode:
     who = f"episode {index} of '{info.scenario}' (seed {info.seed})"
 
@@ -157,29 +162,20 @@ def _record(
         except Exception as error:
             raise EpisodeError(f"{who}, reset: {type(error).__name__}: {error}") from error
 
-    def episode() -> Episode:
-        return simulate(
-            diagram,
-            start,
-            ports,
-            duration_s=info.num_steps * info.step_s,
-            step_s=info.step_s,
-            watch_period_s=watch_period_s,
-            after_leaving_s=0.0,
-            constraint_names=info.constraint_names,
-            may_fail=True,
-            index=index,
-            who=who,
-        ).episode()
-
-    found = episode()
-    if index == 0 and not is_same(found, episode()):
-        raise ValueError(
-            f"record_episodes: episode 0 of '{info.scenario}', simulated a second time, differs: "
-            "the diagram, or its reset, keeps state outside its Context, such as in an attribute "
-            "of a system; declare it as state"
-        )
-    return found
+    return simulate(
+        diagram,
+        start,
+        ports,
+        duration_s=info.num_steps * info.step_s,
+        step_s=info.step_s,
+        watch_period_s=watch_period_s,
+        after_leaving_s=0.0,
+        monitor=monitor,
+        constraint_names=info.constraint_names,
+        may_fail=True,
+        index=index,
+        who=who,
+    ).episode()
 
 
 def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str], dict[str, int]]:

@@ -38,12 +38,14 @@ from drake_safety.simulation.capabilities import (
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, is_same, load_episodes
 from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.simulation.hidden_state import difference
 from drake_safety.simulation.motion import Motion, simulate
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import BATCH_SIZE, MadeOnce, Progress, map_items
 
 MOTION_PIECE_S = 60.0
 """Duration of one undisturbed motion [s]."""
+_MANY = 64  # Episodes of which two more are a small share.
 _LOGGER = logging.getLogger("drake_safety")
 
 
@@ -99,6 +101,7 @@ def run_episode(
     is_standing: bool = False,
     start: EpisodeStart | None = None,
     plan: Any = None,
+    monitor: Callable[[Context], None] | None = None,
 ) -> Episode:
     """Simulates one episode, which ends when it leaves the safe set or its time is over.
 
@@ -110,6 +113,7 @@ def run_episode(
         start: Initial state and plan, in place of random ones. The noise is that of the seed and
             the index.
         plan: Replaces the initial plan: one of the loop's ``candidate_plans``.
+        monitor: Called with the Context after each step of the simulator.
 
     Returns:
         The episode. If the simulation fails, its cause is ``diverged`` and it has the rows that
@@ -148,6 +152,7 @@ def run_episode(
         step_s=scenario.step_s,
         watch_period_s=scenario.watch_period_s,
         after_leaving_s=0.0,
+        monitor=monitor,
         may_fail=True,
         index=index,
         who=f"episode {index} of '{scenario.name}' (seed {seed})",
@@ -242,7 +247,8 @@ def run_motions(
     return collect_episodes(
         replace(info, step_s=step_s, num_steps=round(piece_s / step_s)),
         math.ceil(duration_s / piece_s - 1e-6),
-        partial(make.run, run_motion, seed=seed, until_s=until_s),
+        make,
+        partial(run_motion, seed=seed, until_s=until_s),
         num_workers=num_workers,
         path=path,
         progress=progress,
@@ -329,8 +335,8 @@ def run_episodes(
 
     Raises:
         ValueError: The folder holds another set or one that is not the same any more, the task
-            takes no goals, there is not one finite goal per episode, or both goals and a folder are
-            given.
+            takes no goals, there is not one finite goal per episode, both goals and a folder are
+            given, or one of many episodes, simulated again, differs.
         EpisodeError: A system of the loop raised an error, which is its cause.
     """
     if path is not None and goals is not None:
@@ -340,36 +346,46 @@ def run_episodes(
     if goals is not None:
         goals = _checked_goals(make(), goals, num_episodes)
 
-    def run(index: int) -> Episode:
+    def run(loop: ClosedLoop, index: int, **options: Any) -> Episode:
         goal = None if goals is None else goals[index]
-        return run_episode(make(), index, seed=seed, goal=goal, is_standing=is_standing)
+        return run_episode(loop, index, seed=seed, goal=goal, is_standing=is_standing, **options)
 
     return collect_episodes(
         episodes_info(make(), seed, loop_options),
         num_episodes,
+        make,
         run,
         num_workers=num_workers,
         path=path,
         progress=progress,
         extra=extra,
+        is_repeated=num_episodes >= _MANY,
     )
 
 
 def collect_episodes(
     info: EpisodesInfo,
     num_episodes: int,
-    run: Callable[[int], Episode],
+    make: MadeOnce[Any],
+    function: Callable[..., Episode],
     *,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
     progress: Progress | bool | None = None,
     extra: dict[str, Any] | None = None,
     batch_size: int = BATCH_SIZE,
+    is_repeated: bool = False,
 ) -> Episodes:
     """Simulates the episodes of a set that a folder does not hold yet, in worker processes.
 
-    ``run`` returns the episode of an index; for the rest see :func:`run_episodes`.
+    Args:
+        make: Makes the diagram.
+        function: Returns the episode of a diagram and an index.
+        is_repeated: Whether the first episode is simulated again after the second, by a new
+            diagram, and must be the same; ``function`` then takes the ``monitor`` of
+            :func:`~drake_safety.simulation.motion.simulate`.
     """
+    run = partial(make.run, function)
     with nullcontext() if path is None else EpisodeWriter(path, info, extra) as writer:
         episodes: list[Episode] = []
         if writer is not None:
@@ -380,9 +396,12 @@ def collect_episodes(
                     "%d of %d episodes are kept from %s", len(episodes), num_episodes, path
                 )
         kept = {episode.index for episode in episodes}
+        pending = [index for index in range(num_episodes) if index not in kept]
+        if is_repeated:
+            run = partial(_run_repeated, make, function, info.scenario, pending[:2])
         results = map_items(
             run,
-            [index for index in range(num_episodes) if index not in kept],
+            pending,
             num_workers=num_workers,
             progress=progress,
             num_done=len(kept),
@@ -405,6 +424,22 @@ def collect_episodes(
             ", ".join(map(str, which[:10])) + (", ..." if len(which) > 10 else ""),
         )
     return collected
+
+
+def _run_repeated(
+    make: MadeOnce[Any],
+    function: Callable[..., Episode],
+    scenario: str,
+    repeated: list[int],
+    index: int,
+) -> Episode:
+    """Simulates an episode, and the first of ``repeated`` once more after the last of them."""
+    found = make.run(function, index)
+    if index == repeated[0]:
+        text = difference(found, repeated[-1], make=make.anew, run=function)
+        if text:
+            raise ValueError(f"episode {index} of '{scenario}', simulated a second time, {text}")
+    return found
 
 
 def _check_kept(path: Path, kept: list[Episode], run: Callable[[int], Episode]) -> None:

@@ -6,6 +6,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from drake_safety.robots.urdf_survey import WITHOUT_STOPS_RAD, Limb, Survey, odd
 from drake_safety.simulation.capabilities import HasBall
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed
+from drake_safety.simulation.hidden_state import difference
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
@@ -394,6 +396,19 @@ def _episodes(loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgr
         report("episodes", index, num_episodes)
         episodes.append(run_episode(loop, index, seed=seed))
     report("episodes", num_episodes, num_episodes)
+    differs = difference(
+        episodes[0],
+        num_episodes - 1,
+        make=partial(loop.scenario.make_loop, loop.variation),
+        run=partial(run_episode, seed=seed),
+    )
+    yield _judged(
+        "state outside the Context",
+        not differs,
+        "none: an episode, simulated again after others, is the same to the last bit",
+        f"episode 0, simulated again after others, {differs}",
+        "declare it as discrete, continuous or abstract state, or as a parameter",
+    )
     causes = Counter(episode.cause for episode in episodes if not episode.is_safe)
     yield passed("starts can be sampled", f"{num_episodes} episodes simulated")
     lost = sum(episode.num_steps == 0 for episode in episodes)

@@ -193,6 +193,11 @@ class MadeOnce(Generic[_Made]):
             self._made[self._key] = self._make()
         return self._made[self._key]
 
+    def anew(self) -> _Made:
+        """The diagram, made once more."""
+        self._made.clear()
+        return self()
+
     def run(self, function: Callable[..., _Result], *arguments: Any, **options: Any) -> _Result:
         """Calls a function of the diagram and of more arguments."""
         return function(self(), *arguments, **options)
