@@ -15,7 +15,7 @@ def new(folder, policy, *more):
     """`new` of a hexapod that walks by a policy: its folder, and what the command said."""
     write_hexapod(folder)
     urdf, out = folder / "hexapod.urdf", folder / "walker"
-    words = ["new", "walker", "--model", str(urdf), "--out", str(out), "--task", "walking"]
+    words = ["new", "walker", "--urdf", str(urdf), "--out", str(out), "--task", "walking"]
     result = CliRunner().invoke(make_app(), [*words, "--policy", str(policy), *more])
     return out, result
 

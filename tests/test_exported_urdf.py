@@ -577,7 +577,7 @@ def test_moments_that_break_the_triangle_inequality_are_reduced(zero, tmp_path):
 def test_notes_are_printed_and_kept(tmp_path):
     urdf = tmp_path / "w.urdf"
     urdf.write_text(wheel(CYLINDER))
-    result = invoked("new", "w", "--model", urdf, "--out", tmp_path / "w")
+    result = invoked("new", "w", "--urdf", urdf, "--out", tmp_path / "w")
     assert result.exit_code == 0
     assert "note  joints ['FL_foot_joint'" in result.output
 

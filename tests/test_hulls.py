@@ -117,7 +117,7 @@ def test_without_the_extra_its_command_is_told_and_the_meshes_are_left_out(tmp_p
     urdf = shaped(tmp_path, femur_0=bar())
     monkeypatch.setitem(sys.modules, "trimesh", None)
     out = tmp_path / "spider"
-    result = invoked("new", "spider", "--model", urdf, "--out", out)
+    result = invoked("new", "spider", "--urdf", urdf, "--out", out)
     assert result.exit_code == 0
     assert "WARNING  1 links have lost their collision meshes" in result.output
     assert result.output.count("pip install 'drake_safety[robots]'") == 1

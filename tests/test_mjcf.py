@@ -352,7 +352,7 @@ def test_bodies_that_the_mjcf_excludes_do_not_collide(tmp_path):
 
 def test_gains_are_asked_for_where_actuators_are_motors(tmp_path):
     path = write_dog(tmp_path, actuator="motor")
-    result = invoked("new", "dog", "--model", path, "--out", tmp_path / "dog")
+    result = invoked("new", "dog", "--mjcf", path, "--out", tmp_path / "dog")
     assert result.exit_code == 0, result.output
     assert "posture keyframe 'home'" in result.output
     assert "the maker's servo gains" in result.output

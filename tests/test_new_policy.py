@@ -171,7 +171,7 @@ def test_new_refuses_a_policy_before_it_writes_anything(tmp_path):
         out, result = new(tmp_path, tmp_path / policy)
         assert result.exit_code != 0 and not out.exists()
     write_hexapod(tmp_path)
-    words = ["new", "walker", "--model", str(tmp_path / "hexapod.urdf")]
+    words = ["new", "walker", "--urdf", str(tmp_path / "hexapod.urdf")]
     result = CliRunner().invoke(make_app(), [*words, "--task", "walking"])
     assert result.exit_code != 0
     with pytest.raises(ValueError, match=r"is neither a deploy\.yaml"):

@@ -241,7 +241,7 @@ def bare(tmp_path):
 
 def test_links_that_lose_their_collision_meshes_are_told_loudly(bare, tmp_path):
     out = tmp_path / "spider"
-    result = invoked("new", "spider", "--model", bare, "--out", out)
+    result = invoked("new", "spider", "--urdf", bare, "--out", out)
     assert result.exit_code == 0
     assert "WARNING  2 links have lost their collision meshes, which are missing" in result.output
     assert "everything passes through femur_0, femur_1. Add boxes" in result.output
@@ -297,7 +297,7 @@ def test_new_says_which_visuals_it_left_out(tmp_path):
     gone = mesh("visual", "gone.stl")
     urdf = urdf_of_spider(tmp_path, lambda text: with_shape(text, "body", gone))
     out = tmp_path / "spider"
-    result = invoked("new", "spider", "--model", urdf, "--out", out)
+    result = invoked("new", "spider", "--urdf", urdf, "--out", out)
     assert result.exit_code == 0
     assert "not where the URDF says are left out: gone.stl" in result.output
     assert "left out: gone.stl" in (out / "README.md").read_text()

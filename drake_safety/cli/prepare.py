@@ -39,7 +39,7 @@ def scenarios() -> None:
 
 def new(
     name: Annotated[str, Argument(help="Name of the robot, and of its folder.")],
-    model: Annotated[Path, Option(help="Its URDF or MJCF.", dir_okay=False)],
+    model: Annotated[Path, Option("--urdf", "--mjcf", help="Its model file.", dir_okay=False)],
     task: Annotated[str, Option(help="'balancing', 'reaching' or 'walking'.")] = "balancing",
     policy: Annotated[
         Path | None,
