@@ -130,7 +130,7 @@ def _message(schema: Any, error: Any) -> str:
     text = error["msg"].removeprefix("Value error, ")
     if kind == "value_error" and isinstance(error["input"], dict):
         return f"{name}: {text}" if place else text
-    text = re.sub(r"^\w+ should ", "must ", text)
+    text = re.sub(r"^\w+ should ", "must ", text).replace(" after validation", "")
     if kind == "literal_error":
         text += did_you_mean(error["input"], re.findall("'(.*?)'", error["ctx"]["expected"]))
     return f"{name} {text}; got {got}"
