@@ -9,6 +9,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_safety.robots.joint_drives import read_drives
 from drake_safety.robots.meshes import mesh_points
 from drake_safety.robots.simulatable_urdf import simulatable_copy
 from urdf_files import GOOD, LINK, mesh, stl, written
@@ -135,7 +136,7 @@ def test_friction_and_impossible_inertias_are_corrected_and_told(tmp_path):
     )
     assert copy.joint_friction == {"j": 0.2}
     assert [element.get("ixy") for element in copy.root.iter("inertia")] == ["0", "0"]
-    assert copy.effort_limits()["j"] == 5.0
+    assert read_drives(copy.root).efforts["j"] == 5.0
     (dynamics,) = copy.root.iter("dynamics")
     assert dynamics.attrib == {"damping": "0.1"}
     assert len(copy.notes) == 2

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 
-from drake_safety.robots.urdf_copy import number
+from drake_safety.robots.urdf_copy import MOVABLE, as_number, number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,10 +20,10 @@ class JointDrives:
         efforts: Effort limits [N·m]; NaN without one.
     """
 
-    mimics: dict[str, tuple[str, float, float]]
-    listed: set[str]
-    springs: dict[str, float]
-    efforts: dict[str, float]
+    mimics: dict[str, tuple[str, float, float]] = field(default_factory=dict)
+    listed: set[str] = field(default_factory=set)
+    springs: dict[str, float] = field(default_factory=dict)
+    efforts: dict[str, float] = field(default_factory=dict)
 
     def passive(self, names: Collection[str]) -> dict[str, str]:
         """Returns those of some joints that have no motor, and the evidence."""
@@ -54,60 +54,49 @@ class JointDrives:
 
 def read_drives(root: ET.Element) -> JointDrives:
     """Reads the drives of a URDF, also those that only Gazebo and ROS know."""
-    joints = {
-        joint.get("name", ""): joint
-        for joint in root.findall("joint")
-        if joint.get("type") in ("revolute", "continuous", "prismatic")
-    }
+    movable = [joint for joint in root.findall("joint") if joint.get("type") in MOVABLE]
+    joints = {joint.get("name", ""): joint for joint in movable}
     listed = {one.get("name", "") for one in root.findall("transmission//joint")}
     listed |= {one.get("name", "") for one in root.findall("ros2_control/joint[command_interface]")}
-    springs = {}
+    stated: dict[str, Mapping[str, str | None]] = {}  # Couplings; <mimic> comes last.
+    for plugin in root.findall("gazebo/plugin[mimicJoint]"):
+        one = {part.tag: part.text for part in plugin}
+        stated[(one.get("joint") or "").strip()] = one | {"joint": one["mimicJoint"]}
+    for joint in root.findall("ros2_control/joint"):
+        one = {part.get("name", ""): part.text for part in joint.findall("param")}
+        if "mimic" in one:
+            stated[joint.get("name", "")] = one | {"joint": one["mimic"]}
     for name, joint in joints.items():
-        gazebo = [one for one in root.findall("gazebo") if one.get("reference") == name]
-        springs[name] = max((k for one in (joint, *gazebo) for k in _stiffness(one)), default=0.0)
+        for mimic in joint.findall("mimic"):
+            stated[name] = mimic.attrib
+    springs = {name: _stiffness(joint) for name, joint in joints.items()}
+    for gazebo in root.findall("gazebo"):
+        name = gazebo.get("reference", "")
+        springs[name] = max(springs.get(name, 0.0), _stiffness(gazebo))
     return JointDrives(
         mimics={
             name: (
-                str(stated["joint"]).strip(),
-                _number(stated.get("multiplier"), 1.0),
-                _number(stated.get("offset"), 0.0),
+                (one.get("joint") or "").strip(),
+                as_number(one.get("multiplier"), 1.0),
+                as_number(one.get("offset"), 0.0),
             )
-            for name, stated in _couplings(root, joints)
+            for name, one in stated.items()
             if name in joints
         },
         listed=listed,
-        springs={name: stiffness for name, stiffness in springs.items() if stiffness > 0},
+        springs={name: springs[name] for name in joints if springs[name] > 0},
         efforts={name: number(one.find("limit"), "effort") for name, one in joints.items()},
     )
 
 
-def _couplings(
-    root: ET.Element, joints: Mapping[str, ET.Element]
-) -> Iterator[tuple[str, Mapping[str, str | None]]]:
-    """Couplings by Gazebo's plugins, ``<ros2_control>`` and ``<mimic>``, which comes last."""
-    for plugin in root.findall("gazebo/plugin[mimicJoint]"):
-        stated = {one.tag: one.text for one in plugin}
-        yield (plugin.findtext("joint") or "").strip(), stated | {"joint": stated["mimicJoint"]}
-    for joint in root.findall("ros2_control/joint"):
-        stated = {one.get("name", ""): one.text for one in joint.findall("param")}
-        if "mimic" in stated:
-            yield joint.get("name", ""), stated | {"joint": stated["mimic"]}
-    for name, joint in joints.items():
-        mimic = joint.find("mimic")
-        if mimic is not None:
-            yield name, {"joint": "", **mimic.attrib}
-
-
-def _stiffness(element: ET.Element) -> Iterator[float]:
-    """Stiffnesses, whatever they are called: springStiffness, spring_stiffness, stiffness."""
-    for part in element.iter():
-        for key, value in {**part.attrib, part.tag: part.text}.items():
-            if "stiffness" in key.lower():
-                yield _number(value, 0.0)
-
-
-def _number(text: str | None, default: float) -> float:
-    try:
-        return float(text or default)
-    except ValueError:
-        return default  # Drake refuses it where it is an attribute.
+def _stiffness(element: ET.Element) -> float:
+    """The largest, whatever they are called: springStiffness, spring_stiffness, stiffness."""
+    return max(
+        (
+            as_number(value, 0.0)
+            for part in element.iter()
+            for key, value in {**part.attrib, part.tag: part.text}.items()
+            if "stiffness" in key.lower()
+        ),
+        default=0.0,
+    )

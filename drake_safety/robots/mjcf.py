@@ -18,6 +18,7 @@ from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.extras import require_extra
+from drake_safety.robots.urdf_copy import DRAKE, as_text
 
 _NUM_SHOWN_GROUPS = 3  # MuJoCo shows geoms of the groups 0 to 2.
 _GREY = [0.5, 0.5, 0.5, 1.0]  # MuJoCo's colour of a geom that states none.
@@ -76,8 +77,7 @@ def mjcf_to_urdf(path: Path, target: Path) -> ModelFacts:
         robot = _Robot(mujoco, spec.compile(), target.parent)
     except ValueError as error:
         raise ValueError(f"MJCF '{path}': {error}") from error
-    drake = {"xmlns:drake": "http://drake.mit.edu"}
-    urdf = _tag("robot", *robot.parts, name=target.stem, **drake)
+    urdf = _tag("robot", *robot.parts, name=target.stem, **{"xmlns:drake": DRAKE})
     target.write_text(urdf, encoding="utf-8")
     return robot.facts
 
@@ -88,25 +88,25 @@ class _Robot:
     def __init__(self, mujoco: Any, model: Any, folder: Path):
         self.mujoco, self.model, self.folder = mujoco, model, folder
         self.facts, self.parts = ModelFacts(), list[str]()
-        trees = Counter(model.body_rootid[model.jnt_bodyid].tolist()).most_common()
-        if not trees:
+        roots = model.body_rootid[model.jnt_bodyid]
+        if not len(roots):
             raise ValueError("it has no joint")
-        (base, _), *others = trees
+        (base, _), *others = Counter(roots.tolist()).most_common()
         self.bodies = self._names("body", np.flatnonzero(model.body_rootid == base).tolist())
-        ids = [j for j in range(model.njnt) if model.jnt_bodyid[j] in self.bodies]
-        free = [j for j in ids if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
-        self.joints = self._names("joint", [j for j in ids if j not in free])
+        ids, kinds = np.flatnonzero(roots == base), mujoco.mjtJoint
+        is_free = model.jnt_type[ids] == kinds.mjJNT_FREE
+        self.joints = self._names("joint", ids[~is_free].tolist())
         for j, name in self.joints.items():
-            if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL or model.jnt_bodyid[j] == base:
+            if model.jnt_type[j] == kinds.mjJNT_BALL or model.jnt_bodyid[j] == base:
                 raise ValueError(
                     f"joint '{name}' is a ball joint or moves the base '{self.bodies[base]}'; "
                     "expected a base with a free joint, and joints that turn or slide"
                 )
+        fixed = [] if is_free.any() else [base]
         self._note("moving bodies beside the robot are left out", "body", [i for i, _ in others])
-        if not free:
-            self._note("the base is fixed to the world there, and floats here", "body", [base])
+        self._note("the base is fixed to the world there, and floats here", "body", fixed)
         self._note("tendons are left out", "tendon", range(model.ntendon))
-        self.damping = {j: float(model.dof_damping[model.jnt_dofadr[j]]) for j in self.joints}
+        self.damping = {j: float(model.joint(j).damping[0]) for j in self.joints}
         self.efforts: dict[int, float] = {}
         self.mimics: dict[int, str] = {}
         self._read_actuators()
@@ -116,11 +116,11 @@ class _Robot:
                 self._add_joints(body)
             self._add_link(body)
         for signature in model.exclude_signature.tolist():
-            one, other = divmod(signature, 1 << 16)
-            if {one, other} <= self.bodies.keys():
-                self.facts.apart.append((self.bodies[one], self.bodies[other]))
-        for key in range(model.nkey):
-            q = {name: self._position(model.key_qpos[key], j) for j, name in self.joints.items()}
+            pair = divmod(signature, 1 << 16)
+            if self.bodies.keys() >= set(pair):
+                self.facts.apart.append((self.bodies[pair[0]], self.bodies[pair[1]]))
+        for key, qpos in enumerate(model.key_qpos):
+            q = {name: float(qpos[model.jnt_qposadr[j]]) for j, name in self.joints.items()}
             self.facts.postures[model.key(key).name or str(key)] = q
 
     def _names(self, kind: str, ids: Iterable[int]) -> dict[int, str]:
@@ -130,86 +130,80 @@ class _Robot:
         if names := self._names(kind, ids).values():
             self.facts.left_out.append(f"{what}: {', '.join(names)}")
 
-    def _position(self, qpos: np.ndarray, joint: int) -> float:
-        return float(qpos[self.model.jnt_qposadr[joint]])
-
     def _read_actuators(self) -> None:
         model, mujoco = self.model, self.mujoco
         gains = {j: np.zeros(2) for j in self.joints}
-        armature = {j: float(model.dof_armature[model.jnt_dofadr[j]]) for j in self.joints}
+        armature = {j: float(model.joint(j).armature[0]) for j in self.joints}
         others: dict[int, int] = {}  # Joints of actuators that are no motors.
-        for i, kind in enumerate(model.actuator_trntype.tolist()):
+        for i in range(model.nu):
             one, j = model.actuator(i), int(model.actuator_trnid[i, 0])
-            if kind not in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+            if int(one.trntype[0]) not in (
+                mujoco.mjtTrn.mjTRN_JOINT,
+                mujoco.mjtTrn.mjTRN_JOINTINPARENT,
+            ):
                 others[i] = -1
                 continue
             if j not in self.joints:
                 continue
-            gear, limit, bias = abs(float(one.gear[0])), math.inf, one.biastype[0]
-            if one.forcelimited[0]:
-                limit = float(np.abs(one.forcerange).max())
+            gear, bias = abs(float(one.gear[0])), one.biastype[0]
+            limit = float(np.abs(one.forcerange).max()) if one.forcelimited[0] else math.inf
             is_fixed = one.gaintype[0] == mujoco.mjtGain.mjGAIN_FIXED
-            if is_fixed and bias == mujoco.mjtBias.mjBIAS_NONE:
-                if one.ctrllimited[0]:
-                    limit = min(limit, float(np.abs(one.gainprm[0] * one.ctrlrange).max()))
-            else:
+            if not (is_fixed and bias == mujoco.mjtBias.mjBIAS_NONE):
                 others[i] = j
                 is_integrated = one.dyntype[0] == mujoco.mjtDyn.mjDYN_INTEGRATOR
                 if bias == mujoco.mjtBias.mjBIAS_AFFINE and not is_integrated:
                     # A servo may be two actuators, of position and of velocity.
                     gains[j] -= gear**2 * one.biasprm[1:3]
+            elif one.ctrllimited[0]:
+                limit = min(limit, float(np.abs(one.gainprm[0] * one.ctrlrange).max()))
             self.efforts[j] = self.efforts.get(j, 0.0) + gear * limit
             armature[j] += gear**2 * float(model.actuator_armature[i])
             self.damping[j] += gear**2 * float(model.actuator_damping[i])
         odd = [i for i, j in others.items() if j < 0 or gains[j][0] <= 0]
         what = "actuators that are neither motors nor position servos of a joint have no gains"
         self._note(what, "actuator", odd)
-        for j, name in self.joints.items():
-            if j in self.efforts and model.jnt_actfrclimited[j]:
+        for j in self.efforts:
+            if model.jnt_actfrclimited[j]:
                 most = float(np.abs(model.jnt_actfrcrange[j]).max())
                 self.efforts[j] = min(self.efforts[j], most)
-            if gains[j][0] > 0:
-                self.facts.gains[name] = float(gains[j][0]), float(gains[j][1])
-            if armature[j] > 0:
-                self.facts.rotor_inertia[name] = armature[j]
+        names, facts = self.joints, self.facts
+        facts.gains = {names[j]: (float(k), float(d)) for j, (k, d) in gains.items() if k > 0}
+        facts.rotor_inertia = {names[j]: inertia for j, inertia in armature.items() if inertia > 0}
 
     def _read_constraints(self) -> None:
         """Finds joints that others drive; refuses loops."""
-        model, kinds = self.model, self.mujoco.mjtEq
-        left_out = []
+        model, kinds, left_out = self.model, self.mujoco.mjtEq, []
         for i in np.flatnonzero(model.eq_active0).tolist():
-            kind, one, other = model.eq_type[i], int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
-            constant, slope, *higher = model.eq_data[i, :5].tolist()
-            if kind == kinds.mjEQ_CONNECT or kind == kinds.mjEQ_WELD:
+            kind, pair = int(model.eq_type[i]), [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
+            if kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
                 if model.eq_objtype[i] == self.mujoco.mjtObj.mjOBJ_SITE:
-                    one, other = model.site_bodyid[[one, other]].tolist()
-                if {one, other} <= self.bodies.keys():
+                    pair = model.site_bodyid[pair].tolist()
+                if self.bodies.keys() >= set(pair):
                     raise ValueError(
-                        f"a constraint connects bodies '{self.bodies[one]}' and "
-                        f"'{self.bodies[other]}' to a loop; expected a tree of bodies"
+                        f"a constraint connects bodies '{self.bodies[pair[0]]}' and "
+                        f"'{self.bodies[pair[1]]}' to a loop; expected a tree of bodies"
                     )
-            if kind == kinds.mjEQ_JOINT and {one, other} <= self.joints.keys() and not any(higher):
-                offset = self._position(model.qpos0, one) + constant
-                offset -= slope * self._position(model.qpos0, other)
-                driver = self.joints[other]
-                self.mimics[one] = _tag("mimic", joint=driver, multiplier=slope, offset=offset)
+            constant, slope, *higher = model.eq_data[i, :5].tolist()
+            if kind == kinds.mjEQ_JOINT and self.joints.keys() >= set(pair) and not any(higher):
+                zero, zero_of_driver = (float(model.joint(j).qpos0[0]) for j in pair)
+                driver, offset = self.joints[pair[1]], zero + constant - slope * zero_of_driver
+                self.mimics[pair[0]] = _tag("mimic", joint=driver, multiplier=slope, offset=offset)
             else:
                 left_out.append(i)
         self._note("constraints are left out", "equality", left_out)
 
     def _add_link(self, body: int) -> None:
-        model, inside = self.model, []
-        if model.body_mass[body] > 0:
-            X_BI = _pose(model.body_ipos[body], model.body_iquat[body])
+        one, inside = self.model.body(body), []
+        if one.mass[0] > 0:
+            X_BI = _pose(one.ipos, one.iquat)
             R_BI = X_BI.rotation().matrix()
-            moments = R_BI @ np.diag(model.body_inertia[body]) @ R_BI.T
+            moments = R_BI @ np.diag(one.inertia) @ R_BI.T
             pairs = combinations_with_replacement(range(3), 2)
             inertia = {f"i{'xyz'[i]}{'xyz'[j]}": moments[i, j] for i, j in pairs}
-            mass = _tag("mass", value=model.body_mass[body])
             origin = _origin(RigidTransform(X_BI.translation()))
-            inside.append(_tag("inertial", origin, mass, _tag("inertia", **inertia)))
-        first = int(model.body_geomadr[body])
-        for geom in range(first, first + int(model.body_geomnum[body])):
+            mass, inertia_tag = _tag("mass", value=one.mass), _tag("inertia", **inertia)
+            inside.append(_tag("inertial", origin, mass, inertia_tag))
+        for geom in range(one.geomadr[0], one.geomadr[0] + one.geomnum[0]):
             inside += self._shapes(geom, self.bodies[body])
         self.parts.append(_tag("link", *inside, name=self.bodies[body]))
 
@@ -236,7 +230,7 @@ class _Robot:
             rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
             if material >= 0 and np.allclose(rgba, _GREY):
                 rgba = model.mat_rgba[material]
-            colour = _tag("material", _tag("color", rgba=rgba), name=f"rgba {_text(rgba)}")
+            colour = _tag("material", _tag("color", rgba=rgba), name=f"rgba {as_text(rgba)}")
             shapes.append(_tag("visual", origin, shape, colour))
         paired = geom in model.pair_geom1 or geom in model.pair_geom2
         if model.geom_contype[geom] or model.geom_conaffinity[geom] or paired:
@@ -265,31 +259,29 @@ class _Robot:
         X_PB = _pose(model.body_pos[body], model.body_quat[body])
         joints = [j for j in self.joints if model.jnt_bodyid[j] == body]
         for j in joints:
-            joint, anchor, axis = self.joints[j], model.jnt_pos[j], model.jnt_axis[j]
-            child = name if j == joints[-1] and not anchor.any() else f"{joint}_frame"
+            one, joint = model.joint(j), self.joints[j]
+            child = name if j == joints[-1] and not one.pos.any() else f"{joint}_frame"
             if child != name:
                 self.parts.append(_tag("link", name=child))
-            limit: dict[str, float] = {}
-            if model.jnt_limited[j]:
-                limit["lower"], limit["upper"] = model.jnt_range[j]
+            limit = dict(zip(("lower", "upper"), one.range, strict=True)) if one.limited[0] else {}
             # Bodies are drawn at the joint's reference, which need not be zero.
-            q = self._position(model.qpos0, j)
-            if model.jnt_type[j] == self.mujoco.mjtJoint.mjJNT_SLIDE:
-                kind, X_AJ = "prismatic", RigidTransform(-q * axis)
+            q = float(one.qpos0[0])
+            if one.type[0] == self.mujoco.mjtJoint.mjJNT_SLIDE:
+                kind, X_AJ = "prismatic", RigidTransform(-q * one.axis)
             else:
                 kind = "revolute" if limit else "continuous"
-                X_AJ = RigidTransform(AngleAxis(-q, axis), np.zeros(3))
+                X_AJ = RigidTransform(AngleAxis(-q, one.axis), np.zeros(3))
             if math.isfinite(self.efforts.get(j, math.inf)):
                 limit["effort"] = self.efforts[j]
-            spring = float(model.jnt_stiffness[j])  # Drake ignores it; `new` does not.
-            friction = model.dof_frictionloss[model.jnt_dofadr[j]]
+            # Drake ignores the stiffness; `new` does not.
+            resists = {"friction": one.frictionloss, "stiffness": one.stiffness}
             inside = [
-                _tag("axis", xyz=axis),
+                _tag("axis", xyz=one.axis),
                 _tag("limit", **limit) if limit else "",
-                _tag("dynamics", damping=self.damping[j], friction=friction, stiffness=spring),
+                _tag("dynamics", damping=self.damping[j], **resists),
                 self.mimics.get(j, ""),
             ]
-            X_PJ = X_PB @ RigidTransform(anchor) @ X_AJ
+            X_PJ = X_PB @ RigidTransform(one.pos) @ X_AJ
             self._add_joint(joint, kind, parent, child, X_PJ, *inside)
             if j in self.efforts:
                 inside = [
@@ -298,7 +290,7 @@ class _Robot:
                     _tag("actuator", name=f"{joint}_motor"),
                 ]
                 self.parts.append(_tag("transmission", *inside, name=f"{joint}_transmission"))
-            parent, X_PB = child, RigidTransform(-anchor)
+            parent, X_PB = child, RigidTransform(-one.pos)
         if parent != name:
             self._add_joint(f"{name}_fixed", "fixed", parent, name, X_PB)
 
@@ -319,11 +311,8 @@ def _origin(X: RigidTransform) -> str:
 
 def _tag(tag: str, *inside: str, **attributes: Any) -> str:
     """An element of the URDF; attributes are text, a number or several."""
-    words = (f" {key}={quoteattr(_text(value))}" for key, value in attributes.items())
-    return f"<{tag}{''.join(words)}>{''.join(inside)}</{tag}>"
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, str):
-        return value
-    return " ".join(f"{number:.9g}" for number in np.atleast_1d(value))
+    words = ""
+    for key, value in attributes.items():
+        text = value if isinstance(value, str) else as_text(np.atleast_1d(value))
+        words += f" {key}={quoteattr(text)}"
+    return f"<{tag}{words}>{''.join(inside)}</{tag}>"

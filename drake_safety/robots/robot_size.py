@@ -26,6 +26,11 @@ class RobotSize:
     """Largest distance of a contact point from the feet's centroid along y."""
     mass_kg: float
 
+    @property
+    def load(self) -> float:
+        """Mass times height [kg·m], with which torques grow."""
+        return self.mass_kg * self.height_m
+
     def factors(self, reference: "RobotSize") -> dict[str, float]:
         """Scale factors by quantity, from the robot that the parameters were chosen for.
 

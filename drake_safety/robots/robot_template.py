@@ -22,6 +22,7 @@ from drake_safety.robots.simulatable_urdf import simulatable_copy
 from drake_safety.robots.standing_posture import standing_posture
 from drake_safety.robots.urdf_copy import UrdfCopy, read_urdf
 from drake_safety.robots.urdf_requirements import (
+    listed,
     mirrored,
     require_masses,
     require_motors,
@@ -35,7 +36,6 @@ _STIFFNESS = 28.0  # [1/s² · N·m/(rad kg m)]
 _DAMPING_S = 0.027
 _LEAST_HEIGHT_M, _GREATEST_HEIGHT_M = 0.02, 20.0
 _LEAST_STANCE = 0.02  # Half the stance's width, by the height.
-_ESCAPE = "\\"  # Of templates of mirrored names.
 
 
 @dataclass(kw_only=True)
@@ -113,7 +113,7 @@ def write_robot(
     if folder.exists():
         raise ValueError(f"new: '{folder}' exists already; choose another name, or another --out")
     with tempfile.TemporaryDirectory() as scratch:
-        found = _survey(name, model, task, Path(scratch) / f"{name}.urdf", feet, moved)
+        found = _survey(name, model, task, Path(scratch), feet, moved)
         # Copied to the target only when complete.
         found.folder = Path(scratch) / "robot"
         found.folder.mkdir()
@@ -139,7 +139,7 @@ def _survey(
 ) -> NewRobot:
     urdf, facts = model, ModelFacts()
     if is_mjcf(model):
-        urdf = scratch.parent / "mjcf" / scratch.name
+        urdf = scratch / "mjcf" / f"{name}.urdf"
         urdf.parent.mkdir()
         facts = mjcf_to_urdf(model, urdf)
     copy = simulatable_copy(urdf)
@@ -147,58 +147,40 @@ def _survey(
     copy.left_out = facts.left_out + copy.left_out
     copy.notes += [f"it is converted from '{model.name}'", *facts.left_out][urdf == model :]
     drives = read_drives(read_urdf(urdf).root)
-    copy.write(scratch)
-    survey = Survey(scratch, model, drives)
 
-    def with_base(limbs: list[Limb], *, is_up: bool) -> Survey:
+    def surveyed() -> Survey:
+        copy.write(scratch / f"{name}.urdf")
+        return Survey(scratch / f"{name}.urdf", model, drives)
+
+    def with_base(survey: Survey, limbs: list[Limb], *, is_up: bool) -> Survey:
         pose, why = upright_base(survey, limbs, is_up=is_up)
-        if why and pose is None:
+        if pose is not None:
+            base = copy.add_root("hips", survey.base, pose)
+            copy.warn(f"the root link '{survey.base}' {why}; the base is a new link '{base}'")
+            return surveyed()
+        if why:
             copy.warn(f"the robot {why} of '{survey.base}'")
-        if pose is None:
-            return survey
-        base = copy.add_root("hips", survey.base, pose)
-        copy.warn(f"the root link '{survey.base}' {why}; the base is a new link '{base}'")
-        copy.write(scratch)
-        return Survey(scratch, model, drives)
+        return survey
 
-    survey = with_base(survey.limbs(), is_up=False)
+    survey = surveyed()
+    survey = with_base(survey, survey.limbs(), is_up=False)
     require_shapes(survey, copy, urdf, are_feet_named=feet is not None)
-    survey = with_base(survey.legs(feet), is_up=True)
+    survey = with_base(survey, survey.legs(feet), is_up=True)
     legs = survey.legs(feet)
-    require_motors(survey, legs, drives, moved or (), model)
+    require_motors(survey, legs, moved or ())
     arms = survey.arms(legs)
     if task == "reaching" and not arms:
         raise ValueError(
             f"new: '{model}' has no arm (a limb of four joints or more that is not a leg) to reach "
             "with; use --task balancing"
         )
-    used = {joint for limb in (*legs, *arms) for joint in survey.chain(limb.body)}
-    used |= {joint.name() for joint in survey.joints} if moved is None else set(moved)
-    legged = {joint for limb in legs for joint in survey.chain(limb.body)}
-    used -= {name for name, (leader, *_) in drives.mimics.items() if leader in legged}
-    coupled = used & set(drives.mimics)
-    leaders = {drives.mimics[name][0] for name in coupled}
-    if coupled and task != "balancing":
-        raise ValueError(
-            f"new: '{model}': joints {sorted(coupled)} follow others by <mimic>, for which --task "
-            f"{task} has no controller; use --task balancing, or remove <mimic>"
-        )
-    others = used - legged - coupled - leaders - set(moved or ())
-    passive = drives.passive(sorted(others))
-    used = used - set(passive) | leaders
-    listed = ", ".join(f"'{name}' ({why})" for name, why in passive.items())
     wheels = survey.wheels(legs)
-    loose = {name for name, (leader, *_) in drives.mimics.items() if leader in used} - used
-    for names, note in (
-        (coupled, "follow others by <mimic>, in the posture too"),
-        (loose, "follow joints that move, by <mimic>, but move no foot or hand and are fixed"),
-        (passive, f"have no motor and are fixed: {listed}"),
-        (used & set(drives.springs), "have springs beside their motors, which are left out"),
-        (wheels, "turn wheels: position servos hold them, so that they neither roll nor drive"),
-    ):
-        if names:
-            copy.warn(f"joints {sorted(names)} {note}")
-    idle = [joint for joint in survey.joints if joint.name() not in used]
+    used = _used_joints(survey, copy, task, legs, arms, moved)
+    if wheels:
+        copy.warn(
+            f"joints {sorted(wheels)} turn wheels: position servos hold them, so that they neither "
+            "roll nor drive"
+        )
     for limb in legs:
         if not limb.is_own_shape:
             copy.replace_collisions(limb.body, limb.points, limb.radius_m)
@@ -208,60 +190,95 @@ def _survey(
     copy.fix_joints(
         {
             joint.name(): survey.joint_pose(joint) if joint.name() in drives.mimics else None
-            for joint in idle
+            for joint in survey.joints
+            if joint.name() not in used
         }
     )
-    copy.write(scratch)
-    survey = Survey(scratch, model, drives)
-    require_masses(survey, model)
+    survey = surveyed()
+    require_masses(survey)
     try:
         posture, posture_source = standing_posture(survey, legs, facts.postures)
     except ValueError as error:
         raise ValueError(". ".join([f"{error}", *copy.warnings, *copy.left_out])) from error
     _lift_hulls(copy, survey, legs)
-    copy.write(scratch)
-    survey = Survey(scratch, model)
+    survey = surveyed()
     survey.set_joints(posture)
     if odd := odd_inertias(survey.plant, survey.context, survey.instance):
         copy.warn(odd)
     # Balls are thrown at the base.
     is_base_bare = not survey.collides(survey.base)
     copy.ignore_collisions({*survey.overlaps(), *facts.apart})
-    found = NewRobot(
+    sizes = _sizes(survey, legs, arms, copy)
+    if not _LEAST_HEIGHT_M < sizes.height_m < _GREATEST_HEIGHT_M:
+        raise ValueError(
+            f"new: '{model}': base '{survey.base}' would stand {sizes.height_m:.3g} m high. "
+            "Are the <origin>s in millimetres?"
+        )
+    if min(sizes.half_length_m, sizes.half_width_m) < _LEAST_STANCE * sizes.height_m:
+        copy.warn(
+            "the contact points of the feet lie on a line: on them, no posture stands by servos"
+        )
+    asked = [
+        f"where foot '{limb.body}' touches: the file has no shape there [m]"
+        for limb in legs
+        if limb.is_guess
+    ]
+    if is_base_bare:
+        asked.append(
+            f"a <collision> shape of the base '{survey.base}', in {name}.urdf [m]: without one no "
+            "ball can hit it"
+        )
+    return NewRobot(
         name=name,
         task=task,
-        folder=scratch.parent,
+        folder=scratch,
         copy=copy,
         survey=survey,
         legs=legs,
         arms=arms,
         posture=posture,
         posture_source=posture_source,
-        sizes=_sizes(survey, legs, arms, copy),
+        sizes=sizes,
         facts=facts,
         wheels=wheels,
+        asked=asked,
     )
-    found.asked += [
-        f"where foot '{limb.body}' touches: the file has no shape there [m]"
-        for limb in legs
-        if limb.is_guess
-    ]
-    if not _LEAST_HEIGHT_M < found.sizes.height_m < _GREATEST_HEIGHT_M:
+
+
+def _used_joints(
+    survey: Survey,
+    copy: UrdfCopy,
+    task: str,
+    legs: list[Limb],
+    arms: list[Limb],
+    moved: Collection[str] | None,
+) -> set[str]:
+    """The joints that are not fixed; what couplings, motors and springs mean for them is told."""
+    mimics, stated = survey.drives.mimics, set(moved or ())
+    legged, armed = (
+        {joint for limb in limbs for joint in survey.chain(limb.body)} for limbs in (legs, arms)
+    )
+    used = legged | armed | (set(survey.limits) if moved is None else stated)
+    used -= {name for name, (leader, *_) in mimics.items() if leader in legged}
+    coupled = used & set(mimics)
+    leaders = {mimics[name][0] for name in coupled}
+    if coupled and task != "balancing":
         raise ValueError(
-            f"new: '{model}': base '{survey.base}' would stand {found.sizes.height_m:.3g} m high. "
-            "Are the <origin>s in millimetres?"
+            f"new: '{survey.source}': joints {sorted(coupled)} follow others by <mimic>, for which "
+            f"--task {task} has no controller; use --task balancing, or remove <mimic>"
         )
-    half = min(found.sizes.half_length_m, found.sizes.half_width_m)
-    if half < _LEAST_STANCE * found.sizes.height_m:
-        copy.warn(
-            "the contact points of the feet lie on a line: on them, no posture stands by servos"
-        )
-    if is_base_bare:
-        found.asked.append(
-            f"a <collision> shape of the base '{survey.base}', in {name}.urdf [m]: without one no "
-            "ball can hit it"
-        )
-    return found
+    passive = survey.drives.passive(sorted(used - legged - coupled - leaders - stated))
+    used = used - set(passive) | leaders
+    loose = {name for name, (leader, *_) in mimics.items() if leader in used} - used
+    for names, note in (
+        (coupled, "follow others by <mimic>, in the posture too"),
+        (loose, "follow joints that move, by <mimic>, but move no foot or hand and are fixed"),
+        (passive, f"have no motor and are fixed: {listed(passive)}"),
+        (used & set(survey.drives.springs), "have springs beside their motors, which are left out"),
+    ):
+        if names:
+            copy.warn(f"joints {sorted(names)} {note}")
+    return used
 
 
 def _lift_hulls(copy: UrdfCopy, survey: Survey, legs: list[Limb]) -> None:
@@ -277,16 +294,13 @@ def _lift_hulls(copy: UrdfCopy, survey: Survey, legs: list[Limb]) -> None:
 
 
 def _sizes(survey: Survey, legs: list[Limb], arms: list[Limb], copy: UrdfCopy) -> Sizes:
-    points = [survey.positions(limb) for limb in legs]
-    lowest = min(float(p[:, 2].min()) - limb.radius_m for p, limb in zip(points, legs, strict=True))
-    everything = np.concatenate(points)
-    centroid = everything.mean(axis=0)
-    half = np.abs(everything - centroid).max(axis=0)
-    feet = np.array([p.mean(axis=0) for p in points])
-    reach = 0.0
-    shoulder = np.zeros(3)
-    if arms:
-        arm = arms[0]
+    points = np.concatenate([survey.positions(limb) for limb in legs])
+    lowest = min(float(survey.positions(limb)[:, 2].min()) - limb.radius_m for limb in legs)
+    centroid = points.mean(axis=0)
+    half = np.abs(points - centroid).max(axis=0)
+    feet = np.array([survey.positions(limb).mean(axis=0) for limb in legs])
+    reach, shoulder, friction = 0.0, np.zeros(3), list(copy.joint_friction.values())
+    for arm in arms[:1]:
         origins = [survey.joint_origin(joint) for joint in arm.joints]
         hand = survey.pose(arm.body).translation()
         reach = float(np.linalg.norm(np.diff([*origins, hand], axis=0), axis=1).sum())
@@ -300,18 +314,15 @@ def _sizes(survey: Survey, legs: list[Limb], arms: list[Limb], copy: UrdfCopy) -
         reach_m=reach,
         shoulder_m=shoulder.tolist(),
         base=survey.base,
-        joint_friction_nm=float(np.median(list(copy.joint_friction.values())))
-        if copy.joint_friction
-        else None,
+        joint_friction_nm=float(np.median(friction)) if friction else None,
     )
 
 
 def _robot_yaml(found: NewRobot) -> str:
-    survey, sizes, names = found.survey, found.sizes, found.joints
-    base, keys = yaml_text(survey.base), {name: yaml_text(as_pattern(name)) for name in names}
-    unit = sizes.mass_kg * sizes.height_m
+    sizes, facts, names, source = found.sizes, found.facts, found.joints, found.copy.source.name
+    base, keys = yaml_text(sizes.base), {name: yaml_text(as_pattern(name)) for name in names}
     lines = [
-        f"# {found.name}: written from {found.copy.source.name}. Lines marked ASK have values that",
+        f"# {found.name}: written from {source}. Lines marked ASK have values that",
         "# it lacks: look them up, and state their sources in README.md.",
         f"name: {found.name}",
         f"urdf: {found.name}.urdf",
@@ -323,33 +334,26 @@ def _robot_yaml(found: NewRobot) -> str:
     for limb in found.legs:
         points = [[round(float(value), 5) for value in point] for point in limb.points]
         ask = "  # ASK its contact points [m]" if limb.is_guess else ""
-        lines += [
-            f"  {yaml_text(limb.body)}:{ask}",
-            f"    body: {yaml_text(limb.body)}",
-            f"    contact_points: {points}",
-            f"    radius_m: {float(f'{limb.radius_m:.5g}')}",
-            f"    joints: [{', '.join(map(yaml_text, limb.joints))}]"
-            + "  # the last turns a wheel, which its servo holds"
-            * (limb.joints[-1] in found.wheels),
-        ]
+        is_wheel = limb.joints[-1] in found.wheels
+        about = [f"contact_points: {points}", f"radius_m: {float(f'{limb.radius_m:.5g}')}"]
+        lines += _limb_lines(limb, about, ask)
+        lines[-1] += "  # the last turns a wheel, which its servo holds" * is_wheel
     if found.arms:
         lines.append("reaching_frames:")
     for limb in found.arms:
-        lines += [
-            f"  {yaml_text(limb.body)}:",
-            f"    body: {yaml_text(limb.body)}",
-            "    point: [0.0, 0.0, 0.0]  # ASK the point that reaches, in the body's frame [m]",
-            "    radius_m: 0.05  # ASK the radius of the hand's collision sphere [m]",
-            f"    joints: [{', '.join(map(yaml_text, limb.joints))}]",
+        about = [
+            "point: [0.0, 0.0, 0.0]  # ASK the point that reaches, in the body's frame [m]",
+            "radius_m: 0.05  # ASK the radius of the hand's collision sphere [m]",
         ]
+        lines += _limb_lines(limb, about)
         found.asked.append(f"the point of hand '{limb.body}' that reaches, and its size [m]")
-    lines += _gain_lines(found, keys, unit)
-    source, facts = found.copy.source.name, found.facts
-    rotors = {keys[name]: facts.rotor_inertia.get(name) for name in names}
-    if any(rotors.values()):
+    lines += _gain_lines(found, keys)
+    if rotors := {
+        keys[name]: facts.rotor_inertia[name] for name in names if name in facts.rotor_inertia
+    }:
         lines.append(f"rotor_inertia:  # of {source} [kg·m²]")
-        lines += [f"  {key}: {inertia:.4g}" for key, inertia in rotors.items() if inertia]
-    lines += _effort_lines(found, keys, unit)
+        lines += [f"  {key}: {inertia:.4g}" for key, inertia in rotors.items()]
+    lines += _effort_lines(found, keys)
     # Of the shape nearest to a foot's contact points.
     stated = [
         min(shapes, key=lambda one: float(np.linalg.norm(one[0] - limb.points.mean(axis=0))))[1]
@@ -362,13 +366,10 @@ def _robot_yaml(found: NewRobot) -> str:
         f"foot_friction: {friction:g}  # ASK Coulomb's coefficient of feet on your ground [1]"
     )
     found.asked.append(f"the friction of feet on your ground [1]; {friction:g} is {origin}")
-    mirror = mirrored(names)
+    mirror = {keys[one]: other.replace("\\", r"\\") for one, other in mirrored(names).items()}
     if mirror:
-        lines.append("mirror:")
-        for one, other in mirror.items():
-            lines.append(f"  {keys[one]}: {yaml_text(other.replace(_ESCAPE, 2 * _ESCAPE))}")
-    bare = found.bare
-    if bare:
+        lines += ["mirror:", *(f"  {key}: {yaml_text(other)}" for key, other in mirror.items())]
+    if bare := found.bare:
         lines += [
             "without_collision:  # ASK shapes in place of these links' lost meshes [m]",
             *(f"  - {yaml_text(link)}" for link in bare),
@@ -382,7 +383,13 @@ def _robot_yaml(found: NewRobot) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _gain_lines(found: NewRobot, keys: dict[str, str], unit: float) -> list[str]:
+def _limb_lines(limb: Limb, about: list[str], note: str = "") -> list[str]:
+    body, joints = yaml_text(limb.body), ", ".join(map(yaml_text, limb.joints))
+    entries = [f"body: {body}", *about, f"joints: [{joints}]"]
+    return [f"  {body}:{note}", *(f"    {entry}" for entry in entries)]
+
+
+def _gain_lines(found: NewRobot, keys: dict[str, str]) -> list[str]:
     known, source = found.facts.gains, found.copy.source.name
     num_guessed = len(keys.keys() - known.keys())
     ask = "ASK the maker's; these grow with mass times height " if num_guessed else ""
@@ -394,41 +401,35 @@ def _gain_lines(found: NewRobot, keys: dict[str, str], unit: float) -> list[str]
         )
     legs = {name for limb in found.legs for name in limb.joints}
     for name, key in keys.items():
-        stiffness = _STIFFNESS * unit * (1.0 if name in legs else 0.5)
+        stiffness = _STIFFNESS * found.sizes.load * (1.0 if name in legs else 0.5)
         stiffness, damping = known.get(name, (stiffness, _DAMPING_S * stiffness))
         origin = f"  # of {source}" if name in known else ""
         lines.append(f"  {key}: {{stiffness: {stiffness:.4g}, damping: {damping:.4g}}}{origin}")
     return lines
 
 
-def _effort_lines(found: NewRobot, keys: dict[str, str], unit: float) -> list[str]:
-    plant = found.survey.plant
-    motors = {
-        plant.get_joint_actuator(index).joint().name()
-        for index in plant.GetJointActuatorIndices(found.survey.instance)
-        if math.isfinite(plant.get_joint_actuator(index).effort_limit())
-    }
-    limits = found.copy.effort_limits()
+def _effort_lines(found: NewRobot, keys: dict[str, str]) -> list[str]:
+    plant, limits = found.survey.plant, found.survey.drives.efforts
+    indices = plant.GetJointActuatorIndices(found.survey.instance)
+    motors = [*map(plant.get_joint_actuator, indices)]
+    driven = {one.joint().name() for one in motors if math.isfinite(one.effort_limit())}
     lines = []
     for name, key in keys.items():
-        if name in motors:
+        if name in driven:
             continue
-        effort = limits[name]
-        if effort > 0 and math.isfinite(effort):
-            lines.append(f"  {key}: {effort:g}")
+        if 0 < limits[name] < math.inf:
+            lines.append(f"  {key}: {limits[name]:g}")
         else:
-            lines.append(f"  {key}: {4 * unit:.3g}  # ASK the motor's largest torque [N·m]")
+            guess = f"{4 * found.sizes.load:.3g}"
+            lines.append(f"  {key}: {guess}  # ASK the motor's largest torque [N·m]")
             found.asked.append(f"the largest torque of joint '{name}' [N·m]")
-    if not lines:
-        return []
-    return ["effort_limits:  # where the file has no motor, or none with a limit [N·m]", *lines]
+    title = "effort_limits:  # where the file has no motor, or none with a limit [N·m]"
+    return [title, *lines] if lines else []
 
 
 def _readme(found: NewRobot) -> str:
     sizes = found.sizes
-    notes = (
-        "\n".join(f"- {note[0].upper()}{note[1:]}." for note in found.copy.notes) or "- Nothing."
-    )
+    notes = "\n".join(f"- {note[0].upper()}{note[1:]}." for note in found.copy.notes)
     asked = "\n".join(f"- [ ] {what}" for what in found.asked)
     stated = f"`{found.copy.source.name}`"
     has_gains = set(found.joints) <= found.facts.gains.keys()
@@ -444,7 +445,7 @@ Fill in the sources, so that every figure can be looked up.
 
 | figure | source |
 |---|---|
-| masses, inertias, joints, limits | `{found.copy.source.name}`, from ... (address, version) |
+| masses, inertias, joints, limits | {stated}, from ... (address, version) |
 | standing posture | {found.posture_source} |
 | servo gains | {gains} |
 | friction of the feet | {friction} |
@@ -453,7 +454,7 @@ Fill in the sources, so that every figure can be looked up.
 {asked}
 
 ## Changes of the URDF
-{notes}
+{notes or "- Nothing."}
 
 ## Licence of the file
 ...

@@ -6,22 +6,23 @@ import contextlib
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable
 from functools import partial
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from drake_safety.extras import MissingExtraError
+from drake_safety.files.reading import is_number
 from drake_safety.robots.meshes import SHOWN_FORMATS, convex_hull, mesh_points, shown_mesh
 from drake_safety.robots.model_files import model_file
-from drake_safety.robots.urdf_copy import UrdfCopy, number, pose_of, read_urdf
+from drake_safety.robots.urdf_copy import UrdfCopy, as_number, number, pose_of, read_urdf, remove
 
 if TYPE_CHECKING:
     import trimesh
 
 _Mesh = TypeVar("_Mesh")
-_IGNORED = ("calibration", "safety_controller")
-"""Elements of a joint that Drake ignores with a warning."""
+_IGNORED = ("calibration", "safety_controller")  # By Drake, with a warning.
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ROWS, _COLUMNS = np.triu_indices(3)
 _ROUNDING = 1e-6  # Of the digits of moments of inertia.
@@ -39,11 +40,10 @@ def simulatable_copy(path: Path) -> UrdfCopy:
         ValueError: The file does not exist or is not a URDF.
     """
     copy = read_urdf(path)
-    for element in copy.root.findall("gazebo"):
-        copy.root.remove(element)
+    remove(copy.root, "gazebo")
     for joint in copy.root.findall("joint"):
-        for element in [part for part in joint if part.tag in _IGNORED]:
-            joint.remove(element)
+        for tag in _IGNORED:
+            remove(joint, tag)
     copy.free_fixed_joints()
     copy.drop_world()
     _drop_zeros(copy)
@@ -72,38 +72,33 @@ def _drop_zeros(copy: UrdfCopy) -> None:
     for link, shape, words in copy.empty_shapes():
         link.remove(shape)
         copy.warn(f"{words}: it is left out")
-    joints = [one for one in copy.root.findall("joint") if one.get("type") != "fixed"]
-    limits = {joint.get("name"): joint.find("limit") for joint in joints}
-    zeros = {name: limit for name, limit in limits.items() if number(limit, "velocity") == 0}
-    for limit in zeros.values():
-        if limit is not None:
-            del limit.attrib["velocity"]
+    zeros = []
+    for joint in copy.root.findall("joint"):
+        for limit in joint.findall("limit"):
+            if joint.get("type") != "fixed" and number(limit, "velocity") == 0:
+                del limit.attrib["velocity"]
+                zeros.append(joint.get("name"))
     if zeros:
-        copy.warn(f'velocity="0" of joints {list(zeros)} is read as no limit')
+        copy.warn(f'velocity="0" of joints {zeros} is read as no limit')
 
 
 def _drop_transmissions(copy: UrdfCopy) -> None:
     """Removes transmissions that Drake ignores with a warning, and their reductions."""
     fixed = {joint.get("name") for joint in copy.root.findall("joint[@type='fixed']")}
     for transmission in copy.root.findall("transmission"):
-        kind, joint = transmission.find("type"), transmission.find("joint")
-        name = "" if kind is None or kind.text is None else kind.text.strip()
-        is_simple = name.rpartition("/")[2] == "SimpleTransmission"
+        kind, joint = transmission.findtext("type", "").strip(), transmission.find("joint")
+        is_simple = kind.rpartition("/")[2] == "SimpleTransmission"
         if not is_simple or (joint is not None and joint.get("name") in fixed):
             copy.root.remove(transmission)
-            continue
         for actuator in transmission.findall("actuator"):
-            for reduction in actuator.findall("mechanicalReduction"):
-                actuator.remove(reduction)
+            remove(actuator, "mechanicalReduction")
 
 
 def _drop_friction(copy: UrdfCopy) -> None:
     """Removes dry friction, which Drake does not simulate from a URDF."""
     for joint in copy.root.iter("joint"):
-        dynamics = joint.find("dynamics")
-        if dynamics is not None:
-            friction = number(dynamics, "friction")
-            dynamics.attrib.pop("friction", None)
+        for dynamics in joint.findall("dynamics[@friction]"):
+            friction = as_number(dynamics.attrib.pop("friction"))
             if friction > 0:
                 copy.joint_friction[joint.get("name", "")] = friction
     if copy.joint_friction:
@@ -116,26 +111,23 @@ def _drop_friction(copy: UrdfCopy) -> None:
 def _fix_inertias(copy: UrdfCopy) -> None:
     """Removes impossible products of inertia, and inertias of bodies without mass."""
     for link in copy.root.iter("link"):
-        inertial, inertia = link.find("inertial"), link.find("inertial/inertia")
-        if inertial is None or inertia is None:
+        inertia, mass = link.find("inertial/inertia"), number(link.find("inertial/mass"), "value")
+        if inertia is None:
             continue
-        if number(inertial.find("mass"), "value") == 0:
-            link.remove(inertial)
+        if mass == 0:
+            remove(link, "inertial")
             continue
         moments = np.zeros((3, 3))
         moments[_ROWS, _COLUMNS] = np.nan_to_num([number(inertia, key) for key in _MOMENTS])
         moments[_COLUMNS, _ROWS] = moments[_ROWS, _COLUMNS]
         values, axes = np.linalg.eigh(moments)
-        mass, lowest = number(inertial.find("mass"), "value"), moments.diagonal().min()
-        tell = copy.notes.append
+        lowest, tell = moments.diagonal().min(), copy.notes.append
         # Flat and thin bodies are allowed.
         if lowest < -max(_ROUNDING * values[2], _NOISE):
             radius_m = (0.75 * mass / (np.pi * _WATER_KG_M3)) ** (1 / 3)
             changed, tell = 0.4 * mass * radius_m**2 * np.eye(3), copy.warn
-            how = (
-                f"{lowest:g} is replaced by {changed[0, 0]:.3g} kg·m² about all axes, as of a ball "
-            )
-            how += "of water of its mass"
+            how = f"{lowest:g} is replaced by {changed[0, 0]:.3g} kg·m² about all axes, as of a "
+            how += "ball of water of its mass"
         elif values[0] < _ROUNDING * values[2] and np.triu(moments, 1).any():
             changed, how = np.diag(np.diag(moments)), "its products of inertia are set to zero"
         elif values[1] > 0 and values[2] > (1 + _ROUNDING) * (values[0] + values[1]):
@@ -158,7 +150,8 @@ def _tell_materials_apart(copy: UrdfCopy) -> None:
         values = " ".join(value for part in material for value in part.attrib.values())
         if not values:
             continue  # A reference to a material.
-        content = [_plain(value) for value in values.split()]
+        # 0 and 0.0 are equal.
+        content = [f"{float(v):g}" if is_number(v) else v for v in values.split()]
         name = material.get("name", "")
         known = seen.setdefault(name, [])
         if content not in known:
@@ -170,14 +163,6 @@ def _tell_materials_apart(copy: UrdfCopy) -> None:
         for name, contents in seen.items()
         if len(contents) > 1
     ]
-
-
-def _plain(value: str) -> str:
-    """Canonical form of a number, so that 0 and 0.0 are equal."""
-    try:
-        return f"{float(value):g}"
-    except ValueError:
-        return value
 
 
 def _gather_visual_meshes(copy: UrdfCopy, lost: dict[str, list[str]]) -> None:
@@ -264,12 +249,9 @@ def _converted(
 
 def _gather(copy: UrdfCopy, file: Path, name: str) -> str:
     """Adds a mesh to the copy and returns its name; equal names get separate folders."""
-    index = 0
-    while True:
-        target = f"meshes/{index}/{name}" if index else f"meshes/{name}"
-        if copy.meshes.setdefault(target, file) == file:
-            return target
-        index += 1
+    folders = chain(["meshes"], (f"meshes/{index}" for index in count(1)))
+    targets = (f"{folder}/{name}" for folder in folders)
+    return next(target for target in targets if copy.meshes.setdefault(target, file) == file)
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -281,15 +263,9 @@ def _mesh_file(url: str, source: Path) -> Path | None:
     scheme, _, rest = url.rpartition("://")
     if scheme not in ("", "package", "file", "model"):
         return None
-    if scheme in ("", "file"):
-        candidates = [source.parent / rest]
-    else:
-        package, _, inside = rest.partition("/")
-        candidates = []
-        for folder in source.resolve().parents:
-            if folder.name == package:
-                candidates.append(folder / inside)
-            candidates.append(folder / package / inside)
+    candidates = [source.parent / rest]
+    if scheme in ("package", "model"):
+        candidates = [folder / rest for folder in source.resolve().parents]
         if scheme == "package":
             with contextlib.suppress(ValueError):
                 candidates.append(model_file(url))

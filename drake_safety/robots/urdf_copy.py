@@ -21,11 +21,13 @@ from drake_safety.robots.model_files import model_file
 if TYPE_CHECKING:
     import trimesh
 
-_DRAKE = "http://drake.mit.edu"
+DRAKE = "http://drake.mit.edu"
+"""Namespace of Drake's elements."""
+MOVABLE = ("revolute", "continuous", "prismatic")
+"""Types of joints with one degree of freedom."""
 _PREFIX = re.compile(rb"""(xmlns:drake\s*=\s*)["'][^"']*["']""")
-ET.register_namespace("drake", _DRAKE)
-_SIZES = ("size", "radius", "length", "scale")
-"""Attributes of shapes."""
+ET.register_namespace("drake", DRAKE)
+_SIZES = ("size", "radius", "length", "scale")  # Attributes of shapes.
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
@@ -82,14 +84,6 @@ class UrdfCopy:
             if link.get("name") in self.lost_links and link.find("collision") is None
         ]
 
-    def effort_limits(self) -> dict[str, float]:
-        """Returns the effort limits of all movable joints by name [N·m]; NaN without a limit."""
-        return {
-            joint.get("name", ""): number(joint.find("limit"), "effort")
-            for joint in self.root.findall("joint")
-            if joint.get("type") in ("revolute", "continuous", "prismatic")
-        }
-
     def empty_shapes(self) -> list[tuple[ET.Element, ET.Element, str]]:
         """Returns shapes without extent: link, shape, and both in words."""
         found = []
@@ -100,9 +94,9 @@ class UrdfCopy:
                     sizes = [float(word) for word in _NUMBER.findall(" ".join(stated.values()))]
                     # Meshes may be mirrored by a negative scale.
                     if 0.0 in sizes or ("scale" not in stated and min(sizes, default=0.0) < 0):
-                        words = ", ".join(f"{key} {text}" for key, text in stated.items())
-                        kind, name = part.tag.rpartition("}")[2], link.get("name")
-                        words = f"the {shape.tag} of link '{name}' is a {kind} of {words}"
+                        words = f"the {shape.tag} of link '{link.get('name')}' is a "
+                        words += f"{part.tag.rpartition('}')[2]} of "
+                        words += ", ".join(f"{key} {text}" for key, text in stated.items())
                         found.append((link, shape, words))
         return found
 
@@ -133,34 +127,32 @@ class UrdfCopy:
     def free_fixed_joints(self) -> None:
         """Removes <mimic> from fixed joints, where Drake rejects it."""
         for joint in self.root.findall("joint[@type='fixed']"):
-            _remove(joint, "mimic")
+            remove(joint, "mimic")
 
     def drop_collisions(self) -> None:
         """Removes all collision shapes."""
         for link in self.root.findall("link"):
-            _remove(link, "collision")
+            remove(link, "collision")
 
     def replace_visual_meshes(self, shown: Callable[[str, str], str]) -> None:
         """Replaces visual meshes by ``shown(url, rgba)``, or removes them where that is "".
 
         The material of a converted mesh is removed: the mesh has its own, and Drake warns of two.
         """
-        colours = {one.get("name", ""): one for one in self.root.findall("material")}
+        shared = {one.get("name"): _colour(one) for one in self.root.findall("material")}
         for link in self.root.findall("link"):
             for visual in link.findall("visual"):
-                mesh = visual.find("geometry/mesh")
+                material, mesh = visual.find("material"), visual.find("geometry/mesh")
                 if mesh is None:
                     continue
-                material = visual.find("material")
                 url = mesh.get("filename", "")
-                replacement = shown(url, _colour(material, colours))
+                name = None if material is None else material.get("name")
+                replacement = shown(url, _colour(material) or shared.get(name, ""))
+                mesh.set("filename", replacement)
                 if not replacement:
                     link.remove(visual)
-                    continue
-                mesh.set("filename", replacement)
-                is_converted = Path(replacement).suffix != Path(url).suffix
-                if material is not None and is_converted:
-                    visual.remove(material)
+                elif Path(replacement).suffix != Path(url).suffix:
+                    remove(visual, "material")
 
     def convert_visual_meshes(self) -> None:
         """Replaces visual meshes that Drake does not render by glTF files in the user's cache."""
@@ -181,28 +173,26 @@ class UrdfCopy:
 
     def fix_joints(self, poses: Mapping[str, RigidTransform | None]) -> None:
         """Fixes joints at zero, or at the pose of the child in the parent."""
-        fixed = set(poses)
         for joint in self.root.findall("joint"):
-            if joint.get("name") in fixed:
+            if joint.get("name") in poses:
                 pose = poses[joint.get("name", "")]
                 if pose is not None:
                     set_pose(joint, pose)
                 joint.set("type", "fixed")
-                _remove(joint, "mimic")
-        for transmission in self.root.findall("transmission"):
-            driven = transmission.find("joint")
-            if driven is not None and driven.get("name") in fixed:
+                remove(joint, "mimic")
+        for transmission in self.root.findall("transmission[joint]"):
+            if any(joint.get("name") in poses for joint in transmission.findall("joint")):
                 self.root.remove(transmission)
-        if fixed:
+        if poses:
             self.notes.append(
-                f"{len(fixed)} joints that move neither a foot nor a hand are fixed at zero: "
-                + ", ".join(sorted(fixed))
+                f"{len(poses)} joints that move neither a foot nor a hand are fixed at zero: "
+                + ", ".join(sorted(poses))
             )
 
     def replace_collisions(self, link_name: str, points: np.ndarray, radius_m: float) -> None:
         """Replaces all collision shapes of a link by spheres at points (n, 3) [m] in its frame."""
         link = self.link(link_name)
-        _remove(link, "collision")
+        remove(link, "collision")
         self.hulls.pop(link_name, None)
         for index, point in enumerate(points):
             collision = ET.SubElement(link, "collision", name=f"{link_name}_contact_{index}")
@@ -224,22 +214,19 @@ class UrdfCopy:
         if not hulls:
             self.lost_links.setdefault(link_name, [])
         for index in range(len(hulls)):
-            name = _hull_name(link_name, index)
-            geometry = ET.SubElement(ET.SubElement(link, "collision", name=name), "geometry")
+            shape = ET.SubElement(link, "collision", name=f"{link_name}_hull_{index}")
+            geometry = ET.SubElement(shape, "geometry")
             mesh = ET.SubElement(geometry, "mesh", filename=_hull_file(link_name, index))
-            ET.SubElement(mesh, f"{{{_DRAKE}}}declare_convex")
+            ET.SubElement(mesh, f"{{{DRAKE}}}declare_convex")
 
     def ignore_collisions(self, pairs: Iterable[tuple[str, str]]) -> None:
         """Filters collisions between pairs of links."""
         for index, (one, other) in enumerate(sorted(pairs)):
-            group = ET.SubElement(
-                self.root, f"{{{_DRAKE}}}collision_filter_group", name=f"overlap_{index}"
-            )
+            drake, name = f"{{{DRAKE}}}", f"overlap_{index}"
+            group = ET.SubElement(self.root, f"{drake}collision_filter_group", name=name)
             for link in (one, other):
-                ET.SubElement(group, f"{{{_DRAKE}}}member", link=link)
-            ET.SubElement(
-                group, f"{{{_DRAKE}}}ignored_collision_filter_group", name=f"overlap_{index}"
-            )
+                ET.SubElement(group, f"{drake}member", link=link)
+            ET.SubElement(group, f"{drake}ignored_collision_filter_group", name=name)
             self.notes.append(f"collisions of the overlapping links '{one}' and '{other}' are off")
 
     def write(self, path: Path) -> None:
@@ -266,9 +253,10 @@ def read_urdf(path: Path) -> UrdfCopy:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"URDF '{path}' does not exist")
+    content = path.read_bytes()
     try:
         # Drake knows its elements by their prefix, whatever address the file gives.
-        root = ET.fromstring(_PREFIX.sub(rf'\1"{_DRAKE}"'.encode(), path.read_bytes()))
+        root = ET.fromstring(_PREFIX.sub(rf'\1"{DRAKE}"'.encode(), content))
     except ET.ParseError as error:
         raise ValueError(f"'{path}' is not XML: {error}") from error
     if root.tag != "robot":
@@ -276,7 +264,8 @@ def read_urdf(path: Path) -> UrdfCopy:
             f"'{path}' is not a URDF: its root element is <{root.tag}>, expected <robot>. Convert "
             "it first, or write robot.yaml by hand: Drake also reads SDFormat and MJCF"
         )
-    if any("xacro" in element.tag for element in root.iter()):
+    # It may be in a comment, too.
+    if b"<xacro:" in content and any("xacro" in element.tag for element in root.iter()):
         raise ValueError(f"'{path}' is not expanded yet: run `xacro {path.name} > robot.urdf`")
     if not root.findall("link"):
         raise ValueError(f"'{path}' has no links")
@@ -289,23 +278,18 @@ def read_urdf(path: Path) -> UrdfCopy:
                 f"'{path}': link '{link.get('name')}' has a mass of {mass:g} kg, expected a finite "
                 "number that is not negative"
             )
-    for joint in root.findall("joint"):
-        _require_limits(path, joint)
+    for joint in root.findall("joint[limit]"):
+        kind, limit = joint.get("type"), joint.findall("limit")[0]
+        wrong = [key for key in ("effort", "velocity") if number(limit, key) < 0]
+        if number(limit, "lower") > number(limit, "upper") and kind in ("revolute", "prismatic"):
+            wrong = ["lower", "upper"]
+        if wrong and kind != "fixed":
+            stated = " ".join(f'{key}="{limit.get(key)}"' for key in wrong)
+            raise ValueError(
+                f"'{path}': joint '{joint.get('name')}' has {stated}; expected lower below upper, "
+                "and positive limits of effort and velocity"
+            )
     return UrdfCopy(source=path, root=root)
-
-
-def _require_limits(path: Path, joint: ET.Element) -> None:
-    limit = joint.find("limit")
-    low, high = number(limit, "lower"), number(limit, "upper")
-    wrong = [key for key in ("effort", "velocity") if number(limit, key) < 0]
-    if low > high and joint.get("type") in ("revolute", "prismatic"):
-        wrong = ["lower", "upper"]
-    if limit is not None and wrong and joint.get("type") != "fixed":
-        stated = " ".join(f'{key}="{limit.get(key)}"' for key in wrong)
-        raise ValueError(
-            f"'{path}': joint '{joint.get('name')}' has {stated}; expected lower below upper, and "
-            "positive limits of effort and velocity"
-        )
 
 
 def _end(joint: ET.Element, tag: str) -> ET.Element:
@@ -318,11 +302,8 @@ def _end(joint: ET.Element, tag: str) -> ET.Element:
 def pose_of(element: ET.Element) -> RigidTransform:
     """Returns the pose of an element's <origin>."""
     origin = element.find("origin")
-    xyz, rpy = (
-        [float(word) for word in ("" if origin is None else origin.get(key, "")).split()]
-        or [0.0, 0.0, 0.0]
-        for key in ("xyz", "rpy")
-    )
+    stated = {} if origin is None else origin.attrib
+    xyz, rpy = ([*map(float, (stated.get(key) or "0 0 0").split())] for key in ("xyz", "rpy"))
     return RigidTransform(RollPitchYaw(rpy), xyz)
 
 
@@ -331,43 +312,42 @@ def set_pose(element: ET.Element, pose: RigidTransform) -> None:
     origin = element.find("origin")
     if origin is None:
         origin = ET.SubElement(element, "origin")
-    for key, values in (
-        ("xyz", pose.translation()),
-        ("rpy", pose.rotation().ToRollPitchYaw().vector()),
-    ):
-        origin.set(key, " ".join(f"{value:.9g}" for value in values))
+    rpy = pose.rotation().ToRollPitchYaw().vector()
+    for key, values in (("xyz", pose.translation()), ("rpy", rpy)):
+        origin.set(key, as_text(values))
 
 
-def _hull_name(link: str, index: int) -> str:
-    return f"{link}_hull_{index}"
+def as_text(values: Iterable[float]) -> str:
+    """Returns numbers with nine digits, as attributes have them."""
+    return " ".join(f"{value:.9g}" for value in values)
 
 
 def _hull_file(link: str, index: int) -> str:
     """Names are data: what is no part of a file's name is replaced, and told apart by a hash."""
     plain = re.sub(r"[^\w.-]", "_", link)
     mark = "" if plain == link else f"_{zlib.crc32(link.encode()):08x}"
-    return f"meshes/{_hull_name(plain + mark, index)}.obj"
+    return f"meshes/{plain}{mark}_hull_{index}.obj"
 
 
-def _remove(element: ET.Element, tag: str) -> None:
-    """Removes all children with a tag."""
+def remove(element: ET.Element, tag: str) -> None:
+    """Removes all children of an element with a tag."""
     for part in element.findall(tag):
         element.remove(part)
 
 
-def _colour(material: ET.Element | None, colours: dict[str, ET.Element]) -> str:
-    if material is None:
-        return ""
-    for one in (material, colours.get(material.get("name", ""))):
-        colour = None if one is None else one.find("color")
-        if colour is not None:
-            return colour.get("rgba", "")
-    return ""
+def _colour(material: ET.Element | None) -> str:
+    colour = None if material is None else material.find("color")
+    return "" if colour is None else colour.get("rgba", "")
 
 
 def number(element: ET.Element | None, key: str) -> float:
     """Returns an attribute as a number; NaN if it is missing or not a number."""
+    return as_number(None if element is None else element.get(key))
+
+
+def as_number(text: str | None, default: float = math.nan) -> float:
+    """Returns a text as a number; the default if it is missing or not a number."""
     try:
-        return math.nan if element is None else float(element.get(key, "nan"))
+        return float(text or default)
     except ValueError:
-        return math.nan
+        return default

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import re
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_safety.robots.joint_drives import JointDrives
 from drake_safety.robots.urdf_copy import UrdfCopy, read_urdf
 from drake_safety.robots.urdf_survey import Limb, Survey
 
@@ -24,13 +24,12 @@ def require_shapes(survey: Survey, copy: UrdfCopy, urdf: Path, *, are_feet_named
     Raises:
         ValueError: It names the links and the files of their meshes.
     """
-    path = copy.source
     for link, size in survey.oversized().items():
         files = [mesh.get("filename") for mesh in read_urdf(urdf).link(link).iter("mesh")]
         raise ValueError(
-            f"new: '{path}': a collision shape of link '{link}' {files or ''} is {size:.3g} m "
-            f"large, in a robot of {survey.extent():.2g} m; in millimetres? State sizes in metres, "
-            'or scale="0.001 0.001 0.001"'
+            f"new: '{survey.source}': a collision shape of link '{link}' {files or ''} is "
+            f"{size:.3g} m large, in a robot of {survey.extent():.2g} m; in millimetres? State "
+            'sizes in metres, or scale="0.001 0.001 0.001"'
         )
     groups = [group for group in survey.leaves() if len(survey.chain(group[0])) >= 2]
     lowest = [survey.lowest(group) for group in groups]
@@ -46,44 +45,45 @@ def require_shapes(survey: Survey, copy: UrdfCopy, urdf: Path, *, are_feet_named
     ]
     if lost and not are_feet_named:
         raise ValueError(
-            f"new: '{path}': collision meshes at the ends of limbs were not found or not read, so "
-            f"that the feet cannot be told: {'; '.join(lost)}. Put them where the URDF says, give "
-            f"these links a box or sphere, or name the feet by --feet. {'. '.join(copy.left_out)}"
+            f"new: '{survey.source}': collision meshes at the ends of limbs were not found or not "
+            f"read, so that the feet cannot be told: {'; '.join(lost)}. Put them where the URDF "
+            "says, give these links a box or sphere, or name the feet by --feet. "
+            f"{'. '.join(copy.left_out)}"
         )
 
 
-def require_motors(
-    survey: Survey, legs: list[Limb], drives: JointDrives, moved: Collection[str], urdf: Path
-) -> None:
+def require_motors(survey: Survey, legs: list[Limb], moved: Collection[str]) -> None:
     """Refuses legs with joints that no motor moves by itself, unless a policy ``moved`` them.
 
     Raises:
         ValueError: It names the joints and what the file says of them.
     """
+    drives = survey.drives
     joints = list(dict.fromkeys(joint for limb in legs for joint in survey.chain(limb.body)))
     mimics = {name: drives.mimics[name] for name in joints if name in drives.mimics}
     coupled = {name: "= {1:g} · '{0}' + {2:g}".format(*one) for name, one in mimics.items()}
     passive = {name: why for name, why in drives.passive(joints).items() if name not in moved}
-    equal = {name: f"{low:g}" for name, (low, high) in survey.limits.items() if low == high}
-    stuck = {name: value for name, value in equal.items() if name in joints}
+    limits = {name: survey.limits[name] for name in survey.limits if name in joints}
+    stuck = {name: f"{low:g}" for name, (low, high) in limits.items() if low == high}
+    fix = 'or fix them (type="fixed")'
     for found, what, remedy in (
         (coupled, "follow others by <mimic>", "remove <mimic> if each has a motor of its own"),
-        (
-            passive,
-            "have no motor",
-            'add a <transmission> if they have one, or fix them (type="fixed")',
-        ),
-        (stuck, "have equal limits", 'correct <limit>, or fix them (type="fixed")'),
+        (passive, "have no motor", f"add a <transmission> if they have one, {fix}"),
+        (stuck, "have equal limits", f"correct <limit>, {fix}"),
     ):
         if found:
-            listed = ", ".join(f"'{name}' ({why})" for name, why in found.items())
             raise ValueError(
-                f"new: '{urdf}': a robot that stands by servos needs a motor on every joint of its "
-                f"legs, but some {what}: {listed}. Remedy: {remedy}"
+                f"new: '{survey.source}': a robot that stands by servos needs a motor on every "
+                f"joint of its legs, but some {what}: {listed(found)}. Remedy: {remedy}"
             )
 
 
-def require_masses(survey: Survey, urdf: Path) -> None:
+def listed(reasons: Mapping[str, str]) -> str:
+    """Returns names with their reasons in a sentence."""
+    return ", ".join(f"'{name}' ({why})" for name, why in reasons.items())
+
+
+def require_masses(survey: Survey) -> None:
     """Refuses joints that move nothing with mass or inertia, whose acceleration is infinite.
 
     Raises:
@@ -93,9 +93,9 @@ def require_masses(survey: Survey, urdf: Path) -> None:
     for joint in survey.joints:
         if M[joint.velocity_start(), joint.velocity_start()] < _LEAST_INERTIA:
             raise ValueError(
-                f"new: '{urdf}': joint '{joint.name()}' moves link '{joint.child_body().name()}', "
-                "which has no mass or inertia about its axis, and carries none. Correct its "
-                '<inertial>, or fix the joint (type="fixed")'
+                f"new: '{survey.source}': joint '{joint.name()}' moves link "
+                f"'{joint.child_body().name()}', which has no mass or inertia about its axis, and "
+                'carries none. Correct its <inertial>, or fix the joint (type="fixed")'
             )
 
 
@@ -162,10 +162,8 @@ def mirrored(names: list[str]) -> dict[str, str]:
     for name in names:
         for left, right in _SIDES:
             # As a word, or as the letter that begins or ends one: FL_hip, hip_left, l_arm.
-            start = name.find(left)
-            while start >= 0:
-                partner = f"{name[:start]}{right}{name[start + len(left) :]}"
+            for match in re.finditer(left, name):
+                partner = f"{name[: match.start()]}{right}{name[match.end() :]}"
                 if partner in names:
                     pairs.setdefault(name, partner)
-                start = name.find(left, start + 1)
     return pairs

@@ -63,17 +63,12 @@ class _Shape:
     def lowest_m(self) -> float:
         return float(self.centers[:, 2].min()) - self.radius_m
 
-    def is_beside(self, foot: _Shape) -> bool:
-        """Whether it touches the ground as a foot does, and is part of its body."""
-        is_alike = not self.is_sphere and abs(self.radius_m - foot.radius_m) < 1e-6
-        return self.body == foot.body and is_alike and self.lowest_m < foot.lowest_m + _FLAT_M
-
 
 class Survey:
     """A URDF in a plant, with the base at the world's origin and all joints at or near zero."""
 
     def __init__(self, path: Path, source: Path | None = None, drives: JointDrives | None = None):
-        source = source or path
+        self.source, self.drives = source or path, drives or JointDrives()
         builder = DiagramBuilder()
         plant: MultibodyPlant
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
@@ -83,56 +78,48 @@ class Survey:
         # Where a condition of Drake's C++ fails, pydrake raises SystemExit.
         except (RuntimeError, ValueError, SystemExit) as error:
             reason = re.sub(rf"{re.escape(str(path))}:\d+: ", "", str(error))
-            raise ValueError(f"Drake cannot read '{source}': {reason}") from error
+            raise ValueError(f"Drake cannot read '{self.source}': {reason}") from error
         self.plant, self._scene_graph = plant, scene_graph
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self.context = plant.GetMyMutableContextFromRoot(self._root)
-        floating = [
-            plant.get_body(i).name()
-            for i in plant.GetBodyIndices(self.instance)
-            if plant.get_body(i).is_floating_base_body()
-        ]
+        bodies = [*map(plant.get_body, plant.GetBodyIndices(self.instance))]
+        self.bodies = [body.name() for body in bodies]
+        floating = [body.name() for body in bodies if body.is_floating_base_body()]
         if len(floating) != 1:
             raise ValueError(
-                f"'{source}' must have exactly one floating body, its base; got "
+                f"'{self.source}' must have exactly one floating body, its base; got "
                 f"{floating or 'none'}. Remove a link 'world' and its joint"
             )
         (self.base,) = floating
         joints = [plant.get_joint(i) for i in plant.GetJointIndices(self.instance)]
         odd = [j.name() for j in joints if 1 < j.num_velocities() < 6]
         if odd:
-            raise ValueError(f"'{source}': joints {odd} have more than one degree of freedom")
-        self.joints: list[Joint] = sorted(
-            (j for j in joints if j.num_velocities() == 1), key=lambda j: j.position_start()
-        )
+            raise ValueError(f"'{self.source}': joints {odd} have more than one degree of freedom")
+        single = (joint for joint in joints if joint.num_velocities() == 1)
+        self.joints: list[Joint] = sorted(single, key=lambda joint: joint.position_start())
         self.limits = {
             joint.name(): (joint.position_lower_limit(), joint.position_upper_limit())
             for joint in self.joints
         }
         self._index = {joint.name(): joint.position_start() for joint in self.joints}
-        self._neutral = plant.GetPositions(self.context)
-        for name, (low, high) in self.limits.items():
-            self._neutral[self._index[name]] = _near_zero(low, high)
-        if drives is not None:
-            neutral = {name: self._neutral[index] for name, index in self._index.items()}
-            for name, value in drives.coupled(neutral).items():
-                self._neutral[self._index[name]] = value
+        neutral = {name: _near_zero(*limits) for name, limits in self.limits.items()}
+        self._neutral = self.drives.coupled(neutral)
         self._above = {joint.child_body().name(): joint for joint in joints}
         self.set_joints({})
         self.total_mass = plant.CalcTotalMass(self.context, [self.instance])
 
     def set_joints(self, values: dict[str, float]) -> None:
         """Sets joint positions [rad]; other joints are as close to zero as their limits allow."""
-        q = self._neutral.copy()
-        for name, value in values.items():
+        q = self.plant.GetPositions(self.context)
+        for name, value in {**self._neutral, **values}.items():
             q[self._index[name]] = value
         self.plant.SetPositions(self.context, q)
 
     def rest_joints(self, values: dict[str, float]) -> None:
         """Sets the positions [rad] of joints that are not set otherwise, within their limits."""
         for name in self._index.keys() & values.keys():
-            self._neutral[self._index[name]] = np.clip(values[name], *self.limits[name])
+            self._neutral[name] = np.clip(values[name], *self.limits[name])
 
     def posture(self) -> dict[str, float]:
         """Returns the present joint positions by name [rad]."""
@@ -164,9 +151,8 @@ class Survey:
 
     def joint_pose(self, joint: Joint) -> RigidTransform:
         """Returns the present pose of a joint's child in its parent."""
-        return self.pose(joint.parent_body().name()).inverse() @ self.pose(
-            joint.child_body().name()
-        )
+        X_BP, X_BC = map(self.pose, (joint.parent_body().name(), joint.child_body().name()))
+        return X_BP.inverse() @ X_BC
 
     def joint_axis(self, joint: str) -> np.ndarray:
         """Returns the direction of a joint's axis in the base's frame, (3,)."""
@@ -185,15 +171,9 @@ class Survey:
 
     def leaves(self) -> list[list[str]]:
         """Returns groups of welded bodies at the ends of the kinematic tree."""
-        carries = {
-            name for joint in self.joints for name in self.welded(joint.parent_body().name())
-        }
-        groups = []
-        for joint in self.joints:
-            group = self.welded(joint.child_body().name())
-            if not carries & set(group):
-                groups.append(group)
-        return groups
+        carriers = {joint.parent_body().name() for joint in self.joints}
+        groups = [self.welded(joint.child_body().name()) for joint in self.joints]
+        return [group for group in groups if not carriers & set(group)]
 
     def welded(self, body: str) -> list[str]:
         """Returns the bodies welded to a body, including itself."""
@@ -202,10 +182,7 @@ class Survey:
 
     def collides(self, body: str) -> bool:
         """Whether a body or one welded to it has collision geometry."""
-        return any(
-            self.plant.GetCollisionGeometriesForBody(self.plant.GetBodyByName(name, self.instance))
-            for name in self.welded(body)
-        )
+        return any(True for _ in self._geometries(self.welded(body)))
 
     def limbs(self) -> list[Limb]:
         """Returns the limbs of two joints or more."""
@@ -214,27 +191,25 @@ class Survey:
     def legs(self, feet: list[str] | None = None) -> list[Limb]:
         """Returns the limbs that reach lowest, or those that end in the given links."""
         groups = self.leaves()
+        ends = [name for group in groups for name in group]
+        for name in feet or ():
+            if name not in ends:
+                raise ValueError(f"no limb ends in link '{name}'; limbs end in {ends}")
         if feet is None:
-            lowest = [self.lowest(group) for group in groups]
-            floor = min(lowest, default=0.0)
+            floor = min(map(self.lowest, groups), default=0.0)
             # Hanging arms end well above the ground.
+            highest = floor + max(-0.25 * floor, 0.02)
             groups = [
                 group
-                for group, z in zip(groups, lowest, strict=True)
-                if z <= floor + max(-0.25 * floor, 0.02) and len(self.chain(group[0])) >= 2
+                for group in groups
+                if self.lowest(group) <= highest and len(self.chain(group[0])) >= 2
             ]
         else:
-            for name in feet:
-                if not any(name in group for group in groups):
-                    raise ValueError(
-                        f"no limb ends in link '{name}'; limbs end in "
-                        f"{[name for group in groups for name in group]}"
-                    )
             groups = [group for group in groups if set(group) & set(feet)]
         if len(groups) < 2:
             raise ValueError(
                 f"found {len(groups)} feet, expected at least 2: name the links that touch the "
-                f"ground by --feet; limbs end in {[name for g in self.leaves() for name in g]}"
+                f"ground by --feet; limbs end in {ends}"
             )
         limbs = [self._leg(group) for group in groups]
         shared = set.intersection(*(set(limb.joints) for limb in limbs))
@@ -287,34 +262,37 @@ class Survey:
         axis, origin = self.joint_axis(limb.joints[-1]), self.joint_origin(limb.joints[-1])
         group = self.welded(limb.body)
         lowest = self.lowest(group)
-        for name, shape, box in self._boxes(group):
-            X_WO = self.pose(name) @ box.pose()
+        for _, _, shape, X_WG, box in self._geometries(group):
+            if box is None or isinstance(shape, Box):
+                continue
+            X_WO = X_WG @ box.pose()
             along = np.abs(X_WO.rotation().matrix().T @ axis)
             across = np.delete(box.half_width(), np.argmax(along))
             radius, center = float(across.max()), X_WO.translation()
             is_low = center[2] - 1.5 * radius < lowest
             is_turned = along.max() > 0.95 or isinstance(shape, Sphere)
             offset = max(np.ptp(across), np.linalg.norm(np.cross(axis, center - origin)))
-            if is_low and is_turned and not isinstance(shape, Box) and offset < _ROUND * radius:
+            if is_low and is_turned and offset < _ROUND * radius:
                 return (self.pose(limb.body).inverse() @ center)[None], radius
         return None
 
     def oversized(self) -> dict[str, float]:
         """Returns links with a collision shape beyond ten times the robot's extent; sizes [m]."""
-        names = [self.plant.get_body(i).name() for i in self.plant.GetBodyIndices(self.instance)]
-        sizes = {name: 2 * max(box.half_width()) for name, _, box in self._boxes(names)}
+        boxes = ((name, box) for name, _, _, _, box in self._geometries(self.bodies) if box)
+        sizes = {name: 2 * max(box.half_width()) for name, box in boxes}
         return {name: size for name, size in sizes.items() if size > 10 * self.extent()}
 
-    def _boxes(self, bodies: list[str]) -> Iterator[tuple[str, Shape, Obb]]:
-        """The collision shapes of bodies: body, shape and box around it, in the body's frame."""
+    def _geometries(
+        self, bodies: list[str]
+    ) -> Iterator[tuple[str, GeometryId, Shape, RigidTransform, Obb | None]]:
+        """The collision shapes of bodies: body, id, shape, pose, and the box in its frame."""
         inspector = self._scene_graph.model_inspector()
         for name in bodies:
             body = self.plant.GetBodyByName(name, self.instance)
-            for geometry in self.plant.GetCollisionGeometriesForBody(body):
-                box = inspector.GetObbInGeometryFrame(geometry)
-                if box is not None:
-                    X_BO = inspector.GetPoseInFrame(geometry) @ box.pose()
-                    yield name, inspector.GetShape(geometry), Obb(X_BO, box.half_width())
+            for one in self.plant.GetCollisionGeometriesForBody(body):
+                X_WG = self.pose(name) @ inspector.GetPoseInFrame(one)
+                box = inspector.GetObbInGeometryFrame(one)
+                yield name, one, inspector.GetShape(one), X_WG, box
 
     def overlaps(self) -> set[tuple[str, str]]:
         """Returns pairs of links that overlap in the present posture."""
@@ -326,11 +304,8 @@ class Survey:
         def link(geometry: GeometryId) -> str:
             return self.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).name()
 
-        found = set()
-        for pair in query.ComputePointPairPenetration():
-            one, other = sorted((link(pair.id_A), link(pair.id_B)))
-            found.add((one, other))
-        return found
+        pairs = [(link(one.id_A), link(one.id_B)) for one in query.ComputePointPairPenetration()]
+        return {(min(pair), max(pair)) for pair in pairs}
 
     def lowest(self, group: list[str]) -> float:
         """Returns the height of bodies' lowest point over the base [m]."""
@@ -346,23 +321,19 @@ class Survey:
             return Limb(body=body, joints=joints)
         # A sphere of the URDF's rather than what is hardly lower, such as the shank at its height.
         foot = min(shapes, key=lambda one: one.lowest_m - (_LEVEL_M if one.is_sphere else 0.0))
-        if foot.is_sphere:
-            level_m = min(shape.lowest_m for shape in shapes) + _LEVEL_M
-            centers = np.concatenate(
-                [
-                    one.centers
-                    for one in shapes
-                    if one.is_sphere
-                    and one.body == foot.body
-                    and abs(one.radius_m - foot.radius_m) < 1e-6
-                    and one.lowest_m < level_m
-                ]
-            )
-        else:
-            # A sole may be several shapes.
-            centers = np.concatenate([one.centers for one in shapes if one.is_beside(foot)])
-            heights = centers[:, 2]
-            centers = centers[heights < heights.min() + _LEVEL_M + foot.radius_m]
+        lowest_m = min(shape.lowest_m for shape in shapes)
+        # A sole may be several shapes.
+        level_m = lowest_m + _LEVEL_M if foot.is_sphere else foot.lowest_m + _FLAT_M
+        centers = np.concatenate(
+            [
+                one.centers
+                for one in shapes
+                if (one.body, one.is_sphere) == (foot.body, foot.is_sphere)
+                and abs(one.radius_m - foot.radius_m) < 1e-6
+                and one.lowest_m < level_m
+            ]
+        )
+        centers = centers[centers[:, 2] < centers[:, 2].min() + _LEVEL_M + foot.radius_m]
         return Limb(
             body=foot.body,
             joints=joints,
@@ -373,30 +344,26 @@ class Survey:
         )
 
     def _shapes(self, group: list[str]) -> list[_Shape]:
-        inspector = self._scene_graph.model_inspector()
         found = []
-        for name in group:
-            body = self.plant.GetBodyByName(name, self.instance)
-            for geometry in self.plant.GetCollisionGeometriesForBody(body):
-                shape = inspector.GetShape(geometry)
-                X_WG = self.pose(name) @ inspector.GetPoseInFrame(geometry)
-                if isinstance(shape, Sphere):
-                    found.append(_Shape(name, X_WG.translation()[None], shape.radius(), True))
-                elif isinstance(shape, Cylinder) and _is_plate(X_WG, shape):
-                    half = np.array([*2 * [math.sqrt(0.5) * shape.radius()], shape.length() / 2])
-                    found.append(_Shape(name, *_corners(X_WG, half)))
-                elif isinstance(shape, Capsule | Cylinder):
-                    radius = shape.radius()
-                    half = shape.length() / 2 - (0 if isinstance(shape, Capsule) else radius)
-                    ends = np.array([[0, 0, -half], [0, 0, half]]) if half > 0 else np.zeros((1, 3))
-                    found.append(_Shape(name, (X_WG @ ends.T).T, radius))
-                elif (hull := inspector.GetConvexHull(geometry)) is not None:
-                    middle, edges = hull.CalcBoundingBox()
-                    X_WO = X_WG @ RigidTransform(middle)
-                    found.append(_Shape(name, *_corners(X_WO, np.array(edges) / 2)))
-                elif (box := inspector.GetObbInGeometryFrame(geometry)) is not None:
-                    X_WO = X_WG @ box.pose()
-                    found.append(_Shape(name, *_corners(X_WO, np.array(box.half_width()))))
+        for name, geometry, shape, X_WG, box in self._geometries(group):
+            hull = self._scene_graph.model_inspector().GetConvexHull(geometry)
+            if isinstance(shape, Sphere):
+                found.append(_Shape(name, X_WG.translation()[None], shape.radius(), True))
+            elif isinstance(shape, Cylinder) and _is_plate(X_WG, shape):
+                half = np.array([*2 * [math.sqrt(0.5) * shape.radius()], shape.length() / 2])
+                found.append(_Shape(name, *_corners(X_WG, half)))
+            elif isinstance(shape, Capsule | Cylinder):
+                radius = shape.radius()
+                half = shape.length() / 2 - (0 if isinstance(shape, Capsule) else radius)
+                ends = np.array([[0, 0, -half], [0, 0, half]]) if half > 0 else np.zeros((1, 3))
+                found.append(_Shape(name, (X_WG @ ends.T).T, radius))
+            elif hull is not None:
+                middle, edges = hull.CalcBoundingBox()
+                X_WO = X_WG @ RigidTransform(middle)
+                found.append(_Shape(name, *_corners(X_WO, np.array(edges) / 2)))
+            elif box is not None:
+                X_WO = X_WG @ box.pose()
+                found.append(_Shape(name, *_corners(X_WO, np.array(box.half_width()))))
         return found
 
 
@@ -429,7 +396,8 @@ def odd_inertias(plant: MultibodyPlant, context: Context, instance: ModelInstanc
     found = []
     for body in map(plant.get_body, plant.GetBodyIndices(instance)):
         M_BBo = body.default_spatial_inertia()
-        if not (mass := M_BBo.get_mass()) > 0:
+        mass = M_BBo.get_mass()
+        if not mass > 0:
             continue
         G_BBcm = M_BBo.get_unit_inertia().ShiftToCenterOfMass(M_BBo.get_com())
         radius = math.sqrt(max(*G_BBcm.CalcPrincipalMomentsOfInertia(), 0.0))
@@ -460,6 +428,6 @@ def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]
     inner = np.maximum(half - _CORNER_RADIUS_M, 0.0)
     # A thin sole's spheres rise above it.
     inner[axis] = half[axis] - _CORNER_RADIUS_M
-    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    signs = np.array(np.meshgrid(*3 * [[-1, 1]])).reshape(3, -1).T
     signs = signs[signs[:, axis] * down[axis] > 0]
     return (X_WG @ (signs * inner).T).T, _CORNER_RADIUS_M
