@@ -8,12 +8,13 @@ import shutil
 import tempfile
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from drake_safety.files.reading import yaml_text
-from drake_safety.robots.joint_drives import read_drives
+from drake_safety.robots.joint_drives import JointDrives, read_drives
 from drake_safety.robots.meshes import above
 from drake_safety.robots.mjcf import ModelFacts, is_mjcf, mjcf_to_urdf
 from drake_safety.robots.robot_model import as_pattern, load_robot_file
@@ -53,15 +54,23 @@ class NewRobot:
     task: str
     folder: Path
     copy: UrdfCopy
-    survey: Survey
-    legs: list[Limb]
-    arms: list[Limb]
-    posture: dict[str, float]
-    posture_source: str
-    sizes: Sizes
+    drives: JointDrives
     facts: ModelFacts
+    survey: Survey = field(init=False)
+    legs: list[Limb] = field(default_factory=list)
+    arms: list[Limb] = field(default_factory=list)
+    posture: dict[str, float] = field(default_factory=dict)
+    posture_source: str = ""
     wheels: list[str] = field(default_factory=list)
     asked: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.renew_survey()
+
+    def renew_survey(self) -> None:
+        """Writes the URDF, and surveys what is written."""
+        self.copy.write(self.files[0])
+        self.survey = Survey(self.files[0], self.copy.source, self.drives)
 
     @property
     def files(self) -> list[Path]:
@@ -83,6 +92,34 @@ class NewRobot:
     def bare(self) -> list[str]:
         """Links whose collision meshes the copy lacks, and that have no other shape."""
         return self.copy.bare_links()
+
+    @cached_property
+    def sizes(self) -> Sizes:
+        """Its sizes as it stands."""
+        survey, friction = self.survey, list(self.copy.joint_friction.values())
+        points = [survey.positions(limb) for limb in self.legs]
+        centroid = np.concatenate(points).mean(axis=0)
+        half = np.abs(np.concatenate(points) - centroid).max(axis=0)
+        feet = np.array([one.mean(axis=0) for one in points])
+        legs = zip(points, self.legs, strict=True)
+        lowest = min(float(one[:, 2].min()) - limb.radius_m for one, limb in legs)
+        reach, shoulder = 0.0, np.zeros(3)
+        for arm in self.arms[:1]:
+            origins = [survey.joint_origin(joint) for joint in arm.joints]
+            hand = survey.pose(arm.body).translation()
+            reach = float(np.linalg.norm(np.diff([*origins, hand], axis=0), axis=1).sum())
+            shoulder = origins[0] - [*centroid[:2], lowest]
+        return Sizes(
+            mass_kg=survey.total_mass,
+            height_m=-lowest,
+            half_length_m=float(half[0]),
+            half_width_m=float(half[1]),
+            lateral_m=float(np.abs(feet[:, 1] - centroid[1]).min()),
+            reach_m=reach,
+            shoulder_m=shoulder.tolist(),
+            base=survey.base,
+            joint_friction_nm=float(np.median(friction)) if friction else None,
+        )
 
 
 def write_robot(
@@ -113,12 +150,25 @@ def write_robot(
     if folder.exists():
         raise ValueError(f"new: '{folder}' exists already; choose another name, or another --out")
     with tempfile.TemporaryDirectory() as scratch:
-        found = _survey(name, model, task, Path(scratch), feet, moved)
+        urdf, facts = model, ModelFacts()
+        if is_mjcf(model):
+            urdf = Path(scratch) / "mjcf" / f"{name}.urdf"
+            urdf.parent.mkdir()
+            facts = mjcf_to_urdf(model, urdf)
+        copy, drives = simulatable_copy(urdf), read_drives(read_urdf(urdf).root)
+        copy.source = model
+        copy.left_out = facts.left_out + copy.left_out
+        copy.notes += [f"it is converted from '{model.name}'", *facts.left_out][urdf == model :]
+        at = Path(scratch)
+        found = NewRobot(name=name, task=task, folder=at, copy=copy, drives=drives, facts=facts)
+        _find_limbs(found, urdf, feet, moved or ())
+        _fix_joints(found, moved)
+        _stand(found)
         # Copied to the target only when complete.
-        found.folder = Path(scratch) / "robot"
+        found.folder = at / "robot"
         found.folder.mkdir()
         description, robot, readme, scenario = found.files
-        found.copy.write(description)
+        copy.write(description)
         robot.write_text(_robot_yaml(found), encoding="utf-8")
         load_robot_file(robot)
         scenario.write_text(scenario_yaml(task, found.sizes), encoding="utf-8")
@@ -129,156 +179,114 @@ def write_robot(
     return found
 
 
-def _survey(
-    name: str,
-    model: Path,
-    task: str,
-    scratch: Path,
-    feet: list[str] | None,
-    moved: Collection[str] | None,
-) -> NewRobot:
-    urdf, facts = model, ModelFacts()
-    if is_mjcf(model):
-        urdf = scratch / "mjcf" / f"{name}.urdf"
-        urdf.parent.mkdir()
-        facts = mjcf_to_urdf(model, urdf)
-    copy = simulatable_copy(urdf)
-    copy.source = model
-    copy.left_out = facts.left_out + copy.left_out
-    copy.notes += [f"it is converted from '{model.name}'", *facts.left_out][urdf == model :]
-    drives = read_drives(read_urdf(urdf).root)
-
-    def surveyed() -> Survey:
-        copy.write(scratch / f"{name}.urdf")
-        return Survey(scratch / f"{name}.urdf", model, drives)
-
-    def with_base(survey: Survey, limbs: list[Limb], *, is_up: bool) -> Survey:
-        pose, why = upright_base(survey, limbs, is_up=is_up)
-        if pose is not None:
-            base = copy.add_root("hips", survey.base, pose)
-            copy.warn(f"the root link '{survey.base}' {why}; the base is a new link '{base}'")
-            return surveyed()
-        if why:
-            copy.warn(f"the robot {why} of '{survey.base}'")
-        return survey
-
-    survey = surveyed()
-    survey = with_base(survey, survey.limbs(), is_up=False)
-    require_shapes(survey, copy, urdf, are_feet_named=feet is not None)
-    survey = with_base(survey, survey.legs(feet), is_up=True)
-    legs = survey.legs(feet)
-    require_motors(survey, legs, moved or ())
-    arms = survey.arms(legs)
-    if task == "reaching" and not arms:
+def _find_limbs(
+    found: NewRobot, urdf: Path, feet: list[str] | None, moved: Collection[str]
+) -> None:
+    _set_base(found, found.survey.limbs(), is_up=False)
+    require_shapes(found.survey, found.copy, urdf, are_feet_named=feet is not None)
+    _set_base(found, found.survey.legs(feet), is_up=True)
+    found.legs = found.survey.legs(feet)
+    require_motors(found.survey, found.legs, moved)
+    found.arms = found.survey.arms(found.legs)
+    if found.task == "reaching" and not found.arms:
         raise ValueError(
-            f"new: '{model}' has no arm (a limb of four joints or more that is not a leg) to reach "
-            "with; use --task balancing"
+            f"new: '{found.copy.source}' has no arm (a limb of four joints or more that is not a "
+            "leg) to reach with; use --task balancing"
         )
-    wheels = survey.wheels(legs)
-    used = _used_joints(survey, copy, task, legs, arms, moved)
-    if wheels:
-        copy.warn(
-            f"joints {sorted(wheels)} turn wheels: position servos hold them, so that they neither "
-            "roll nor drive"
+    found.wheels = found.survey.wheels(found.legs)
+
+
+def _set_base(found: NewRobot, limbs: list[Limb], *, is_up: bool) -> None:
+    copy, old = found.copy, found.survey.base
+    pose, why = upright_base(found.survey, limbs, is_up=is_up)
+    if pose is not None:
+        base = copy.add_root("hips", old, pose)
+        copy.warn(f"the root link '{old}' {why}; the base is a new link '{base}'")
+        found.renew_survey()
+    elif why:
+        copy.warn(f"the robot {why} of '{old}'")
+
+
+def _fix_joints(found: NewRobot, moved: Collection[str] | None) -> None:
+    """Fixes what moves no foot or hand, and tells of couplings, motors, springs and wheels."""
+    survey, copy, drives, stated = found.survey, found.copy, found.drives, set(moved or ())
+    legged, armed = (
+        {joint for limb in limbs for joint in survey.chain(limb.body)}
+        for limbs in (found.legs, found.arms)
+    )
+    used = legged | armed | (set(survey.limits) if moved is None else stated)
+    used -= {name for name, (leader, *_) in drives.mimics.items() if leader in legged}
+    coupled = used & set(drives.mimics)
+    leaders = {drives.mimics[name][0] for name in coupled}
+    if coupled and found.task != "balancing":
+        raise ValueError(
+            f"new: '{copy.source}': joints {sorted(coupled)} follow others by <mimic>, for which "
+            f"--task {found.task} has no controller; use --task balancing, or remove <mimic>"
         )
-    for limb in legs:
+    passive = drives.passive(sorted(used - legged - coupled - leaders - stated))
+    used = used - set(passive) | leaders
+    loose = {name for name, (leader, *_) in drives.mimics.items() if leader in used} - used
+    for names, note in (
+        (coupled, "follow others by <mimic>, in the posture too"),
+        (loose, "follow joints that move, by <mimic>, but move no foot or hand and are fixed"),
+        (passive, f"have no motor and are fixed: {listed(passive)}"),
+        (used & set(drives.springs), "have springs beside their motors, which are left out"),
+        (
+            found.wheels,
+            "turn wheels: position servos hold them, so that they neither roll nor drive",
+        ),
+    ):
+        if names:
+            copy.warn(f"joints {sorted(names)} {note}")
+    for limb in found.legs:
         if not limb.is_own_shape:
             copy.replace_collisions(limb.body, limb.points, limb.radius_m)
         elif limb.body in copy.hulls:
             copy.set_hulls(limb.body, [])
             copy.notes.append(f"foot '{limb.body}' has no hull: its spheres alone touch")
-    copy.fix_joints(
-        {
-            joint.name(): survey.joint_pose(joint) if joint.name() in drives.mimics else None
-            for joint in survey.joints
-            if joint.name() not in used
-        }
-    )
-    survey = surveyed()
-    require_masses(survey)
+    idle = {joint.name(): joint for joint in survey.joints if joint.name() not in used}
+    coupled_poses = {name: survey.joint_pose(idle[name]) for name in idle if name in drives.mimics}
+    copy.fix_joints(dict.fromkeys(idle) | coupled_poses)
+    found.renew_survey()
+
+
+def _stand(found: NewRobot) -> None:
+    """Finds the posture, and what touches what in it."""
+    copy, source = found.copy, found.copy.source
+    require_masses(found.survey)
     try:
-        posture, posture_source = standing_posture(survey, legs, facts.postures)
+        found.posture, found.posture_source = standing_posture(
+            found.survey, found.legs, found.facts.postures
+        )
     except ValueError as error:
         raise ValueError(". ".join([f"{error}", *copy.warnings, *copy.left_out])) from error
-    _lift_hulls(copy, survey, legs)
-    survey = surveyed()
-    survey.set_joints(posture)
+    _lift_hulls(copy, found.survey, found.legs)
+    found.renew_survey()
+    survey = found.survey
+    survey.set_joints(found.posture)
     if odd := odd_inertias(survey.plant, survey.context, survey.instance):
         copy.warn(odd)
-    # Balls are thrown at the base.
-    is_base_bare = not survey.collides(survey.base)
-    copy.ignore_collisions({*survey.overlaps(), *facts.apart})
-    sizes = _sizes(survey, legs, arms, copy)
+    copy.ignore_collisions({*survey.overlaps(), *found.facts.apart})
+    sizes = found.sizes
     if not _LEAST_HEIGHT_M < sizes.height_m < _GREATEST_HEIGHT_M:
         raise ValueError(
-            f"new: '{model}': base '{survey.base}' would stand {sizes.height_m:.3g} m high. "
+            f"new: '{source}': base '{survey.base}' would stand {sizes.height_m:.3g} m high. "
             "Are the <origin>s in millimetres?"
         )
     if min(sizes.half_length_m, sizes.half_width_m) < _LEAST_STANCE * sizes.height_m:
         copy.warn(
             "the contact points of the feet lie on a line: on them, no posture stands by servos"
         )
-    asked = [
+    found.asked += [
         f"where foot '{limb.body}' touches: the file has no shape there [m]"
-        for limb in legs
+        for limb in found.legs
         if limb.is_guess
     ]
-    if is_base_bare:
-        asked.append(
-            f"a <collision> shape of the base '{survey.base}', in {name}.urdf [m]: without one no "
-            "ball can hit it"
+    if not survey.collides(survey.base):  # Balls are thrown at it.
+        found.asked.append(
+            f"a <collision> shape of the base '{survey.base}', in {found.name}.urdf [m]: without "
+            "one no ball can hit it"
         )
-    return NewRobot(
-        name=name,
-        task=task,
-        folder=scratch,
-        copy=copy,
-        survey=survey,
-        legs=legs,
-        arms=arms,
-        posture=posture,
-        posture_source=posture_source,
-        sizes=sizes,
-        facts=facts,
-        wheels=wheels,
-        asked=asked,
-    )
-
-
-def _used_joints(
-    survey: Survey,
-    copy: UrdfCopy,
-    task: str,
-    legs: list[Limb],
-    arms: list[Limb],
-    moved: Collection[str] | None,
-) -> set[str]:
-    """The joints that are not fixed; what couplings, motors and springs mean for them is told."""
-    mimics, stated = survey.drives.mimics, set(moved or ())
-    legged, armed = (
-        {joint for limb in limbs for joint in survey.chain(limb.body)} for limbs in (legs, arms)
-    )
-    used = legged | armed | (set(survey.limits) if moved is None else stated)
-    used -= {name for name, (leader, *_) in mimics.items() if leader in legged}
-    coupled = used & set(mimics)
-    leaders = {mimics[name][0] for name in coupled}
-    if coupled and task != "balancing":
-        raise ValueError(
-            f"new: '{survey.source}': joints {sorted(coupled)} follow others by <mimic>, for which "
-            f"--task {task} has no controller; use --task balancing, or remove <mimic>"
-        )
-    passive = survey.drives.passive(sorted(used - legged - coupled - leaders - stated))
-    used = used - set(passive) | leaders
-    loose = {name for name, (leader, *_) in mimics.items() if leader in used} - used
-    for names, note in (
-        (coupled, "follow others by <mimic>, in the posture too"),
-        (loose, "follow joints that move, by <mimic>, but move no foot or hand and are fixed"),
-        (passive, f"have no motor and are fixed: {listed(passive)}"),
-        (used & set(survey.drives.springs), "have springs beside their motors, which are left out"),
-    ):
-        if names:
-            copy.warn(f"joints {sorted(names)} {note}")
-    return used
 
 
 def _lift_hulls(copy: UrdfCopy, survey: Survey, legs: list[Limb]) -> None:
@@ -293,53 +301,26 @@ def _lift_hulls(copy: UrdfCopy, survey: Survey, legs: list[Limb]) -> None:
             copy.set_hulls(link, [part for part in parts if part is not None])
 
 
-def _sizes(survey: Survey, legs: list[Limb], arms: list[Limb], copy: UrdfCopy) -> Sizes:
-    points = np.concatenate([survey.positions(limb) for limb in legs])
-    lowest = min(float(survey.positions(limb)[:, 2].min()) - limb.radius_m for limb in legs)
-    centroid = points.mean(axis=0)
-    half = np.abs(points - centroid).max(axis=0)
-    feet = np.array([survey.positions(limb).mean(axis=0) for limb in legs])
-    reach, shoulder, friction = 0.0, np.zeros(3), list(copy.joint_friction.values())
-    for arm in arms[:1]:
-        origins = [survey.joint_origin(joint) for joint in arm.joints]
-        hand = survey.pose(arm.body).translation()
-        reach = float(np.linalg.norm(np.diff([*origins, hand], axis=0), axis=1).sum())
-        shoulder = origins[0] - [*centroid[:2], lowest]
-    return Sizes(
-        mass_kg=survey.total_mass,
-        height_m=-lowest,
-        half_length_m=float(half[0]),
-        half_width_m=float(half[1]),
-        lateral_m=float(np.abs(feet[:, 1] - centroid[1]).min()),
-        reach_m=reach,
-        shoulder_m=shoulder.tolist(),
-        base=survey.base,
-        joint_friction_nm=float(np.median(friction)) if friction else None,
-    )
-
-
 def _robot_yaml(found: NewRobot) -> str:
     sizes, facts, names, source = found.sizes, found.facts, found.joints, found.copy.source.name
     base, keys = yaml_text(sizes.base), {name: yaml_text(as_pattern(name)) for name in names}
+    posture = [f"{key}: {found.posture[j]:g}" for j, key in keys.items() if found.posture.get(j)]
     lines = [
         f"# {found.name}: written from {source}. Lines marked ASK have values that",
         "# it lacks: look them up, and state their sources in README.md.",
         f"name: {found.name}",
         f"urdf: {found.name}.urdf",
         f"base: {base}  # {sizes.mass_kg:.2f} kg in all, {sizes.height_m:.3f} m high [m]",
-        f"posture:  # standing, {found.posture_source} [rad]",
-        *(f"  {keys[name]}: {found.posture[name]:g}" for name in names if found.posture.get(name)),
+        *_block(f"posture:  # standing, {found.posture_source} [rad]", posture, always=True),
         "feet:  # contact_points are centres of spheres, in the body's frame [m]",
     ]
     for limb in found.legs:
         points = [[round(float(value), 5) for value in point] for point in limb.points]
-        ask = "  # ASK its contact points [m]" if limb.is_guess else ""
-        is_wheel = limb.joints[-1] in found.wheels
         about = [f"contact_points: {points}", f"radius_m: {float(f'{limb.radius_m:.5g}')}"]
-        lines += _limb_lines(limb, about, ask)
-        lines[-1] += "  # the last turns a wheel, which its servo holds" * is_wheel
-    if found.arms:
-        lines.append("reaching_frames:")
+        lines += _limb_lines(limb, about, "  # ASK its contact points [m]" * limb.is_guess)
+        if limb.joints[-1] in found.wheels:
+            lines[-1] += "  # the last turns a wheel, which its servo holds"
+    lines += ["reaching_frames:"] * bool(found.arms)
     for limb in found.arms:
         about = [
             "point: [0.0, 0.0, 0.0]  # ASK the point that reaches, in the body's frame [m]",
@@ -348,11 +329,8 @@ def _robot_yaml(found: NewRobot) -> str:
         lines += _limb_lines(limb, about)
         found.asked.append(f"the point of hand '{limb.body}' that reaches, and its size [m]")
     lines += _gain_lines(found, keys)
-    if rotors := {
-        keys[name]: facts.rotor_inertia[name] for name in names if name in facts.rotor_inertia
-    }:
-        lines.append(f"rotor_inertia:  # of {source} [kg·m²]")
-        lines += [f"  {key}: {inertia:.4g}" for key, inertia in rotors.items()]
+    rotors = [f"{keys[j]}: {facts.rotor_inertia[j]:.4g}" for j in names if j in facts.rotor_inertia]
+    lines += _block(f"rotor_inertia:  # of {source} [kg·m²]", rotors)
     lines += _effort_lines(found, keys)
     # Of the shape nearest to a foot's contact points.
     stated = [
@@ -360,27 +338,27 @@ def _robot_yaml(found: NewRobot) -> str:
         for limb in found.legs
         if (shapes := facts.friction.get(limb.body))
     ]
-    friction = min(filter(None, stated), default=0.6)
+    mu = min(filter(None, stated), default=0.6)
     origin = f"that of {source}" if stated else "assumed"
-    lines.append(
-        f"foot_friction: {friction:g}  # ASK Coulomb's coefficient of feet on your ground [1]"
-    )
-    found.asked.append(f"the friction of feet on your ground [1]; {friction:g} is {origin}")
-    mirror = {keys[one]: other.replace("\\", r"\\") for one, other in mirrored(names).items()}
-    if mirror:
-        lines += ["mirror:", *(f"  {key}: {yaml_text(other)}" for key, other in mirror.items())]
-    if bare := found.bare:
-        lines += [
-            "without_collision:  # ASK shapes in place of these links' lost meshes [m]",
-            *(f"  - {yaml_text(link)}" for link in bare),
-        ]
+    lines.append(f"foot_friction: {mu:g}  # ASK Coulomb's coefficient of feet on your ground [1]")
+    found.asked.append(f"the friction of feet on your ground [1]; {mu:g} is {origin}")
+    partners = {keys[one]: other.replace("\\", r"\\") for one, other in mirrored(names).items()}
+    lines += _block("mirror:", [f"{key}: {yaml_text(other)}" for key, other in partners.items()])
+    title = "without_collision:  # ASK shapes in place of these links' lost meshes [m]"
+    lines += _block(title, [f"- {yaml_text(link)}" for link in found.bare])
+    if found.bare:
         found.asked.append(
-            f"collision shapes of the {len(bare)} links under 'without_collision' in robot.yaml [m]"
+            f"collision shapes of the {len(found.bare)} links under 'without_collision' in "
+            "robot.yaml [m]"
         )
-    lines += ["whole_body:", f"  orientation: {{{base}: {{weight: 20.0}}}}"]
+    lines += _block("whole_body:", [f"orientation: {{{base}: {{weight: 20.0}}}}"])
     if found.task == "balancing" and len(found.legs) > 2:
         lines.append("  posture: {weight: 0.001}")
     return "\n".join(lines) + "\n"
+
+
+def _block(title: str, entries: list[str], *, always: bool = False) -> list[str]:
+    return [title, *(f"  {entry}" for entry in entries)] if entries or always else []
 
 
 def _limb_lines(limb: Limb, about: list[str], note: str = "") -> list[str]:
@@ -390,41 +368,38 @@ def _limb_lines(limb: Limb, about: list[str], note: str = "") -> list[str]:
 
 
 def _gain_lines(found: NewRobot, keys: dict[str, str]) -> list[str]:
-    known, source = found.facts.gains, found.copy.source.name
-    num_guessed = len(keys.keys() - known.keys())
-    ask = "ASK the maker's; these grow with mass times height " if num_guessed else ""
-    lines = [f"joint_gains:  # {ask}[N·m/rad, N·m·s/rad]"]
-    if num_guessed:
-        which = f" of {num_guessed} joints" if num_guessed < len(keys) else ""
-        found.asked.append(
-            f"the maker's servo gains{which} [N·m/rad, N·m·s/rad]; estimated from the mass"
-        )
+    known, source, lines = found.facts.gains, found.copy.source.name, []
     legs = {name for limb in found.legs for name in limb.joints}
     for name, key in keys.items():
         stiffness = _STIFFNESS * found.sizes.load * (1.0 if name in legs else 0.5)
         stiffness, damping = known.get(name, (stiffness, _DAMPING_S * stiffness))
         origin = f"  # of {source}" if name in known else ""
-        lines.append(f"  {key}: {{stiffness: {stiffness:.4g}, damping: {damping:.4g}}}{origin}")
-    return lines
+        lines.append(f"{key}: {{stiffness: {stiffness:.4g}, damping: {damping:.4g}}}{origin}")
+    num_guessed, ask = len(keys.keys() - known.keys()), ""
+    if num_guessed:
+        ask = "ASK the maker's; these grow with mass times height "
+        which = f" of {num_guessed} joints" if num_guessed < len(keys) else ""
+        found.asked.append(
+            f"the maker's servo gains{which} [N·m/rad, N·m·s/rad]; estimated from the mass"
+        )
+    return _block(f"joint_gains:  # {ask}[N·m/rad, N·m·s/rad]", lines, always=True)
 
 
 def _effort_lines(found: NewRobot, keys: dict[str, str]) -> list[str]:
-    plant, limits = found.survey.plant, found.survey.drives.efforts
+    plant, lines = found.survey.plant, []
     indices = plant.GetJointActuatorIndices(found.survey.instance)
     motors = [*map(plant.get_joint_actuator, indices)]
     driven = {one.joint().name() for one in motors if math.isfinite(one.effort_limit())}
-    lines = []
-    for name, key in keys.items():
-        if name in driven:
-            continue
-        if 0 < limits[name] < math.inf:
-            lines.append(f"  {key}: {limits[name]:g}")
-        else:
-            guess = f"{4 * found.sizes.load:.3g}"
-            lines.append(f"  {key}: {guess}  # ASK the motor's largest torque [N·m]")
+    for name in (name for name in keys if name not in driven):
+        limit, note = found.drives.efforts[name], ""
+        if not 0 < limit < math.inf:
+            limit = float(f"{4 * found.sizes.load:.3g}")
+            note = "  # ASK the motor's largest torque [N·m]"
             found.asked.append(f"the largest torque of joint '{name}' [N·m]")
-    title = "effort_limits:  # where the file has no motor, or none with a limit [N·m]"
-    return [title, *lines] if lines else []
+        lines.append(f"{keys[name]}: {limit:g}{note}")
+    return _block(
+        "effort_limits:  # where the file has no motor, or none with a limit [N·m]", lines
+    )
 
 
 def _readme(found: NewRobot) -> str:

@@ -26,17 +26,11 @@ _FREE_RAD = 2.5  # Range of a joint without stops.
 def standing_posture(
     survey: Survey, legs: list[Limb], keyframes: Mapping[str, Mapping[str, float]]
 ) -> tuple[dict[str, float], str]:
-    """Takes a standing posture from the model file's keyframes, or solves for one.
+    """Takes a standing posture [rad] from the model file's keyframes, or solves for one; its origin.
 
     Keyframes called home or stand come first. In a keyframe in which the robot stands, all joints
     are within their stops, not all joints of legs at zero, all contact points at the same height,
     and the centre of mass is amid them. Without one, joints of no leg are as in the first.
-
-    Args:
-        keyframes: Joint positions by the keyframe's name [rad].
-
-    Returns:
-        Positions of all joints by name [rad], and where they come from.
     """
     names = sorted(keyframes, key=lambda name: not re.search("home|stand", name.lower()))
     for name in names:
@@ -45,9 +39,8 @@ def standing_posture(
             return posture, f"keyframe '{name}'"
     source = "solved: feet under the hips"
     if names:
-        in_legs = {joint for leg in legs for joint in leg.joints}
-        keyframe = keyframes[names[0]].items()
-        survey.rest_joints({joint: q for joint, q in keyframe if joint not in in_legs})
+        legged = {joint for leg in legs for joint in leg.joints}
+        survey.rest_joints({j: q for j, q in keyframes[names[0]].items() if j not in legged})
         source += f", as it stands in no keyframe; other joints as in keyframe '{names[0]}'"
     return solve_standing_posture(survey, legs), source
 
@@ -59,9 +52,8 @@ def _stands(survey: Survey, legs: list[Limb], posture: dict[str, float]) -> bool
     center = survey.center_of_mass()[:2]
     is_within = all(survey.limits[j][0] <= q <= survey.limits[j][1] for j, q in posture.items())
     is_bent = any(posture[joint] for leg in legs for joint in leg.joints)
-    is_level = bool(high[2] - low[2] <= _LEVEL_M)
-    is_balanced = bool(np.all((low[:2] < center) & (center < high[:2])))
-    return is_within and is_bent and is_level and is_balanced
+    is_balanced = np.all((low[:2] < center) & (center < high[:2]))
+    return bool(is_within and is_bent and high[2] - low[2] <= _LEVEL_M and is_balanced)
 
 
 def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]:
@@ -167,20 +159,15 @@ class _Leg:
 
         low, high = self._bounds
         rng = np.random.default_rng(0)
-        best: tuple[float, np.ndarray] | None = None
-        num_found = 0
+        solutions: list[np.ndarray] = []
         for index in range(_NUM_GUESSES):
-            guess = np.clip(np.zeros(len(low)) if index == 0 else rng.uniform(low, high), low, high)
-            found = least_squares(residual, guess, bounds=(low, high), max_nfev=40)
-            if np.abs(errors(found.x)).max() > _TOLERANCE_M:
-                continue
-            score = self._penalty(found.x)
-            if best is None or score < best[0]:
-                best = (score, found.x)
-            num_found += 1
-            if num_found == _ENOUGH:
+            guess = rng.uniform(low, high) if index else np.clip(0.0, low, high)
+            angles = least_squares(residual, guess, bounds=(low, high), max_nfev=40).x
+            if np.abs(errors(angles)).max() <= _TOLERANCE_M:
+                solutions.append(angles)
+            if len(solutions) == _ENOUGH:
                 break
-        return None if best is None else best[1]
+        return min(solutions, key=self._penalty, default=None)
 
     def _penalty(self, angles: np.ndarray) -> float:
         self._set(angles)
