@@ -33,10 +33,8 @@ _FLAT_M = 1e-6  # Extent below which points lie in a plane.
 
 def cache_folder() -> Path:
     """Returns ``$DRAKE_SAFETY_CACHE``, else ``drake_safety`` in ``$XDG_CACHE_HOME`` or ~/.cache."""
-    if os.environ.get(CACHE_VARIABLE):
-        return Path(os.environ[CACHE_VARIABLE])
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "drake_safety"
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(os.environ.get(CACHE_VARIABLE) or Path(base, "drake_safety"))
 
 
 def is_shown(path: Path) -> bool:
@@ -105,8 +103,7 @@ def convex_hull(points: np.ndarray) -> trimesh.Trimesh:
     except QhullError:  # Of flat ones; trimesh joggles others.
         pass
     low, high = points.min(axis=0), points.max(axis=0)
-    half = 0.5 * np.maximum(high - low, _THINNEST_M)
-    middle = 0.5 * (low + high)
+    half, middle = 0.5 * np.maximum(high - low, _THINNEST_M), 0.5 * (low + high)
     return creation.box(bounds=[middle - half, middle + half])
 
 
@@ -138,14 +135,10 @@ def _scene(path: Path) -> trimesh.Scene:
         # COLLADA states its unit and its vertical axis; trimesh applies neither.
         if scene.units not in (None, "meters"):
             scene = scene.convert_units("meters")
-        if _up_axis(path) == "Y_UP":
+        up = _UP_AXIS.search(path.read_text("utf-8", "replace"))
+        if up is None or up[1] == "Y_UP":  # COLLADA's default.
             scene.apply_transform(_X_ZY)
     return scene
-
-
-def _up_axis(path: Path) -> str:
-    found = _UP_AXIS.search(path.read_text("utf-8", "replace"))
-    return found.group(1) if found else "Y_UP"  # COLLADA's default.
 
 
 def _to_gltf(path: Path, rgba: str) -> bytes:
@@ -162,7 +155,6 @@ def _to_gltf(path: Path, rgba: str) -> bytes:
             )
     # In glTF the y axis points up; Drake rotates it back to z.
     scene.apply_transform(_X_ZY.T)
-    (content,) = trimesh.exchange.gltf.export_gltf(
-        scene, merge_buffers=True, embed_buffers=True
-    ).values()
+    export = trimesh.exchange.gltf.export_gltf
+    (content,) = export(scene, merge_buffers=True, embed_buffers=True).values()
     return bytes(content)

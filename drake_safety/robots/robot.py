@@ -123,9 +123,8 @@ def _set_friction(
                 continue
             properties = ProximityProperties(inspector.GetProximityProperties(geometry_id))
             properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(mu, mu))
-            scene_graph.AssignRole(
-                plant.get_source_id(), geometry_id, properties, RoleAssign.kReplace
-            )
+            source = plant.get_source_id()
+            scene_graph.AssignRole(source, geometry_id, properties, RoleAssign.kReplace)
 
 
 def add_robot(
@@ -201,11 +200,8 @@ def add_robot(
             joint.set_default_damping(joint.default_damping() + damping)
     if variation.joint_friction_nm:
         for name in actuated:
-            friction = plant.AddJointActuator(
-                f"{name}{_FRICTION_SUFFIX}",
-                plant.GetJointByName(name, instance),
-                variation.joint_friction_nm,
-            )
+            joint, most = plant.GetJointByName(name, instance), variation.joint_friction_nm
+            friction = plant.AddJointActuator(f"{name}{_FRICTION_SUFFIX}", joint, most)
             friction.set_controller_gains(PdControllerGains(p=0.0, d=_FRICTION_DAMPING))
     if scene_graph is not None:
         mu = variation.foot_friction or robot.foot_friction
@@ -269,11 +265,9 @@ def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, flo
     """Returns the standing position [rad] of every servo joint; zero if robot.yaml has none."""
     names = servo_joints(plant, robot)
     _require_joints(robot, "posture pattern", robot.posture, names)
-    positions = {}
-    for name in names:
-        value = by_pattern(robot.posture, name, "posture", robot.name)
-        positions[name] = 0.0 if value is None else float(value)
-    return positions
+    return {
+        name: float(by_pattern(robot.posture, name, "posture", robot.name) or 0.0) for name in names
+    }
 
 
 def actuation_matrix(

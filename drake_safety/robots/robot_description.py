@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -61,9 +62,8 @@ def _named_conditions(path: Path, urdf: UrdfCopy | None) -> Iterator[None]:
         yield
     except SystemExit as error:
         shapes = [] if urdf is None else [words for _, _, words in urdf.empty_shapes()]
-        raise ValueError(
-            "; ".join([f"Drake cannot build '{path}'", *shapes, f"{error}"])
-        ) from error
+        what = [f"Drake cannot build '{path}'", *shapes, str(error)]
+        raise ValueError("; ".join(what)) from error
 
 
 @contextmanager
@@ -92,38 +92,24 @@ def add_stated_shapes(
     plant: MultibodyPlant, robot: RobotModel, instance: ModelInstanceIndex
 ) -> None:
     """Adds the collision geometry of robot.yaml: contact points and shapes."""
-    bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instance)]
-    matched = set()
-    for body in bodies:
-        shapes = by_pattern(robot.shapes, body.name(), "shapes", robot.name, "body")
-        if shapes is None:
-            continue
-        matched.add(id(shapes))
-        for i, stated in enumerate(shapes):
-            X_BG, shape = _shape_of(stated)
-            plant.RegisterCollisionGeometry(
-                body,
-                X_BG,
-                shape,
-                f"{body.name()}_shape_{i}",
-                CoulombFriction(_SHAPE_FRICTION, _SHAPE_FRICTION),
-            )
-    unused = [pattern for pattern, shapes in robot.shapes.items() if id(shapes) not in matched]
-    if unused:
-        raise ValueError(
-            f"robot '{robot.name}' has no body for shapes {unused}; it has "
-            f"{[body.name() for body in bodies]}"
+    names = [plant.get_body(index).name() for index in plant.GetBodyIndices(instance)]
+
+    def add(body: str, name: str, X_BG: RigidTransform, shape: Shape, mu: float) -> None:
+        plant.RegisterCollisionGeometry(
+            plant.GetBodyByName(body, instance), X_BG, shape, name, CoulombFriction(mu, mu)
         )
+
+    for body in names:
+        shapes = by_pattern(robot.shapes, body, "shapes", robot.name, "body") or []
+        for i, stated in enumerate(shapes):
+            add(body, f"{body}_shape_{i}", *_shape_of(stated), _SHAPE_FRICTION)
+    unused = [one for one in robot.shapes if not any(re.fullmatch(one, body) for body in names)]
+    if unused:
+        raise ValueError(f"robot '{robot.name}' has no body for shapes {unused}; it has {names}")
     for name, foot in robot.feet.items():
-        body = plant.GetBodyByName(foot.body, instance)
         for i, point in enumerate(foot.contact_points):
-            plant.RegisterCollisionGeometry(
-                body,
-                RigidTransform(point),
-                Sphere(foot.radius_m),
-                f"{name}_contact_{i}",
-                CoulombFriction(robot.foot_friction, robot.foot_friction),
-            )
+            X_BG, sphere = RigidTransform(point), Sphere(foot.radius_m)
+            add(foot.body, f"{name}_contact_{i}", X_BG, sphere, robot.foot_friction)
 
 
 def ignore_neighbours(
@@ -133,19 +119,13 @@ def ignore_neighbours(
 
     Drake filters the two bodies of a joint, but not bodies that are welded to them.
     """
-    joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
-    for joint in joints:
-        if joint.num_velocities() == 0:
-            continue
-        sides = [
-            plant.GetBodiesWeldedTo(body) for body in (joint.parent_body(), joint.child_body())
-        ]
-        if all(len(side) == 1 for side in sides):
-            continue
-        parent, child = (GeometrySet(_geometries(plant, side)) for side in sides)
-        scene_graph.collision_filter_manager().Apply(
-            CollisionFilterDeclaration().ExcludeBetween(parent, child)
-        )
+    for joint in map(plant.get_joint, plant.GetJointIndices(instance)):
+        ends = joint.parent_body(), joint.child_body()
+        sides = [plant.GetBodiesWeldedTo(body) for body in ends]
+        if joint.num_velocities() and any(len(side) > 1 for side in sides):
+            parent, child = (GeometrySet(_geometries(plant, side)) for side in sides)
+            apart = CollisionFilterDeclaration().ExcludeBetween(parent, child)
+            scene_graph.collision_filter_manager().Apply(apart)
 
 
 def _geometries(plant: MultibodyPlant, bodies: list[RigidBody]) -> list[GeometryId]:

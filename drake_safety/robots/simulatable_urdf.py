@@ -173,9 +173,10 @@ def _gather_visual_meshes(copy: UrdfCopy, lost: dict[str, list[str]]) -> None:
         mesh = _converted("visual", url, file, lambda file: shown_mesh(file, rgba), lost)
         if file is None or mesh is None:
             return ""
-        if mesh != file:
-            converted.append(file.name)
-        return _gather(copy, mesh, file.name if mesh == file else f"{file.stem}.gltf")
+        if mesh == file:
+            return _gather(copy, file, file.name)
+        converted.append(file.name)
+        return _gather(copy, mesh, f"{file.stem}.gltf")
 
     copy.replace_visual_meshes(shown)
     if converted:
@@ -229,21 +230,16 @@ def _converted(
     lost: dict[str, list[str]],
 ) -> _Mesh | None:
     """A mesh that Drake reads; None, with the reason in ``lost``, if it is left out."""
-    name = url
+    name, why, until = url if file is None else file.name, "are not where the URDF says", ""
     try:
         if file is not None:
-            name = file.name
             return convert(file)
-        reason = f"{kind} meshes that are not where the URDF says are left out"
     except MissingExtraError as error:
-        reason = (
-            f"{kind} meshes that Drake does not read are left out, until you "
-            f"`pip install '{error.needs}'` and write the folder again"
-        )
+        why = "Drake does not read"
+        until = f", until you `pip install '{error.needs}'` and write the folder again"
     except ValueError as error:
-        reason = f"{kind} meshes that cannot be read are left out"
-        name = str(error) if name in str(error) else f"{name}: {error}"
-    lost.setdefault(reason, []).append(name)
+        why, name = "cannot be read", str(error) if name in str(error) else f"{name}: {error}"
+    lost.setdefault(f"{kind} meshes that {why} are left out{until}", []).append(name)
     return None
 
 

@@ -26,7 +26,7 @@ _FREE_RAD = 2.5  # Range of a joint without stops.
 def standing_posture(
     survey: Survey, legs: list[Limb], keyframes: Mapping[str, Mapping[str, float]]
 ) -> tuple[dict[str, float], str]:
-    """Takes a standing posture [rad] from the model file's keyframes, or solves for one; its origin.
+    """Takes a standing posture [rad] from the model file's keyframes, or solves one; and which.
 
     Keyframes called home or stand come first. In a keyframe in which the robot stands, all joints
     are within their stops, not all joints of legs at zero, all contact points at the same height,
@@ -121,11 +121,11 @@ class _Leg:
         neutral = [survey.joint_origin(name) for name in limb.joints]
         foot = survey.positions(limb).mean(axis=0)
         hops = np.linalg.norm(np.diff([*neutral, foot], axis=0), axis=1)
-        self._hip_index = int(np.argmax(hops > 0.6 * hops.max()))
+        hip = int(np.argmax(hops > 0.6 * hops.max()))
         # The knee is the joint after the hip.
-        self._knee_index = min(self._hip_index + 1, len(neutral) - 1)
-        self.hip = neutral[self._hip_index]
-        self.length = float(hops[self._hip_index :].sum())
+        self._hip_and_knee = limb.joints[hip], limb.joints[min(hip + 1, len(neutral) - 1)]
+        self.hip = neutral[hip]
+        self.length = float(hops[hip:].sum())
         self._R_BF = survey.pose(limb.body).rotation()
         across = foot - self.hip
         self.is_spread = abs(across[2]) < 0.3 * self.length
@@ -171,7 +171,7 @@ class _Leg:
 
     def _penalty(self, angles: np.ndarray) -> float:
         self._set(angles)
-        knee = self._survey.joint_origin(self.limb.joints[self._knee_index])
-        bend = (knee - self._survey.joint_origin(self.limb.joints[self._hip_index])) / self.length
+        hip, knee = map(self._survey.joint_origin, self._hip_and_knee)
+        bend = (knee - hip) / self.length
         wanted = bend[2] if self.is_spread else self._forwards * bend[0]
         return float(np.sum(angles**2) + (1.5 if wanted < -0.01 else 0.0))

@@ -103,15 +103,16 @@ class UrdfCopy:
     def drop_world(self) -> None:
         """Removes a root link 'world', and root links under which the robot floats."""
         joints = self.root.findall("joint")
-        carried = {_end(joint, "child").get("link") for joint in joints}
+        carried = {_end(joint, "child") for joint in joints}
         for link in self.root.findall("link"):
-            below = [one for one in joints if _end(one, "parent").get("link") == link.get("name")]
+            name = link.get("name")
+            below = [joint for joint in joints if _end(joint, "parent") == name]
             kinds = {joint.get("type") for joint in below}
-            is_world = link.get("name") == "world" and kinds == {"fixed"}
-            if link.get("name") not in carried and (is_world or kinds & {"floating", "planar"}):
+            is_world = name == "world" and kinds == {"fixed"}
+            if name not in carried and (is_world or kinds & {"floating", "planar"}):
                 for element in (link, *below):
                     self.root.remove(element)
-                self.warn(f"the root link '{link.get('name')}' is left out, as the base floats")
+                self.warn(f"the root link '{name}' is left out, as the base floats")
 
     def add_root(self, name: str, below: str, pose: RigidTransform) -> str:
         """Adds a massless root link at a pose in the present one; returns its name, not taken."""
@@ -292,11 +293,11 @@ def read_urdf(path: Path) -> UrdfCopy:
     return UrdfCopy(source=path, root=root)
 
 
-def _end(joint: ET.Element, tag: str) -> ET.Element:
+def _end(joint: ET.Element, tag: str) -> str | None:
     element = joint.find(tag)
     if element is None:
         raise ValueError(f"joint '{joint.get('name')}' of the URDF has no <{tag} link=...>")
-    return element
+    return element.get("link")
 
 
 def pose_of(element: ET.Element) -> RigidTransform:

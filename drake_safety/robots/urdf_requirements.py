@@ -139,8 +139,8 @@ def _left(survey: Survey, limbs: list[Limb], up: np.ndarray) -> np.ndarray:
     pairs = [origins[one] - origins[other] for one, other in mirrored(list(origins)).items()]
     if pairs and np.linalg.norm(np.mean(pairs, axis=0) * level) > 0.01:
         return _nearest_axis(np.mean(pairs, axis=0) * level)
-    axes = [np.abs([survey.joint_axis(joint) for joint in limb.joints]) > 0.9 for limb in limbs]
-    turns = np.array([one.sum(axis=0) for one in axes]) * level
+    axes = ([survey.joint_axis(joint) for joint in limb.joints] for limb in limbs)
+    turns = np.array([(np.abs(one) > 0.9).sum(axis=0) for one in axes]) * level
     # Legs that do not agree decide nothing.
     others = np.flatnonzero(np.all(turns > turns[:, [1]], axis=0))
     left = np.eye(3)[others[0]] if len(others) else _nearest_axis(_Y * level + 0.1 * level)

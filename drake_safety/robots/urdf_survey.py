@@ -216,10 +216,8 @@ class Survey:
         for limb in limbs:
             limb.joints = [name for name in limb.joints if name not in shared]
         # Front to back, then right to left, for readability.
-        limbs.sort(
-            key=lambda limb: tuple(np.round(self.positions(limb).mean(axis=0), 1) * [-1, 1, 0])
-        )
-        return limbs
+        places = [np.round(self.positions(limb).mean(axis=0), 1) for limb in limbs]
+        return [limbs[i] for i in np.lexsort([[y for _, y, _ in places], [-p[0] for p in places]])]
 
     def arms(self, legs: list[Limb]) -> list[Limb]:
         """Returns other limbs of four joints or more; a hand's fingers are no limbs."""
@@ -231,10 +229,10 @@ class Survey:
                 arms.setdefault(tuple(chain[:4]), []).append((chain, group[-1]))
         found = []
         for start, members in arms.items():
-            steps = zip(*(chain for chain, _ in members), strict=False)
-            shared = [names[0] for names in steps if len(set(names)) == 1]
-            body = members[0][1]
+            shared, body = members[0]
             if len(members) > 1:
+                steps = zip(*(chain for chain, _ in members), strict=False)
+                shared = [names[0] for names in steps if len(set(names)) == 1]
                 joint = self.plant.GetJointByName(shared[-1], self.instance)
                 body = joint.child_body().name()
             # Joints of the torso are shared between arms.
