@@ -265,9 +265,7 @@ def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, flo
     """Returns the standing position [rad] of every servo joint; zero if robot.yaml has none."""
     names = servo_joints(plant, robot)
     _require_joints(robot, "posture pattern", robot.posture, names)
-    return {
-        name: float(by_pattern(robot.posture, name, "posture", robot.name) or 0.0) for name in names
-    }
+    return {name: by_pattern(robot.posture, name, "posture", robot.name) or 0.0 for name in names}
 
 
 def actuation_matrix(
