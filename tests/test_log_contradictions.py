@@ -158,16 +158,6 @@ def test_a_noisy_log_of_a_robot_that_stands_or_falls_is_read(index, tmp_path):
     read(noisy(frame_of(recorded(index), JOINTS), rng), tmp_path)
 
 
-@pytest.mark.parametrize("spoil, changes, message", [
-    (lambda f: f.rename(columns={"gyro_y": "gyro_y [rad/s]"}), [], "'gyro_y' the unit 'rad/s'"),
-    (lambda f: f.rename(columns={f"{JOINTS[0]}_pos": f"{JOINTS[0]}_pos (rad)"}), [], "write rad"),
-    (lambda f: f.rename(columns={"base_x": "base_x [m]"}), [], "unit' of the map is mm: write m"),
-])  # fmt: skip
-def test_a_unit_in_the_header_that_is_not_the_maps_is_refused(spoil, changes, message, tmp_path):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        read(spoil(frame_of(walked(), JOINTS)), tmp_path, *changes)
-
-
 def test_velocities_that_were_never_filled_in_are_derivatives(tmp_path):
     frame = times([*LINEAR, *GYRO, *RATES], 0)(frame_of(walked(), JOINTS))
     found = read(frame, tmp_path, reader=read_pieces)

@@ -115,7 +115,7 @@ SPOILT = {
                                     "quat_z": "quat_w"}), [],
         "line 2: .*tilted by .*would stand if 'base_orientation.order' is wxyz"),
     "degrees as radians": (lambda f: f, [('_pos", unit: deg', '_pos", unit: rad')],
-                           "its stops are .*would stand if 'joint_positions.unit' is deg"),
+                           "far beyond its stops .*would stand if 'joint_positions.unit' is deg"),
     "millimetres as metres": (lambda f: f, [("base_z], unit: mm", "base_z], unit: m")],
                               "above the ground.*'base_position.unit' is mm"),
     "metres as millimetres": (lambda f: f.assign(base_z=f.base_z / 1e3), [],

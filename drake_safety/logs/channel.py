@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,6 @@ class Channel:
         columns: The requested columns by name, (N,) floats each.
         row_name: Name of a row: "line", "row" or "message".
         rows: Numbers of the rows in the file, (N,).
-        units: Units that a table's header gives columns, such as ``deg/s`` of "gyro_x [deg/s]".
     """
 
     path: Path
@@ -35,7 +34,6 @@ class Channel:
     columns: dict[str, np.ndarray]
     row_name: str
     rows: np.ndarray
-    units: Mapping[str, str] = field(default_factory=dict)
 
     def where(self, row: int, column: str = "") -> str:
         """Describes the location of a row, and of a column if given."""
@@ -52,13 +50,10 @@ class Channel:
         """Returns the time between consecutive rows, (N - 1,) [s]."""
         return np.diff(self.time) / TIME_UNITS[self.time_unit]
 
-    def select(
-        self, rows: slice | np.ndarray, columns: Mapping[str, np.ndarray] | None = None
-    ) -> Channel:
-        """Returns some of the rows, of all columns or of given ones, (N,) each."""
-        columns = self.columns if columns is None else columns
-        values = {name: value[rows] for name, value in columns.items()}
-        return replace(self, time=self.time[rows], columns=values, rows=self.rows[rows])
+    def select(self, rows: np.ndarray | slice) -> Channel:
+        """Returns some of the rows."""
+        columns = {name: values[rows] for name, values in self.columns.items()}
+        return replace(self, time=self.time[rows], columns=columns, rows=self.rows[rows])
 
     def table(self, names: Iterable[str]) -> np.ndarray:
         """Returns columns as an array, (N, n)."""

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.observation import quaternion_of
-from drake_safety.learning.segments import LARGEST
 from drake_safety.logs.channel import Channel
-from drake_safety.logs.log_map import QUANTITIES, TIME_UNITS, LogMap
+from drake_safety.logs.log_map import TIME_UNITS
 
 MIN_ROWS = 3
 """Least number of rows, for derivatives."""
@@ -21,14 +19,6 @@ _MAX_TILT_RAD = math.radians(60.0)
 _FOOT_SHARE = 0.2  # Largest height of the lowest foot, relative to the standing height.
 _FAR_RAD = 0.3  # Largest excess over a joint stop by servo errors and encoder offsets.
 _REACH_SHARE = 3.0  # Largest distance of z* from the base, relative to the standing height.
-
-_UNITS = {"m": "m", "meter": "m", "mm": "mm", "rad": "rad", "deg": "deg", "°": "deg"}
-
-
-def rows_after_gaps(channel: Channel, max_gap_s: float) -> np.ndarray:
-    """Returns the rows before which a gap is longer than ``max_gap_s``."""
-    # The tolerance covers rounding, so that a log of 10 Hz passes a limit of 0.1 s.
-    return np.flatnonzero(channel.steps_s() > max_gap_s * (1 + 1e-6)) + 1
 
 
 def check_clock(channel: Channel) -> None:
@@ -61,11 +51,6 @@ def check_clock(channel: Channel) -> None:
         )
 
 
-def bad_values(channel: Channel) -> dict[str, np.ndarray]:
-    """Returns which values are missing, not finite or absurdly large, (N,) by column."""
-    return {name: ~(np.abs(values) < LARGEST) for name, values in channel.columns.items()}
-
-
 def check_norms(channel: Channel, names: list[str]) -> None:
     """Checks that quaternions have a norm of 1."""
     norms = np.linalg.norm(channel.table(names), axis=1)
@@ -80,14 +65,8 @@ def check_norms(channel: Channel, names: list[str]) -> None:
 
 def implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:
     """Returns why a robot at positions (n_q,) does not stand on the ground z = 0, or ""."""
-    excess = _beyond_limits(kinematics, q[None, 7:])[0]
-    joint = int(np.argmax(excess))
-    if excess[joint] > _FAR_RAD:
-        low, high = kinematics.position_limits[joint]
-        return (
-            f"joint '{kinematics.joint_names[joint]}' is at {q[7 + joint]:.3g} rad, its stops are "
-            f"{low:.3g} and {high:.3g}"
-        )
+    if beyond := _beyond_stops(kinematics, q[None, 7:]):
+        return beyond[2]
     up = quaternion_of(q).rotation()[2, 2]
     tilt = math.acos(min(max(up, -1.0), 1.0))
     if tilt > _MAX_TILT_RAD:
@@ -99,40 +78,28 @@ def implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:
     return ""
 
 
-def _beyond_limits(kinematics: RobotKinematics, joints: np.ndarray) -> np.ndarray:
-    """Excess of joints (N, n_j) over their stops [rad], negative inside."""
+def _beyond_stops(kinematics: RobotKinematics, joints: np.ndarray) -> tuple[int, int, str] | None:
+    """The first row of joints (N, n_j) [rad] with one far beyond its stops, and which and where."""
     low, high = kinematics.position_limits.T
-    return np.maximum(low - joints, joints - high)
-
-
-def check_units(log_map: LogMap, channels: Mapping[str, Channel], joints: list[str]) -> None:
-    """Checks the map's units against those that a table's header gives, as "gyro_x [deg/s]"."""
-    for name in QUANTITIES:
-        part = getattr(log_map, name)
-        for column in part.names(joints) if hasattr(part, "unit") else ():
-            given = channels[part.topic].units.get(column, "")
-            unit = _UNITS.get(given.lower().split("/")[0].strip())
-            if unit not in (None, part.unit):
-                raise ValueError(
-                    f"log '{channels[part.topic].path}': the header gives column '{column}' the "
-                    f"unit '{given}', but '{name}.unit' of the map is {part.unit}: write {unit}"
-                )
+    excess = np.maximum(low - joints, joints - high)
+    if not (excess > _FAR_RAD).any():
+        return None
+    row = int(np.argmax((excess > _FAR_RAD).any(axis=1)))
+    joint = int(np.argmax(excess[row]))
+    text = (
+        f"joint '{kinematics.joint_names[joint]}' is at {joints[row, joint]:.3g} rad, far beyond "
+        f"its stops {low[joint]:.3g} and {high[joint]:.3g}"
+    )
+    return row, joint, text
 
 
 def check_limits(
     kinematics: RobotKinematics, joints: np.ndarray, channel: Channel, names: list[str]
 ) -> None:
     """Checks that joints (N, n_j) [rad] are not far beyond their stops."""
-    excess = _beyond_limits(kinematics, joints)
-    is_far = excess > _FAR_RAD
-    if is_far.any():
-        row = int(np.argmax(is_far.any(axis=1)))
-        joint = int(np.argmax(excess[row]))
-        low, high = kinematics.position_limits[joint]
-        raise ValueError(
-            f"{channel.where(row, names[joint])}: joint '{kinematics.joint_names[joint]}' is at "
-            f"{joints[row, joint]:.3g} rad, far beyond its stops {low:.3g} and {high:.3g}"
-        )
+    if beyond := _beyond_stops(kinematics, joints):
+        row, joint, text = beyond
+        raise ValueError(f"{channel.where(row, names[joint])}: {text}")
 
 
 def check_desired_output(

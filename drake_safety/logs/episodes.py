@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -66,26 +67,22 @@ def cut_log(
     """
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")
+    scenario = loop.scenario
+    shortest = shortest_steps(scenario.assessment)
+    rows = _Rows(scenario.step_s, scenario.episode_duration_s, shortest)
     episodes: list[Episode] = []
     starts: list[EpisodeStart] = []
-    for pieces in _by_log([log] if isinstance(log, RobotLog) else log):
-        num_before = len(episodes)
-        for one in pieces:
-            desired = _desired_output(one, loop, desired_output)
-            found, has_left = _cut(one, loop, desired, _Rows.of(loop.scenario))
-            for episode, start in found:
-                episodes.append(replace(episode, index=len(episodes)))
-                starts.append(start)
-            if has_left:
-                break
-        if len(episodes) == num_before:
-            longest_s = max(one.duration_s for one in pieces)
-            scenario = loop.scenario
+    for parts in _parts(log, loop, desired_output, rows):
+        found = [both for _, several in parts for both in several]
+        if not found:
+            longest = max((one for one, _ in parts), key=lambda one: one.duration_s)
             raise ValueError(
-                f"log '{pieces[0].path}' lasts {longest_s:g} s: too short for a segment of "
-                f"{shortest_steps(scenario.assessment)} steps of {scenario.step_s} s of scenario "
-                f"'{scenario.name}'"
+                f"log '{longest.path}' lasts {longest.duration_s:g} s: too short for a segment of "
+                f"{shortest} steps of {scenario.step_s} s of scenario '{scenario.name}'"
             )
+        for episode, start in found:
+            episodes.append(replace(episode, index=len(episodes)))
+            starts.append(start)
     return Episodes(episodes_info(loop, seed=NOT_DRAWN), episodes), starts
 
 
@@ -111,16 +108,13 @@ def motions_from_log(
         )
     rows = _Rows(step_s or loop.scenario.monitor_step_s, MOTION_PIECE_S, shortest=2)
     motions: list[Episode] = []
-    for pieces in _by_log([log] if isinstance(log, RobotLog) else log):
-        for one in pieces:
-            found, has_left = _cut(one, loop, _desired_output(one, loop, desired_output), rows)
+    for parts in _parts(log, loop, desired_output, rows):
+        for one, found in parts:
             begin_s = one.begin_s
             for motion, _ in found:
                 time_s = begin_s + motion.time_s
                 motions.append(replace(motion, index=len(motions), time_s=time_s))
                 begin_s = float(time_s[-1])
-            if has_left:
-                break
     return Episodes(replace(episodes_info(loop, seed=NOT_DRAWN), step_s=rows.step_s), motions)
 
 
@@ -131,25 +125,29 @@ class _Rows(NamedTuple):
     duration_s: float
     shortest: int
 
-    @classmethod
-    def of(cls, scenario: Scenario) -> _Rows:
-        shortest = shortest_steps(scenario.assessment)
-        return cls(scenario.step_s, scenario.episode_duration_s, shortest)
-
 
 def shortest_steps(assessment: AssessmentParameters) -> int:
     """Least number of steps of a safe part of a log that gives an episode."""
     return assessment.preview_stride * mode_settings(assessment).shortest
 
 
-def _by_log(logs: Sequence[RobotLog]) -> list[list[RobotLog]]:
-    """The pieces of each log."""
-    found: list[list[RobotLog]] = []
-    for one in logs:
-        if one.piece == 0 or not found:
-            found.append([])
-        found[-1].append(one)
-    return found
+def _parts(
+    log: RobotLog | Sequence[RobotLog],
+    loop: LeggedLoop,
+    desired_output: np.ndarray | None,
+    rows: _Rows,
+) -> Iterator[list[tuple[RobotLog, list[tuple[Episode, EpisodeStart]]]]]:
+    """The pieces of each log, to where the robot leaves the safe set, and their episodes."""
+    logs = [log] if isinstance(log, RobotLog) else log
+    begins = [i for i, one in enumerate(logs) if i == 0 or one.piece == 0]
+    for begin, end in itertools.pairwise([*begins, len(logs)]):
+        parts, has_left = [], False
+        for one in logs[begin:end]:
+            if not has_left:
+                desired = _desired_output(one, loop, desired_output)
+                found, has_left = _cut(one, loop, desired, rows)
+                parts.append((one, found))
+        yield parts
 
 
 def _cut(

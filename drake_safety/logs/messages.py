@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
-import sqlite3
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -78,60 +76,32 @@ def read_bag(
 ) -> tuple[dict[str, Channel], str]:
     """Reads the wanted fields, by topic, of a ROS 1 bag (a file) or a ROS 2 bag (a folder).
 
-    Of a ROS 2 bag that was cut off what is left is read; the text says how much that is.
+    A ROS 2 bag needs no ``metadata.yaml``; of MCAP files in it that were cut off the rest is read.
     """
     require_extra("logs", f"log '{path}'", "rosbags")
-    hint = ", cut off ('rosbag reindex' mends it)" if path.suffix == ".bag" else ""
-    # A damaged bag makes the reader raise errors of any kind.
-    with reading(path, f"damaged{hint}, or not a ROS bag: log", Exception):
-        try:
-            return _read_bags(path, [path], wanted, time), ""
-        except Exception:
-            chunked, files = (sorted(path.glob(f"*.{kind}")) for kind in ("mcap", "db3"))
-            if chunked:
-                return read_mcap(path, wanted, time, chunked)
-            if not files:
-                raise
-            with TemporaryDirectory() as folder:
-                copies = [Path(folder) / one.name for one in files]
-                share = np.mean([_recover(*both) for both in zip(files, copies, strict=True)])
-                channels = _read_bags(path, copies, wanted, time)
-            return channels, f"log '{path}' is cut off: {share:.0%} of its bytes are left"
-
-
-def _read_bags(
-    path: Path, files: Sequence[Path], wanted: Mapping[str, Sequence[str]], time: LogTime
-) -> dict[str, Channel]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    with AnyReader(files, default_typestore=get_typestore(Stores.LATEST)) as reader:
-        connections = [c for c in reader.connections if c.topic in wanted]
-        _require_topics(path, wanted, {c.topic for c in reader.connections})
-        messages = (
-            (connection.topic, stamp, reader.deserialize(raw, connection.msgtype))
-            for connection, stamp, raw in reader.messages(connections=connections)
-        )
-        return _channels(path, messages, wanted, time)
-
-
-def _recover(source: Path, target: Path) -> float:
-    """Copies an SQLite file up to the first row that is lost; returns the share of its bytes."""
-    data, uri = source.read_bytes(), f"{source.resolve().as_uri()}?mode=ro"
-    size = int.from_bytes(data[16:18], "big") * int.from_bytes(data[28:32], "big")
-    with (
-        contextlib.closing(sqlite3.connect(uri, uri=True)) as old,
-        contextlib.closing(sqlite3.connect(target)) as new,
-    ):
-        old.execute("PRAGMA writable_schema=ON")  # Else a file that lacks pages is not opened.
-        tables = "SELECT name, sql FROM sqlite_master WHERE type = 'table'"
-        for name, statement in old.execute(tables).fetchall():
-            with contextlib.suppress(sqlite3.DatabaseError):
-                new.execute(statement)
-                for row in old.execute(f'SELECT * FROM "{name}"'):
-                    new.execute(f'INSERT INTO "{name}" VALUES ({",".join("?" * len(row))})', row)
-        new.commit()
-    return min(len(data) / max(size, 1), 1.0)
+    mend = (
+        "'rosbag reindex' mends it" if path.suffix == ".bag" else "'sqlite3 .recover' may mend it"
+    )
+    # A damaged bag makes the reader raise errors of any kind.
+    with reading(path, f"damaged, cut off ({mend}), or not a ROS bag: log", Exception):
+        is_whole = path.is_file() or (path / "metadata.yaml").is_file()
+        files = [path] if is_whole else sorted(path.glob("*.db3")) or [path]
+        try:
+            with AnyReader(files, default_typestore=get_typestore(Stores.LATEST)) as reader:
+                connections = [c for c in reader.connections if c.topic in wanted]
+                _require_topics(path, wanted, {c.topic for c in reader.connections})
+                messages = (
+                    (connection.topic, stamp, reader.deserialize(raw, connection.msgtype))
+                    for connection, stamp, raw in reader.messages(connections=connections)
+                )
+                return _channels(path, messages, wanted, time), ""
+        except Exception:
+            if not (chunked := sorted(path.glob("*.mcap"))):
+                raise
+            return read_mcap(path, wanted, time, chunked)
 
 
 def _require_topics(path: Path, wanted: Mapping[str, Sequence[str]], existing: set[str]) -> None:
@@ -151,44 +121,33 @@ def _require_topics(path: Path, wanted: Mapping[str, Sequence[str]], existing: s
 def _channels(
     path: Path, messages: Iterator[Message], wanted: Mapping[str, Sequence[str]], time: LogTime
 ) -> dict[str, Channel]:
-    fields = {topic: {name: field_of(name) for name in names} for topic, names in wanted.items()}
-    stamp_of = field_of(time.column) if time.column else None
-    stamps: dict[str, list[float | int]] = {topic: [] for topic in wanted}
-    rows: dict[str, list[list[float]]] = {topic: [] for topic in wanted}
-    numbers: dict[str, list[int]] = {topic: [] for topic in wanted}
-    counts = dict.fromkeys(wanted, 0)
+    stamp_names = [time.column] if time.column else []
+    fields = {one: {n: field_of(n) for n in (*wanted[one], *stamp_names)} for one in wanted}
+    found: dict[str, list[tuple[int, float | int, list[float]]]] = {topic: [] for topic in wanted}
     failed: dict[tuple[str, str], ValueError] = {}
+    counts: Counter[str] = Counter()
     is_stamp = not time.column
 
-    def read(topic: str, name: str, field: Callable[[Any], Any], message: Any) -> float | int:
+    def read(topic: str, name: str, message: Any) -> float | int:
         """A number, or NaN if the message lacks it: others may have it."""
         nonlocal is_stamp
         try:
-            value = field(message)
+            value = fields[topic][name](message)
             is_stamp = is_stamp or hasattr(value, "nanosec") or hasattr(value, "nsec")
             return _number(value)
         except (LookupError, TypeError) as error:
-            failed.setdefault(
-                (topic, name),
-                ValueError(
-                    f"log '{path}', message {counts[topic]} of topic '{topic}': cannot read "
-                    f"'{name}': {error}"
-                ),
-            )
+            where = f"log '{path}', message {counts[topic]} of topic '{topic}'"
+            failed.setdefault((topic, name), ValueError(f"{where}: cannot read '{name}': {error}"))
             return math.nan
 
     for topic, recorded_ns, message in messages:
-        row = [float(read(topic, name, one, message)) for name, one in fields[topic].items()]
-        stamp = recorded_ns if stamp_of is None else read(topic, time.column, stamp_of, message)
+        row = [float(read(topic, name, message)) for name in wanted[topic]]
+        stamp = read(topic, time.column, message) if time.column else recorded_ns
         if not all(map(math.isnan, row)):  # Such as the joints of another part of the robot.
-            stamps[topic].append(stamp)
-            rows[topic].append(row)
-            numbers[topic].append(counts[topic])
+            found[topic].append((counts[topic], stamp, row))
         counts[topic] += 1
-    tables = {
-        topic: np.array(rows[topic], dtype=float).reshape(-1, len(names))
-        for topic, names in wanted.items()
-    }
+    rows = {topic: np.array([row for _, _, row in found[topic]]) for topic in wanted}
+    tables = {topic: rows[topic].reshape(-1, len(names)) for topic, names in wanted.items()}
     for (topic, name), error in failed.items():
         if name == time.column or np.isnan(tables[topic][:, wanted[topic].index(name)]).all():
             raise error
@@ -196,12 +155,12 @@ def _channels(
         topic: Channel(
             path=path,
             topic=topic,
-            time=np.array(stamps[topic]),
+            time=np.array([stamp for _, stamp, _ in found[topic]]),
             time_unit="ns" if is_stamp else time.unit,
             time_name=time.column or "time of recording",
             columns=dict(zip(names, tables[topic].T, strict=True)),
             row_name="message",
-            rows=np.array(numbers[topic], dtype=int),
+            rows=np.array([number for number, _, _ in found[topic]], dtype=int),
         )
         for topic, names in wanted.items()
     }

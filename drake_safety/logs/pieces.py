@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping
 
 import numpy as np
 
+from drake_safety.learning.segments import LARGEST
 from drake_safety.logs import checks
 from drake_safety.logs.channel import Channel
 
@@ -45,26 +45,23 @@ def cut_channels(
 
 def _unbroken(channel: Channel, max_gap_s: float) -> tuple[list[slice], list[str]]:
     """Stretches of rows without a missing value and without a gap, and what lies between them."""
-    bad = checks.bad_values(channel)
-    is_bad = np.any([np.zeros(len(channel.time), dtype=bool), *bad.values()], axis=0)
+    # A value that is missing, not finite or absurdly large is bad.
+    bad = ~(np.abs(channel.table(channel.columns)) < LARGEST)
+    is_bad, steps = bad.any(axis=1), channel.steps_s()
     is_bad_before = np.concatenate([[False], is_bad[:-1]])
     reasons = []
     for row in np.flatnonzero(is_bad & ~is_bad_before).tolist():
-        name = next(name for name, values in bad.items() if values[row])
-        reasons.append(f"{channel.where(row, name)}: the value is {channel.columns[name][row]}")
-    steps = channel.steps_s()
-    after_gap = checks.rows_after_gaps(channel, max_gap_s)
+        name, value = list(channel.columns.items())[int(np.argmax(bad[row]))]
+        reasons.append(f"{channel.where(row, name)}: the value is {value[row]}")
+    # The tolerance covers rounding, so that a log of 10 Hz passes a limit of 0.1 s.
+    is_after_gap = np.concatenate([[True], steps > max_gap_s * (1 + 1e-6)])
     reasons += [
         f"{channel.where(row, channel.time_name)}: a gap of {steps[row - 1]:g} s before it, "
         f"expected at most {max_gap_s:g} s ('max_gap_s' of the map)"
-        for row in after_gap.tolist()
+        for row in np.flatnonzero(is_after_gap)[1:].tolist()
     ]
-    begins = ~is_bad & is_bad_before
-    begins[0] = not is_bad[0]
-    begins[after_gap] = ~is_bad[after_gap]
-    starts = np.flatnonzero(begins)
-    found = []
-    for start, stop in itertools.pairwise([*starts, len(channel.time)]):
-        ends = np.flatnonzero(is_bad[start:stop])
-        found.append(slice(int(start), int(start + ends[0] if len(ends) else stop)))
-    return [one for one in found if one.stop - one.start >= checks.MIN_ROWS], reasons
+    begins = ~is_bad & (is_bad_before | is_after_gap)
+    rows = np.flatnonzero(~is_bad)
+    found = np.split(rows, np.flatnonzero(begins[rows]))
+    long = [one for one in found if len(one) >= checks.MIN_ROWS]
+    return [slice(int(one[0]), int(one[-1]) + 1) for one in long], reasons

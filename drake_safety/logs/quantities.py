@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from drake_safety.extras import require_extra
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.log_map import COMMANDS, QUANTITIES, TIME_UNITS, VELOCITIES, LogMap, si_units
 
@@ -43,19 +44,18 @@ def quantities(
     for topic, channel in topics.items():
         used = {one for name in QUANTITIES for one in columns[name] if one in channel.columns}
         is_whole = ~np.isnan(channel.table(used)).any(axis=1)
-        share = is_whole.sum() / max(len(is_whole), 1)
-        if share < _SPARSE and len(is_whole):
+        if len(is_whole) and is_whole.mean() < _SPARSE:
             sparse.add(topic)
             rows = f"the messages of topic '{topic}'" if topic else "the rows"
             notes.append(
-                f"log '{channel.path}': {share:.0%} of {rows} have every value: each quantity is "
-                "read at its own rows and resampled"
+                f"log '{channel.path}': {is_whole.mean():.0%} of {rows} have every value: each "
+                "quantity is read at its own rows and resampled"
             )
     found: dict[str, Channel] = {}
     for name in filter(columns.get, QUANTITIES):
         part = getattr(log_map, name)
         own = topics[part.topic]
-        own = own.select(slice(None), {one: own.columns[one] for one in columns[name]})
+        own = replace(own, columns={one: own.columns[one] for one in columns[name]})
         if part.topic in sparse:
             own = _present(own, log_map.max_gap_s)
         if name not in COMMANDS:
@@ -83,14 +83,13 @@ def _present(channel: Channel, max_gap_s: float) -> Channel:
     at_s, time_s = (one.seconds_since(own.time[0]) for one in (own, channel))
     covered = np.ones(len(at_s), dtype=bool)
     for name, is_known in zip(channel.columns, has.T, strict=True):
-        known_s = time_s[is_known]
-        if not len(known_s):
+        if not is_known.any():
             continue
+        known_s = time_s[is_known]
         after = np.minimum(np.searchsorted(known_s, at_s), len(known_s) - 1)
-        gap_s = known_s[after] - known_s[np.maximum(after - 1, 0)]
+        is_near = known_s[after] - known_s[np.maximum(after - 1, 0)] <= max_gap_s
         filled = np.interp(at_s, known_s, channel.columns[name][is_known])
-        is_near = (known_s[after] == at_s) | (gap_s <= max_gap_s)
-        own.columns[name] = np.where(is_near, filled, np.nan)
+        own.columns[name] = np.where(is_near | (known_s[after] == at_s), filled, np.nan)
         covered &= (at_s >= known_s[0]) & (at_s <= known_s[-1])
     return own.select(covered)
 
@@ -122,7 +121,7 @@ def _started(channel: Channel, jump: float) -> Channel:
     if is_known and np.abs(values[first] - values[0]).max() > jump:
         is_unfilled[:first] = True
     columns = {one: np.where(is_unfilled, np.nan, value) for one, value in channel.columns.items()}
-    return channel.select(slice(None), columns)
+    return replace(channel, columns=columns)
 
 
 def _held(command: Channel, base: Channel, max_gap_s: float) -> Channel:
@@ -136,7 +135,7 @@ def _held(command: Channel, base: Channel, max_gap_s: float) -> Channel:
     known_s, at_s = (one.seconds_since(base.time[0]) for one in (known, base))
     last = np.searchsorted(known_s, at_s, side="right") - 1
     columns = {name: values[last] for name, values in known.columns.items()}
-    return base.select(last >= 0, columns)
+    return replace(base, columns=columns).select(last >= 0)
 
 
 def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
@@ -148,21 +147,21 @@ def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
     step = np.diff(channel.time)
     if (step > 0).all() or not (step >= -max_gap_s * TIME_UNITS[channel.time_unit]).all():
         return channel, []  # In order, or of another clock, which is refused.
+    require_extra("logs", f"log '{channel.path}'", "pandas")
+    import pandas as pd
+
+    groups = pd.DataFrame(channel.columns).groupby(channel.time)
+    num_lost = (groups.count() - 1).clip(lower=0).sum().max()
+    is_back, order = step < 0, np.argsort(channel.time, kind="stable")
     lost = []
-    if (step < 0).any():
-        where = channel.where(int(np.argmax(step < 0)) + 1, channel.time_name)
-        lost.append(f"{where}: time runs backwards in {np.mean(step < 0):.1%} of the rows: sorted")
-        channel = channel.select(np.argsort(channel.time, kind="stable"))
-    is_new = np.concatenate([[True], np.diff(channel.time) > 0])
-    group, joined, num_lost = np.cumsum(is_new) - 1, channel.select(is_new), 0
-    for name, values in channel.columns.items():
-        known = np.flatnonzero(~np.isnan(values))
-        groups, places = np.unique(group[known], return_index=True)
-        joined.columns[name] = np.full(len(joined.time), np.nan)
-        joined.columns[name][groups] = values[known[places]]
-        num_lost = max(num_lost, len(known) - len(groups))
+    if is_back.any():
+        where = channel.where(int(np.argmax(is_back)) + 1, channel.time_name)
+        lost.append(f"{where}: time runs backwards in {is_back.mean():.1%} of the rows: sorted")
     if num_lost:
-        where = channel.where(int(np.argmin(is_new)), channel.time_name)
-        share = num_lost / len(group)
+        again = order[1:][np.diff(channel.time[order]) == 0]
+        where = channel.where(int(again[0]), channel.time_name)
+        share = num_lost / len(channel.time)
         lost.append(f"{where}: time stands still in {share:.1%} of the rows: the first is kept")
-    return joined, lost
+    joined = channel.select(np.unique(channel.time, return_index=True)[1])
+    firsts = groups.first()  # Of the values that are there.
+    return replace(joined, columns={name: firsts[name].to_numpy() for name in firsts}), lost

@@ -119,7 +119,6 @@ def _read(
     kinematics = RobotKinematics(robot)
     joints = kinematics.joint_names
     topics, cut = _read_channels(path, _wanted(log_map, kinematics), log_map)
-    checks.check_units(log_map, topics, joints)
     cuts = [cut] if cut else []
     for topic, channel in topics.items():
         topics[topic], lost = in_order(channel, log_map.max_gap_s)
@@ -200,25 +199,20 @@ def _check(sources: list[Source], kinematics: RobotKinematics, step_s: float | N
     """
     longest = max(sources, key=lambda one: float(np.ptp(one.span_s)))
     for source in sources:
-        checks.check_norms(
-            source.channels["base_orientation"], source.log_map.base_orientation.columns
-        )
-        at_s = _times(source, step_s)
-        base = source.channels["base_position"]
-        where = base.where(int(np.searchsorted(source.times["base_position"], at_s[0])))
+        channels, log_map, at_s = source.channels, source.log_map, _times(source, step_s)
+        checks.check_norms(channels["base_orientation"], log_map.base_orientation.columns)
+        first = int(np.searchsorted(source.times["base_position"], at_s[0]))
+        where = channels["base_position"].where(first)
         if source is sources[0]:
             check_start(source, kinematics, at_s, where)
-            if "desired_output" in source.channels:
+            if "desired_output" in channels:
                 names = ("desired_output", "base_position")
                 desired, position = (source.at(name, at_s[:1])[0] for name in names)
-                unit = source.log_map.desired_output.unit
+                unit = log_map.desired_output.unit
                 checks.check_desired_output(kinematics, desired, position, where, unit)
-        checks.check_limits(
-            kinematics,
-            source.table("joint_positions"),
-            source.channels["joint_positions"],
-            source.log_map.joint_positions.names(source.joints),
-        )
+        names = log_map.joint_positions.names(source.joints)
+        joints = source.table("joint_positions")
+        checks.check_limits(kinematics, joints, channels["joint_positions"], names)
         if source is longest:
             check_stance(source, kinematics, at_s, f"{where} and after it")
             check_velocities(source)
@@ -256,13 +250,13 @@ def _read_channels(
     path: Path, wanted: dict[str, list[str]], log_map: LogMap
 ) -> tuple[dict[str, Channel], str]:
     """Channels by topic, and what is said of a file that was cut off."""
-    suffix = path.suffix.lower()
+    suffix, is_folder = path.suffix.lower(), path.is_dir()
     kinds = ("metadata.yaml", "*.db3", "*.mcap")
-    if suffix == ".bag" or (path.is_dir() and any(any(path.glob(kind)) for kind in kinds)):
+    if suffix == ".bag" or (is_folder and any(any(path.glob(kind)) for kind in kinds)):
         return read_bag(path, wanted, log_map.time)
     if not path.is_file():
         what = "is a folder without the metadata.yaml of a ROS 2 bag"
-        raise ValueError(f"log '{path}' {what if path.is_dir() else 'does not exist'}")
+        raise ValueError(f"log '{path}' {what if is_folder else 'does not exist'}")
     if suffix == ".mcap":
         return read_mcap(path, wanted, log_map.time)
     if suffix not in FORMATS:
@@ -270,8 +264,7 @@ def _read_channels(
             f"log '{path}' has the suffix '{suffix}'; known are {list(FORMATS)} and the folder of "
             "a ROS 2 bag"
         )
-    topics = [topic for topic in wanted if topic]
-    if topics:
+    if topics := [topic for topic in wanted if topic]:
         raise ValueError(f"log '{path}' is a table and has no topics; the map names {topics}")
     read = read_parquet if suffix == ".parquet" else read_csv
     channel, cut = read(path, wanted[""], log_map.time)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import re
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,12 +44,11 @@ def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> tuple[Channel,
         text = data.decode(encoding).rstrip("\0")
         lines = text[: 1 << 20].splitlines()[:_NUM_HEAD_LINES] or [""]
         keys = {_key(name) for name in (time.column, *wanted)}
-        headers = [
-            (i, one, _cells(line, one)) for i, line in enumerate(lines) for one in _SEPARATORS
-        ]
+        headers = [(i, by, _cells(line, by)) for i, line in enumerate(lines) for by in _SEPARATORS]
         line, separator, names = max(
             headers, key=lambda one: sum(bool({_key(n), _bare(n)} & keys) for n in one[2])
         )
+        places = _places(path, wanted, time, names)
         # Read as text, so that errors can quote cells that are not numbers.
         frame = pd.read_csv(
             io.StringIO(text),
@@ -61,7 +60,7 @@ def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> tuple[Channel,
             keep_default_na=False,
             skip_blank_lines=False,
             skipinitialspace=True,
-            usecols=[*(places := _places(path, wanted, time, names)).values()],
+            usecols=[*places.values()],
         )
         cut = ""
         if not text.endswith(("\n", "\r")):
@@ -69,7 +68,7 @@ def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> tuple[Channel,
             frame = frame[:-1]
         frame = frame[[*places.values()]].set_axis([*places], axis=1)
         frame = frame[~_is_remark(frame, time.column)]
-        return _channel(path, frame, names, places, time, "line", line + 2), cut
+        return _channel(path, frame, time, "line", line + 2), cut
 
 
 def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> tuple[Channel, str]:
@@ -81,12 +80,12 @@ def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> tuple[Chan
         reading(path, "damaged, cut off, or not a Parquet file: log", Exception),
         pq.ParquetFile(path, page_checksum_verification=True) as file,
     ):
-        names = file.schema_arrow.names
-        places = _places(path, wanted, time, names)
-        table = file.read(columns=[names[place] for place in places.values()])
+        existing = file.schema_arrow.names
+        places = _places(path, wanted, time, existing)
+        names = [existing[place] for place in places.values()]
+        table = file.read(columns=names).select(names).rename_columns([*places])
         frame = table.to_pandas(timestamp_as_object=False, ignore_metadata=True)
-        frame = frame[[names[place] for place in places.values()]].set_axis([*places], axis=1)
-        return _channel(path, frame, names, places, time, "row", 0), ""
+        return _channel(path, frame, time, "row", 0), ""
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -115,14 +114,14 @@ def _places(
         )
     keys, bare = list(map(_key, existing)), list(map(_bare, existing))
     columns = {name: keys if _key(name) in keys else bare for name in (time.column, *wanted)}
-    counts = {name: names.count(_key(name)) for name, names in columns.items()}
+    counts = {name: among.count(_key(name)) for name, among in columns.items()}
     if missing := [name for name, count in counts.items() if not count]:
         raise ValueError(
             f"log '{path}' has no columns {listed(missing, 5)}; it has {listed(existing)}"
         )
     if twice := [name for name, count in counts.items() if count > 1]:
         raise ValueError(f"log '{path}' has columns of the same name: {twice}")
-    return {name: names.index(_key(name)) for name, names in columns.items()}
+    return {name: among.index(_key(name)) for name, among in columns.items()}
 
 
 def _is_remark(frame: pd.DataFrame, clock: str) -> np.ndarray:
@@ -135,15 +134,8 @@ def _is_remark(frame: pd.DataFrame, clock: str) -> np.ndarray:
 
 
 def _channel(
-    path: Path,
-    frame: pd.DataFrame,
-    names: list[str],
-    places: dict[str, int],
-    time: LogTime,
-    row_name: str,
-    first_row: int,
+    path: Path, frame: pd.DataFrame, time: LogTime, row_name: str, first_row: int
 ) -> Channel:
-    units = {name: _UNIT.search(names[place].strip()) for name, place in places.items()}
     channel = Channel(
         path=path,
         topic="",
@@ -153,16 +145,14 @@ def _channel(
         columns={},
         row_name=row_name,
         rows=first_row + frame.index.to_numpy(),
-        units={name: found.group(1).strip() for name, found in units.items() if found},
     )
-    stamps = frame[time.column]
-    dates = stamps if stamps.dtype.kind in "Mm" else _dates(stamps)
+    dates = _dates(frame[time.column])
     if dates is None:
         channel.time = _numbers(channel, frame, time.column)
     else:
         kind = "datetime64[ns]" if dates.dtype.kind == "M" else "timedelta64[ns]"
         channel.time, channel.time_unit = dates.to_numpy(kind).astype(np.int64), "ns"
-    wanted = [name for name in places if name != time.column]
+    wanted = frame.columns.drop(time.column)
     channel.columns = {name: _numbers(channel, frame, name).astype(float) for name in wanted}
     return channel
 
@@ -171,19 +161,18 @@ def _dates(stamps: pd.Series) -> pd.Series | None:
     """Dates, or times of day, if the cells of a column are all of that kind."""
     import pandas as pd
 
+    if stamps.dtype.kind in "Mm":
+        return stamps
     if stamps.dtype.kind in "iuf" or is_number(next(iter(stamps), 0)):
         return None
     text = stamps.astype(str).str.strip().str.replace(",", ".")
-    for parse in (
-        lambda: pd.to_datetime(text, format="ISO8601", utc=True),
-        lambda: pd.to_timedelta(text),
-        lambda: pd.to_datetime(text, utc=True),
-    ):
-        with contextlib.suppress(ValueError, OverflowError), warnings.catch_warnings():
+    date = partial(pd.to_datetime, utc=True)
+    for parse in (partial(date, format="ISO8601"), pd.to_timedelta, date):
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # That the format had to be guessed.
-            dates = parse()
-            if not dates.isna().any():
-                return dates
+            dates = parse(text, errors="coerce")
+        if not dates.isna().any():
+            return dates
     return None
 
 
