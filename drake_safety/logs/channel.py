@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,6 +10,8 @@ import numpy as np
 
 from drake_safety.logs.log_map import TIME_UNITS, TimeUnit
 
+Wanted = Mapping[str, Sequence[str]]
+"""Names of the columns or fields to read, by topic; "" is a table's."""
 _MANY = 40  # Largest number of names in a message.
 
 

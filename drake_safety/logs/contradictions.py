@@ -6,12 +6,10 @@ spoil less than derivatives; feet that stand must not slide. An error names the 
 
 from __future__ import annotations
 
-import copy
 import math
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -31,19 +29,20 @@ _FACTOR, _TURN_RAD = 1.6, math.radians(30.0)  # Least factor of a unit or rate, 
 _STEP_S, _NUM_STEPS = 0.05, 80  # In which a foot on the ground does not move.
 _SHORTEST_S = 0.5  # Of a log that says how feet move.
 _SLIP_M, _SLIP_FACTOR = 0.004, 3.0
+_INVERSE = "'base_orientation' is the inverse, of the world in the base"
 
 _Reading = tuple[str, np.ndarray, np.ndarray]
 """Another reading in words, and the changes by positions and by velocities in it, (M, n)."""
+_Pose = tuple[str, bool, tuple[float, float]]
+"""A reading of the base's pose: whether the robot stands at first, and how its feet slide [m]."""
 
 
 def check_velocities(source: Source) -> None:
     """Checks that logged velocities are the derivatives of positions, in frame, sign and unit.
 
     Raises:
-        ValueError: A velocity differs by more than 0.4 of the motion and another reading by less
-            than 0.25 and half as much; or it differs by more than 0.9. These are medians over
-            windows of 0.1 s with a change of at least 1 cm, 0.05 rad of the base, or 0.1 rad of a
-            joint; the difference is at least this too, three times as much in the second case.
+        ValueError: Changes in windows of 0.1 s differ, in median, by more than 0.4 of the motion,
+            and by less than 0.25 and half as much in another reading; or by more than 0.9.
     """
     for name, positions in VELOCITIES.items():
         if name not in source.channels:
@@ -57,27 +56,26 @@ def check_velocities(source: Source) -> None:
         windows = np.linspace(begin, end - width, number) + np.array([[0.0], [width]])
         sums = cumulative_trapezoid(source.table(name), source.times[name], axis=0, initial=0.0)
         logged = np.subtract(*(values_at(source.times[name], sums, at_s) for at_s in windows[::-1]))
+        moved = np.subtract(*(source.at(positions, at_s) for at_s in windows[::-1]))
         if name == "joint_velocities":
-            _check_joints(source, logged, windows)
+            _check_joints(source, moved, logged, windows)
         else:
-            _check_base(source, name, logged, windows)
+            _check_base(source, name, moved, logged, windows)
 
 
-def _check_base(source: Source, name: str, logged: np.ndarray, windows: np.ndarray) -> None:
+def _check_base(
+    source: Source, name: str, moved: np.ndarray, logged: np.ndarray, windows: np.ndarray
+) -> None:
     begin, end, middle = (source.rotations_at(at_s) for at_s in (*windows, windows.mean(axis=0)))
     is_linear = name == "base_linear_velocity"
-    moved = (
-        np.subtract(*(source.at("base_position", at_s) for at_s in windows[::-1]))
-        if is_linear
-        else (end * begin.inv()).as_rotvec()
-    )
+    if not is_linear:
+        moved = (end * begin.inv()).as_rotvec()
     derived = {"world": moved, "body": middle.inv().apply(moved)}
     part = getattr(source.log_map, name)
     frame, other = part.frame, "body" if part.frame == "world" else "world"
     simple: list[_Reading] = [(f"'{name}.frame' is {other}", derived[other], logged)]
     if not is_linear or frame == "body":
-        inverse = middle.apply(moved) if is_linear else -derived[other]
-        simple.append((_INVERSE, inverse, logged))
+        simple.append((_INVERSE, middle.apply(moved) if is_linear else -derived[other], logged))
     turned: list[_Reading] = []
     for one, also in ((frame, ""), (other, f" and '{name}.frame' is {other}")):
         simple += _scaled(source, name, derived[one], logged, also)
@@ -91,18 +89,19 @@ def _check_base(source: Source, name: str, logged: np.ndarray, windows: np.ndarr
     _require(source, name, part.columns, ("", derived[frame], logged), (simple, turned), windows)
 
 
-def _check_joints(source: Source, logged: np.ndarray, windows: np.ndarray) -> None:
+def _check_joints(
+    source: Source, moved: np.ndarray, logged: np.ndarray, windows: np.ndarray
+) -> None:
     name, joints = "joint_velocities", source.joints
-    derived = np.subtract(*(source.at("joint_positions", at_s) for at_s in windows[::-1]))
     for i, column in enumerate(source.log_map.joint_velocities.names(joints)):
-        readings = _scaled(source, name, derived[:, [i]], logged[:, [i]], "")
-        readings += [
-            (f"it is of joint '{joint}'", derived[:, [k]], logged[:, [i]])
+        given = moved[:, [i]], logged[:, [i]]
+        others: list[_Reading] = [
+            (f"it is of joint '{joint}'", moved[:, [k]], given[1])
             for k, joint in enumerate(joints)
             if k != i
         ]
-        given = ("", derived[:, [i]], logged[:, [i]])
-        _require(source, name, [column], given, (readings,), windows)
+        readings = _scaled(source, name, *given, "") + others
+        _require(source, name, [column], ("", *given), (readings,), windows)
 
 
 def _scaled(
@@ -112,23 +111,13 @@ def _scaled(
     factor = float((derived * logged).sum() / max((logged**2).sum(), 1e-12))
     if 1 / _FACTOR < factor < _FACTOR or factor == 0:
         return []
-    part = getattr(source.log_map, name)
     units = LENGTH_UNITS if name == "base_linear_velocity" else ANGLE_UNITS
-    what = f"it is multiplied by {factor:.3g}: a gear ratio, a unit, or the rate of time"
-    if abs(factor + 1) < 0.2:
-        what = "its sign is reversed"
-    for one, unit in units.items():
-        if abs(factor * units[part.unit] / unit - 1) < 0.2:
-            what = f"'{name}.unit' is {one}"
-    return [(what + also, derived, factor * logged)]
-
-
-def _differs(reading: _Reading, moves: np.ndarray) -> tuple[float, float]:
-    """Median difference of changes in the windows with motion, relative to it and absolute."""
-    derived, logged = (one[moves] for one in reading[1:])
-    sizes = np.maximum(*(np.linalg.norm(one, axis=1) for one in (derived, logged)))
-    difference = float(np.median(np.linalg.norm(derived - logged, axis=1)))
-    return difference / float(np.median(sizes)), difference
+    unit = units[getattr(source.log_map, name).unit]
+    known = {-1.0: "its sign is reversed"}
+    known |= {units[one] / unit: f"'{name}.unit' is {one}" for one in units}
+    near = [what for one, what in known.items() if abs(factor / one - 1) < 0.2]
+    text = f"it is multiplied by {factor:.3g}: a gear ratio, a unit, or the rate of time"
+    return [((near or [text])[0] + also, derived, factor * logged)]
 
 
 def _require(
@@ -140,9 +129,18 @@ def _require(
     windows: np.ndarray,
 ) -> None:
     """Raises if the given reading differs and one of a tier does not, or if it differs by far."""
-    sizes = np.maximum(*(np.linalg.norm(one, axis=1) for one in given[1:]))
-    moves = sizes > _LEAST[name]
-    share, size = _differs(given, moves) if moves.any() else (0.0, 0.0)
+
+    def sizes(changes: Iterable[np.ndarray]) -> np.ndarray:
+        return np.maximum(*(np.linalg.norm(one, axis=1) for one in changes))
+
+    def differs(reading: _Reading) -> tuple[float, float, str]:
+        """Median difference in the windows with motion, relative to it and absolute."""
+        derived, logged = (one[moves] for one in reading[1:])
+        size = float(np.median(np.linalg.norm(derived - logged, axis=1)))
+        return size / float(np.median(sizes((derived, logged)))), size, reading[0]
+
+    moves = sizes(given[1:]) > _LEAST[name]
+    share, size, _ = differs(given) if moves.any() else (0.0, 0.0, "")
     if share <= _DISAGREES or size < _LEAST[name]:
         return
     width, unit = windows[1, 0] - windows[0, 0], "m/s" if "linear" in name else "rad/s"
@@ -151,8 +149,8 @@ def _require(
         f"derivative of '{VELOCITIES[name]}' by {size / width:.2f} {unit}, median where it moves"
     )
     for tier in tiers:
-        found = [(*_differs(one, moves), one[0]) for one in tier]
-        best, _, _ = min(found, default=(math.inf, 0.0, ""))
+        found = [differs(one) for one in tier]
+        best = min((one[0] for one in found), default=math.inf)
         if best < min(_AGREES, share / 2):
             close = [one for one in found if one[0] < best + 0.05][:2]
             likely = " or ".join(what for _, _, what in close)
@@ -172,45 +170,36 @@ def _turn_text(turn: Rotation) -> str:
     return f"{math.degrees(turn.magnitude()):.0f}° about {axis}{vertical}"
 
 
-class _Pose(NamedTuple):
-    """A reading of the base's pose: whether the robot stands at first, and how its feet slide."""
-
-    what: str
-    stands: bool
-    slips: tuple[float, float]
-
-
-def check_stance(source: Source, kinematics: RobotKinematics, at_s: np.ndarray, where: str) -> None:
+def check_stance(source: Source, kinematics: RobotKinematics, where: str) -> None:
     """Checks that feet slide no less by another reading of the base's orientation.
 
     Raises:
-        ValueError: The contact points move by more than 4 mm, and by three times as much as with
-            another order, inverse or turn of the quaternion. This is the distance (rms) from their
-            means, as of a robot that stands, or the median movement in 0.05 s of the lowest one,
-            as of a robot that walks.
+        ValueError: The contact points move by more than 4 mm, and by three times as much as in
+            another reading: from their means (rms), or the lowest one in 0.05 s (median).
     """
-    if at_s[-1] - at_s[0] < _SHORTEST_S:
+    if np.ptp(source.at_s) < _SHORTEST_S:
         return
-    given, *others = _poses(source, kinematics, at_s)
+    given, *others = _poses(source, kinematics)
     for i, how in enumerate(("from their means", "while the lowest one stands")):
-        best, slip = _stillest(others, np.eye(2)[i]) or given, given.slips[i]
-        if slip > max(_SLIP_M, _SLIP_FACTOR * best.slips[i]):
+        what, _, slips = _stillest(others, i) or given
+        if given[2][i] > max(_SLIP_M, _SLIP_FACTOR * slips[i]):
             raise ValueError(
                 f"{where}: columns {source.log_map.base_orientation.columns}: the feet of robot "
-                f"'{kinematics.robot.name}' slide by {slip:.3g} m with the base ({how}), but only "
-                f"by {best.slips[i]:.3g} m if {best.what}"
+                f"'{kinematics.robot.name}' slide by {given[2][i]:.3g} m with the base ({how}), "
+                f"but only by {slips[i]:.3g} m if {what}"
             )
 
 
-def _stillest(poses: Iterable[_Pose], weights: np.ndarray) -> _Pose | None:
+def _stillest(poses: Iterable[_Pose], i: int) -> _Pose | None:
     """The first of the poses in which a robot stands whose feet slide least, to a millimetre."""
-    standing = [(one, float(weights @ one.slips)) for one in poses if one.stands]
-    least = min((slip for _, slip in standing), default=0.0)
-    return next((one for one, slip in standing if slip <= least + 0.001), None)
+    standing = [one for one in poses if one[1]]
+    least = min((slips[i] for _, _, slips in standing), default=0.0)
+    return next((one for one in standing if one[2][i] <= least + 0.001), None)
 
 
-def _poses(source: Source, kinematics: RobotKinematics, at_s: np.ndarray) -> Iterator[_Pose]:
-    """What the pose's readings say of the feet from the first of some times on; the map's first."""
+def _poses(source: Source, kinematics: RobotKinematics) -> Iterator[_Pose]:
+    """What the pose's readings say of the feet, the map's reading first."""
+    at_s = source.at_s
     step = max(_STEP_S, float(np.diff(at_s).max(initial=0.0)))
     begins = np.linspace(at_s[0], max(at_s[-1] - step, at_s[0]), _NUM_STEPS)
     q = source.positions(np.concatenate([begins, begins + step]))
@@ -222,13 +211,9 @@ def _poses(source: Source, kinematics: RobotKinematics, at_s: np.ndarray) -> Ite
         first, last = np.split(feet, 2)
         lowest = np.argmin(first[..., 2] + last[..., 2], axis=1)
         moved = np.linalg.norm(last - first, axis=2)[np.arange(_NUM_STEPS), lowest]
-        spread = np.sqrt(np.mean((feet - feet.mean(axis=0)) ** 2))
         start = np.concatenate([R[0].as_quat(scalar_first=True), p[0], q[0, 7:]])
-        stands = not checks.implausible(kinematics, start)
-        yield _Pose(what, stands, (float(spread), float(np.median(moved))))
-
-
-_INVERSE = "'base_orientation' is the inverse, of the world in the base"
+        slips = np.sqrt(np.mean((feet - feet.mean(axis=0)) ** 2)), np.median(moved)
+        yield what, not checks.implausible(kinematics, start), (float(slips[0]), float(slips[1]))
 
 
 def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rotation, np.ndarray]]:
@@ -250,32 +235,29 @@ def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rot
         yield what, Rotation.from_euler("z", angle, degrees=True) * R, p
 
 
-def check_start(source: Source, kinematics: RobotKinematics, at_s: np.ndarray, where: str) -> None:
-    """Checks that the robot stands on the ground at the first of some times (M,) [s].
+def check_start(source: Source, kinematics: RobotKinematics, where: str) -> None:
+    """Checks that the robot stands on the ground in the first row.
 
     A wrong order or turn of the quaternion tilts it; wrong units lift its feet off the ground or
     move joints beyond their stops. The error suggests readings that pass the check.
     """
 
     def wrong(read: Source) -> str:
-        return checks.implausible(kinematics, read.positions(at_s[:1])[0])
+        return checks.implausible(kinematics, read.positions(source.at_s[:1])[0])
 
-    if not wrong(source):
+    if not (reason := wrong(source)):
         return
     likely = []
-    for part, name, values in (
-        ("joint_positions", "unit", ANGLE_UNITS),
-        ("base_position", "unit", LENGTH_UNITS),
-    ):
-        for value in values:
-            other = copy.deepcopy(source.log_map)
-            setattr(getattr(other, part), name, value)
-            if other != source.log_map and not wrong(replace(source, log_map=other)):
-                likely.append(f"'{part}.{name}' is {value}")
-    if best := _stillest(_poses(source, kinematics, at_s), np.eye(2)[1]):
-        likely.append(best.what)
+    for name, units in (("joint_positions", ANGLE_UNITS), ("base_position", LENGTH_UNITS)):
+        part = getattr(source.log_map, name)
+        for unit in units:
+            log_map = replace(source.log_map, **{name: replace(part, unit=unit)})
+            if unit != part.unit and not wrong(replace(source, log_map=log_map)):
+                likely.append(f"'{name}.unit' is {unit}")
+    if best := _stillest(_poses(source, kinematics), 1):
+        likely.append(best[0])
     hint = f"; it would stand if {' or '.join(likely)}" if likely else ""
     raise ValueError(
         f"{where}: robot '{kinematics.robot.name}' does not stand on the ground z = 0 at the "
-        f"start: {wrong(source)}{hint}"
+        f"start: {reason}{hint}"
     )

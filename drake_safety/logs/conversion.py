@@ -21,23 +21,29 @@ class Source:
         joints: Names of the joints in the robot's order.
         origin: First instant of the log, on its clock.
         channels: Columns of every quantity that is in the map, by its field of the map.
+        step_s: Time between two converted rows [s]; by default those of the base's position.
     """
 
     log_map: LogMap
     joints: list[str]
     origin: float | int
     channels: Mapping[str, Channel]
+    step_s: float | None = None
 
     @cached_property
     def times(self) -> dict[str, np.ndarray]:
         """Times of every quantity since the origin [s]."""
         return {name: one.seconds_since(self.origin) for name, one in self.channels.items()}
 
-    @property
-    def span_s(self) -> tuple[float, float]:
-        """First and last time that all quantities cover [s]."""
+    @cached_property
+    def at_s(self) -> np.ndarray:
+        """Times of the converted rows [s], which all quantities cover."""
         times = self.times.values()
-        return float(max(one[0] for one in times)), float(min(one[-1] for one in times))
+        begin, end = max(one[0] for one in times), min(one[-1] for one in times)
+        if self.step_s is not None:
+            return begin + self.step_s * np.arange(int((end - begin) / self.step_s + 1e-9) + 1)
+        base_time = self.times["base_position"]
+        return base_time[(base_time >= begin) & (base_time <= end)]
 
     def table(self, name: str) -> np.ndarray:
         """Returns a quantity's columns in the unit m or rad, per second, (N, n)."""
@@ -82,8 +88,6 @@ class Source:
 
 def rotations_at(time_s: np.ndarray, rotations: Rotation, at_s: np.ndarray) -> Rotation:
     """Rotations at times (M,) [s], clipped to the range of the increasing times (N,), by slerp."""
-    if len(time_s) == 1:
-        return rotations[np.zeros(len(at_s), dtype=int)]
     return Slerp(time_s, rotations)(np.clip(at_s, time_s[0], time_s[-1]))
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 from drake_safety.files.schema import Positive, load_typed_file, schema
 
@@ -11,6 +11,7 @@ TimeUnit = Literal["s", "ms", "us", "ns"]
 LengthUnit = Literal["m", "mm"]
 AngleUnit = Literal["rad", "deg"]
 Order = Literal["wxyz", "xyzw"]
+Frame = Literal["world", "body"]
 TIME_UNITS: dict[TimeUnit, int] = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}
 """Units per second."""
 LENGTH_UNITS: dict[LengthUnit, float] = {"m": 1.0, "mm": 1e-3}
@@ -86,26 +87,20 @@ class Orientation(_Columns):
 
 
 @schema(kw_only=True)
-class Velocity(_Columns):
-    """A velocity of the base relative to the world: x, y, z per second."""
+class LinearVelocity(_Columns):
+    """Velocity of the base's origin relative to the world: x, y, z per second."""
 
-    unit: LengthUnit | AngleUnit
-    frame: Literal["world", "body"] = "world"
+    unit: LengthUnit = "m"
+    frame: Frame = "world"
     """Frame of x, y, z: ``world`` or ``body``, the base's own (as in ROS odometry)."""
 
 
 @schema(kw_only=True)
-class LinearVelocity(Velocity):
-    """Velocity of the base's origin relative to the world: x, y, z per second."""
-
-    unit: LengthUnit = "m"
-
-
-@schema(kw_only=True)
-class AngularVelocity(Velocity):
+class AngularVelocity(_Columns):
     """Angular velocity of the base relative to the world: x, y, z per second."""
 
     unit: AngleUnit = "rad"
+    frame: Frame = "world"
 
 
 @schema(kw_only=True)
@@ -170,8 +165,7 @@ class LogMap:
 
 def si_units(part: object) -> float:
     """Returns the SI units, m or rad, per unit of a quantity's columns; 1 if it has no unit."""
-    units: dict[Any, float] = dict(LENGTH_UNITS) | dict(ANGLE_UNITS)
-    return units.get(getattr(part, "unit", ""), 1.0)
+    return {**LENGTH_UNITS, **ANGLE_UNITS}.get(getattr(part, "unit", ""), 1.0)
 
 
 def load_log_map(path: str | Path) -> LogMap:

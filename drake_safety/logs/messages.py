@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from drake_safety.extras import require_extra
 from drake_safety.files.reading import reading
-from drake_safety.logs.channel import Channel, listed
+from drake_safety.logs.channel import Channel, Wanted, listed
 from drake_safety.logs.log_map import LogTime
 
 Message = tuple[str, int, Any]
@@ -23,7 +23,7 @@ _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]|\.")
 
 
 def read_mcap(
-    path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime, files: Sequence[Path] = ()
+    path: Path, wanted: Wanted, time: LogTime, files: Sequence[Path] = ()
 ) -> tuple[dict[str, Channel], str]:
     """Reads the wanted fields, by topic, of an MCAP file with ROS 2 messages, or of several files.
 
@@ -71,9 +71,7 @@ def _decoded(found: tuple[int, Any, Any]) -> Message:
     return channel.topic, stamp, decode(message.data)
 
 
-def read_bag(
-    path: Path, wanted: Mapping[str, Sequence[str]], time: LogTime
-) -> tuple[dict[str, Channel], str]:
+def read_bag(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Channel], str]:
     """Reads the wanted fields, by topic, of a ROS 1 bag (a file) or a ROS 2 bag (a folder).
 
     A ROS 2 bag needs no ``metadata.yaml``; of MCAP files in it that were cut off the rest is read.
@@ -104,22 +102,18 @@ def read_bag(
             return read_mcap(path, wanted, time, chunked)
 
 
-def _require_topics(path: Path, wanted: Mapping[str, Sequence[str]], existing: set[str]) -> None:
+def _require_topics(path: Path, wanted: Wanted, existing: set[str]) -> None:
+    there = f"its topics are {listed(sorted(existing))}"
     if "" in wanted:
         raise ValueError(
-            f"log '{path}' has messages: the map must name the topic of {list(wanted[''])}; its "
-            f"topics are {listed(sorted(existing))}"
+            f"log '{path}' has messages: the map must name the topic of {list(wanted[''])}; {there}"
         )
-    missing = [topic for topic in wanted if topic not in existing]
-    if missing:
-        raise ValueError(
-            f"log '{path}' has no messages of topics {missing}; its topics are "
-            f"{listed(sorted(existing))}"
-        )
+    if missing := [topic for topic in wanted if topic not in existing]:
+        raise ValueError(f"log '{path}' has no messages of topics {missing}; {there}")
 
 
 def _channels(
-    path: Path, messages: Iterator[Message], wanted: Mapping[str, Sequence[str]], time: LogTime
+    path: Path, messages: Iterator[Message], wanted: Wanted, time: LogTime
 ) -> dict[str, Channel]:
     stamp_names = [time.column] if time.column else []
     fields = {one: {n: field_of(n) for n in (*wanted[one], *stamp_names)} for one in wanted}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from os import PathLike
 from pathlib import Path
@@ -12,17 +13,24 @@ from scipy.spatial.transform import Rotation
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.files.schema import load_typed
 from drake_safety.logs import checks
-from drake_safety.logs.channel import Channel
+from drake_safety.logs.channel import Channel, Wanted
 from drake_safety.logs.contradictions import check_stance, check_start, check_velocities
 from drake_safety.logs.conversion import Source, rotations_at, values_at
-from drake_safety.logs.log_map import COMMANDS, QUANTITIES, LogMap, load_log_map
+from drake_safety.logs.log_map import COMMANDS, QUANTITIES, LogMap, LogTime, load_log_map
 from drake_safety.logs.messages import read_bag, read_mcap
 from drake_safety.logs.pieces import cut_channels
 from drake_safety.logs.quantities import in_order, quantities
 from drake_safety.logs.tables import read_csv, read_parquet
 from drake_safety.robots.robot_model import RobotModel
 
-FORMATS = (".csv", ".tsv", ".parquet", ".mcap", ".bag")
+_READERS: dict[str, Callable[[Path, Wanted, LogTime], tuple[dict[str, Channel], str]]] = {
+    ".csv": read_csv,
+    ".tsv": read_csv,
+    ".parquet": read_parquet,
+    ".mcap": read_mcap,
+    ".bag": read_bag,
+}
+FORMATS = tuple(_READERS)
 """Suffixes of readable files; a folder is a ROS 2 bag."""
 
 _MOST_CUTS = 3  # In a message.
@@ -72,12 +80,19 @@ class LogPieces:
 
     Attributes:
         duration_s: Duration of the whole log [s].
-        cuts: What was cut, left out or resampled, and where.
+        lost: What was cut or left out, and where.
+        notes: What was resampled, or is a derivative, and where.
     """
 
     pieces: list[RobotLog]
     duration_s: float
-    cuts: list[str]
+    lost: list[str]
+    notes: list[str]
+
+    @property
+    def cuts(self) -> list[str]:
+        """What was cut, left out or resampled, and where."""
+        return self.lost + self.notes
 
     @property
     def kept_share(self) -> float:
@@ -100,16 +115,7 @@ def read_pieces(
     Raises:
         ValueError: See :func:`read_log`; or nothing is left.
     """
-    return _read(Path(path), log_map, robot, step_s)[0]
-
-
-def _read(
-    path: Path,
-    log_map: LogMap | str | PathLike[str],
-    robot: RobotModel,
-    step_s: float | None,
-) -> tuple[LogPieces, list[str]]:
-    """The pieces of a log, and what was cut or left out; resampling loses nothing."""
+    path = Path(path)
     if isinstance(log_map, LogMap):  # Its values may have been set since the construction.
         log_map = load_typed(LogMap, asdict(log_map), "map")
     else:
@@ -119,43 +125,43 @@ def _read(
     kinematics = RobotKinematics(robot)
     joints = kinematics.joint_names
     topics, cut = _read_channels(path, _wanted(log_map, kinematics), log_map)
-    cuts = [cut] if cut else []
+    lost = [cut] if cut else []
     for topic, channel in topics.items():
-        topics[topic], lost = in_order(channel, log_map.max_gap_s)
-        cuts += lost
+        topics[topic], unsorted = in_order(channel, log_map.max_gap_s)
+        lost += unsorted
     channels, log_map, notes = quantities(topics, log_map, joints)
     found, reasons = cut_channels(channels, log_map.max_gap_s)
-    cuts += reasons
+    lost += reasons
     origin = min(channel.time[0] for channel in topics.values())
     sources = [
-        Source(log_map=log_map, joints=joints, origin=origin, channels=part) for part in found
+        Source(log_map=log_map, joints=joints, origin=origin, channels=part, step_s=step_s)
+        for part in found
     ]
-    sources = [source for source in sources if len(_times(source, step_s)) > 1]
+    sources = [source for source in sources if len(source.at_s) > 1]
     measured = {getattr(log_map, name).topic for name in channels if name not in COMMANDS}
     spans = {topic: topics[topic].seconds_since(origin)[[0, -1]].tolist() for topic in measured}
     begin, end = max(one[0] for one in spans.values()), min(one[1] for one in spans.values())
     if not sources:
-        why = "; ".join(cuts[:_MOST_CUTS]) if end > begin else f"its topics do not overlap: {spans}"
+        why = "; ".join(lost[:_MOST_CUTS]) if end > begin else f"its topics do not overlap: {spans}"
         raise ValueError(
             f"log '{path}' has no {checks.MIN_ROWS} rows without a missing value or a gap between "
             f"them: {why}"
         )
-    _check(sources, kinematics, step_s)
-    times = [_times(source, step_s) for source in sources]
+    _check(sources, kinematics)
     pieces = [
         RobotLog(
             path=path,
             robot=robot.name,
-            time_s=at_s - at_s[0],
-            q=source.positions(at_s),
-            v=source.velocities(at_s),
+            time_s=one.at_s - one.at_s[0],
+            q=one.positions(one.at_s),
+            v=one.velocities(one.at_s),
             piece=i,
-            begin_s=float(at_s[0]),
-            **{name: source.at(name, at_s) for name in COMMANDS if name in source.channels},
+            begin_s=float(one.at_s[0]),
+            **{name: one.at(name, one.at_s) for name in COMMANDS if name in one.channels},
         )
-        for i, (source, at_s) in enumerate(zip(sources, times, strict=True))
+        for i, one in enumerate(sources)
     ]
-    return LogPieces(pieces=pieces, duration_s=end - begin, cuts=cuts + notes), cuts
+    return LogPieces(pieces=pieces, duration_s=end - begin, lost=lost, notes=notes)
 
 
 def read_log(
@@ -177,48 +183,37 @@ def read_log(
     Raises:
         ValueError: A value is missing or implausible; the message names file, row and column.
     """
-    found, lost = _read(Path(path), log_map, robot, step_s)
-    if lost:
-        raise ValueError(f"{lost[0]}, expected a log of which nothing is lost")
+    found = read_pieces(path, log_map, robot, step_s=step_s)
+    if found.lost:
+        raise ValueError(f"{found.lost[0]}, expected a log of which nothing is lost")
     return found.pieces[0]
 
 
-def _times(source: Source, step_s: float | None) -> np.ndarray:
-    """Times of the rows of a converted piece, since the log's origin [s]."""
-    begin, end = source.span_s
-    if step_s is not None:
-        return begin + step_s * np.arange(int((end - begin) / step_s + 1e-9) + 1)
-    base_time = source.times["base_position"]
-    return base_time[(base_time >= begin) & (base_time <= end)]
-
-
-def _check(sources: list[Source], kinematics: RobotKinematics, step_s: float | None) -> None:
-    """Checks the first piece's start and the longest one's motion, and the values of all.
-
-    The first two are about the map: another piece may begin in mid-motion, or after a fall.
-    """
-    longest = max(sources, key=lambda one: float(np.ptp(one.span_s)))
+def _check(sources: list[Source], kinematics: RobotKinematics) -> None:
+    """Checks the first piece's start and the longest one's motion, and the values of all."""
+    longest = max(sources, key=lambda one: float(np.ptp(one.at_s)))
     for source in sources:
-        channels, log_map, at_s = source.channels, source.log_map, _times(source, step_s)
+        channels, log_map, begin = source.channels, source.log_map, source.at_s[:1]
         checks.check_norms(channels["base_orientation"], log_map.base_orientation.columns)
-        first = int(np.searchsorted(source.times["base_position"], at_s[0]))
+        first = int(np.searchsorted(source.times["base_position"], begin[0]))
         where = channels["base_position"].where(first)
         if source is sources[0]:
-            check_start(source, kinematics, at_s, where)
+            check_start(source, kinematics, where)
             if "desired_output" in channels:
-                names = ("desired_output", "base_position")
-                desired, position = (source.at(name, at_s[:1])[0] for name in names)
+                desired, base = (
+                    source.at(n, begin)[0] for n in ("desired_output", "base_position")
+                )
                 unit = log_map.desired_output.unit
-                checks.check_desired_output(kinematics, desired, position, where, unit)
+                checks.check_desired_output(kinematics, desired, base, where, unit)
         names = log_map.joint_positions.names(source.joints)
         joints = source.table("joint_positions")
         checks.check_limits(kinematics, joints, channels["joint_positions"], names)
         if source is longest:
-            check_stance(source, kinematics, at_s, f"{where} and after it")
+            check_stance(source, kinematics, f"{where} and after it")
             check_velocities(source)
 
 
-def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> dict[str, list[str]]:
+def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> Wanted:
     """Names of the mapped columns by topic."""
     wanted: dict[str, list[str]] = {}
     joints = kinematics.joint_names
@@ -246,26 +241,17 @@ def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> dict[str, list[str]
     return {topic: list(dict.fromkeys(names)) for topic, names in wanted.items()}
 
 
-def _read_channels(
-    path: Path, wanted: dict[str, list[str]], log_map: LogMap
-) -> tuple[dict[str, Channel], str]:
+def _read_channels(path: Path, wanted: Wanted, log_map: LogMap) -> tuple[dict[str, Channel], str]:
     """Channels by topic, and what is said of a file that was cut off."""
-    suffix, is_folder = path.suffix.lower(), path.is_dir()
     kinds = ("metadata.yaml", "*.db3", "*.mcap")
-    if suffix == ".bag" or (is_folder and any(any(path.glob(kind)) for kind in kinds)):
-        return read_bag(path, wanted, log_map.time)
-    if not path.is_file():
+    is_bag = path.is_dir() and any(any(path.glob(kind)) for kind in kinds)
+    if not is_bag and not path.is_file():
         what = "is a folder without the metadata.yaml of a ROS 2 bag"
-        raise ValueError(f"log '{path}' {what if is_folder else 'does not exist'}")
-    if suffix == ".mcap":
-        return read_mcap(path, wanted, log_map.time)
-    if suffix not in FORMATS:
+        raise ValueError(f"log '{path}' {what if path.is_dir() else 'does not exist'}")
+    suffix = ".bag" if is_bag else path.suffix.lower()
+    if suffix not in _READERS:
         raise ValueError(
             f"log '{path}' has the suffix '{suffix}'; known are {list(FORMATS)} and the folder of "
             "a ROS 2 bag"
         )
-    if topics := [topic for topic in wanted if topic]:
-        raise ValueError(f"log '{path}' is a table and has no topics; the map names {topics}")
-    read = read_parquet if suffix == ".parquet" else read_csv
-    channel, cut = read(path, wanted[""], log_map.time)
-    return {"": channel}, cut
+    return _READERS[suffix](path, wanted, log_map.time)

@@ -6,7 +6,6 @@ import csv
 import io
 import re
 import warnings
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +14,7 @@ import numpy as np
 
 from drake_safety.extras import require_extra
 from drake_safety.files.reading import is_number, reading
-from drake_safety.logs.channel import Channel, listed
+from drake_safety.logs.channel import Channel, Wanted, listed
 from drake_safety.logs.log_map import LogTime
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ _MISSING = {"", "na", "n/a", "nan", "null", "none", "-"}
 _UNIT = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]$")  # In brackets at the end of a name.
 
 
-def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> tuple[Channel, str]:
+def read_csv(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Channel], str]:
     """Reads columns of a CSV file with a header line, and says whether its end is cut off.
 
     The header is the line among the first ones that has the most of the names, and the separator
@@ -43,7 +42,7 @@ def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> tuple[Channel,
         encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
         text = data.decode(encoding).rstrip("\0")
         lines = text[: 1 << 20].splitlines()[:_NUM_HEAD_LINES] or [""]
-        keys = {_key(name) for name in (time.column, *wanted)}
+        keys = {_key(name) for name in (time.column, *wanted.get("", ()))}
         headers = [(i, by, _cells(line, by)) for i, line in enumerate(lines) for by in _SEPARATORS]
         line, separator, names = max(
             headers, key=lambda one: sum(bool({_key(n), _bare(n)} & keys) for n in one[2])
@@ -68,10 +67,10 @@ def read_csv(path: Path, wanted: Sequence[str], time: LogTime) -> tuple[Channel,
             frame = frame[:-1]
         frame = frame[[*places.values()]].set_axis([*places], axis=1)
         frame = frame[~_is_remark(frame, time.column)]
-        return _channel(path, frame, time, "line", line + 2), cut
+        return {"": _channel(path, frame, time, "line", line + 2)}, cut
 
 
-def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> tuple[Channel, str]:
+def read_parquet(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Channel], str]:
     """Reads columns of a Parquet file; of one that is cut off nothing can be read."""
     require_extra("logs", f"log '{path}'", "pandas", "pyarrow")
     import pyarrow.parquet as pq
@@ -85,7 +84,7 @@ def read_parquet(path: Path, wanted: Sequence[str], time: LogTime) -> tuple[Chan
         names = [existing[place] for place in places.values()]
         table = file.read(columns=names).select(names).rename_columns([*places])
         frame = table.to_pandas(timestamp_as_object=False, ignore_metadata=True)
-        return _channel(path, frame, time, "row", 0), ""
+        return {"": _channel(path, frame, time, "row", 0)}, ""
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -103,17 +102,17 @@ def _bare(name: str) -> str:
     return _UNIT.sub("", _key(name))
 
 
-def _places(
-    path: Path, wanted: Sequence[str], time: LogTime, existing: list[str]
-) -> dict[str, int]:
+def _places(path: Path, wanted: Wanted, time: LogTime, existing: list[str]) -> dict[str, int]:
     """Places of the columns, by their name or by that without a unit."""
+    if topics := [topic for topic in wanted if topic]:
+        raise ValueError(f"log '{path}' is a table and has no topics; the map names {topics}")
     if not time.column:
         raise ValueError(
             f"log '{path}' is a table: 'time.column' of the map must name its time; it has "
             f"{existing}"
         )
     keys, bare = list(map(_key, existing)), list(map(_bare, existing))
-    columns = {name: keys if _key(name) in keys else bare for name in (time.column, *wanted)}
+    columns = {name: keys if _key(name) in keys else bare for name in (time.column, *wanted[""])}
     counts = {name: among.count(_key(name)) for name, among in columns.items()}
     if missing := [name for name, count in counts.items() if not count]:
         raise ValueError(
