@@ -9,6 +9,7 @@ import numpy as np
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.observation import quaternion_of
 from drake_safety.logs.channel import Channel
+from drake_safety.logs.conversion import Source
 from drake_safety.logs.log_map import TIME_UNITS
 
 MIN_ROWS = 3
@@ -51,15 +52,16 @@ def check_clock(channel: Channel) -> None:
         )
 
 
-def check_norms(channel: Channel, names: list[str]) -> None:
+def check_norms(source: Source) -> None:
     """Checks that quaternions have a norm of 1."""
-    norms = np.linalg.norm(channel.table(names), axis=1)
+    names = source.log_map.base_orientation.columns
+    norms = np.linalg.norm(source.table("base_orientation"), axis=1)
     is_bad = np.abs(norms - 1.0) > _NORM_TOLERANCE
     if is_bad.any():
         row = int(np.argmax(is_bad))
         raise ValueError(
-            f"{channel.where(row)}, columns {names}: the quaternion has a norm of "
-            f"{norms[row]:g}, expected 1"
+            f"{source.channels['base_orientation'].where(row)}, columns {names}: the quaternion "
+            f"has a norm of {norms[row]:g}, expected 1"
         )
 
 
@@ -93,22 +95,23 @@ def _beyond_stops(kinematics: RobotKinematics, joints: np.ndarray) -> tuple[int,
     return row, joint, text
 
 
-def check_limits(
-    kinematics: RobotKinematics, joints: np.ndarray, channel: Channel, names: list[str]
-) -> None:
-    """Checks that joints (N, n_j) [rad] are not far beyond their stops."""
-    if beyond := _beyond_stops(kinematics, joints):
+def check_limits(source: Source, kinematics: RobotKinematics) -> None:
+    """Checks that joints are not far beyond their stops."""
+    if beyond := _beyond_stops(kinematics, source.table("joint_positions")):
         row, joint, text = beyond
-        raise ValueError(f"{channel.where(row, names[joint])}: {text}")
+        column = source.log_map.joint_positions.column(source.joints[joint])
+        raise ValueError(f"{source.channels['joint_positions'].where(row, column)}: {text}")
 
 
-def check_desired_output(
-    kinematics: RobotKinematics, desired: np.ndarray, base: np.ndarray, where: str, unit: str
-) -> None:
-    """Checks that the desired output (3,) [m] is near the base (3,) [m]."""
+def check_desired_output(source: Source, kinematics: RobotKinematics) -> None:
+    """Checks that the desired output, if there is one, begins near the base."""
+    if "desired_output" not in source.channels:
+        return
+    desired, base = (source.at(n, source.at_s[:1]) for n in ("desired_output", "base_position"))
     distance = float(np.linalg.norm(desired - base))
     if distance > _REACH_SHARE * kinematics.standing_height:
         raise ValueError(
-            f"{where}: the desired output is {distance:.3g} m from the base of robot "
-            f"'{kinematics.robot.name}': check its frame and its unit, {unit}"
+            f"{source.where}: the desired output is {distance:.3g} m from the base of robot "
+            f"'{kinematics.robot.name}': check its frame and its unit, "
+            f"{source.log_map.desired_output.unit}"
         )

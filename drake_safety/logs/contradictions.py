@@ -170,7 +170,7 @@ def _turn_text(turn: Rotation) -> str:
     return f"{math.degrees(turn.magnitude()):.0f}° about {axis}{vertical}"
 
 
-def check_stance(source: Source, kinematics: RobotKinematics, where: str) -> None:
+def check_stance(source: Source, kinematics: RobotKinematics) -> None:
     """Checks that feet slide no less by another reading of the base's orientation.
 
     Raises:
@@ -184,9 +184,9 @@ def check_stance(source: Source, kinematics: RobotKinematics, where: str) -> Non
         what, _, slips = _stillest(others, i) or given
         if given[2][i] > max(_SLIP_M, _SLIP_FACTOR * slips[i]):
             raise ValueError(
-                f"{where}: columns {source.log_map.base_orientation.columns}: the feet of robot "
-                f"'{kinematics.robot.name}' slide by {given[2][i]:.3g} m with the base ({how}), "
-                f"but only by {slips[i]:.3g} m if {what}"
+                f"{source.where} and after it: columns {source.log_map.base_orientation.columns}: "
+                f"the feet of robot '{kinematics.robot.name}' slide by {given[2][i]:.3g} m with "
+                f"the base ({how}), but only by {slips[i]:.3g} m if {what}"
             )
 
 
@@ -235,7 +235,7 @@ def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rot
         yield what, Rotation.from_euler("z", angle, degrees=True) * R, p
 
 
-def check_start(source: Source, kinematics: RobotKinematics, where: str) -> None:
+def check_start(source: Source, kinematics: RobotKinematics) -> None:
     """Checks that the robot stands on the ground in the first row.
 
     A wrong order or turn of the quaternion tilts it; wrong units lift its feet off the ground or
@@ -258,6 +258,6 @@ def check_start(source: Source, kinematics: RobotKinematics, where: str) -> None
         likely.append(best[0])
     hint = f"; it would stand if {' or '.join(likely)}" if likely else ""
     raise ValueError(
-        f"{where}: robot '{kinematics.robot.name}' does not stand on the ground z = 0 at the "
-        f"start: {reason}{hint}"
+        f"{source.where}: robot '{kinematics.robot.name}' does not stand on the ground z = 0 at "
+        f"the start: {reason}{hint}"
     )

@@ -45,6 +45,12 @@ class Source:
         base_time = self.times["base_position"]
         return base_time[(base_time >= begin) & (base_time <= end)]
 
+    @property
+    def where(self) -> str:
+        """The location of the first converted row."""
+        row = int(np.searchsorted(self.times["base_position"], self.at_s[0]))
+        return self.channels["base_position"].where(row)
+
     def table(self, name: str) -> np.ndarray:
         """Returns a quantity's columns in the unit m or rad, per second, (N, n)."""
         part = getattr(self.log_map, name)

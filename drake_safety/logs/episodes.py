@@ -12,7 +12,6 @@ from pydrake.systems.framework import Context
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import planar_pose
-from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.mode_settings import mode_settings
 from drake_safety.learning.seeds import NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
@@ -68,7 +67,8 @@ def cut_log(
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")
     scenario = loop.scenario
-    shortest = shortest_steps(scenario.assessment)
+    assessment = scenario.assessment
+    shortest = assessment.preview_stride * mode_settings(assessment).shortest
     rows = _Rows(scenario.step_s, scenario.episode_duration_s, shortest)
     episodes: list[Episode] = []
     starts: list[EpisodeStart] = []
@@ -124,11 +124,6 @@ class _Rows(NamedTuple):
     step_s: float
     duration_s: float
     shortest: int
-
-
-def shortest_steps(assessment: AssessmentParameters) -> int:
-    """Least number of steps of a safe part of a log that gives an episode."""
-    return assessment.preview_stride * mode_settings(assessment).shortest
 
 
 def _parts(

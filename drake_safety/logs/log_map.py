@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 from drake_safety.files.schema import Positive, load_typed_file, schema
 
@@ -165,7 +165,8 @@ class LogMap:
 
 def si_units(part: object) -> float:
     """Returns the SI units, m or rad, per unit of a quantity's columns; 1 if it has no unit."""
-    return {**LENGTH_UNITS, **ANGLE_UNITS}.get(getattr(part, "unit", ""), 1.0)
+    units: dict[Any, float] = {**LENGTH_UNITS, **ANGLE_UNITS}
+    return units.get(getattr(part, "unit", ""), 1.0)
 
 
 def load_log_map(path: str | Path) -> LogMap:

@@ -127,7 +127,7 @@ def _channels(
         nonlocal is_stamp
         try:
             value = fields[topic][name](message)
-            is_stamp = is_stamp or hasattr(value, "nanosec") or hasattr(value, "nsec")
+            is_stamp = is_stamp or hasattr(value, "sec")
             return _number(value)
         except (LookupError, TypeError) as error:
             where = f"log '{path}', message {counts[topic]} of topic '{topic}'"
@@ -201,9 +201,9 @@ def _place(owner: Any, name: str) -> int:
 
 def _number(value: Any) -> float | int:
     """A number; a ROS stamp in nanoseconds."""
-    for name in ("nanosec", "nsec"):
-        if hasattr(value, name):
-            return int(value.sec) * 1_000_000_000 + int(getattr(value, name))
+    if hasattr(value, "sec"):
+        fraction = value.nanosec if hasattr(value, "nanosec") else value.nsec
+        return int(value.sec) * 1_000_000_000 + int(fraction)
     if isinstance(value, np.number):
         return value.item()
     if isinstance(value, int | float):

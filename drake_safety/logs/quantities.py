@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_safety.extras import require_extra
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.log_map import COMMANDS, QUANTITIES, TIME_UNITS, VELOCITIES, LogMap, si_units
 
@@ -76,37 +75,33 @@ def quantities(
 
 def _present(channel: Channel, max_gap_s: float) -> Channel:
     """The rows with most values; a column that is missing in one of them is interpolated."""
-    has = ~np.isnan(channel.table(channel.columns))
-    own = channel.select(has[:, has.sum(axis=0).argmax()])
-    if not len(own.time):
+    import pandas as pd
+
+    frame = pd.DataFrame(channel.columns, index=channel.seconds_since(channel.time[0]))
+    if not np.isfinite(channel.time).all() or not frame.notna().any(axis=None):
         return channel
-    at_s, time_s = (one.seconds_since(own.time[0]) for one in (own, channel))
-    covered = np.ones(len(at_s), dtype=bool)
-    for name, is_known in zip(channel.columns, has.T, strict=True):
-        if not is_known.any():
-            continue
-        known_s = time_s[is_known]
-        after = np.minimum(np.searchsorted(known_s, at_s), len(known_s) - 1)
-        is_near = known_s[after] - known_s[np.maximum(after - 1, 0)] <= max_gap_s
-        filled = np.interp(at_s, known_s, channel.columns[name][is_known])
-        own.columns[name] = np.where(is_near | (known_s[after] == at_s), filled, np.nan)
-        covered &= (at_s >= known_s[0]) & (at_s <= known_s[-1])
-    return own.select(covered)
+    known_s = frame.notna().apply(lambda is_known: is_known.index.where(is_known))
+    before_s, after_s = known_s.ffill(), known_s.bfill()
+    filled = frame.interpolate("index").where(after_s - before_s <= max_gap_s)
+    is_covered = (before_s.notna() & after_s.notna()) | frame.isna().all()
+    most = frame.notna().sum().idxmax()
+    columns = {name: filled[name].to_numpy() for name in filled}
+    rows = is_covered.all(axis=1) & frame[most].notna()
+    return replace(channel, columns=columns).select(rows.to_numpy())
 
 
 def _without_holds(channel: Channel) -> tuple[Channel, float]:
     """The rows at which a value that is held for equally many rows changes, and that number."""
     values = np.nan_to_num(channel.table(channel.columns))
-    begins = np.concatenate([[0], np.flatnonzero(np.diff(values, axis=0).any(axis=1)) + 1])
-    holds = np.diff(begins)[1:]
+    hold = np.append(0, np.diff(values, axis=0).any(axis=1).cumsum())
+    holds = np.bincount(hold)[1:-1]  # Rows of each but the first and the last.
     if len(holds) < _MANY_HOLDS:
         return channel, 1.0
     number = float(holds[holds < 3 * np.median(holds)].mean())
     is_regular = np.abs(holds - number) < max(1.0, number / 3)
     if number < 1.8 or is_regular.mean() < _REGULAR:
         return channel, 1.0
-    rows = np.arange(len(values))
-    since = rows - begins[np.searchsorted(begins, rows, side="right") - 1]
+    since = np.arange(len(hold)) - np.searchsorted(hold, hold)
     # A value that stays the same for longer was measured again.
     return channel.select(since % int(2 * number) == 0), number
 
@@ -147,7 +142,6 @@ def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
     step = np.diff(channel.time)
     if (step > 0).all() or not (step >= -max_gap_s * TIME_UNITS[channel.time_unit]).all():
         return channel, []  # In order, or of another clock, which is refused.
-    require_extra("logs", f"log '{channel.path}'", "pandas")
     import pandas as pd
 
     groups = pd.DataFrame(channel.columns).groupby(channel.time)

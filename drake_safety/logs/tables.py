@@ -33,7 +33,6 @@ def read_csv(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Chann
     The header is the line among the first ones that has the most of the names, and the separator
     the one that gives them.
     """
-    require_extra("logs", f"log '{path}'", "pandas")
     import pandas as pd
 
     # Parser errors are of several kinds.
@@ -72,7 +71,7 @@ def read_csv(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Chann
 
 def read_parquet(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Channel], str]:
     """Reads columns of a Parquet file; of one that is cut off nothing can be read."""
-    require_extra("logs", f"log '{path}'", "pandas", "pyarrow")
+    require_extra("logs", f"log '{path}'", "pyarrow")
     import pyarrow.parquet as pq
 
     with (
