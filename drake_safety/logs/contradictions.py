@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.logs import checks
 from drake_safety.logs.conversion import Source, values_at
-from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, ORDERS, VELOCITIES
+from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, ORDERS, VELOCITIES, si_units
 
 _WINDOW_S, _MANY_WINDOWS = 0.1, 400
 _LEAST = {"base_linear_velocity": 0.01, "base_angular_velocity": 0.05, "joint_velocities": 0.1}
@@ -112,9 +112,9 @@ def _scaled(
     if 1 / _FACTOR < factor < _FACTOR or factor == 0:
         return []
     units = LENGTH_UNITS if name == "base_linear_velocity" else ANGLE_UNITS
-    unit = units[getattr(source.log_map, name).unit]
+    unit = si_units(getattr(source.log_map, name))
     known = {-1.0: "its sign is reversed"}
-    known |= {units[one] / unit: f"'{name}.unit' is {one}" for one in units}
+    known |= {size / unit: f"'{name}.unit' is {one}" for one, size in units.items()}
     near = [what for one, what in known.items() if abs(factor / one - 1) < 0.2]
     text = f"it is multiplied by {factor:.3g}: a gear ratio, a unit, or the rate of time"
     return [((near or [text])[0] + also, derived, factor * logged)]
