@@ -156,8 +156,8 @@ class Kinematics:
     num_positions, num_velocities, num_joints = 9, 8, 2
 
 
-def controller(evaluate=lambda batch: [batch[:, :2] + 1.0], find_memory=lambda batch: []):
-    network = PolicyNetwork(None, evaluate, (9, 2), find_memory=find_memory)
+def controller(evaluate=lambda batch, parts: (batch[:, :2] + 1.0, {}), **start):
+    network = PolicyNetwork(None, evaluate, (9, 2), start=start)
     terms = ["velocity_commands", "last_action", "sin_phase", "cos_phase"]
     parameters = PolicyParameters(
         network="net.onnx",

@@ -31,7 +31,7 @@ def test_the_state_of_an_action_is_carried_to_another_context():
 @pytest.mark.parametrize("what", ["command", "plant_state", "action"])
 def test_what_is_not_finite_leaves_the_last_action_and_a_status(what):
     broken = []
-    system = controller(lambda batch: [batch[:, :2] * np.nan if broken else batch[:, :2] + 1.0])
+    system = controller(lambda batch, parts: (batch[:, :2] * (np.nan if broken else 1.0) + 1.0, {}))
     bench = started(system)
     good = bench.get("desired_joint_state")
     if what == "action":

@@ -124,9 +124,11 @@ def test_a_memory_of_another_kind_is_refused(tmp_path, save, message):
 
 def counting():
     """A controller whose network counts its evaluations."""
-    return controller(
-        lambda batch, count: (batch[:, :2] + count, count + 1.0), lambda batch: [np.zeros(1)]
-    )
+
+    def evaluate(batch, parts):
+        return batch[:, :2] + parts["count"], {"count": parts["count"] + 1.0}
+
+    return controller(evaluate, count=np.zeros(1))
 
 
 def test_a_cloned_context_continues_alike_and_a_new_one_from_the_start():

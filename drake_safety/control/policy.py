@@ -166,8 +166,8 @@ class Policy:
         stiffness, damping = by_joint("stiffness", names), by_joint("damping", names)
         servos = {
             name: JointGains(stiffness=stiffness[name], damping=damping[name])
-            for name in names
-            if name in stiffness and name in damping
+            for name in stiffness
+            if name in damping
         }
         self.gains: dict[str, JointGains] = servos | by_joint("gains", names)
         missing = []
@@ -187,9 +187,8 @@ class Policy:
                 f"registered are {registered_terms()}"
             )
         if missing:
-            raise ValueError(
-                f"{who}: state in policy.yaml {'; '.join([*missing, *metadata.unread])}"
-            )
+            missing += metadata.unread
+            raise ValueError(f"{who}: state in policy.yaml {'; '.join(missing)}")
         self.default_positions = np.array([positions.get(name, 0.0) for name in joint_names])
         self.action_scale = np.array([scales[name] for name in names])
         gait = parameters.gait

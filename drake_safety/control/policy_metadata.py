@@ -6,9 +6,10 @@ import ast
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 
@@ -38,14 +39,13 @@ class PolicyMetadata:
 
 
 # Keys of Holosoma, then of Isaac Lab and mjlab.
-_KEYS: dict[str, tuple[str, ...]] = {
+_OF_JOINTS = {
     "stiffness": ("kp", "joint_stiffness"),
     "damping": ("kd", "joint_damping"),
     "default_positions": ("default_joint_pos",),
     "action_scale": ("action_scale",),
 }
-_JOINTS = ("dof_names", "joint_names")
-_TERM_KEYS = {
+_OF_TERMS = {
     "scale": ("observation_terms_scale",),
     "clip": ("observation_terms_clip",),
     "history": ("observation_history_lengths", "observation_terms_history_length"),
@@ -66,78 +66,72 @@ def read_metadata(raw: Mapping[str, str]) -> PolicyMetadata:
     Values are JSON, Python's, or words and numbers between commas. Numbers are one for all joints,
     one for each, or by regular expression.
     """
-    found = PolicyMetadata(joints=_words(_first(raw, _JOINTS)))
-    for name, keys in _KEYS.items():
-        value = _parsed(_first(raw, keys))
+    joints = _words(raw.get("dof_names", raw.get("joint_names", "")))
+    names = _words(raw.get("observation_names", ""))
+    terms: list[dict[str, Any]] = [{"name": TERM_NAMES.get(name, name)} for name in names]
+    found = PolicyMetadata(joints=joints, observation=terms)
+
+    def read(name: str, keys: Iterable[str], convert: Callable[[Any], Any], expected: str) -> Any:
+        text = next((raw[key] for key in keys if raw.get(key)), "")
+        value = _parsed(text)
         try:
-            setattr(found, name, _by_joint(value, found.joints))
-        except (TypeError, ValueError, re.error):
-            found.unread.append(
-                f"its metadata '{name}' must be a number for each of the joints {found.joints}, "
-                f"one for all or by regular expression; got {value}"
-            )
+            return convert(value) if text else {}
+        except (KeyError, TypeError, ValueError, re.error):
+            found.unread.append(f"its metadata '{name}' must be {expected}; got {value}")
+            return {}
+
+    expected = f"a number for each of the joints {joints}, one for all or by regular expression"
+    for name, keys in _OF_JOINTS.items():
+        setattr(found, name, read(name, keys, partial(_by_joint, joints), expected))
     command = _parsed(raw.get("command_ranges", ""))
     found.command = command if isinstance(command, dict) else {}
-    names = _words(raw.get("observation_names", ""))
-    found.observation = [{"name": TERM_NAMES.get(name, name)} for name in names]
-    for key, keys in _TERM_KEYS.items():
-        value = _parsed(_first(raw, keys))
-        if value and names:
-            try:
-                _add_to_terms(found.observation, names, key, value)
-            except (KeyError, TypeError, ValueError):
-                for term in found.observation:
-                    term.pop(key, None)
-                found.unread.append(
-                    f"its metadata '{key}' must be a value for each of the terms {names}; "
-                    f"got {value}"
-                )
+    for name, keys in _OF_TERMS.items() if names else ():
+        of_terms = partial(_by_term, names, terms, name)
+        values = read(name, keys, of_terms, f"a value for each of the terms {names}")
+        for term, value in zip(terms, values, strict=False):
+            term[name] = value
     return found
 
 
-def _by_joint(value: Any, joints: list[str]) -> dict[str, float]:
-    if isinstance(value, int | float):
-        value = {".*": value}
+def _by_joint(joints: list[str], value: Any) -> dict[str, float]:
+    if isinstance(value, list):
+        value = dict(zip(map(re.escape, joints), value, strict=True))
     elif not isinstance(value, dict):
-        value = dict(zip(map(re.escape, joints), value, strict=True)) if value else {}
+        value = {".*": value}
     numbers = {re.compile(pattern).pattern: float(number) for pattern, number in value.items()}
     if not all(map(math.isfinite, numbers.values())):
         raise ValueError(value)
     return numbers
 
 
-def _add_to_terms(terms: list[dict[str, Any]], names: list[str], key: str, value: Any) -> None:
-    """Adds a key of ``policy.yaml``; several numbers of a term are between semicolons."""
+def _by_term(names: list[str], terms: list[dict[str, Any]], key: str, value: Any) -> list[Any]:
+    """Values of a key of ``policy.yaml``; several numbers of a term are between semicolons."""
     if isinstance(value, dict):
         value = [value[name] for name in names]
-    values = value if isinstance(value, list) else [value]
-    for term, one in zip(terms, values, strict=True):
-        numbers = [float(x) for x in (one if isinstance(one, list) else str(one).split(";"))]
-        if key == "scale":
-            term[key] = numbers
-        elif key == "history":
-            term[key] = max(1, int(numbers[0]))
-        else:  # It is before the scale there.
+    values = []
+    for term, one in zip(terms, value if isinstance(value, list) else [value], strict=True):
+        numbers = [float(x) for x in str(one).split(";")]
+        if key == "history":
+            values.append(max(1, int(numbers[0])))
+        elif key == "clip":  # It is before the scale there.
             limits = {abs(x * factor) for x in numbers for factor in term.get("scale", [1.0])}
             if numbers[0] != -numbers[-1] or len(limits) != 1:
                 raise ValueError("only one symmetric limit of a term is supported")
-            term[key] = limits.pop()
-
-
-def _first(raw: Mapping[str, str], keys: tuple[str, ...]) -> str:
-    return next((raw[key] for key in keys if key in raw), "")
+            values.append(limits.pop())
+        else:
+            values.append(numbers)
+    return values
 
 
 def _words(text: str) -> list[str]:
-    """Names in a list, or between commas; they may be numbers."""
-    value = _parsed(text)
-    is_list = isinstance(value, list) and text.lstrip().startswith("[")
-    return [str(x) for x in value] if is_list else [x.strip() for x in text.split(",") if x.strip()]
+    """Names between commas, or in a list."""
+    words = (word.strip(" \n\"'") for word in text.strip("[] \n").split(","))
+    return [word for word in words if word]
 
 
 def _parsed(text: str) -> Any:
     for read in (json.loads, ast.literal_eval):
-        with suppress(ValueError, SyntaxError, MemoryError, RecursionError):
+        with suppress(TypeError, ValueError, SyntaxError, MemoryError, RecursionError):
             value = read(text)
             return list(value) if isinstance(value, tuple) else value
-    return [word.strip() for word in text.split(",")] if text.strip() else None
+    return text.split(",")

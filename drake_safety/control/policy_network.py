@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -19,19 +19,17 @@ _SUPPORTED = (
     "supported are one observation, an action, and as memory further inputs and outputs of ONNX in "
     "pairs of one shape, such as h_in and h_out, or buffers of TorchScript"
 )
-_OF_NEXT = {"in": "out", "ins": "outs", "0": "n"}
-"""What an input's name has of memory, and its output's in that place: h_in, h_out or h0, hn."""
-_DTYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(int64)": np.int64}
+_Memory = Mapping[str, np.ndarray]
 
 
 class PolicyNetwork:
     """A network that maps an observation (n_o,) and its memory (n_m,) to an action (n_a,).
 
     Args:
-        evaluate: Takes a batch (1, n_o) of float32 and the parts of the memory, and returns the
-            action and the new parts.
+        evaluate: Takes a batch (1, n_o) of float32 and parts of the memory by name, and returns the
+            action and the parts after it.
         widths: Of observation and action; None where the file does not say them.
-        find_memory: Returns the parts of the memory at the start, for a batch.
+        start: All that may be memory, at the start.
 
     Attributes:
         initial_memory: The memory at the start, (n_m,), known after :meth:`check`; n_m is 0 for a
@@ -41,30 +39,32 @@ class PolicyNetwork:
     def __init__(
         self,
         path: Path,
-        evaluate: Callable[..., Sequence[np.ndarray]],
+        evaluate: Callable[[np.ndarray, _Memory], tuple[np.ndarray, _Memory]],
         widths: tuple[int | None, int | None],
         metadata: PolicyMetadata | None = None,
-        find_memory: Callable[[np.ndarray], list[np.ndarray]] = lambda batch: [],
+        start: _Memory | None = None,
     ):
         self.path = path
         self.widths = widths
         self.metadata = metadata or PolicyMetadata()
         self._evaluate = evaluate
-        self._find_memory = find_memory
-        self._parts: list[np.ndarray] = []
+        self._start = dict(start or {})
         self.initial_memory = np.zeros(0)
 
     def __call__(
         self, observation: np.ndarray, memory: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns the action (n_a,) for an observation (n_o,), and the new memory (n_m,)."""
-        ends = np.cumsum([part.size for part in self._parts])
-        parts = [
-            values.reshape(part.shape).astype(part.dtype)
-            for part, values in zip(self._parts, np.split(memory, ends), strict=False)
-        ]
-        action, *parts = self._evaluate(_batch(observation), *parts)
-        return np.asarray(action, dtype=float).reshape(-1), _flat(parts)
+        ends = np.cumsum([part.size for part in self._start.values()])
+        given = {
+            name: values.reshape(part.shape).astype(part.dtype)
+            for (name, part), values in zip(
+                self._start.items(), np.split(memory, ends), strict=False
+            )
+        }
+        batch = np.asarray(observation, dtype=np.float32)[np.newaxis]
+        action, after = self._evaluate(batch, given)
+        return np.asarray(action, dtype=float).reshape(-1), _flat(after[name] for name in given)
 
     def check(self, who: str, num_inputs: int, num_outputs: int, terms: str) -> None:
         """Checks the widths of the network, and that it remembers nothing but its memory."""
@@ -74,10 +74,16 @@ class PolicyNetwork:
                 f"{who}: the network expects an observation of {seen} entries; the terms have "
                 f"{num_inputs}: {terms}"
             )
-        probe = np.linspace(-1.0, 1.0, num_inputs)
+        probe = np.linspace(-1.0, 1.0, num_inputs, dtype=np.float32)
         try:
-            self._parts = self._find_memory(_batch(probe))
-            self.initial_memory = _flat(self._parts)
+            _, after = self._evaluate(probe[np.newaxis], self._start)
+            # What does not change is no memory, and what grows has no place in a Context.
+            self._start = {
+                name: part
+                for name, part in self._start.items()
+                if part.shape == after[name].shape and part.tobytes() != after[name].tobytes()
+            }
+            self.initial_memory = _flat(self._start.values())
             action, later = self(probe, self.initial_memory)
             self(probe, later)
             again, _ = self(probe, self.initial_memory)
@@ -94,16 +100,12 @@ class PolicyNetwork:
         if action.tobytes() != again.tobytes():
             raise ValueError(
                 f"{who}: the network answers the same observation differently after another, "
-                f"though its memory of {len(self._parts)} buffers was set back: it draws random "
+                f"though its memory of {len(self._start)} buffers was set back: it draws random "
                 f"numbers, or has a memory that is no buffer of a fixed size; {_SUPPORTED}"
             )
 
 
-def _batch(observation: np.ndarray) -> np.ndarray:
-    return np.asarray(observation, dtype=np.float32)[np.newaxis]
-
-
-def _flat(parts: Sequence[np.ndarray]) -> np.ndarray:
+def _flat(parts: Iterable[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.zeros(0), *map(np.ravel, parts)])
 
 
@@ -135,25 +137,31 @@ def network_files(path: Path) -> list[Path]:
         return [path]
     require_extra("walking", f"ONNX network {path} with weights in other files", "onnx")
     import onnx
-    from onnx import external_data_helper as external
 
-    try:
-        model = onnx.load(str(path), load_external_data=False)
-    except Exception as error:  # Of protobuf, which need not be installed.
-        raise ValueError(f"{path}: not an ONNX network: {str(error)[:200]}") from error
-    tensors = filter(external.uses_external_data, external._get_all_tensors(model))
-    names = sorted({external.ExternalDataInfo(tensor).location for tensor in tensors})
+    with _reading(path, "an ONNX network"):
+        weights = onnx.load(str(path), load_external_data=False).graph.initializer
+    entries = (entry for weight in weights for entry in weight.external_data)
+    names = sorted({entry.value for entry in entries if entry.key == "location"})
+    files = [path.parent / name for name in names]
     lost = [
         name
-        for name in map(Path, names)
-        if name.is_absolute() or ".." in name.parts or not (path.parent / name).is_file()
+        for name, file in zip(names, files, strict=True)
+        if Path(name).is_absolute() or ".." in file.parts or not file.is_file()
     ]
     if lost:
         raise ValueError(
             f"{path}: its weights are in {names}, as paths from its folder; there is no "
-            f"{', '.join(map(str, lost))}"
+            f"{', '.join(lost)}"
         )
-    return [path, *(path.parent / name for name in names)]
+    return [path, *files]
+
+
+@contextmanager
+def _reading(path: Path, what: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:  # Those of onnxruntime and protobuf have no common base but this.
+        raise ValueError(f"{path}: not {what}: {str(error).splitlines()[0][:200]}") from error
 
 
 def _load_onnx(path: Path) -> PolicyNetwork:
@@ -165,120 +173,82 @@ def _load_onnx(path: Path) -> PolicyNetwork:
     # A thread pool costs more than the network, and would make sums depend on its size.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
-    try:
+    with _reading(path, "an ONNX network"):
         session = onnxruntime.InferenceSession(
             str(path), options, providers=["CPUExecutionProvider"]
         )
-    except Exception as error:  # Its exceptions have no common base but this.
-        raise ValueError(
-            f"{path}: not an ONNX network: {str(error).splitlines()[0][:200]}"
-        ) from error
     inputs, outputs = session.get_inputs(), session.get_outputs()
-    shapes = {one.name: one.shape for one in outputs}
-    after = {one.name: _name_after(one.name) for one in inputs}
-    memory = [one for one in inputs if _fits(one.shape, shapes.get(after[one.name], []))]
+    shapes = {one.name: _shape(one) for one in outputs}
+    memory = [one for one in inputs if shapes.get(_name_after(one.name)) == _shape(one)]
     seen = [one for one in inputs if one not in memory]
-    names = [after[one.name] for one in memory]
+    names = [_name_after(one.name) for one in memory]
     acting = [one for one in outputs if one.name not in names]
-    if len(seen) != 1 or not acting or any(one.type not in _DTYPES for one in inputs):
+    if len(seen) != 1 or not acting:
         raise ValueError(
             f"{path}: got inputs {[f'{one.name} {one.shape} {one.type}' for one in inputs]} and "
             f"outputs {[f'{one.name} {one.shape}' for one in outputs]}; {_SUPPORTED}"
         )
     (observed,) = seen
-    axes = (1,) * (len(observed.shape) - 1)
+    start = {one.name: np.zeros(_shape(one), np.float32) for one in memory}
 
-    def evaluate(batch: np.ndarray, *parts: np.ndarray) -> list[np.ndarray]:
-        given = {one.name: part for one, part in zip(memory, parts, strict=True)}
-        given[observed.name] = batch.astype(_DTYPES[observed.type]).reshape(*axes, -1)
-        return session.run([acting[0].name, *names], given)
+    def evaluate(batch: np.ndarray, parts: _Memory) -> tuple[np.ndarray, _Memory]:
+        batch = batch.reshape(*_shape(observed)[:-1], -1)
+        action, *after = session.run(
+            [acting[0].name, *names], {**start, **parts, observed.name: batch}
+        )
+        return action, dict(zip(start, after, strict=True))
 
     return PolicyNetwork(
         path,
         evaluate,
         (_width(observed.shape), _width(acting[0].shape)),
         read_metadata(session.get_modelmeta().custom_metadata_map),
-        lambda batch: [np.zeros(_fixed(one.shape), _DTYPES[one.type]) for one in memory],
+        start,
     )
 
 
-def _fixed(shape: list[Any]) -> list[int]:
+def _shape(one: Any) -> list[int]:
     """A shape for one robot: a size that varies is that of the batch."""
-    return [size if isinstance(size, int) else 1 for size in shape]
-
-
-def _fits(shape: list[Any], other: list[Any]) -> bool:
-    pairs = zip(shape, other, strict=False)
-    return len(shape) == len(other) > 0 and all(
-        a == b or str in {type(a), type(b)} for a, b in pairs
-    )
+    return [size if isinstance(size, int) else 1 for size in one.shape]
 
 
 def _name_after(name: str) -> str:
-    """The output of an input of memory: h_out of h_in."""
-    return re.sub(r"(?<![A-Za-z])ins?(?![A-Za-z])|0$", lambda found: _OF_NEXT[found[0]], name)
+    """The output of an input of memory: h_out of h_in, or hn of h0."""
+    return re.sub("0$", "n", name.replace("_in", "_out"))
 
 
 def _load_torchscript(path: Path) -> PolicyNetwork:
     require_extra("train", f"TorchScript network {path}", "torch")
     import torch
 
-    try:
-        with warnings.catch_warnings():
-            # Torch deprecates the format, in which policies are nevertheless published.
-            warnings.simplefilter("ignore", DeprecationWarning)
-            module = torch.jit.load(str(path), map_location="cpu").eval()
-    except (RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"{path}: not a TorchScript network: {str(error).splitlines()[0][:200]}"
-        ) from error
+    with _reading(path, "a TorchScript network"), warnings.catch_warnings():
+        # Torch deprecates the format, in which policies are nevertheless published.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        module = torch.jit.load(str(path), map_location="cpu").eval()
     arguments = [one.name for one in module.forward.schema.arguments[1:]]
     if len(arguments) != 1:
         raise ValueError(f"{path}: got inputs {arguments}; {_SUPPORTED}")
-    memory: list[str] = []  # Names of buffers.
+    for reset in ("reset", "reset_memory"):
+        # Without one, or with one of several robots, the file has the start.
+        with suppress(AttributeError, RuntimeError):
+            getattr(module, reset)()
 
-    @contextmanager
-    def inference() -> Iterator[None]:
+    def evaluate(batch: np.ndarray, parts: _Memory) -> tuple[np.ndarray, _Memory]:
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # As for ONNX.
         try:
             with torch.inference_mode():
-                yield
+                buffers = dict(module.named_buffers())
+                for name, part in parts.items():
+                    buffers[name].copy_(torch.from_numpy(part))
+                action = module(torch.from_numpy(batch)).numpy()
+                buffers = dict(module.named_buffers())  # The script may have replaced them.
+                return action, {name: buffers[name].numpy().copy() for name in parts}
         finally:
             torch.set_num_threads(threads)
 
-    def copies() -> dict[str, np.ndarray]:
-        return {name: buffer.numpy().copy() for name, buffer in module.named_buffers()}
-
-    def evaluate(batch: np.ndarray, *parts: np.ndarray) -> list[np.ndarray]:
-        with inference():
-            if not memory:
-                return [module(torch.from_numpy(batch)).numpy()]
-            buffers = dict(module.named_buffers())
-            for name, part in zip(memory, parts, strict=True):
-                buffers[name].copy_(torch.from_numpy(part))
-            action = module(torch.from_numpy(batch)).numpy()
-            buffers = dict(module.named_buffers())  # The script may have replaced them.
-            return [action, *(buffers[name].numpy().copy() for name in memory)]
-
-    def find_memory(batch: np.ndarray) -> list[np.ndarray]:
-        """The buffers that an evaluation changes, as they are before it and after a reset."""
-        with inference():
-            for reset in ("reset", "reset_memory"):
-                # Without one, or with one of several robots, the file has the start.
-                with suppress(AttributeError, RuntimeError):
-                    getattr(module, reset)()
-            before = copies()
-            module(torch.from_numpy(batch))
-            after = copies()
-            memory[:] = [
-                name
-                for name, value in before.items()
-                if value.shape == after[name].shape and value.tobytes() != after[name].tobytes()
-            ]
-            return [before[name] for name in memory]
-
-    return PolicyNetwork(path, evaluate, (None, None), find_memory=find_memory)
+    start = {name: buffer.numpy().copy() for name, buffer in module.named_buffers()}
+    return PolicyNetwork(path, evaluate, (None, None), start=start)
 
 
 def _width(shape: list[Any]) -> int | None:

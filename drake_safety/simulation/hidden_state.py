@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable
+from contextlib import suppress
 
-from pydrake.systems.framework import (
-    Context,
-    Diagram,
-    InputPort,
-    OutputPort,
-    PortDataType,
-    System,
-)
+from pydrake.systems.framework import Context, Diagram, PortDataType, System
 
 from drake_safety.learning.segments import Episode
 from drake_safety.simulation.dataset import is_same
@@ -21,6 +14,7 @@ _CAUSE = (
     "the diagram, or its reset, keeps state outside its Context, such as a memory, a random "
     "generator or a cache in an attribute of a system; declare it as state"
 )
+_Key = tuple[str, str, str]  # Path of a leaf system, kind and name of a port.
 
 
 def difference(
@@ -39,66 +33,51 @@ def difference(
     """
     diagram = make()
     run(diagram, other)
-    again = run(diagram, found.index)
-    if is_same(found, again):
+    if is_same(found, run(diagram, found.index)):
         return ""
-    traced, alone = _traced(make(), run, found.index)
-    _, after = _traced(make(), run, other, found.index)
-    for (time_s, one), (_, two) in zip(alone, after, strict=False):
-        changed = [what for what, a, b in zip(traced, one, two, strict=True) if a != b]
-        outputs = [port for port in changed if isinstance(port, OutputPort)]
+
+    def steps(diagram: Diagram) -> list[tuple[float, dict[_Key, int]]]:
+        seen: list[tuple[float, dict[_Key, int]]] = []
+
+        def monitor(context: Context) -> None:
+            seen.append((context.get_time(), _hashes(diagram, context)))
+
+        run(diagram, found.index, monitor=monitor)
+        return seen
+
+    alone, diagram = steps(make()), make()
+    run(diagram, other)
+    for (time_s, one), (_, two) in zip(alone, steps(diagram), strict=False):
+        changed = [key for key in one if one[key] != two.get(key)]
+        states, inputs = (
+            {path for path, of, _ in changed if of == kind} for kind in ("state", "input")
+        )
+        outputs = [(path, port) for path, kind, port in changed if kind == "output"]
         if outputs:
             # A discrete state follows from values before the step, which were still the same.
-            states = {_path(what) for what in changed if isinstance(what, System)}
-            inputs = {_path(what) for what in changed if isinstance(what, InputPort)}
-            first = min(outputs, key=lambda p: (_path(p) not in states, _path(p) in inputs))
-            where = f"output port '{first.get_name()}' of system '{_path(first)}'"
+            path, port = min(outputs, key=lambda one: (one[0] not in states, one[0] in inputs))
+            where = f"output port '{port}' of system '{path}'"
             return f"differs, first at {time_s:g} s in {where}: {_CAUSE}"
     return f"differs from the first time in this process: {_CAUSE}"
 
 
-def _traced(
-    diagram: Diagram, run: Callable[..., Episode], *indices: int
-) -> tuple[list[Any], list[tuple[float, list[int | None]]]]:
-    """Simulates episodes; what is traced, and its bits after each step of the last episode."""
-    traced = list(_parts(diagram))
-    steps: list[tuple[float, list[int | None]]] = []
-
-    def monitor(context: Context) -> None:
-        steps.append((context.get_time(), [_hash(what, context) for what in traced]))
-
-    for index in indices[:-1]:
-        run(diagram, index)
-    run(diagram, indices[-1], monitor=monitor)
-    return traced, steps
-
-
-def _parts(system: System) -> Iterator[Any]:
-    """The leaf systems, for their discrete state, and their vector ports."""
+def _hashes(system: System, root: Context) -> dict[_Key, int]:
+    """Of discrete states and vector ports."""
+    found: dict[_Key, int] = {}
     if isinstance(system, Diagram):
         for inner in system.GetSystems():
-            yield from _parts(inner)
-        return
-    yield system
+            found |= _hashes(inner, root)
+        return found
+    path = system.GetSystemPathname().removeprefix("::").partition("::")[2]
+    context = system.GetMyContextFromRoot(root)
+    state = context.get_discrete_state()
+    groups = (state.value(i).tobytes() for i in range(state.num_groups()))
+    found[path, "state", ""] = hash(b"".join(groups))
     inputs = map(system.get_input_port, range(system.num_input_ports()))
     outputs = map(system.get_output_port, range(system.num_output_ports()))
-    for port in (*inputs, *outputs):
-        if port.get_data_type() == PortDataType.kVectorValued:
-            yield port
-
-
-def _hash(what: Any, root: Context) -> int | None:
-    """Of its bits; None for a port that cannot be evaluated, such as one without an input."""
-    if isinstance(what, System):
-        state = what.GetMyContextFromRoot(root).get_discrete_state()
-        return hash(b"".join(state.value(i).tobytes() for i in range(state.num_groups())))
-    try:
-        return hash(what.Eval(what.get_system().GetMyContextFromRoot(root)).tobytes())
-    except Exception:  # A user's system may raise anything.
-        return None
-
-
-def _path(what: Any) -> str:
-    """Path of a system in its diagram, such as ``controller::policy``."""
-    system = what if isinstance(what, System) else what.get_system()
-    return system.GetSystemPathname().removeprefix("::").partition("::")[2]
+    for kind, ports in (("input", inputs), ("output", outputs)):
+        for port in ports:
+            if port.get_data_type() == PortDataType.kVectorValued:
+                with suppress(Exception):  # Such as of a port without an input.
+                    found[path, kind, port.get_name()] = hash(port.Eval(context).tobytes())
+    return found

@@ -385,7 +385,18 @@ def collect_episodes(
             diagram, and must be the same; ``function`` then takes the ``monitor`` of
             :func:`~drake_safety.simulation.motion.simulate`.
     """
-    run = partial(make.run, function)
+    repeated: list[int] = []
+
+    def run(index: int) -> Episode:
+        episode = make.run(function, index)
+        if index in repeated[:1]:
+            text = difference(episode, repeated[-1], make=make.make, run=function)
+            if text:
+                raise ValueError(
+                    f"episode {index} of '{info.scenario}', simulated a second time, {text}"
+                )
+        return episode
+
     with nullcontext() if path is None else EpisodeWriter(path, info, extra) as writer:
         episodes: list[Episode] = []
         if writer is not None:
@@ -398,7 +409,7 @@ def collect_episodes(
         kept = {episode.index for episode in episodes}
         pending = [index for index in range(num_episodes) if index not in kept]
         if is_repeated:
-            run = partial(_run_repeated, make, function, info.scenario, pending[:2])
+            repeated += pending[:2]
         results = map_items(
             run,
             pending,
@@ -424,22 +435,6 @@ def collect_episodes(
             ", ".join(map(str, which[:10])) + (", ..." if len(which) > 10 else ""),
         )
     return collected
-
-
-def _run_repeated(
-    make: MadeOnce[Any],
-    function: Callable[..., Episode],
-    scenario: str,
-    repeated: list[int],
-    index: int,
-) -> Episode:
-    """Simulates an episode, and the first of ``repeated`` once more after the last of them."""
-    found = make.run(function, index)
-    if index == repeated[0]:
-        text = difference(found, repeated[-1], make=make.anew, run=function)
-        if text:
-            raise ValueError(f"episode {index} of '{scenario}', simulated a second time, {text}")
-    return found
 
 
 def _check_kept(path: Path, kept: list[Episode], run: Callable[[int], Episode]) -> None:

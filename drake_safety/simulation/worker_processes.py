@@ -184,19 +184,14 @@ class MadeOnce(Generic[_Made]):
     _made: ClassVar[dict[Hashable, Any]] = {}
 
     def __init__(self, key: Hashable, make: Callable[[], _Made]) -> None:
-        self._key, self._make = key, make
+        self._key, self.make = key, make
 
     def __call__(self) -> _Made:
         """The diagram."""
         if self._key not in self._made:
             self._made.clear()
-            self._made[self._key] = self._make()
+            self._made[self._key] = self.make()
         return self._made[self._key]
-
-    def anew(self) -> _Made:
-        """The diagram, made once more."""
-        self._made.clear()
-        return self()
 
     def run(self, function: Callable[..., _Result], *arguments: Any, **options: Any) -> _Result:
         """Calls a function of the diagram and of more arguments."""
