@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from drake_safety.control.policy import PolicyParameters
-from drake_safety.control.policy_metadata import TERM_NAMES
+from drake_safety.control.policy_metadata import TERM_NAMES, limit
 from drake_safety.control.policy_network import load_network
 from drake_safety.control.policy_terms import registered_terms
 from drake_safety.files.reading import YamlLoader, parse_yaml, reading
@@ -294,7 +294,8 @@ def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
         entry["clip"] = math.inf
         if "clip" in spec:
             is_scaled = spec.raw.get("scale_first", terms.raw.get("scale_first", False))
-            entry["clip"] = _clip(spec, [1.0] if is_scaled else entry.get("scale", [1.0]))
+            factors = [1.0] if is_scaled else entry.get("scale", [1.0])
+            entry["clip"] = limit(*spec.numbers("clip", 2), factors, spec.who)
         length = int(spec.number("history_length")) if "history_length" in spec else 1
         entry["history"] = max(length, 1)
         if entry["name"] == "gait_phase":
@@ -314,17 +315,6 @@ def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
         if length > 1:
             found["history"] = {"ages": list(range(length))[::-1], "by": "time"}
     return found
-
-
-def _clip(spec: _Entries, factors: list[float]) -> float:
-    """Largest absolute value after scaling by some factors."""
-    low, high = spec.numbers("clip", 2)
-    sizes = {abs(factor) for factor in factors}
-    if low != -high or len(sizes) != 1:
-        raise ValueError(
-            f"{spec.who} clip must be symmetric, with one scale; got {[low, high]} and {factors}"
-        )
-    return high * sizes.pop()
 
 
 def _from_rl_sar(raw: dict[str, Any], path: Path) -> dict[str, Any]:

@@ -6,10 +6,9 @@ import ast
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 
@@ -20,10 +19,8 @@ class PolicyMetadata:
     Attributes:
         joints: Joint names in the network's order.
         stiffness, damping: Servo gains by regular expression [N·m/rad, N·m·s/rad].
-        default_positions: Joint positions at zero action, by regular expression [rad].
-        action_scale: Joint positions per unit of action, by regular expression [rad].
-        observation: Terms in the network's order, as in ``policy.yaml``. A term without a scale or
-            a history is one of which the file does not state it.
+        default_positions, action_scale: As in ``policy.yaml``, by regular expression [rad].
+        observation: As in ``policy.yaml``, but terms have only the keys that the file states.
         command: Lowest and highest v_x, v_y and ω_z by name.
         unread: Entries that do not fit the joints, and why.
     """
@@ -39,13 +36,11 @@ class PolicyMetadata:
 
 
 # Keys of Holosoma, then of Isaac Lab and mjlab.
-_OF_JOINTS = {
+_KEYS = {
     "stiffness": ("kp", "joint_stiffness"),
     "damping": ("kd", "joint_damping"),
     "default_positions": ("default_joint_pos",),
     "action_scale": ("action_scale",),
-}
-_OF_TERMS = {
     "scale": ("observation_terms_scale",),
     "clip": ("observation_terms_clip",),
     "history": ("observation_history_lengths", "observation_terms_history_length"),
@@ -69,31 +64,28 @@ def read_metadata(raw: Mapping[str, str]) -> PolicyMetadata:
     joints = _words(raw.get("dof_names", raw.get("joint_names", "")))
     names = _words(raw.get("observation_names", ""))
     terms: list[dict[str, Any]] = [{"name": TERM_NAMES.get(name, name)} for name in names]
-    found = PolicyMetadata(joints=joints, observation=terms)
-
-    def read(name: str, keys: Iterable[str], convert: Callable[[Any], Any], expected: str) -> Any:
-        text = next((raw[key] for key in keys if raw.get(key)), "")
-        value = _parsed(text)
-        try:
-            return convert(value) if text else {}
-        except (KeyError, TypeError, ValueError, re.error):
-            found.unread.append(f"its metadata '{name}' must be {expected}; got {value}")
-            return {}
-
-    expected = f"a number for each of the joints {joints}, one for all or by regular expression"
-    for name, keys in _OF_JOINTS.items():
-        setattr(found, name, read(name, keys, partial(_by_joint, joints), expected))
     command = _parsed(raw.get("command_ranges", ""))
-    found.command = command if isinstance(command, dict) else {}
-    for name, keys in _OF_TERMS.items() if names else ():
-        of_terms = partial(_by_term, names, terms, name)
-        values = read(name, keys, of_terms, f"a value for each of the terms {names}")
-        for term, value in zip(terms, values, strict=False):
-            term[name] = value
+    command = command if isinstance(command, dict) else {}
+    found = PolicyMetadata(joints=joints, observation=terms, command=command)
+    of_joints = f"number for each of the joints {joints}, one for all or by regular expression"
+    of_terms = f"value for each of the terms {names}"
+    for name, keys in _KEYS.items():
+        text = next((raw[key] for key in keys if raw.get(key)), "")
+        value, is_of_joints = _parsed(text), hasattr(found, name)
+        try:
+            if text and is_of_joints:
+                setattr(found, name, _by_joint(value, joints))
+            elif text and names:
+                values = _by_term(value, names, terms, name)
+                for term, one in list(zip(terms, values, strict=True)):
+                    term[name] = one
+        except (KeyError, TypeError, ValueError, re.error):
+            expected = of_joints if is_of_joints else of_terms
+            found.unread.append(f"its metadata '{name}' must be a {expected}; got {value}")
     return found
 
 
-def _by_joint(joints: list[str], value: Any) -> dict[str, float]:
+def _by_joint(value: Any, joints: list[str]) -> dict[str, float]:
     if isinstance(value, list):
         value = dict(zip(map(re.escape, joints), value, strict=True))
     elif not isinstance(value, dict):
@@ -104,23 +96,27 @@ def _by_joint(joints: list[str], value: Any) -> dict[str, float]:
     return numbers
 
 
-def _by_term(names: list[str], terms: list[dict[str, Any]], key: str, value: Any) -> list[Any]:
+def _by_term(value: Any, names: list[str], terms: list[dict[str, Any]], key: str) -> list[Any]:
     """Values of a key of ``policy.yaml``; several numbers of a term are between semicolons."""
-    if isinstance(value, dict):
-        value = [value[name] for name in names]
-    values = []
-    for term, one in zip(terms, value if isinstance(value, list) else [value], strict=True):
-        numbers = [float(x) for x in str(one).split(";")]
-        if key == "history":
-            values.append(max(1, int(numbers[0])))
-        elif key == "clip":  # It is before the scale there.
-            limits = {abs(x * factor) for x in numbers for factor in term.get("scale", [1.0])}
-            if numbers[0] != -numbers[-1] or len(limits) != 1:
-                raise ValueError("only one symmetric limit of a term is supported")
-            values.append(limits.pop())
-        else:
-            values.append(numbers)
-    return values
+    value = [value[name] for name in names] if isinstance(value, dict) else value
+    texts = value if isinstance(value, list) else [value]
+    numbers = [[float(x) for x in str(text).split(";")] for text in texts]
+    if key == "history":
+        return [max(1, int(length)) for (length,) in numbers]
+    if key == "clip":
+        clips = zip(terms, numbers, strict=True)
+        return [limit(low, high, term.get("scale", [1.0])) for term, (low, high) in clips]
+    return numbers
+
+
+def limit(low: float, high: float, factors: list[float], who: str = "") -> float:
+    """Returns the largest absolute value after scaling by factors, of limits before it."""
+    limits = {abs(high * factor) for factor in factors}
+    if low != -high or len(limits) != 1:
+        raise ValueError(
+            f"{who} clip must be symmetric, with one scale; got {[low, high]} and {factors}"
+        )
+    return limits.pop()
 
 
 def _words(text: str) -> list[str]:

@@ -26,14 +26,13 @@ class PolicyNetwork:
     """A network that maps an observation (n_o,) and its memory (n_m,) to an action (n_a,).
 
     Args:
-        evaluate: Takes a batch (1, n_o) of float32 and parts of the memory by name, and returns the
-            action and the parts after it.
+        evaluate: Maps a batch (1, n_o) of float32 and parts of the memory by name to the action and
+            the new parts.
         widths: Of observation and action; None where the file does not say them.
         start: All that may be memory, at the start.
 
     Attributes:
-        initial_memory: The memory at the start, (n_m,), known after :meth:`check`; n_m is 0 for a
-            network without one.
+        initial_memory: (n_m,), known after :meth:`check`; n_m is 0 without a memory.
     """
 
     def __init__(
@@ -56,12 +55,8 @@ class PolicyNetwork:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns the action (n_a,) for an observation (n_o,), and the new memory (n_m,)."""
         ends = np.cumsum([part.size for part in self._start.values()])
-        given = {
-            name: values.reshape(part.shape).astype(part.dtype)
-            for (name, part), values in zip(
-                self._start.items(), np.split(memory, ends), strict=False
-            )
-        }
+        pairs = zip(self._start.items(), np.split(memory, ends), strict=False)
+        given = {name: new.reshape(one.shape).astype(one.dtype) for (name, one), new in pairs}
         batch = np.asarray(observation, dtype=np.float32)[np.newaxis]
         action, after = self._evaluate(batch, given)
         return np.asarray(action, dtype=float).reshape(-1), _flat(after[name] for name in given)
@@ -142,18 +137,14 @@ def network_files(path: Path) -> list[Path]:
         weights = onnx.load(str(path), load_external_data=False).graph.initializer
     entries = (entry for weight in weights for entry in weight.external_data)
     names = sorted({entry.value for entry in entries if entry.key == "location"})
-    files = [path.parent / name for name in names]
-    lost = [
-        name
-        for name, file in zip(names, files, strict=True)
-        if Path(name).is_absolute() or ".." in file.parts or not file.is_file()
-    ]
+    files = {name: path.parent / name for name in names}
+    lost = [n for n, file in files.items() if {"/", ".."} & {*Path(n).parts} or not file.is_file()]
     if lost:
         raise ValueError(
             f"{path}: its weights are in {names}, as paths from its folder; there is no "
             f"{', '.join(lost)}"
         )
-    return [path, *files]
+    return [path, *files.values()]
 
 
 @contextmanager
@@ -179,9 +170,11 @@ def _load_onnx(path: Path) -> PolicyNetwork:
         )
     inputs, outputs = session.get_inputs(), session.get_outputs()
     shapes = {one.name: _shape(one) for one in outputs}
-    memory = [one for one in inputs if shapes.get(_name_after(one.name)) == _shape(one)]
+    # Such as h_out after h_in, or hn after h0.
+    after = {one.name: re.sub("0$", "n", one.name.replace("_in", "_out")) for one in inputs}
+    memory = [one for one in inputs if shapes.get(after[one.name]) == _shape(one)]
     seen = [one for one in inputs if one not in memory]
-    names = [_name_after(one.name) for one in memory]
+    names = [after[one.name] for one in memory]
     acting = [one for one in outputs if one.name not in names]
     if len(seen) != 1 or not acting:
         raise ValueError(
@@ -192,11 +185,9 @@ def _load_onnx(path: Path) -> PolicyNetwork:
     start = {one.name: np.zeros(_shape(one), np.float32) for one in memory}
 
     def evaluate(batch: np.ndarray, parts: _Memory) -> tuple[np.ndarray, _Memory]:
-        batch = batch.reshape(*_shape(observed)[:-1], -1)
-        action, *after = session.run(
-            [acting[0].name, *names], {**start, **parts, observed.name: batch}
-        )
-        return action, dict(zip(start, after, strict=True))
+        given = {**start, **parts, observed.name: batch.reshape(*_shape(observed)[:-1], -1)}
+        action, *new = session.run([acting[0].name, *names], given)
+        return action, dict(zip(start, new, strict=True))
 
     return PolicyNetwork(
         path,
@@ -210,11 +201,6 @@ def _load_onnx(path: Path) -> PolicyNetwork:
 def _shape(one: Any) -> list[int]:
     """A shape for one robot: a size that varies is that of the batch."""
     return [size if isinstance(size, int) else 1 for size in one.shape]
-
-
-def _name_after(name: str) -> str:
-    """The output of an input of memory: h_out of h_in, or hn of h0."""
-    return re.sub("0$", "n", name.replace("_in", "_out"))
 
 
 def _load_torchscript(path: Path) -> PolicyNetwork:

@@ -85,16 +85,12 @@ class PolicyTemplate:
             lines.append("period_s: 0.02  # ASK the time between two actions [s]")
             asked.append("policy.yaml: the time between two actions [s]; 0.02 is assumed")
         if metadata.observation and "observation" not in found:
-            found["observation"] = [
-                {"name": "", "scale": [1.0], "clip": math.inf, "history": 1} | term
-                for term in metadata.observation
-            ]
+            without = {"name": "", "clip": math.inf}
+            found["observation"] = [without | term for term in metadata.observation]
             unstated = [k for k in ("scale", "history") if k not in metadata.observation[0]]
             if unstated:
-                asked.append(
-                    f"policy.yaml: {' and '.join(unstated)} of the terms of the observation; 1 is "
-                    "assumed, as the network only names them"
-                )
+                what = f"{' and '.join(unstated)} of the terms of the observation"
+                asked.append(f"policy.yaml: {what}; 1 is assumed, as the network only names them")
         if "observation" not in found:
             width, _ = self.network.widths
             entries = "" if width is None else f", {width} entries"

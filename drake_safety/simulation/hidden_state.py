@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import chain
 
-from pydrake.systems.framework import Context, Diagram, PortDataType, System
+from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
 
 from drake_safety.learning.segments import Episode
 from drake_safety.simulation.dataset import is_same
@@ -14,70 +15,61 @@ _CAUSE = (
     "the diagram, or its reset, keeps state outside its Context, such as a memory, a random "
     "generator or a cache in an attribute of a system; declare it as state"
 )
-_Key = tuple[str, str, str]  # Path of a leaf system, kind and name of a port.
+_Hashes = dict[tuple[str, str, str], int]
 
 
-def difference(
-    found: Episode, other: int, *, make: Callable[[], Diagram], run: Callable[..., Episode]
-) -> str:
-    """Says where an episode differs when it is repeated after another one; "" if it does not.
+def difference(found: Episode, make: Callable[[], Diagram], run: Callable[..., Episode]) -> str:
+    """Says where an episode differs when it is repeated after the next one; "" if it does not.
 
-    If it does, it is simulated alone and after the other once more, and the vector ports of all
+    If it does, it is simulated alone and after the next once more, and the vector ports of all
     systems are compared after each step.
 
     Args:
-        other: Index of the other episode.
         make: Makes a new diagram.
         run: Simulates an episode of a diagram and an index; ``monitor`` is called with the Context
             after each step.
     """
-    diagram = make()
-    run(diagram, other)
-    if is_same(found, run(diagram, found.index)):
+    index, diagram = found.index, make()
+    run(diagram, index + 1)
+    if is_same(found, run(diagram, index)):
         return ""
 
-    def steps(diagram: Diagram) -> list[tuple[float, dict[_Key, int]]]:
-        seen: list[tuple[float, dict[_Key, int]]] = []
+    def trace(*indices: int) -> list[tuple[float, _Hashes]]:
+        diagram, steps = make(), list[tuple[float, _Hashes]]()
+        for index in indices:
+            steps.clear()
+            run(diagram, index, monitor=lambda c: steps.append((c.get_time(), _hashes(diagram, c))))
+        return steps
 
-        def monitor(context: Context) -> None:
-            seen.append((context.get_time(), _hashes(diagram, context)))
-
-        run(diagram, found.index, monitor=monitor)
-        return seen
-
-    alone, diagram = steps(make()), make()
-    run(diagram, other)
-    for (time_s, one), (_, two) in zip(alone, steps(diagram), strict=False):
+    pairs = zip(trace(index), trace(index + 1, index), strict=False)
+    for (time_s, one), (_, two) in pairs:
         changed = [key for key in one if one[key] != two.get(key)]
-        states, inputs = (
-            {path for path, of, _ in changed if of == kind} for kind in ("state", "input")
-        )
+        states = {path for path, kind, _ in changed if kind == "state"}
+        inputs = {path for path, kind, _ in changed if kind == "input"}
         outputs = [(path, port) for path, kind, port in changed if kind == "output"]
         if outputs:
             # A discrete state follows from values before the step, which were still the same.
-            path, port = min(outputs, key=lambda one: (one[0] not in states, one[0] in inputs))
+            path, port = min(outputs, key=lambda of: (of[0] not in states, of[0] in inputs))
             where = f"output port '{port}' of system '{path}'"
             return f"differs, first at {time_s:g} s in {where}: {_CAUSE}"
     return f"differs from the first time in this process: {_CAUSE}"
 
 
-def _hashes(system: System, root: Context) -> dict[_Key, int]:
-    """Of discrete states and vector ports."""
-    found: dict[_Key, int] = {}
+def _hashes(system: System, root: Context) -> _Hashes:
+    """Of discrete state and vector ports of all leaf systems, by path, kind and name."""
     if isinstance(system, Diagram):
-        for inner in system.GetSystems():
-            found |= _hashes(inner, root)
-        return found
+        inner = (_hashes(one, root).items() for one in system.GetSystems())
+        return dict(chain.from_iterable(inner))
     path = system.GetSystemPathname().removeprefix("::").partition("::")[2]
     context = system.GetMyContextFromRoot(root)
     state = context.get_discrete_state()
-    groups = (state.value(i).tobytes() for i in range(state.num_groups()))
-    found[path, "state", ""] = hash(b"".join(groups))
+    values = [state.value(i).tobytes() for i in range(state.num_groups())]
+    found = {(path, "state", ""): hash(b"".join(values))}
     inputs = map(system.get_input_port, range(system.num_input_ports()))
     outputs = map(system.get_output_port, range(system.num_output_ports()))
-    for kind, ports in (("input", inputs), ("output", outputs)):
-        for port in ports:
-            if port.get_data_type() == PortDataType.kVectorValued:
-                with suppress(Exception):  # Such as of a port without an input.
-                    found[path, kind, port.get_name()] = hash(port.Eval(context).tobytes())
+    for port in (*inputs, *outputs):
+        if port.get_data_type() == PortDataType.kVectorValued:
+            with suppress(Exception):  # Such as that of a port without an input.
+                key = path, "output" if isinstance(port, OutputPort) else "input", port.get_name()
+                found[key] = hash(port.Eval(context).tobytes())
     return found

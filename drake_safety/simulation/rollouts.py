@@ -381,35 +381,29 @@ def collect_episodes(
     Args:
         make: Makes the diagram.
         function: Returns the episode of a diagram and an index.
-        is_repeated: Whether the first episode is simulated again after the second, by a new
-            diagram, and must be the same; ``function`` then takes the ``monitor`` of
-            :func:`~drake_safety.simulation.motion.simulate`.
+        is_repeated: Whether the first episode is simulated again after the next, by a new diagram,
+            and must be the same; ``function`` then takes a ``monitor``.
     """
-    repeated: list[int] = []
-
-    def run(index: int) -> Episode:
-        episode = make.run(function, index)
-        if index in repeated[:1]:
-            text = difference(episode, repeated[-1], make=make.make, run=function)
-            if text:
-                raise ValueError(
-                    f"episode {index} of '{info.scenario}', simulated a second time, {text}"
-                )
-        return episode
-
     with nullcontext() if path is None else EpisodeWriter(path, info, extra) as writer:
         episodes: list[Episode] = []
         if writer is not None:
             episodes += (e for e in load_episodes(writer.path) if e.index < num_episodes)
             if episodes:
-                _check_kept(writer.path, episodes, run)
+                _check_kept(writer.path, episodes, partial(make.run, function))
                 _LOGGER.warning(
                     "%d of %d episodes are kept from %s", len(episodes), num_episodes, path
                 )
         kept = {episode.index for episode in episodes}
         pending = [index for index in range(num_episodes) if index not in kept]
-        if is_repeated:
-            repeated += pending[:2]
+
+        def run(index: int) -> Episode:
+            found = make.run(function, index)
+            if is_repeated and index == pending[0]:
+                if text := difference(found, make.make, function):
+                    who = f"episode {index} of '{info.scenario}', simulated a second time"
+                    raise ValueError(f"{who}, {text}")
+            return found
+
         results = map_items(
             run,
             pending,

@@ -396,12 +396,8 @@ def _episodes(loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgr
         report("episodes", index, num_episodes)
         episodes.append(run_episode(loop, index, seed=seed))
     report("episodes", num_episodes, num_episodes)
-    differs = difference(
-        episodes[0],
-        num_episodes - 1,
-        make=partial(loop.scenario.make_loop, loop.variation),
-        run=partial(run_episode, seed=seed),
-    )
+    make = partial(loop.scenario.make_loop, loop.variation)
+    differs = difference(episodes[0], make, partial(run_episode, seed=seed))
     yield _judged(
         "state outside the Context",
         not differs,

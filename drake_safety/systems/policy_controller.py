@@ -27,12 +27,11 @@ class PolicyController(LeafSystem):
         - status
 
     ``command`` is (v_x, v_y, ω_z) in the base's heading frame [m/s, rad/s]. All outputs and the
-    memory of a recurrent network are discrete states, so that a cloned Context continues from its
-    phase of the gait.
-    ``action_state`` is the last action (n_a,), its largest change in the last period (1,), sine and
-    cosine of the phases (2 n_p,), and the command that the policy followed (3,), which differs from
-    the input while the policy's change of command is limited. An action that is not finite is
-    replaced by the last one, and ``status`` is ``HELD``.
+    memory of a recurrent network are discrete states: a cloned Context continues from its phase of
+    the gait. ``action_state`` is the last action (n_a,), its largest change in the last period
+    (1,), sine and cosine of the phases (2 n_p,), and the command that the policy followed (3,),
+    which differs from the input while the policy's change of command is limited. An action that is
+    not finite is replaced by the last one, and ``status`` is ``HELD``.
     """
 
     def __init__(self, kinematics: RobotKinematics, policy: Policy, *, offset_s: float = 0.0):
@@ -92,9 +91,8 @@ class PolicyController(LeafSystem):
             seen = policy.see(q, v, applied, action, phases)
             history = context.get_discrete_state(self._history).get_value()
             observation = policy.observe(seen, history)
-            found, memory = policy.act(
-                observation, context.get_discrete_state(self._memory).get_value()
-            )
+            memory = context.get_discrete_state(self._memory).get_value()
+            found, memory = policy.act(observation, memory)
             if np.isfinite(found).all() and np.isfinite(memory).all():
                 new, status = found, ACTING
                 discrete_state.set_value(self._history, observation)
