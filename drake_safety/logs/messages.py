@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 import re
+import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -74,32 +77,57 @@ def _decoded(found: tuple[int, Any, Any]) -> Message:
 def read_bag(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Channel], str]:
     """Reads the wanted fields, by topic, of a ROS 1 bag (a file) or a ROS 2 bag (a folder).
 
-    A ROS 2 bag needs no ``metadata.yaml``; of MCAP files in it that were cut off the rest is read.
+    Of a ROS 2 bag that was cut off what is left is read; the text says how much that is.
     """
     require_extra("logs", f"log '{path}'", "rosbags")
+    hint = ", cut off ('rosbag reindex' mends it)" if path.suffix == ".bag" else ""
+    # A damaged bag makes the reader raise errors of any kind.
+    with reading(path, f"damaged{hint}, or not a ROS bag: log", Exception):
+        try:
+            return _read_bags(path, [path], wanted, time), ""
+        except Exception:
+            chunked, files = (sorted(path.glob(f"*.{kind}")) for kind in ("mcap", "db3"))
+            if chunked:
+                return read_mcap(path, wanted, time, chunked)
+            if not files:
+                raise
+            with TemporaryDirectory() as folder:
+                copies = [Path(folder) / one.name for one in files]
+                share = np.mean([_recover(*both) for both in zip(files, copies, strict=True)])
+                channels = _read_bags(path, copies, wanted, time)
+            return channels, f"log '{path}' is cut off: {share:.0%} of its bytes are left"
+
+
+def _read_bags(
+    path: Path, files: Sequence[Path], wanted: Wanted, time: LogTime
+) -> dict[str, Channel]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    mend = (
-        "'rosbag reindex' mends it" if path.suffix == ".bag" else "'sqlite3 .recover' may mend it"
-    )
-    # A damaged bag makes the reader raise errors of any kind.
-    with reading(path, f"damaged, cut off ({mend}), or not a ROS bag: log", Exception):
-        is_whole = path.is_file() or (path / "metadata.yaml").is_file()
-        files = [path] if is_whole else sorted(path.glob("*.db3")) or [path]
-        try:
-            with AnyReader(files, default_typestore=get_typestore(Stores.LATEST)) as reader:
-                connections = [c for c in reader.connections if c.topic in wanted]
-                _require_topics(path, wanted, {c.topic for c in reader.connections})
-                messages = (
-                    (connection.topic, stamp, reader.deserialize(raw, connection.msgtype))
-                    for connection, stamp, raw in reader.messages(connections=connections)
-                )
-                return _channels(path, messages, wanted, time), ""
-        except Exception:
-            if not (chunked := sorted(path.glob("*.mcap"))):
-                raise
-            return read_mcap(path, wanted, time, chunked)
+    with AnyReader(files, default_typestore=get_typestore(Stores.LATEST)) as reader:
+        connections = [c for c in reader.connections if c.topic in wanted]
+        _require_topics(path, wanted, {c.topic for c in reader.connections})
+        messages = (
+            (connection.topic, stamp, reader.deserialize(raw, connection.msgtype))
+            for connection, stamp, raw in reader.messages(connections=connections)
+        )
+        return _channels(path, messages, wanted, time)
+
+
+def _recover(source: Path, target: Path) -> float:
+    """Copies an SQLite file up to the first row that is lost; returns the share of its bytes."""
+    data, uri = source.read_bytes(), f"{source.resolve().as_uri()}?mode=ro"
+    size = int.from_bytes(data[16:18], "big") * int.from_bytes(data[28:32], "big")
+    with closing(sqlite3.connect(uri, uri=True)) as old, closing(sqlite3.connect(target)) as new:
+        old.execute("PRAGMA writable_schema=ON")  # Else a file that lacks pages is not opened.
+        tables = "SELECT name, sql FROM sqlite_master WHERE type = 'table'"
+        for name, statement in old.execute(tables).fetchall():
+            with suppress(sqlite3.DatabaseError):
+                new.execute(statement)
+                for row in old.execute(f'SELECT * FROM "{name}"'):
+                    new.execute(f'INSERT INTO "{name}" VALUES ({",".join("?" * len(row))})', row)
+        new.commit()
+    return min(len(data) / max(size, 1), 1.0)
 
 
 def _require_topics(path: Path, wanted: Wanted, existing: set[str]) -> None:
