@@ -3,7 +3,6 @@
 import re
 
 import numpy as np
-import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -11,6 +10,7 @@ from drake_safety.logs.robot_log import read_log, read_pieces
 from log_files import SAFE, TABLE_MAP, UNSAFE, balancing_loop, frame_of, recorded, walked
 
 pytestmark = pytest.mark.train
+pd = pytest.importorskip("pandas")
 ROBOT = balancing_loop().robot
 JOINTS = balancing_loop().kinematics.joint_names
 QUATERNION = [f"quat_{a}" for a in "xyzw"]

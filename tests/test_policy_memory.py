@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from pydrake.systems.analysis import Simulator
 
@@ -14,6 +13,7 @@ from policy_networks import TERMS, new, recurrent_module, save_network, save_onn
 from system_doubles import Bench, controller
 
 pytestmark = pytest.mark.train
+torch = pytest.importorskip("torch")
 
 N_IN, N_OUT, SIZE = 5, 2, 4
 LSTM = [("h_in", "h_out"), ("c_in", "c_out")]

@@ -5,7 +5,6 @@ import shutil
 from datetime import UTC, datetime
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from drake_safety.logs.robot_log import read_log, read_pieces
@@ -22,6 +21,7 @@ from log_files import (
 )
 
 pytestmark = pytest.mark.train
+pd = pytest.importorskip("pandas")
 ROBOT = balancing_loop().robot
 JOINTS = balancing_loop().kinematics.joint_names
 PLAIN = part(walked(), 0, 60)

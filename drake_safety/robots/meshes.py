@@ -91,20 +91,15 @@ def convex_hull(points: np.ndarray) -> trimesh.Trimesh:
 
     Points in a plane get the box around them, at least 1 mm thick.
     """
-    from scipy.spatial import QhullError
     from trimesh import convex, creation
 
+    if np.linalg.matrix_rank(points - points.mean(axis=0), tol=_FLAT_M) < 3:
+        low, high = points.min(axis=0), points.max(axis=0)
+        half, middle = 0.5 * np.maximum(high - low, _THINNEST_M), 0.5 * (low + high)
+        return creation.box(bounds=[middle - half, middle + half])
     directions = creation.icosphere(subdivisions=1).vertices
-    try:
-        corners = convex.convex_hull(points).vertices
-        corners = corners[np.unique(np.argmax(corners @ directions.T, axis=0))]
-        if np.linalg.matrix_rank(corners - corners.mean(axis=0), tol=_FLAT_M) == 3:
-            return convex.convex_hull(corners)
-    except QhullError:  # Of flat ones; trimesh joggles others.
-        pass
-    low, high = points.min(axis=0), points.max(axis=0)
-    half, middle = 0.5 * np.maximum(high - low, _THINNEST_M), 0.5 * (low + high)
-    return creation.box(bounds=[middle - half, middle + half])
+    corners = convex.convex_hull(points).vertices
+    return convex.convex_hull(corners[np.unique(np.argmax(corners @ directions.T, axis=0))])
 
 
 def above(hull: trimesh.Trimesh, up: np.ndarray, height_m: float) -> trimesh.Trimesh | None:
