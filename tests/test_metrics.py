@@ -187,7 +187,8 @@ def test_segment_recalls_are_shares_of_segments_with_episodes_behind_them(segmen
 @pytest.mark.parametrize(
     ("ask", "message"),
     [
-        (lambda _: proportion(4, 3), r"4.*must not be greater than.*3"),
+        (lambda _: proportion(-1, 3), r"count is -1, expected 0\.\.3"),
+        (lambda _: proportion(4, 3), r"count is 4, expected 0\.\.3"),
         (lambda _: median(np.array([1.0, math.nan])), "1 of 2 values are NaN"),
         (
             lambda segments: segment_estimates(segments, np.zeros(3), threshold=0.5),

@@ -94,9 +94,15 @@ _MEDIAN_BOOTSTRAP = Bootstrap(num_resamples=2000)
 
 
 def proportion(count: int, n: int) -> Estimate:
-    """The share `count` of `n` independent samples, with its Clopper-Pearson interval."""
+    """The share `count` of `n` independent samples, with its Clopper-Pearson interval.
+
+    Raises:
+        ValueError: `count` is not in 0..n.
+    """
     from scipy.stats import binomtest
 
+    if not 0 <= count <= n:
+        raise ValueError(f"proportion: count is {count}, expected 0..{n}")
     if n == 0:
         return Estimate(value=math.nan, low=0.0, high=1.0, n=0)
     interval = binomtest(count, n).proportion_ci(_CONFIDENCE, method="exact")
