@@ -302,7 +302,9 @@ def test_of_a_recording_that_was_cut_off_what_is_whole_is_read(kind, tmp_path):
 def test_a_bag_without_its_metadata_is_read(tmp_path):
     path = write(PLAIN, JOINTS, "ros2", tmp_path)
     (path / "metadata.yaml").unlink()
-    assert_reads(read(path, kind="ros2"))
+    found = read(path, kind="ros2")
+    assert_reads(found)
+    assert found.cuts == []
     mcap = write(PLAIN, JOINTS, "mcap", tmp_path)
     shutil.rmtree(path)
     path.mkdir()
@@ -310,6 +312,25 @@ def test_a_bag_without_its_metadata_is_read(tmp_path):
     found = read(path, kind="mcap")
     assert_reads(found)
     assert found.cuts == []
+    # Its next file was just begun.
+    (path / "bag_1.mcap").write_bytes((path / "bag_0.mcap").read_bytes()[:300])
+    found = read(path, kind="mcap")
+    assert_reads(found)
+    assert "is cut off" in found.cuts[0]
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_velocities_of_a_topic_that_was_never_filled_are_derivatives(value, tmp_path):
+    log = dataclasses.replace(PLAIN, foot_positions=np.full_like(PLAIN.foot_positions, value))
+    feet = map_text("mcap")[map_text("mcap").index("foot_positions") :]
+    odometry = (
+        "/odom\n  columns: [twist.twist.linear.x, twist.twist.linear.y, twist.twist.linear.z]"
+    )
+    empty = '/feet\n  columns: ["position[0]", "position[1]", "position[2]"]'
+    path = write(log, JOINTS, "mcap", tmp_path)
+    found = read(path, (feet, ""), (odometry, empty), kind="mcap")
+    assert_reads(found, atol=0.02)
+    assert "'base_linear_velocity'" in found.notes[0] and "derivative" in found.notes[0]
 
 
 def test_a_recording_that_ends_before_its_first_chunk_says_what_may_help(tmp_path):

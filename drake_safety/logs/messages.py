@@ -54,7 +54,7 @@ def read_mcap(
                         end = file.tell()
                     end = one.stat().st_size
                 except Exception:
-                    if not end:
+                    if not kept + end:
                         raise
             kept, size = kept + end, size + one.stat().st_size
         _require_topics(path, wanted, existing)
@@ -83,10 +83,13 @@ def read_bag(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Chann
     hint = ", cut off ('rosbag reindex' mends it)" if path.suffix == ".bag" else ""
     # A damaged bag makes the reader raise errors of any kind.
     with reading(path, f"damaged{hint}, or not a ROS bag: log", Exception):
+        chunked, files = (sorted(path.glob(f"*.{kind}")) for kind in ("mcap", "db3"))
+        has_index = path.is_file() or (path / "metadata.yaml").is_file()
         try:
-            return _read_bags(path, [path], wanted, time), ""
-        except Exception:
-            chunked, files = (sorted(path.glob(f"*.{kind}")) for kind in ("mcap", "db3"))
+            return _read_bags(path, [path] if has_index else chunked + files, wanted, time), ""
+        except Exception as error:
+            if str(error).startswith(f"log '{path}'"):  # Of what the map says, not of damage.
+                raise
             if chunked:
                 return read_mcap(path, wanted, time, chunked)
             if not files:

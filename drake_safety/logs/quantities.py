@@ -36,13 +36,14 @@ def quantities(
         if columns[name] and not np.nan_to_num(topics[part.topic].table(columns[name])).any():
             notes.append(
                 f"log '{topics[part.topic].path}': '{name}', column '{columns[name][0]}' and so "
-                f"on, is 0 in every row: the derivative of '{source}' is used instead"
+                f"on, is 0 or missing in every row: the derivative of '{source}' is used"
             )
             log_map, columns[name] = replace(log_map, **{name: type(part)()}), []
     sparse = set()
     for topic, channel in topics.items():
         used = {one for name in QUANTITIES for one in columns[name] if one in channel.columns}
-        is_whole = ~np.isnan(channel.table(used)).any(axis=1)
+        # A topic of velocities that are left out is not used.
+        is_whole = ~np.isnan(channel.table(used)).any(axis=1) if used else np.ones(0)
         if len(is_whole) and is_whole.mean() < _SPARSE:
             sparse.add(topic)
             rows = f"the messages of topic '{topic}'" if topic else "the rows"

@@ -134,7 +134,7 @@ def read_pieces(
     channels, log_map, notes = quantities(topics, log_map, joints)
     found, reasons = cut_channels(channels, log_map.max_gap_s)
     lost += reasons
-    origin = min(channel.time[0] for channel in topics.values())
+    origin = min(topics[getattr(log_map, name).topic].time[0] for name in channels)
     sources = [
         Source(log_map=log_map, joints=joints, origin=origin, channels=part, step_s=step_s)
         for part in found
