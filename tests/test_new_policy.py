@@ -114,7 +114,7 @@ def test_metadata_of_a_network_are_not_asked_for(tmp_path):
         damping={".*": 0.1},
         action_scale={".*": 0.25},
         default_positions={"a": 0.0, "b": 0.1},
-        command={"lin_vel_x": [-0.5, 1], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-1, 1]},
+        command={"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-1.0, 1.0]},
     )
     network = PolicyNetwork(tmp_path / "p.onnx", lambda batch: batch, (45, 2), metadata)
     text, asked = PolicyTemplate(network=network).yaml(["a", "b", "c"], {})

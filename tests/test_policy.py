@@ -281,13 +281,15 @@ def test_metadata_are_read_as_exporters_write_them(raw, expected):
         (TWO | {"default_joint_pos": "tensor([1, 2])"}, "'default_positions'"),
         ({NAMES: "x", "observation_terms_scale": "1,2"}, r"'scale' .* terms \['x'\]"),
         ({NAMES: "x", "observation_terms_clip": "-1;2"}, r"'clip' .* got \['-1;2'\]"),
+        ({"command_ranges": '{"lin_vel_x": 1}'}, "'command' must be the lowest and highest"),
+        ({"command_ranges": '{"lin_vel_x": [1, -1]}'}, "'command' .* got {'lin_vel_x': .1, -1.}"),
     ],
 )
 def test_metadata_that_do_not_fit_are_told_and_left_out(raw, message):
     metadata = read_metadata(raw)
     (told,) = metadata.unread
     assert re.search(message, told)
-    assert not metadata.action_scale and not metadata.stiffness
+    assert not metadata.action_scale and not metadata.stiffness and not metadata.command
     assert all(term.keys() == {"name"} for term in metadata.observation)
 
 

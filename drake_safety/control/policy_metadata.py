@@ -21,8 +21,8 @@ class PolicyMetadata:
         stiffness, damping: Servo gains by regular expression [N·m/rad, N·m·s/rad].
         default_positions, action_scale: As in ``policy.yaml``, by regular expression [rad].
         observation: As in ``policy.yaml``, but terms have only the keys that the file states.
-        command: Lowest and highest v_x, v_y and ω_z by name.
-        unread: Entries that do not fit the joints, and why.
+        command: Lowest and highest v_x, v_y and ω_z by name [m/s, rad/s].
+        unread: Entries that do not fit, and why.
     """
 
     joints: list[str] = field(default_factory=list)
@@ -44,7 +44,9 @@ _KEYS = {
     "scale": ("observation_terms_scale",),
     "clip": ("observation_terms_clip",),
     "history": ("observation_history_lengths", "observation_terms_history_length"),
+    "command": ("command_ranges",),
 }
+_VELOCITIES = ("lin_vel_x", "lin_vel_y", "ang_vel_z", "ang_vel_yaw")
 TERM_NAMES = {
     "command": "velocity_commands",
     "keyboard_velocity_commands": "velocity_commands",
@@ -64,25 +66,34 @@ def read_metadata(raw: Mapping[str, str]) -> PolicyMetadata:
     joints = _words(raw.get("dof_names", raw.get("joint_names", "")))
     names = _words(raw.get("observation_names", ""))
     terms: list[dict[str, Any]] = [{"name": TERM_NAMES.get(name, name)} for name in names]
-    command = _parsed(raw.get("command_ranges", ""))
-    command = command if isinstance(command, dict) else {}
-    found = PolicyMetadata(joints=joints, observation=terms, command=command)
-    of_joints = f"number for each of the joints {joints}, one for all or by regular expression"
-    of_terms = f"value for each of the terms {names}"
+    found = PolicyMetadata(joints=joints, observation=terms)
     for name, keys in _KEYS.items():
         text = next((raw[key] for key in keys if raw.get(key)), "")
-        value, is_of_joints = _parsed(text), hasattr(found, name)
+        value = _parsed(text)
+        expected = f"a value for each of the terms {names}"
         try:
-            if text and is_of_joints:
+            if text and name == "command":
+                expected = "the lowest and highest velocity by name"
+                found.command = _ranges(value)
+            elif text and hasattr(found, name):
+                expected = f"a number for each of the joints {joints}, one for all or by regular "
+                expected += "expression"
                 setattr(found, name, _by_joint(value, joints))
             elif text and names:
                 values = _by_term(value, names, terms, name)
                 for term, one in list(zip(terms, values, strict=True)):
                     term[name] = one
         except (KeyError, TypeError, ValueError, re.error):
-            expected = of_joints if is_of_joints else of_terms
-            found.unread.append(f"its metadata '{name}' must be a {expected}; got {value}")
+            found.unread.append(f"its metadata '{name}' must be {expected}; got {value}")
     return found
+
+
+def _ranges(value: Any) -> dict[str, list[float]]:
+    stated = {name: pair for name, pair in dict(value).items() if name in _VELOCITIES}
+    ranges = {name: [float(low), float(high)] for name, (low, high) in stated.items()}
+    if not all(-math.inf < low <= high < math.inf for low, high in ranges.values()):
+        raise ValueError(value)
+    return ranges
 
 
 def _by_joint(value: Any, joints: list[str]) -> dict[str, float]:

@@ -133,7 +133,7 @@ class PolicyTemplate:
             what = "the ranges of commands in training [m/s, m/s, rad/s]"
             ask = f"  # ASK {what}"
             asked.append(f"policy.yaml: {what}; ±1 is assumed")
-        lowest, highest = ([float(pair[i]) for pair in pairs] for i in (0, 1))
+        lowest, highest = ([pair[i] for pair in pairs] for i in (0, 1))
         return [f"command:{ask}", f"  lowest: {lowest}", f"  highest: {highest}"]
 
 
