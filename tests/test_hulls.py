@@ -110,7 +110,7 @@ def test_collisions_of_a_hull_that_overlaps_another_link_are_off(tmp_path):
     assert "<member" not in (tmp_path / "hexapod.urdf").read_text()
     assert_nothing_overlaps(written)
     readme = (written.folder / "README.md").read_text().lower()
-    assert "collisions of the overlapping links" in readme
+    assert "which overlap or are excluded, are off" in readme
 
 
 def test_without_the_extra_its_command_is_told_and_the_meshes_are_left_out(tmp_path, monkeypatch):

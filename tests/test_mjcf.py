@@ -293,6 +293,7 @@ def test_robot_yaml_has_what_the_mjcf_states(dog):
     assert robot["joint_gains"] == {name: {"stiffness": 150, "damping": 3} for name in names}
     assert robot["rotor_inertia"] == dict.fromkeys(names, 0.02)
     assert robot["foot_friction"] == 0.7
+    assert "| friction of the feet | `scene.xml` |" in (dog.folder / "README.md").read_text()
     assert robot["posture"] == {
         f"{leg}_{joint}": q for leg in PLACES for joint, q in (("pitch", 0.8), ("knee", -1.6))
     }
@@ -348,6 +349,28 @@ def test_bodies_that_the_mjcf_excludes_do_not_collide(tmp_path):
         if group.tag.endswith("collision_filter_group")
     }
     assert {"FL_calf", "FR_calf"} in members
+
+
+def test_friction_that_is_stated_of_no_foot_is_assumed_everywhere(tmp_path):
+    path = write_dog(tmp_path, change=lambda text: text.replace('friction="0.7"', 'friction="0"'))
+    found = write_robot("dog", path, "balancing", tmp_path / "dog")
+    assert "foot_friction: 0.6" in found.files[1].read_text()
+    assert "| friction of the feet | assumed;" in found.files[2].read_text()
+    assert "the friction of feet on your ground [1]; 0.6 is assumed" in found.asked
+
+
+def test_bodies_that_overlap_and_are_excluded_are_told_once(tmp_path):
+    def change(text):
+        text = text.replace('<geom type="box" size="0.25 0.08', '<geom type="box" size="0.25 0.3')
+        return text.replace(
+            "</mujoco>",
+            '<contact><exclude body1="trunk" body2="FL_thigh"/></contact></mujoco>',
+        )
+
+    found = write_robot("dog", write_dog(tmp_path, change=change), "balancing", tmp_path / "dog")
+    told = [note for note in found.copy.notes if "'FL_thigh' and 'trunk'" in note]
+    assert len(told) == 1
+    assert not any("'trunk' and 'FL_thigh'" in note for note in found.copy.notes)
 
 
 def test_gains_are_asked_for_where_actuators_are_motors(tmp_path):

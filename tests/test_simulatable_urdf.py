@@ -35,15 +35,16 @@ def loaded_quietly(copy, folder, caplog):
     return plant
 
 
-def test_a_mesh_that_drake_shows_goes_along_as_it_is(tmp_path):
+@pytest.mark.parametrize("name", ["hull", "hull[1]"])
+def test_a_mesh_that_drake_shows_goes_along_as_it_is(name, tmp_path):
     source = tmp_path / "bot_description" / "urdf"
     source.mkdir(parents=True)
-    (source.parent / "hull.obj").write_text("v 0 0 0\n")
-    shapes = mesh("visual", "package://bot_description/hull.obj")
+    (source.parent / f"{name}.obj").write_text("v 0 0 0\n")
+    shapes = mesh("visual", f"package://bot_description/{name}.obj")
     copy = simulatable_copy(written(source, LINK.format("a", GOOD, shapes)))
     copy.write(tmp_path / "copy.urdf")
-    assert meshes_of(tmp_path / "copy.urdf") == ["meshes/hull.obj"]
-    assert (tmp_path / "meshes" / "hull.obj").read_text() == "v 0 0 0\n"
+    assert meshes_of(tmp_path / "copy.urdf") == [f"meshes/{name}.obj"]
+    assert (tmp_path / "meshes" / f"{name}.obj").read_text() == "v 0 0 0\n"
     assert copy.notes == []
 
 
@@ -157,6 +158,12 @@ def test_inertias_beyond_the_triangle_inequality_are_corrected(tmp_path, caplog)
     copy = simulatable_copy(written(tmp_path, LINK.format("a", odd, "")))
     assert "its largest moment is reduced to the sum of the others" in copy.notes[0]
     loaded_quietly(copy, tmp_path, caplog)
+
+
+def test_an_inertia_without_a_mass_is_removed(tmp_path):
+    odd = GOOD.replace('ixx="1"', 'ixx="-1"')
+    text = LINK.format("a", odd, "").replace('<mass value="1"/>', "")
+    assert simulatable_copy(written(tmp_path, text)).root.find("link/inertial") is None
 
 
 def test_transmissions_that_drake_ignores_are_left_out_and_others_stay(tmp_path, caplog):

@@ -34,7 +34,7 @@ class ModelFacts:
         rotor_inertia: Inertia of the rotors as the joints feel it [kg·m²].
         postures: Joint positions [rad] by keyframe.
         friction: Centre (3,) [m] and friction coefficient [1] of each collision shape, by body.
-        apart: Pairs of bodies that do not collide.
+        apart: Pairs of bodies that do not collide, each in alphabetical order.
         left_out: What is left out, a note each.
     """
 
@@ -42,7 +42,7 @@ class ModelFacts:
     rotor_inertia: dict[str, float] = field(default_factory=dict)
     postures: dict[str, dict[str, float]] = field(default_factory=dict)
     friction: dict[str, list[tuple[np.ndarray, float]]] = field(default_factory=dict)
-    apart: list[tuple[str, str]] = field(default_factory=list)
+    apart: set[tuple[str, str]] = field(default_factory=set)
     left_out: list[str] = field(default_factory=list)
 
 
@@ -118,7 +118,8 @@ class _Robot:
         for signature in model.exclude_signature.tolist():
             pair = divmod(signature, 1 << 16)
             if self.bodies.keys() >= set(pair):
-                self.facts.apart.append((self.bodies[pair[0]], self.bodies[pair[1]]))
+                one, other = sorted(self.bodies[i] for i in pair)
+                self.facts.apart.add((one, other))
         for key, qpos in enumerate(model.key_qpos):
             q = {name: float(qpos[model.jnt_qposadr[j]]) for j, name in self.joints.items()}
             self.facts.postures[model.key(key).name or str(key)] = q

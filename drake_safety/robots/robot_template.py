@@ -93,6 +93,16 @@ class NewRobot:
         """Links whose collision meshes the copy lacks, and that have no other shape."""
         return self.copy.bare_links()
 
+    @property
+    def foot_friction(self) -> float:
+        """Least friction of the shapes nearest to the contact points [1]; 0 if none is stated."""
+        stated = [
+            min(shapes, key=lambda one: float(np.linalg.norm(one[0] - limb.points.mean(axis=0))))[1]
+            for limb in self.legs
+            if (shapes := self.facts.friction.get(limb.body))
+        ]
+        return min(filter(None, stated), default=0.0)
+
     @cached_property
     def sizes(self) -> Sizes:
         """Its sizes as it stands."""
@@ -266,7 +276,7 @@ def _stand(found: NewRobot) -> None:
     survey.set_joints(found.posture)
     if odd := odd_inertias(survey.plant, survey.context, survey.instance):
         copy.warn(odd)
-    copy.ignore_collisions({*survey.overlaps(), *found.facts.apart})
+    copy.ignore_collisions(survey.overlaps() | found.facts.apart)
     sizes = found.sizes
     if not _LEAST_HEIGHT_M < sizes.height_m < _GREATEST_HEIGHT_M:
         raise ValueError(
@@ -332,14 +342,8 @@ def _robot_yaml(found: NewRobot) -> str:
     rotors = [f"{keys[j]}: {facts.rotor_inertia[j]:.4g}" for j in names if j in facts.rotor_inertia]
     lines += _block(f"rotor_inertia:  # of {source} [kg·m²]", rotors)
     lines += _effort_lines(found, keys)
-    # Of the shape nearest to a foot's contact points.
-    stated = [
-        min(shapes, key=lambda one: float(np.linalg.norm(one[0] - limb.points.mean(axis=0))))[1]
-        for limb in found.legs
-        if (shapes := facts.friction.get(limb.body))
-    ]
-    mu = min(filter(None, stated), default=0.6)
-    origin = f"that of {source}" if stated else "assumed"
+    mu = found.foot_friction or 0.6
+    origin = f"that of {source}" if found.foot_friction else "assumed"
     lines.append(f"foot_friction: {mu:g}  # ASK Coulomb's coefficient of feet on your ground [1]")
     found.asked.append(f"the friction of feet on your ground [1]; {mu:g} is {origin}")
     partners = {keys[one]: other.replace("\\", r"\\") for one, other in mirrored(names).items()}
@@ -409,7 +413,7 @@ def _readme(found: NewRobot) -> str:
     stated = f"`{found.copy.source.name}`"
     has_gains = set(found.joints) <= found.facts.gains.keys()
     gains = stated if has_gains else "estimated from mass and height; replace them by ..."
-    friction = stated if found.facts.friction else "assumed; replace it by ..."
+    friction = stated if found.foot_friction else "assumed; replace it by ..."
     return f"""# {found.name}
 
 {sizes.mass_kg:.2f} kg; its base, `{sizes.base}`, stands {sizes.height_m:.3f} m high on

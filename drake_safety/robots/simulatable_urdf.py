@@ -114,7 +114,7 @@ def _fix_inertias(copy: UrdfCopy) -> None:
         inertia, mass = link.find("inertial/inertia"), number(link.find("inertial/mass"), "value")
         if inertia is None:
             continue
-        if mass == 0:
+        if not mass > 0:  # Or not stated.
             remove(link, "inertial")
             continue
         moments = np.zeros((3, 3))

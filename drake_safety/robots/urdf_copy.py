@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import math
 import re
 import shutil
@@ -228,7 +229,9 @@ class UrdfCopy:
             for link in (one, other):
                 ET.SubElement(group, f"{drake}member", link=link)
             ET.SubElement(group, f"{drake}ignored_collision_filter_group", name=name)
-            self.notes.append(f"collisions of the overlapping links '{one}' and '{other}' are off")
+            self.notes.append(
+                f"collisions of links '{one}' and '{other}', which overlap or are excluded, are off"
+            )
 
     def write(self, path: Path) -> None:
         """Writes the copy and its meshes."""
@@ -243,7 +246,7 @@ class UrdfCopy:
         for name, mesh in self.meshes.items():
             target = path.parent / name
             target.parent.mkdir(parents=True, exist_ok=True)
-            for file in mesh.parent.glob(f"{mesh.stem}.*"):
+            for file in mesh.parent.glob(f"{glob.escape(mesh.stem)}.*"):
                 # Material files and textures have the mesh's stem.
                 if file.suffix in (mesh.suffix, ".mtl", ".png", ".bin"):
                     shutil.copyfile(file, target.with_suffix(file.suffix))
