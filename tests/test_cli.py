@@ -70,6 +70,11 @@ SCENE, MISSING = "laikago_balancing", "error x holds no 'sharpened'"
     [
         (["train", "nothing", "--out", "x"], "error scenario 'nothing' does not exist"),
         (["train", SCENE, "--out", "x", "--mode", "both ways"], "error train: mode must be one of"),
+        (
+            ["calibrate", SCENE, "--miss-rate", "2"],
+            "error calibration: --miss-rate is 2.0, expected",
+        ),
+        (["calibrate", SCENE, "--confidence", "1"], "error calibration: --confidence is 1.0"),
         (["run", SCENE, "--assessment", "x"], MISSING),
         (["evaluate", SCENE, "--assessment", "x"], MISSING),
         (["adapt", SCENE, "--assessment", "x"], MISSING),

@@ -12,7 +12,7 @@ from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.figure_style import label_of
 from drake_safety.evaluation.scorers import assessment_scorer
-from drake_safety.learning.calibration import KINDS, episode_scores
+from drake_safety.learning.calibration import KINDS, check_share, episode_scores
 from drake_safety.learning.calibration import calibrate as choose
 from drake_safety.learning.seeds import CALIBRATION
 from drake_safety.learning.segments import split
@@ -47,6 +47,10 @@ def calibrate(
     continues, and another promise reuses them. A shipped assessment is not changed; its calibrated
     copy is written to runs/SCENARIO-shipped.
     """
+    check_share("--miss-rate", miss_rate)
+    check_share("--false-alarm-rate", false_alarm_rate)
+    if confidence is not None:
+        check_share("--confidence", confidence)
     loaded = load_scenario(scenario)
     folder = folders.assessment_folder(loaded, assessment)
     learned = {

@@ -200,10 +200,10 @@ def allowed_misses(num_unsafe: int, miss_rate: float, *, confidence: float | Non
     Raises:
         ValueError: A rate is not in (0, 1).
     """
-    _check_share("miss_rate", miss_rate)
+    check_share("miss_rate", miss_rate)
     if confidence is None:
         return math.floor(miss_rate * (num_unsafe + 1) + 1e-9) - 1
-    _check_share("confidence", confidence)
+    check_share("confidence", confidence)
     from scipy.stats import binom
 
     # The quantile is the smallest count with P(X <= count) >= 1 - confidence.
@@ -218,10 +218,10 @@ def episodes_needed(miss_rate: float, *, confidence: float | None = None) -> int
     Raises:
         ValueError: A rate is not in (0, 1).
     """
-    _check_share("miss_rate", miss_rate)
+    check_share("miss_rate", miss_rate)
     if confidence is None:
         return math.ceil(1.0 / miss_rate - 1e-9) - 1
-    _check_share("confidence", confidence)
+    check_share("confidence", confidence)
     return math.ceil(math.log1p(-confidence) / math.log1p(-miss_rate) - 1e-9)
 
 
@@ -271,6 +271,7 @@ def _checked(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> tuple[np.ndarra
     return np.where(np.isnan(score), math.inf, score), label
 
 
-def _check_share(name: str, value: float) -> None:
+def check_share(name: str, value: float) -> None:
+    """Raises a ValueError unless a rate or confidence is between 0 and 1."""
     if not 0.0 < value < 1.0:
         raise ValueError(f"calibration: {name} is {value}, expected a value in (0, 1)")
