@@ -103,6 +103,12 @@ def test_a_folder_goes_on_with_its_own_set_and_refuses_others(tmp_path):
 
 
 @pytest.mark.train
+def test_a_first_row_of_any_type_of_integer_is_the_same_when_it_is_read(tmp_path):
+    options = {"path": tmp_path, "reset": lambda *start: np.int32(reset_glider(*start))}
+    assert_identical(record(4, **options), record(4, **options))
+
+
+@pytest.mark.train
 def test_episodes_of_what_has_changed_since_are_refused_and_those_kept_are_counted(
     tmp_path, caplog
 ):

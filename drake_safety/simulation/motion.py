@@ -259,7 +259,7 @@ def simulate(
         cause=cause,
         fall_time_s=fall_s,
         failure=failure,
-        first_row=first_row or 0,
+        first_row=int(first_row or 0),  # It may be one of NumPy's.
         index=index,
     )
 
