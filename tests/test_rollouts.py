@@ -326,7 +326,7 @@ def test_state_outside_the_context_is_found_in_many_episodes_and_by_check(
         SCENARIO.replace("robot: none\n", f"parameters: {{speed_m_s: {1.7 + is_leaking}}}\n")
     )
     findings = check_scenario(file, num_episodes=3)
-    (found,) = [one for one in findings if one.item == "state outside the Context"]
+    (found,) = [one for one in findings if one.item == "repeated episode"]
     assert found.is_ok == (not is_leaking)
     if not is_leaking:
         assert len(run_episodes(load_scenario(file), 64, num_workers=1)) == 64

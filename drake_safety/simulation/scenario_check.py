@@ -399,9 +399,9 @@ def _episodes(loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgr
     make = partial(loop.scenario.make_loop, loop.variation)
     differs = difference(episodes[0], make, partial(run_episode, seed=seed))
     yield _judged(
-        "state outside the Context",
+        "repeated episode",
         not differs,
-        "none: an episode, simulated again after others, is the same to the last bit",
+        "simulated again after others, it is the same to the last bit",
         f"episode 0, simulated again after others, {differs}",
         "declare it as discrete, continuous or abstract state, or as a parameter",
     )
