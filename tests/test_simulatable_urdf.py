@@ -22,8 +22,16 @@ def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("DRAKE_SAFETY_CACHE", str(tmp_path / "cache"))
 
 
-def meshes_of(path):
-    return [element.get("filename") for element in ET.parse(path).getroot().iter("mesh")]
+def meshes_of(folder):
+    return [mesh.get("filename") for mesh in ET.parse(folder / "copy.urdf").getroot().iter("mesh")]
+
+
+def copy_of(folder, shapes="", inertia=GOOD):
+    """The copy of a URDF of one link, and where it is written."""
+    copy = simulatable_copy(written(folder, LINK.format("a", inertia, shapes)))
+    (folder / "written").mkdir()
+    copy.write(folder / "written" / "copy.urdf")
+    return copy, folder / "written"
 
 
 def loaded_quietly(copy, folder, caplog):
@@ -40,22 +48,17 @@ def test_a_mesh_that_drake_shows_goes_along_as_it_is(name, tmp_path):
     source = tmp_path / "bot_description" / "urdf"
     source.mkdir(parents=True)
     (source.parent / f"{name}.obj").write_text("v 0 0 0\n")
-    shapes = mesh("visual", f"package://bot_description/{name}.obj")
-    copy = simulatable_copy(written(source, LINK.format("a", GOOD, shapes)))
-    copy.write(tmp_path / "copy.urdf")
-    assert meshes_of(tmp_path / "copy.urdf") == [f"meshes/{name}.obj"]
-    assert (tmp_path / "meshes" / f"{name}.obj").read_text() == "v 0 0 0\n"
+    copy, folder = copy_of(source, mesh("visual", f"package://bot_description/{name}.obj"))
+    assert meshes_of(folder) == [f"meshes/{name}.obj"]
+    assert (folder / "meshes" / f"{name}.obj").read_text() == "v 0 0 0\n"
     assert copy.notes == []
 
 
 def test_another_visual_is_converted_and_drake_can_load_what_was_written(tmp_path):
     pytest.importorskip("trimesh")
     stl(tmp_path / "skin.stl", TRIANGLE)
-    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, mesh("visual", "skin.stl"))))
-    folder = tmp_path / "written"
-    folder.mkdir()
-    copy.write(folder / "copy.urdf")
-    assert meshes_of(folder / "copy.urdf") == ["meshes/skin.gltf"]
+    copy, folder = copy_of(tmp_path, mesh("visual", "skin.stl"))
+    assert meshes_of(folder) == ["meshes/skin.gltf"]
     assert copy.notes == ["visual meshes are converted to glTF: skin.stl"]
     assert copy.left_out == []
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
@@ -68,18 +71,17 @@ def test_another_visual_is_converted_and_drake_can_load_what_was_written(tmp_pat
 def test_visuals_without_a_converter_are_left_out_and_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     stl(tmp_path / "skin.stl", TRIANGLE)
-    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, mesh("visual", "skin.stl"))))
+    copy, folder = copy_of(tmp_path, mesh("visual", "skin.stl"))
     (note,) = copy.left_out
     assert "left out, until you `pip install 'drake_safety[robots]'` and" in note
     assert note.endswith(": skin.stl")
-    assert list(copy.root.iter("visual")) == [] and copy.meshes == {}
+    assert meshes_of(folder) == [] and copy.meshes == {}
 
 
 def test_visuals_that_are_missing_or_broken_are_left_out_by_name_and_reason(tmp_path):
     pytest.importorskip("trimesh")
     (tmp_path / "broken.dae").write_text("no mesh")
-    shapes = mesh("visual", "gone.stl") + mesh("visual", "broken.dae")
-    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, shapes)))
+    copy, _ = copy_of(tmp_path, mesh("visual", "gone.stl") + mesh("visual", "broken.dae"))
     missing, broken = copy.left_out
     assert missing == "visual meshes that are not where the URDF says are left out: gone.stl"
     assert "broken.dae' cannot be read" in broken
@@ -87,23 +89,18 @@ def test_visuals_that_are_missing_or_broken_are_left_out_by_name_and_reason(tmp_
 
 
 def test_two_meshes_of_one_name_are_two_in_the_copy(tmp_path):
-    for name, x in (("left", 1), ("right", 2)):
+    for name in ("left", "right"):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "hull.obj").write_text(f"v {x} 0 0\n")
+        (tmp_path / name / "hull.obj").write_text(name)
     shapes = mesh("visual", "left/hull.obj") + mesh("visual", "right/hull.obj")
-    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, shapes)))
-    folder = tmp_path / "written"
-    folder.mkdir()
-    copy.write(folder / "copy.urdf")
-    texts = [(folder / name).read_text() for name in meshes_of(folder / "copy.urdf")]
-    assert texts == ["v 1 0 0\n", "v 2 0 0\n"]
+    _, folder = copy_of(tmp_path, shapes)
+    assert [(folder / name).read_text() for name in meshes_of(folder)] == ["left", "right"]
 
 
 def test_a_mesh_of_an_installed_package_is_found(tmp_path):
     pytest.importorskip("trimesh")
     url = "package://example-robot-data/robots/hyq_description/meshes/leg/lowerleg.dae"
-    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, mesh("visual", url))))
-    assert list(copy.meshes) == ["meshes/lowerleg.gltf"]
+    assert list(copy_of(tmp_path, mesh("visual", url))[0].meshes) == ["meshes/lowerleg.gltf"]
 
 
 @pytest.mark.parametrize("kind", ["stl", "ply"])
@@ -115,13 +112,12 @@ def test_a_collision_mesh_becomes_its_hull_turned_and_scaled(tmp_path, kind):
         .replace("<geometry>", '<origin xyz="0 0 1" rpy="0 0 1.5707963267948966"/><geometry>')
         .replace("/></geo", ' scale="1 1 2"/></geo')
     )
-    copy = simulatable_copy(written(tmp_path, LINK.format("foot", GOOD, shape)))
-    (hull,) = copy.hulls["foot"]
+    copy, folder = copy_of(tmp_path, shape)
+    (hull,) = copy.hulls["a"]
     # A quarter turn about z: x becomes y, and y becomes -x.
     np.testing.assert_allclose(hull.bounds, [[-1, 0, 1], [0, 2, 9]], atol=1e-6)
-    (name,) = (element.get("filename") for element in copy.root.iter("mesh"))
-    copy.write(tmp_path / "copy.urdf")
-    np.testing.assert_allclose(mesh_points(tmp_path / name).max(axis=0), [0, 2, 9], atol=1e-6)
+    (name,) = meshes_of(folder)
+    np.testing.assert_allclose(mesh_points(folder / name).max(axis=0), [0, 2, 9], atol=1e-6)
     assert copy.bare_links() == [] and len(copy.notes) == 1
 
 
@@ -153,11 +149,14 @@ def test_nothing_that_drake_warns_of_at_every_start_is_left(tmp_path, caplog):
     loaded_quietly(copy, tmp_path, caplog)
 
 
-def test_inertias_beyond_the_triangle_inequality_are_corrected(tmp_path, caplog):
-    odd = '<inertia ixx="0.001" iyy="0.001" izz="0.007" ixy="0.0005" ixz="0" iyz="0"/>'
-    copy = simulatable_copy(written(tmp_path, LINK.format("a", odd, "")))
+@pytest.mark.parametrize(
+    "moments", [(0.001, 0.001, 0.007, 0.0005), (0.06, 0.6, 0.0, 0.0), (0.0, 0.6, 0.06, 0.0)]
+)
+def test_inertias_beyond_the_triangle_inequality_are_corrected(tmp_path, caplog, moments):
+    inertia = '<inertia ixx="{}" iyy="{}" izz="{}" ixy="{}" ixz="0" iyz="0"/>'.format(*moments)
+    copy, folder = copy_of(tmp_path, inertia=inertia)
     assert "its largest moment is reduced to the sum of the others" in copy.notes[0]
-    loaded_quietly(copy, tmp_path, caplog)
+    loaded_quietly(copy, folder, caplog)
 
 
 def test_an_inertia_without_a_mass_is_removed(tmp_path):

@@ -132,7 +132,7 @@ def _fix_inertias(copy: UrdfCopy) -> None:
             changed, how = np.diag(np.diag(moments)), "its products of inertia are set to zero"
         elif values[1] > 0 and values[2] > (1 + _ROUNDING) * (values[0] + values[1]):
             # The moments of any body satisfy the triangle inequality.
-            values[2] = 0.999 * (values[0] + values[1])  # Digits are rounded.
+            values[2] = max(0.999 * (values[0] + values[1]), values[1])  # Digits are rounded.
             changed = axes @ np.diag(values) @ axes.T
             how = "its largest moment is reduced to the sum of the others"
         else:
