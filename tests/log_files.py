@@ -10,13 +10,12 @@ from scipy.spatial.transform import Rotation
 from cart_episodes import ARRAYS
 from drake_safety import load_scenario
 from drake_safety.logs.conversion import angular_velocities, rates
-from drake_safety.logs.robot_log import RobotLog
+from drake_safety.logs.robot_log import RobotLog, read_pieces
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.motion import simulate
 from drake_safety.simulation.rollouts import episode_rng
 
 ORIGIN_NS = 1_700_000_000_123_000_000
-POINT = ("x", "y", "z")
 FORMATS = ("csv", "parquet", "mcap", "ros2", "ros1")
 # Episodes of the short balancing below that end so.
 SAFE, UNSAFE = 0, 5
@@ -136,26 +135,37 @@ def walked(speed_m_s=0.4, turn_rad_s=0.3, duration_s=2.0, rate_hz=200):
     )
 
 
+ROBOT = balancing_loop().robot
+JOINTS = balancing_loop().kinematics.joint_names
+BASE, GYRO, LINEAR, GOAL = (
+    [f"{name}_{a}" for a in "xyz"] for name in ("base", "gyro", "velocity", "goal")
+)
+QUATERNION = [f"quat_{a}" for a in "xyzw"]
+ANGLES, RATES = ([f"{joint}_{kind}" for joint in JOINTS] for kind in ("pos", "vel"))
+FEET = [f"feet_{i}" for i in range(12)]
+
+
 def stamps_ns(log):
     return ORIGIN_NS + np.round(log.time_s * 1e9).astype(np.int64)
 
 
-def frame_of(log, joints):
+def body_rates(log):
+    """Angular and linear velocity in the base, (N, 3) each."""
+    turns = Rotation.from_quat(log.q[:, :4], scalar_first=True).inv()
+    return turns.apply(log.v[:, :3]), turns.apply(log.v[:, 3:6])
+
+
+def frame_of(log):
     """A table with millimetres, degrees, x y z w and body velocities, whose clock counts ns."""
-    columns = {"stamp": stamps_ns(log)}
-    columns |= {f"base_{a}": 1e3 * log.q[:, 4 + i] for i, a in enumerate(POINT)}
-    columns |= {f"quat_{a}": log.q[:, i] for a, i in zip("xyzw", (1, 2, 3, 0), strict=True)}
-    rotations = Rotation.from_quat(log.q[:, :4], scalar_first=True)
-    body = rotations.inv().apply(log.v[:, :3]), rotations.inv().apply(log.v[:, 3:6])
-    columns |= {f"gyro_{a}": np.rad2deg(body[0][:, i]) for i, a in enumerate(POINT)}
-    columns |= {f"velocity_{a}": body[1][:, i] for i, a in enumerate(POINT)}
-    columns |= {f"{name}_pos": np.rad2deg(log.q[:, 7 + i]) for i, name in enumerate(joints)}
-    columns |= {f"{name}_vel": log.v[:, 6 + i] for i, name in enumerate(joints)}
-    columns |= {f"goal_{a}": log.desired_output[:, i] for i, a in enumerate(POINT)}
-    columns |= {f"feet_{i}": log.foot_positions[:, i] for i in range(log.foot_positions.shape[1])}
     import pandas as pd
 
-    return pd.DataFrame(columns)
+    turning, moving = body_rates(log)
+    values = [1e3 * log.q[:, 4:7], log.q[:, [1, 2, 3, 0]], np.rad2deg(turning), moving]
+    values += [np.rad2deg(log.q[:, 7:]), log.v[:, 6:], log.desired_output, log.foot_positions]
+    columns = [*BASE, *QUATERNION, *GYRO, *LINEAR, *ANGLES, *RATES, *GOAL, *FEET]
+    frame = pd.DataFrame(np.hstack(values), columns=columns)
+    frame.insert(0, "stamp", stamps_ns(log))
+    return frame
 
 
 TABLE_MAP = """
@@ -167,68 +177,49 @@ base_linear_velocity: {columns: [velocity_x, velocity_y, velocity_z], frame: bod
 joint_positions: {template: "{joint}_pos", unit: deg}
 joint_velocities: {template: "{joint}_vel"}
 desired_output: {columns: [goal_x, goal_y, goal_z]}
-foot_positions:
-  columns: [feet_0, feet_1, feet_2, feet_3, feet_4, feet_5,
-            feet_6, feet_7, feet_8, feet_9, feet_10, feet_11]
-"""
+foot_positions: {columns: FEET}
+""".replace("FEET", str(FEET))
 
 MESSAGE_MAP = """
 time: {column: header.stamp}
-base_position:
-  topic: /odom
-  columns: [pose.pose.position.x, pose.pose.position.y, pose.pose.position.z]
+base_position: {topic: /odom, columns: [POSE.position.x, POSE.position.y, POSE.position.z]}
 base_orientation:
   topic: /odom
-  columns:
-    - pose.pose.orientation.x
-    - pose.pose.orientation.y
-    - pose.pose.orientation.z
-    - pose.pose.orientation.w
+  columns: [POSE.orientation.x, POSE.orientation.y, POSE.orientation.z, POSE.orientation.w]
   order: xyzw
-base_linear_velocity:
-  topic: /odom
-  columns: [twist.twist.linear.x, twist.twist.linear.y, twist.twist.linear.z]
-  frame: body
 base_angular_velocity:
-  topic: /odom
-  columns: [twist.twist.angular.x, twist.twist.angular.y, twist.twist.angular.z]
-  frame: body
+  {topic: /odom, columns: [TWIST.angular.x, TWIST.angular.y, TWIST.angular.z], frame: body}
+base_linear_velocity:
+  {topic: /odom, columns: [TWIST.linear.x, TWIST.linear.y, TWIST.linear.z], frame: body}
 joint_positions: {topic: /joint_states, template: "position[{joint}]"}
 joint_velocities: {topic: /joint_states, template: "velocity[{joint}]"}
 desired_output: {topic: /goal, columns: [point.x, point.y, point.z]}
-foot_positions:
-  topic: /feet
-  columns:
-"""
-MESSAGE_MAP += "".join(f'    - "position[{i}]"\n' for i in range(12))
+foot_positions: {topic: /feet, columns: FEET}
+""".replace("POSE", "pose.pose").replace("TWIST", "twist.twist")
+MESSAGE_MAP = MESSAGE_MAP.replace("FEET", str([f"position[{i}]" for i in range(12)]))
 
 
-def map_text(kind):
-    return TABLE_MAP if kind in ("csv", "parquet") else MESSAGE_MAP
+def map_beside(path, *changes):
+    """Writes the map of a log of `write` or `save` beside it, with changes of its text."""
+    text = TABLE_MAP if path.suffix in (".csv", ".parquet") else MESSAGE_MAP
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (path.parent / "columns.yaml").write_text(text)
+    return path.parent / "columns.yaml"
 
 
-def write(log, joints, kind, folder, **how):
-    """Writes a log in one of the `FORMATS`; returns its path.
+def read(path, *changes, reader=read_pieces, **options):
+    return reader(path, map_beside(path, *changes), ROBOT, **options)
 
-    In messages `change` gives, for a message of joints and its number, those to be written instead,
-    each with a delay [ns]; `chunk_size` is that of an MCAP file.
-    """
-    path = folder / {"ros1": "run.bag", "ros2": "run_ros2"}.get(kind, f"run.{kind}")
+
+def save(frame, folder, kind="csv"):
+    path = folder / f"run.{kind}"
     if kind == "csv":
-        frame_of(log, joints).to_csv(path, index=False)
-    elif kind == "parquet":
-        frame_of(log, joints).to_parquet(path)
-    elif kind == "mcap":
-        _write_mcap(log, joints, path, **how)
+        frame.to_csv(path, index=False)
     else:
-        _write_bag(log, joints, path, kind, **how)
+        frame.to_parquet(path)
     return path
-
-
-def _typestore(ros1=False):
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
 
 
 TYPES = {
@@ -239,94 +230,81 @@ TYPES = {
 }
 
 
-def messages(log, joints, store, array=np.ascontiguousarray):
+def messages(log, store, change):
     """Every message as (topic, stamp, message); joints stand in an order of their own."""
 
-    def of(kind, *values, **named):
-        return store.types[kind.replace("/", "/msg/")](*values, **named)
+    def of(kind, *values):
+        return store.types[kind.replace("/", "/msg/")](*values)
 
-    rotations = Rotation.from_quat(log.q[:, :4], scalar_first=True).inv()
-    w, v = rotations.apply(log.v[:, :3]), rotations.apply(log.v[:, 3:6])
-    names, none, covariance = joints[::-1], array(np.zeros(0)), array(np.zeros(36))
-    fields = store.types["std_msgs/msg/Header"].__dataclass_fields__
-    for i, stamp in enumerate(stamps_ns(log).tolist()):
+    def header(stamp):
+        names = store.types["std_msgs/msg/Header"].__dataclass_fields__
         time = of("builtin_interfaces/Time", *divmod(stamp, 1_000_000_000))
-        sequence = {"seq": i} if "seq" in fields else {}
-        header = of("std_msgs/Header", stamp=time, frame_id="world", **sequence)
+        return of("std_msgs/Header", *([0] if "seq" in names else []), time, "world")
+
+    w, v = body_rates(log)
+    none, covariance = np.zeros(0), np.zeros(36)
+    for i, stamp in enumerate(stamps_ns(log).tolist()):
         qw, *q_xyz = log.q[i, :4]
-        pose = of(
-            "geometry_msgs/Pose",
-            of("geometry_msgs/Point", *log.q[i, 4:7]),
-            of("geometry_msgs/Quaternion", *q_xyz, qw),
-        )
-        rates = (of("geometry_msgs/Vector3", *vector[i]) for vector in (v, w))
+        position = of("geometry_msgs/Point", *log.q[i, 4:7])
+        pose = of("geometry_msgs/Pose", position, of("geometry_msgs/Quaternion", *q_xyz, qw))
         pose = of("geometry_msgs/PoseWithCovariance", pose, covariance)
+        rates = (of("geometry_msgs/Vector3", *vector[i]) for vector in (v, w))
         twist = of("geometry_msgs/Twist", *rates)
         twist = of("geometry_msgs/TwistWithCovariance", twist, covariance)
-        yield "/odom", stamp, of("nav_msgs/Odometry", header, "base", pose, twist)
-        positions, velocities = array(log.q[i, :6:-1]), array(log.v[i, :5:-1])
-        state = of("sensor_msgs/JointState", header, names, positions, velocities, none)
-        yield "/joint_states", stamp, state
+        yield "/odom", stamp, of("nav_msgs/Odometry", header(stamp), "base", pose, twist)
+        values = map(np.ascontiguousarray, (log.q[i, :6:-1], log.v[i, :5:-1]))
+        state = of("sensor_msgs/JointState", header(stamp), JOINTS[::-1], *values, none)
+        for other, delay in change(state, i):
+            late = stamp + delay
+            yield "/joint_states", late, dataclasses.replace(other, header=header(late))
         point = of("geometry_msgs/Point", *log.desired_output[i])
-        yield "/goal", stamp, of("geometry_msgs/PointStamped", header, point)
-        feet = array(log.foot_positions[i])
-        yield "/feet", stamp, of("sensor_msgs/JointState", header, [], feet, none, none)
+        yield "/goal", stamp, of("geometry_msgs/PointStamped", header(stamp), point)
+        feet = of("sensor_msgs/JointState", header(stamp), [], log.foot_positions[i], none, none)
+        yield "/feet", stamp, feet
 
 
-def changed(found, change):
-    """Messages in which those of joints are replaced; their headers say the delay too."""
-    number = 0
-    for topic, stamp, message in found:
-        if topic != "/joint_states" or change is None:
-            yield topic, stamp, message
-            continue
-        for other, delay in change(message, number):
-            time = divmod(stamp + delay, 1_000_000_000)
-            header = dataclasses.replace(message.header, stamp=type(message.header.stamp)(*time))
-            yield topic, stamp + delay, dataclasses.replace(other, header=header)
-        number += 1
+def write(log, folder, kind, *, change=lambda message, i: [(message, 0)], chunk_size=1 << 20):
+    """Writes a log in one of the `FORMATS`; returns its path.
 
-
-def _write_bag(log, joints, path, kind, change=None, chunk_size=None):
+    In messages `change` gives, for a message of joints and its number, those to be written instead,
+    each with a delay [ns]; `chunk_size` is that of an MCAP file.
+    """
+    if kind in ("csv", "parquet"):
+        return save(frame_of(log), folder, kind)
+    import mcap.writer
     from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_typestore
 
-    store = _typestore(ros1=kind == "ros1")
+    path = folder / {"ros1": "run.bag", "ros2": "run_ros2", "mcap": "run.mcap"}[kind]
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
     serialize = store.serialize_ros1 if kind == "ros1" else store.serialize_cdr
-    bag = rosbag1.Writer(path) if kind == "ros1" else rosbag2.Writer(path, version=9)
-    with bag as writer:
-        topics = {
-            topic: writer.add_connection(topic, name, typestore=store)
-            for topic, name in TYPES.items()
-        }
-        for topic, stamp, message in changed(messages(log, joints, store), change):
-            writer.write(topics[topic], stamp, serialize(message, TYPES[topic]))
+    found = [(t, at, serialize(m, TYPES[t])) for t, at, m in messages(log, store, change)]
+    if kind == "mcap":
+        with path.open("wb") as file:
+            writer = mcap.writer.Writer(file, chunk_size)
+            writer.start("ros2")
+            channels = {}
+            for topic, name in TYPES.items():
+                text = store.generate_msgdef(name, ros_version=2)[0].encode()
+                schema = writer.register_schema(name.replace("/msg/", "/"), "ros2msg", text)
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            for topic, stamp, data in found:
+                writer.add_message(channels[topic], stamp, bytes(data), stamp)
+            writer.finish()
+        return path
+    with rosbag1.Writer(path) if kind == "ros1" else rosbag2.Writer(path, version=9) as writer:
+        topics = {t: writer.add_connection(t, name, typestore=store) for t, name in TYPES.items()}
+        for topic, stamp, data in found:
+            writer.write(topics[topic], stamp, data)
+    return path
 
 
-def _write_mcap(log, joints, path, change=None, chunk_size=1 << 20):
-    from mcap_ros2.writer import Writer
-
-    store = _typestore()
-    with path.open("wb") as file, Writer(file, chunk_size) as writer:
-        schemas = {
-            topic: writer.register_msgdef(
-                name.replace("/msg/", "/"), store.generate_msgdef(name, ros_version=2)[0]
-            )
-            for topic, name in TYPES.items()
-        }
-        for topic, stamp, message in changed(messages(log, joints, store, array=list), change):
-            writer.write_message(topic, schemas[topic], message, stamp, stamp)
-
-
-def part(log, first, last):
-    """The rows of a log from one to another, with the time from the first of them."""
-    rows = slice(first, last)
-    values = {
-        name: getattr(log, name)[rows]
-        for name in ("q", "v", "desired_output", "foot_positions")
-        if getattr(log, name) is not None
-    }
-    times = log.time_s[rows] - log.time_s[first]
-    return dataclasses.replace(log, time_s=times, **values)
+def part(log, first, last, again=0, end=0):
+    """The rows of a log from one to another, and of a second such part; time is from the first."""
+    rows = np.r_[first:last, again:end]
+    arrays = {name: getattr(log, name) for name in ("q", "v", "desired_output", "foot_positions")}
+    found = {name: None if array is None else array[rows] for name, array in arrays.items()}
+    return dataclasses.replace(log, time_s=log.time_s[rows] - log.time_s[first], **found)
 
 
 LOAD_TOLERANCE_RAD = 1e-5

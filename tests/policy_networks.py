@@ -20,23 +20,6 @@ def new(folder, policy, *more):
     return out, result
 
 
-def save_network(path, num_inputs, num_outputs, scale=0.01):
-    """Writes a TorchScript network, a matrix of ascending weights; with scale 0 it rests.
-
-    Returns its path.
-    """
-    import torch
-
-    linear = torch.nn.Linear(num_inputs, num_outputs, bias=False)
-    weight = torch.arange(num_inputs * num_outputs) * scale
-    linear.weight = torch.nn.Parameter(weight.reshape(num_inputs, num_outputs).T)
-    with warnings.catch_warnings():
-        # Torch deprecates the format, in which policies are nevertheless published.
-        warnings.simplefilter("ignore")
-        torch.jit.script(linear).save(str(path))
-    return path
-
-
 def save_script(path, module, seen=None):
     """Writes a module as TorchScript, after an evaluation of a batch if one is given.
 
@@ -45,6 +28,7 @@ def save_script(path, module, seen=None):
     import torch
 
     with warnings.catch_warnings():
+        # Torch deprecates the format, in which policies are nevertheless published.
         warnings.simplefilter("ignore")
         script = torch.jit.script(module.eval())
         if seen is not None:
@@ -53,12 +37,21 @@ def save_script(path, module, seen=None):
     return path
 
 
-def recurrent_module(kind, num_inputs, num_outputs, *, size=4, scale=1.0, layers=1):
-    """A network of random weights whose memory is in buffers, as exporters of rsl_rl write it.
+def save_network(path, num_inputs, num_outputs, scale=0.01):
+    """Writes a TorchScript network, a matrix of ascending weights; with scale 0 it rests."""
+    import torch
+
+    linear = torch.nn.Linear(num_inputs, num_outputs, bias=False)
+    weight = torch.arange(num_inputs * num_outputs) * scale
+    linear.weight = torch.nn.Parameter(weight.reshape(num_inputs, num_outputs).T)
+    return save_script(path, linear)
+
+
+def recurrent_module(num_inputs, num_outputs, *, size=4, layers=1, is_replaced=False):
+    """An LSTM of random weights whose memory is in buffers, as exporters of rsl_rl write it.
 
     Args:
-        kind: "lstm", "gru", or "replaced": an LSTM whose buffers are replaced, not written to.
-        scale: Of the actions.
+        is_replaced: Whether its buffers are replaced, not written to.
     """
     import torch
 
@@ -66,45 +59,28 @@ def recurrent_module(kind, num_inputs, num_outputs, *, size=4, scale=1.0, layers
         def __init__(self):
             super().__init__()
             torch.manual_seed(0)
-            rnn = torch.nn.GRU if kind == "gru" else torch.nn.LSTM
-            self.rnn = rnn(num_inputs, size, layers)
+            self.rnn = torch.nn.LSTM(num_inputs, size, layers)
             self.out = torch.nn.Linear(size, num_outputs)
-            self.scale = float(scale)
+            self.is_replaced = is_replaced
             self.register_buffer("mean", torch.zeros(num_inputs))
             self.register_buffer("hidden_state", torch.zeros(layers, 1, size))
             self.register_buffer("cell_state", torch.zeros(layers, 1, size))
 
-    class Lstm(Recurrent):
         def forward(self, x):
             memory = (self.hidden_state, self.cell_state)
             y, (h, c) = self.rnn((x - self.mean).unsqueeze(0), memory)
-            self.hidden_state[:] = h.detach()
-            self.cell_state[:] = c.detach()
-            return self.scale * self.out(y.squeeze(0))
+            if self.is_replaced:
+                self.hidden_state, self.cell_state = h, c
+            else:
+                self.hidden_state[:], self.cell_state[:] = h.detach(), c.detach()
+            return self.out(y.squeeze(0))
 
         @torch.jit.export
         def reset_memory(self):
             self.hidden_state[:] = 0.0
             self.cell_state[:] = 0.0
 
-    class Gru(Recurrent):
-        def forward(self, x):
-            y, h = self.rnn((x - self.mean).unsqueeze(0), self.hidden_state)
-            self.hidden_state[:] = h.detach()
-            return self.scale * self.out(y.squeeze(0))
-
-        @torch.jit.export
-        def reset(self):
-            self.hidden_state[:] = 0.0
-
-    class Replaced(Recurrent):
-        def forward(self, x):
-            y, (h, c) = self.rnn(x.unsqueeze(0), (self.hidden_state, self.cell_state))
-            self.hidden_state = h
-            self.cell_state = c
-            return self.scale * self.out(y.squeeze(0))
-
-    return {"lstm": Lstm, "gru": Gru, "replaced": Replaced}[kind]()
+    return Recurrent()
 
 
 def save_onnx(

@@ -40,24 +40,22 @@ def test_episodes_come_back_bit_for_bit_and_sorted_by_index(tmp_path):
     assert episodes.info == make_info()
 
 
-def test_nan_infinity_minus_zero_and_the_smallest_number_survive(tmp_path):
-    state = np.array([[np.nan, np.inf, -np.inf], [-0.0, 5e-324, 1 / 3]])
-    episode = make_episode(1, num_rows=2, state=state, cause="diverged")
-    write(tmp_path, [episode])
-    assert_identical(load_episodes(tmp_path), [episode])
+STATE = np.array([[np.nan, np.inf, -np.inf], [-0.0, 5e-324, 1 / 3]])
+BARE = make_info(feature_names=[])
 
 
-def test_episodes_of_different_lengths_share_a_shard(tmp_path):
-    written = [make_episode(index, num_rows=1 + index) for index in range(4)]
-    write(tmp_path, written)
+@pytest.mark.parametrize(
+    ("info", "written"),
+    [
+        (make_info(), [make_episode(1, num_rows=2, state=STATE, cause="diverged")]),
+        (make_info(), [make_episode(index, num_rows=1 + index) for index in range(4)]),
+        (BARE, [make_episode(0, BARE)]),  # Without features.
+    ],
+)
+def test_episodes_of_any_numbers_and_lengths_share_a_shard(tmp_path, info, written):
+    write(tmp_path, written, info)
     assert names_in(tmp_path) == ["episodes-00000.parquet", "info.json"]
     assert_identical(load_episodes(tmp_path), written)
-
-
-def test_arrays_without_columns_come_back_without_columns(tmp_path):
-    info = make_info(feature_names=[])
-    write(tmp_path, [make_episode(0, info)], info)
-    assert load_episodes(tmp_path)[0].features.shape == (5, 0)
 
 
 def test_loaded_arrays_can_be_written_to(tmp_path):
@@ -78,24 +76,18 @@ def test_pandas_reads_one_row_per_episode_and_step(tmp_path):
     assert np.array_equal(np.stack(frame.state[:5]), make_episode(1).state)
 
 
-def test_info_and_extra_are_plain_json(tmp_path):
-    with EpisodeWriter(tmp_path, make_info(), {"command": "train cart", "gain": 0.1}):
-        pass
+def test_info_and_extra_are_plain_json_and_tell_the_command_that_a_set_goes_on_with(tmp_path):
+    info = make_info()
+    for extra, expected in [
+        ({"command": "train --episodes 2", "gain": 0.1}, "train --episodes 2"),
+        ({"command": "train --episodes 4"}, "train --episodes 4"),
+        (None, "train --episodes 4"),
+    ]:
+        with EpisodeWriter(tmp_path, info, extra):
+            pass
+        assert read_info(tmp_path) == (info, {"command": expected, "gain": 0.1})
     content = json.loads((tmp_path / "info.json").read_text())
     assert content["info"]["scenario"] == "cart"
-    assert read_info(tmp_path) == (make_info(), {"command": "train cart", "gain": 0.1})
-
-
-def test_a_set_that_goes_on_is_told_by_the_command_that_it_goes_on_with(tmp_path):
-    info = make_info()
-    with EpisodeWriter(tmp_path, info, extra={"command": "train --episodes 2", "kept": 1}):
-        pass
-    with EpisodeWriter(tmp_path, info, extra={"command": "train --episodes 4"}):
-        pass
-    assert read_info(tmp_path) == (info, {"command": "train --episodes 4", "kept": 1})
-    with EpisodeWriter(tmp_path, info):
-        pass
-    assert read_info(tmp_path)[1]["command"] == "train --episodes 4"
 
 
 def test_extra_that_json_cannot_hold_is_refused_and_leaves_nothing(tmp_path):
@@ -148,13 +140,6 @@ def test_a_failed_write_leaves_no_file_and_the_episodes_pending(tmp_path, monkey
     assert names_in(tmp_path) == ["info.json"]
     writer.close()
     assert completed(tmp_path) == {0}
-
-
-def test_a_run_goes_on_where_it_ended(tmp_path):
-    write(tmp_path / "whole", range(6))
-    write(tmp_path / "resumed", [0, 2, 3])
-    write(tmp_path / "resumed", sorted(set(range(6)) - completed(tmp_path / "resumed")))
-    assert_identical(*(load_episodes(tmp_path / name) for name in ("whole", "resumed")))
 
 
 def test_a_removed_shard_is_not_overwritten_but_followed(tmp_path):

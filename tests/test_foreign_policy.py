@@ -175,9 +175,8 @@ def test_numbers_may_be_one_for_all_or_by_regular_expression(tmp_path, change, e
     assert {key: list(found[key].values()) for key in expected} == expected
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+REFUSED = {
+    deploy: [
         (lambda c: c.update(stiffness={"hip": 1.0}), r"finite numbers; got \[None, None, 1.0\]"),
         (lambda c: c.update(stiffness=[1.0]), "'stiffness' must have an entry for each motor, up"),
         (lambda c: c.update(default_joint_pos=[0.0] * 3), "must have 2 entries; got 3"),
@@ -192,12 +191,27 @@ def test_numbers_may_be_one_for_all_or_by_regular_expression(tmp_path, change, e
         (lambda c: rates(c, scale=[1.0] * 4), "'scale' must have 3 entries; got 4"),
         (lambda c: observations(c, use_gym_history=True), r"one history_length; got \[1, 2\]"),
     ],
+    rl_sar: [
+        (lambda c: c.update(num_observations=45), "num_observations is 45, but its .* 8 entries"),
+        (lambda c: c.update(wheel_indices=[1]), r"wheels are not supported; got .*\[1\]"),
+        (lambda c: c.update(rl_kp=[1, 2, 3]), "'rl_kp' must have 2 entries; got 3"),
+        (lambda c: c.update(clip_actions_upper=[8, 9]), "between joints .* Write one for all"),
+        (lambda c: c.update(observations_history=[0, 2]), "newest 2 samples once"),
+        (lambda c: c.update(terrain=1), r"unknown keys \['terrain'\]"),
+        (lambda c: c.update(rows=1, framework="isaacsim"), "rows and cols of old files"),
+        (lambda c: c.update(model_name="gone.pt"), r"no network beside it.*\['gone.pt'\]"),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("write", "change", "message"), [(one, *row) for one in REFUSED for row in REFUSED[one]]
 )
-def test_what_a_deploy_yaml_cannot_say_here_is_refused(tmp_path, change, message):
-    path = deploy(tmp_path, change)
+def test_what_a_file_cannot_say_here_is_refused(tmp_path, write, change, message):
+    path = write(tmp_path, change)
     with pytest.raises(ValueError, match=message) as error:
-        converted_policy(path, MOTORS)
-    assert "deploy.yaml" in str(error.value)
+        converted_policy(path, MOTORS if write is deploy else ())
+    assert path.name in str(error.value)
 
 
 def test_slices_that_an_exporter_writes_are_read(tmp_path):
@@ -258,26 +272,6 @@ def test_history_by_term_is_read_too(tmp_path):
     policy = loaded(rl_sar(tmp_path, lambda c: c.update(observations_history_priority="term")))
     expected = [1.0, 0.2, 0.05] * 2 + [0.3, 0.5] * 2 + [0.0, 0.0, -1.0] * 2
     np.testing.assert_allclose(inputs(policy), expected)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda c: c.update(num_observations=45), "num_observations is 45, but its .* 8 entries"),
-        (lambda c: c.update(wheel_indices=[1]), r"wheels are not supported; got .*\[1\]"),
-        (lambda c: c.update(rl_kp=[1, 2, 3]), "'rl_kp' must have 2 entries; got 3"),
-        (lambda c: c.update(clip_actions_upper=[8, 9]), "between joints .* Write one for all"),
-        (lambda c: c.update(observations_history=[0, 2]), "newest 2 samples once"),
-        (lambda c: c.update(terrain=1), r"unknown keys \['terrain'\]"),
-        (lambda c: c.update(rows=1, framework="isaacsim"), "rows and cols of old files"),
-        (lambda c: c.update(model_name="gone.pt"), r"no network beside it.*\['gone.pt'\]"),
-    ],
-)
-def test_what_a_config_of_rl_sar_cannot_say_here_is_refused(tmp_path, change, message):
-    config = rl_sar(tmp_path, change)
-    with pytest.raises(ValueError, match=message) as error:
-        converted_policy(config)
-    assert "config.yaml" in str(error.value)
 
 
 def test_a_phase_has_a_clock_whose_period_is_asked_for(tmp_path):

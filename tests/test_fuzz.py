@@ -21,7 +21,7 @@ from drake_safety.logs.robot_log import read_log
 from drake_safety.models import load_robot
 from drake_safety.robots.simulatable_urdf import simulatable_copy
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
-from log_files import FORMATS, balancing_loop, map_text, part, recorded, write
+from log_files import FORMATS, ROBOT, map_beside, part, recorded, write
 
 pytestmark = pytest.mark.train
 
@@ -59,16 +59,14 @@ def damaged(content, rng):
 def formats(tmp_path_factory):
     """By format: what is read, the damaged file in it, and the reader."""
     folder, found = tmp_path_factory.mktemp("formats"), {}
-    robot, log = balancing_loop().robot, part(recorded(0), 0, 41)
-    joints = balancing_loop().kinematics.joint_names
+    log = part(recorded(0), 0, 41)
     for kind in FORMATS:
         (folder / kind).mkdir()
-        (folder / f"{kind}.yaml").write_text(map_text(kind))
-        log_map = load_log_map(folder / f"{kind}.yaml")
-        path = write(log, joints, kind, folder / kind)
+        path = write(log, folder / kind, kind)
+        log_map = load_log_map(map_beside(path))
         inner = path if path.is_file() else next(path.glob("*.db3"))
-        found[kind] = path, inner, lambda p, m=log_map: read_log(p, m, robot)
-    found["map"] = *[folder / "csv.yaml"] * 2, load_log_map
+        found[kind] = path, inner, lambda p, m=log_map: read_log(p, m, ROBOT)
+    found["map"] = *[folder / "csv" / "columns.yaml"] * 2, load_log_map
     laikago = ROOT / "models/laikago"
     found["robot"] = laikago, laikago / "robot.yaml", lambda p: load_robot(str(p / "robot.yaml"))
     found["urdf"] = *[next(laikago.glob("*.urdf"))] * 2, simulatable_copy

@@ -9,15 +9,7 @@ from drake_safety.learning.segments import Episodes
 from drake_safety.logs.episodes import cut_log, motions_from_log
 from drake_safety.simulation.feedback import EpisodePairs, pair_starts
 from drake_safety.simulation.rollouts import episodes_info
-from log_files import (
-    FORMATS,
-    balancing_loop,
-    balancing_scenario,
-    frame_of,
-    map_text,
-    recorded,
-    write,
-)
+from log_files import balancing_scenario, frame_of, map_beside, recorded, save
 
 pytestmark = pytest.mark.train
 
@@ -44,68 +36,55 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
-def directly(folder):
-    """What the recorded runs themselves adapt each mode to, without any log."""
-    scenario = load_scenario(folder / "short.yaml")
-    sets = []
-    for loop in (scenario.make_loop("actual"), scenario.make_loop("nominal")):
-        episodes = [run_episode(loop, index) for index in INDICES]
-        sets.append(Episodes(episodes_info(loop, seed=0), episodes))
-    pairs = EpisodePairs(
-        actual=sets[0], nominal=sets[1], nominal_hash=scenario.simulation_hash("nominal")
-    )
-    assert [pair.differs for pair in pairs.feedback()].count(True) == 1
-    assert len(pairs.feedback()) == len(INDICES)
-    return {mode: load(folder, mode).adapt(pairs.feedback()) for mode in MODES}
-
-
-@pytest.fixture(scope="module")
-def unwritten(folder):
-    """What logs adapt to that never were in a file."""
-    scenario = load_scenario(folder / "short.yaml")
-    logs = [recorded(index) for index in INDICES]
-    actual, starts = cut_log(logs, scenario)
-    sets = pair_starts(scenario, actual, starts).feedback()
-    motions = motions_from_log(logs, scenario)
-    return {mode: load(folder, mode).adapt(sets, motions=motions) for mode in MODES}
-
-
 def load(folder, mode):
     return SafetyAssessment.load(assessment_file(folder, mode))
 
 
-@pytest.mark.parametrize("kind", FORMATS)
-def test_logs_of_every_format_adapt_as_the_runs_that_they_are_of(
-    kind, folder, directly, unwritten, tmp_path, monkeypatch
-):
-    joints = balancing_loop().kinematics.joint_names
-    files = []
-    for index in INDICES:
-        (tmp_path / f"{index}").mkdir()
-        files.append(write(recorded(index), joints, kind, tmp_path / f"{index}"))
-    (tmp_path / "columns.yaml").write_text(map_text(kind))
-    logs = [option for file in files for option in ("--log", file)]
-    options = ("--assessment", folder, "--map", tmp_path / "columns.yaml")
-    assert not call(monkeypatch, "adapt", folder / "short.yaml", *logs, *options)
+def logged(index, folder, **missing):
+    """A recorded run as a CSV file, without the values of some rows by column, and its map."""
+    frame = frame_of(recorded(index))
+    for column, row in missing.items():
+        frame.loc[row, column] = np.nan
+    folder.mkdir(exist_ok=True)
+    path = save(frame, folder)
+    return "--log", path, "--map", map_beside(path)
+
+
+def test_logs_adapt_as_the_runs_that_they_are_of(folder, tmp_path, monkeypatch):
+    given = [logged(index, tmp_path / f"{index}") for index in INDICES]
+    options = ("--assessment", folder, *given[0][:2], *given[1])
+    assert not call(monkeypatch, "adapt", folder / "short.yaml", *options)
+    scenario = load_scenario(folder / "short.yaml")
+    # What logs adapt to that never were in a file.
+    logs = [recorded(index) for index in INDICES]
+    actual, starts = cut_log(logs, scenario)
+    unwritten = pair_starts(scenario, actual, starts).feedback()
+    motions = motions_from_log(logs, scenario)
+    # What the recorded runs themselves adapt to, without any log.
+    loops = scenario.make_loop("actual"), scenario.make_loop("nominal")
+    actual, nominal = (
+        Episodes(episodes_info(loop, seed=0), [run_episode(loop, index) for index in INDICES])
+        for loop in loops
+    )
+    hash_ = scenario.simulation_hash("nominal")
+    pairs = EpisodePairs(actual=actual, nominal=nominal, nominal_hash=hash_).feedback()
+    assert sorted(pair.differs for pair in pairs) == [False, True]
     for mode in MODES:
-        adapted = load(adapted_folder(folder, files[0].stem), mode)
-        changed = np.abs(adapted.beliefs_ - load(folder, mode).beliefs_).max()
+        before, adapted = load(folder, mode), load(adapted_folder(folder, "run"), mode)
+        same = load(folder, mode).adapt(unwritten, motions=motions)
+        near = load(folder, mode).adapt(pairs)
+        changed = np.abs(adapted.beliefs_ - before.beliefs_).max()
         assert changed > 0.05
-        np.testing.assert_allclose(adapted.beliefs_, unwritten[mode].beliefs_, atol=1e-6)
+        np.testing.assert_allclose(adapted.beliefs_, same.beliefs_, atol=1e-6)
         change = adapted.correction_.change
-        np.testing.assert_allclose(change, unwritten[mode].correction_.change, atol=1e-6)
-        maps = [
-            one.detector_.predictor.weights["linear.weight"]
-            for one in (adapted, unwritten[mode], load(folder, mode))
-        ]
+        np.testing.assert_allclose(change, same.correction_.change, atol=1e-6)
+        maps = [one.detector_.predictor.weights["linear.weight"] for one in (adapted, same, before)]
         np.testing.assert_allclose(maps[0], maps[1], atol=1e-4)
         assert np.abs(maps[0] - maps[2]).max() > 0.01
         # A twin of a log draws noise of its own, and its plan is another polynomial between rows.
-        np.testing.assert_allclose(
-            adapted.beliefs_, directly[mode].beliefs_, atol=min(0.1 * changed, 0.02)
-        )
-        np.testing.assert_allclose(change, directly[mode].correction_.change, atol=0.05)
+        atol = min(0.1 * changed, 0.02)
+        np.testing.assert_allclose(adapted.beliefs_, near.beliefs_, atol=atol)
+        np.testing.assert_allclose(change, near.correction_.change, atol=0.05)
 
 
 def test_a_log_that_is_given_twice_or_without_a_map_is_refused(folder, capsys, monkeypatch):
@@ -115,16 +94,6 @@ def test_a_log_that_is_given_twice_or_without_a_map_is_refused(folder, capsys, m
     twice = ("--log", log, "--log", log, "--map", log)
     assert call(monkeypatch, *asked, *twice) == 2
     assert "logs must differ" in capsys.readouterr().out
-
-
-def logged(index, folder, **missing):
-    """A recorded run as a CSV file, without the values of some rows by column, and its map."""
-    frame = frame_of(recorded(index), balancing_loop().kinematics.joint_names)
-    for column, row in missing.items():
-        frame.loc[row, column] = np.nan
-    frame.to_csv(folder / "run.csv", index=False)
-    (folder / "columns.yaml").write_text(map_text("csv"))
-    return "--log", folder / "run.csv", "--map", folder / "columns.yaml"
 
 
 def test_a_log_is_cut_where_a_value_is_missing_and_strictly_refused(

@@ -112,8 +112,9 @@ def test_a_log_without_desired_output_needs_one_that_was_kept():
 
 def test_what_gives_no_episode_is_refused():
     log = recorded(SAFE)
+    short = [dataclasses.replace(part(log, 0, 41), piece=i) for i in range(2)]
     with pytest.raises(ValueError, match="too short for a segment of 10 steps"):
-        episodes_from_log(part(log, 0, 41), balancing_loop())
+        episodes_from_log(short, balancing_loop())
     with pytest.raises(ValueError, match="is of robot 'laikago', scenario 'porting' of"):
         episodes_from_log(log, porter())
     low = dataclasses.replace(log, q=log.q - np.eye(log.q.shape[1])[6] * 0.1)

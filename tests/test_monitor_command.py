@@ -13,7 +13,7 @@ from drake_safety.learning.change_detector import rows_of
 from drake_safety.logs.episodes import motions_from_log
 from drake_safety.logs.robot_log import read_pieces
 from drake_safety.logs.sequences import SequenceMap, read_sequences
-from log_files import TABLE_MAP, frame_of, record
+from log_files import frame_of, map_beside, record, save
 from sprung_motions import HORIZON, INFO, STEP_S, learned, motion
 
 pytestmark = pytest.mark.train
@@ -93,18 +93,18 @@ def test_a_map_that_does_not_fit_is_refused(detector, tmp_path, change, message)
 
 
 def test_what_is_no_file_of_arrays_is_refused(detector, tmp_path):
-    (tmp_path / "runs.npz").write_text("time,q\n")
-    with pytest.raises(ValueError, match=r"not an \.npz file: sequences '.*runs\.npz'"):
-        read_sequences(tmp_path / "runs.npz", MAP, detector, INFO)
-    file = write(tmp_path / "objects.npz", np.array([{}], dtype=object))
-    with pytest.raises(ValueError, match=r"not an \.npz file: sequences '.*objects\.npz'"):
-        read_sequences(file, MAP, detector, INFO)
+    text, objects = tmp_path / "text.npz", tmp_path / "objects.npz"
+    text.write_text("time,q\n")
+    for file in (text, write(objects, np.array([{}], dtype=object))):
+        with pytest.raises(ValueError, match=rf"not an \.npz file: sequences '.*{file.name}'"):
+            read_sequences(file, MAP, detector, INFO)
 
 
-@pytest.fixture(scope="module")
-def folder(detector, tmp_path_factory):
+@pytest.fixture
+def folder(detector, tmp_path, monkeypatch):
     """An assessment with the detector of the mass on a spring, and a folder of runs."""
-    folder = tmp_path_factory.mktemp("spring")
+    folder = tmp_path / "spring"
+    folder.mkdir()
     assessment = copy.copy(load_assessment("laikago_balancing"))
     scenario = load_scenario("laikago_balancing")
     assert assessment.info_.scenario_hash == scenario.simulation_hash()
@@ -121,12 +121,11 @@ def folder(detector, tmp_path_factory):
     text = f"step_s: {STEP_S}\nscale: {{knee_rate: 20.0}}\noffset: {{knee: 0.5}}\ncolumns:\n"
     text += "".join(f"  {name}: {column}\n" for name, column in COLUMNS.items())
     (folder / "map.yaml").write_text(text)
-    return folder, assessment
+    monkeypatch.setattr("drake_safety.cli.training_folder.load_assessment", lambda *_: assessment)
+    return folder
 
 
 def test_one_command_judges_a_folder(folder, monkeypatch, capsys, detector):
-    folder, assessment = folder
-    monkeypatch.setattr("drake_safety.cli.training_folder.load_assessment", lambda *_: assessment)
     options = ("--map", folder / "map.yaml", "--assessment", folder, "--out", folder / "out")
     assert not call(monkeypatch, "monitor", "laikago_balancing", "--log", folder / "runs", *options)
     printed = " ".join(capsys.readouterr().out.split())
@@ -148,10 +147,10 @@ def test_one_command_judges_a_folder(folder, monkeypatch, capsys, detector):
 
 
 def test_a_folder_without_logs_is_refused(folder, monkeypatch, capsys, tmp_path):
-    folder, assessment = folder
-    monkeypatch.setattr("drake_safety.cli.training_folder.load_assessment", lambda *_: assessment)
     options = ("--map", folder / "map.yaml", "--assessment", folder)
-    for log, told in ((tmp_path, "has no log; known are ['.csv'"), ("x.npz", "does not exist")):
+    none = tmp_path / "none"
+    none.mkdir()
+    for log, told in ((none, "has no log; known are ['.csv'"), ("x.npz", "does not exist")):
         assert call(monkeypatch, "monitor", "laikago_balancing", "--log", log, *options) == 2
         assert told in capsys.readouterr().out
 
@@ -160,18 +159,17 @@ def test_a_log_is_judged_as_its_motions_are_with_its_own_times(monkeypatch, caps
     scenario = load_scenario("laikago_balancing")
     scenario.episode_duration_s = 2.0
     loop = scenario.make_loop("actual")
-    frame = frame_of(record(loop, 3), loop.kinematics.joint_names)
+    frame = frame_of(record(loop, 3))
     frame.loc[300:320, "gyro_x"] = np.nan
-    frame.to_csv(tmp_path / "stand.csv", index=False)
-    (tmp_path / "columns.yaml").write_text(TABLE_MAP)
-    options = ("--log", tmp_path / "stand.csv", "--map", tmp_path / "columns.yaml")
+    log = save(frame, tmp_path)
+    options = ("--log", log, "--map", map_beside(log))
     assert not call(
         monkeypatch, "monitor", "laikago_balancing", *options, "--out", tmp_path / "out"
     )
-    assert "stand.csv' is cut where values are missing" in capsys.readouterr().out
+    assert "run.csv' is cut where values are missing" in capsys.readouterr().out
     (one,) = json.loads((tmp_path / "out" / "monitor.json").read_text())["entries"]["logs"]
     assessment = load_assessment("laikago_balancing")
-    pieces = read_pieces(tmp_path / "stand.csv", tmp_path / "columns.yaml", loop.robot).pieces
+    pieces = read_pieces(log, tmp_path / "columns.yaml", loop.robot).pieces
     motions = motions_from_log(pieces, loop)
     assert len(motions) == 2
     for begin_s, motion_ in zip((0.0, 321 * scenario.time_step_s), motions, strict=True):
