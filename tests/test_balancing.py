@@ -135,6 +135,8 @@ def test_noise_stands_only_where_it_was_configured():
     assert not np.array_equal(blurred.state, blurred.true_state)
     # Noise on what is measured: output and state both show it.
     assert np.abs(noisy.output[:, 2] - noisy.true_state[:, 2]).max() > 0.004
+    for episode in (noisy, blurred):
+        assert np.abs(episode.features - quiet.features).max() > 1e-4
 
 
 @pytest.mark.parametrize("variation", ["noisy", "blurred"])

@@ -105,6 +105,8 @@ def test_the_verdict_is_that_of_the_probability(session):
             set_state(session, 0.6, 0.0, 1.5, 0.0)  # On its way to the end of the rail.
         assert session.tick()
         assert session.panel.probability == gamma.Eval(session.context)[0]
+        last = pytest.approx(session.panel.probability, abs=0.001)
+        assert session.panel.curve()[-1] == (0.0, last)
         status = session.panel.status
         if not session.cause:
             is_known = session.panel.belief[2] <= 0.65  # Half of it is from empty cells.

@@ -67,15 +67,6 @@ def goals(goals_loop, meshcat):
 
 
 @pytest.mark.train
-def test_a_tick_goes_on_by_its_time_and_the_panel_shows_the_gamma_of_the_loop(throws):
-    assert throws.tick()
-    assert throws.context.get_time() == pytest.approx(TICK_S)
-    gamma = throws.loop.GetOutputPort("safety_probability").Eval(throws.context)[0]
-    assert throws.panel.probability == gamma
-    assert throws.panel.curve()[-1] == (0.0, pytest.approx(gamma, abs=0.001))
-
-
-@pytest.mark.train
 def test_a_click_throws_the_ball_of_the_sliders_once(throws):
     ball = throws.loop.GetOutputPort("ball_state")
     throws.tick()

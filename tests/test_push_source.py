@@ -46,7 +46,7 @@ class FloatingBox(Diagram):
         return V_WB.Shift(R_WB @ p_BoC).get_coeffs()
 
 
-@pytest.mark.parametrize("start_s", [0.0, 0.125])
+@pytest.mark.parametrize("start_s", [0.0, 0.125, 0.13])  # The last between two updates.
 def test_a_push_on_a_floating_body_changes_its_velocity_by_impulse_over_mass(start_s):
     loop = FloatingBox()
     simulator = Simulator(loop)

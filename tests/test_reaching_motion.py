@@ -4,12 +4,10 @@ from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
 from drake_safety.control.kinematic_preview import chain_joints
-from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
 from drake_safety.simulation.reaching_sampling import PostureSampling
 from reaching_loops import (
     EASY,
-    NOISE,
     atlas,
     easy_episode,
     evaluated,
@@ -45,50 +43,6 @@ def test_reality_gaps_run_and_reach_nearly(variation):
     assert np.abs(episode.true_state - easy_episode().true_state).max() > 1e-5
 
 
-def test_friction_holds_the_joints_back():
-    moved = {}
-    for variation in ("nominal", "rough"):
-        loop = porter(variation)
-        context = loop.CreateDefaultContext()
-        loop.reset_standing(context, EASY)
-        before = positions(loop, context)[7:].copy()
-        simulator = Simulator(loop, context)
-        simulator.AdvanceTo(0.25)
-        moved[variation] = np.abs(positions(loop, context)[7:] - before).max()
-    assert moved["rough"] < 0.7 * moved["nominal"]
-
-
-def test_the_plant_is_the_variations_and_the_controller_believes_in_the_nominal_one():
-    masses = {}
-    for variation in ("nominal", "heavy"):
-        loop = porter(variation)
-        context = started(loop)
-        masses[variation] = loop.plant.CalcTotalMass(
-            loop.plant.GetMyContextFromRoot(context), [loop.robot_instance]
-        )
-        assert loop.kinematics.total_mass == pytest.approx(masses["nominal"])
-    assert masses["heavy"] == pytest.approx(1.1 * masses["nominal"])
-
-
-def test_noise_stands_only_where_it_was_configured():
-    quiet, noisy, blurred = map(easy_episode, ("nominal", "noisy", "blurred"))
-    np.testing.assert_array_equal(quiet.state, quiet.true_state)
-    np.testing.assert_array_equal(blurred.true_state, quiet.true_state)
-    np.testing.assert_array_equal(blurred.output, quiet.output)
-    for episode in (noisy, blurred):
-        joints = slice(12, 12 + (episode.state.shape[1] - 12) // 2)
-        error = (episode.state - episode.true_state)[:, joints]
-        assert np.std(error) == pytest.approx(NOISE["position"], rel=0.2)
-        assert np.abs(episode.features - quiet.features).max() > 1e-4
-
-
-def test_episodes_from_the_standing_posture_have_noise_of_their_own():
-    one, other = (run_episode(porter("blurred"), i, goal=EASY, is_standing=True) for i in (0, 1))
-    np.testing.assert_array_equal(one.true_state, other.true_state)
-    np.testing.assert_array_equal(one.state[0], other.state[0])
-    assert (np.abs(one.state - other.state)[1:].max(axis=1) > 1e-4).all()
-
-
 def test_the_preview_foresees_the_joints_of_an_easy_reach():
     loop, goal = atlas(), np.array([0.65, 0.3, 1.05])
     context = loop.CreateDefaultContext()
@@ -121,20 +75,7 @@ def test_an_unsolved_program_shows_in_the_solver_status():
     loop.plant.SetVelocities(plant_context, loop.robot_instance, v)
     simulator.AdvanceTo(0.024)
     assert evaluated(loop, context, "solver_status")[0] != 0
-
-
-def test_any_body_may_be_pushed_and_a_reset_forgets_it():
-    loop = porter()
-    context = loop.CreateDefaultContext()
-    ends = []
-    for is_pushed in (False, True, False):
-        loop.reset_standing(context, EASY)
-        if is_pushed:
-            loop.set_push(context, Push(body=loop.robot.base, force_n=[0.0, 40.0, 0.0], time_s=0.0))
-        Simulator(loop, context).AdvanceTo(0.1)
-        ends.append(positions(loop, context)[5])
-    assert ends[1] - ends[0] > 1e-3
-    assert ends[2] == ends[0]
+    assert evaluated(loop, context, "num_controller_failures")[0] > 0
 
 
 def test_an_episode_that_begins_outside_the_safe_set_ends_at_once(monkeypatch):

@@ -171,12 +171,3 @@ def test_each_hand_names_the_other_as_its_image_and_the_boxes_are_mirrored(robot
     mirror = Mirror(left.kinematics)
     image = np.sort(mirror.points(left.fair_box), axis=0)
     np.testing.assert_array_equal(right.fair_box, image)
-
-
-def test_ticks_without_a_solution_are_counted():
-    loop = porter()
-    context = started(loop, 0, EASY)
-    controller = loop.GetSubsystemByName("whole_body_controller")
-    values = controller.GetMyMutableContextFromRoot(context).get_mutable_discrete_state()
-    values.set_value(values.num_groups() - 1, [3])
-    assert loop.GetOutputPort("num_controller_failures").Eval(context)[0] == 3

@@ -1,13 +1,8 @@
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
-from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.recovery_step import RecoveryStepParameters
-from drake_safety.simulation.legged_loop import UPDATE_TICK
 from drake_safety.systems.recovery_switch import RecoverySwitch
 from legged_robots import ROBOT_NAMES, robot_kinematics
 from system_doubles import Bench
@@ -84,20 +79,6 @@ def test_the_step_planner_ticks_behind_the_trigger_in_the_same_period():
     np.testing.assert_allclose(bench.get("desired_output"), expected, atol=1e-9)
     # Until the step planner has planned, the set point is the nominal one, held.
     np.testing.assert_allclose(before, bench.nominal, atol=1e-9)
-
-
-@pytest.mark.parametrize(("offset_s", "seen"), [(0.0, 0.0), (UPDATE_TICK * 0.001, 0.1)])
-def test_only_a_system_that_updates_a_tick_later_sees_what_another_has_updated(offset_s, seen):
-    # Should Drake declare an order one day, the ticks can go.
-    builder = DiagramBuilder()
-    time = builder.AddSystem(TrajectorySource(PiecewisePolynomial.FirstOrderHold([0, 1], [[0, 1]])))
-    holds = [builder.AddSystem(ZeroOrderHold(0.1, 1, offset)) for offset in (0.0, offset_s)]
-    for one, other in zip((time, *holds), holds, strict=False):
-        builder.Connect(one.get_output_port(), other.get_input_port())
-    simulator = Simulator(builder.Build())
-    simulator.AdvanceTo(0.101)
-    own = holds[1].GetMyContextFromRoot(simulator.get_context())
-    assert holds[1].get_output_port().Eval(own)[0] == pytest.approx(seen)
 
 
 def test_each_recovery_ends_with_the_nominal_plan_passing_through_again():

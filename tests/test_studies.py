@@ -273,15 +273,17 @@ def test_a_gif_shows_every_instant_in_real_time(tmp_path):
         assert np.abs(before - after)[robot.stop :].max() > 50.0
 
 
+FIGURES = {
+    "episodes.sharpened.auc": Estimate(0.95, 0.93, 0.97, 100),
+    "throws.falls_without_recovery": Estimate(0.4, 0.25, 0.55, 40),
+    "throws.sharpened.falls_with_recovery": Estimate(0.025, 0.0, 0.1, 40),
+}
+
+
 def test_a_run_is_a_row_and_a_robot_with_its_figures(monkeypatch, capsys, tmp_path):
-    figures = {
-        "episodes.sharpened.auc": Estimate(0.95, 0.93, 0.97, 100),
-        "throws.falls_without_recovery": Estimate(0.4, 0.25, 0.55, 40),
-        "throws.sharpened.falls_with_recovery": Estimate(0.025, 0.0, 0.1, 40),
-    }
     for name in ("pendulum", "laikago_balancing"):
         (tmp_path / name).mkdir()
-        Results(figures, {"scenario": name}).write(tmp_path / name / "evaluation.json")
+        Results(FIGURES, {"scenario": name}).write(tmp_path / name / "evaluation.json")
     runs = (tmp_path / "pendulum", tmp_path / "laikago_balancing")
     assert study(monkeypatch, "compare", *runs, "--out", tmp_path) == 0
     printed = capsys.readouterr().out
@@ -293,16 +295,11 @@ def test_a_run_is_a_row_and_a_robot_with_its_figures(monkeypatch, capsys, tmp_pa
 
 
 def test_the_picture_shows_each_robot_with_what_its_run_says():
-    figures = {
-        "episodes.sharpened.auc": Estimate(0.95, 0.93, 0.97, 100),
-        "throws.falls_without_recovery": Estimate(0.4, 0.25, 0.55, 40),
-        "throws.sharpened.falls_with_recovery": Estimate(0.025, 0.0, 0.1, 40),
-    }
     assert standing_still(shuttling().make_loop()) is None
     still = standing_still(load_scenario("laikago_balancing").make_loop())
     middle, corner = still[still.shape[0] // 2, still.shape[1] // 2], still[2, 2]
     assert np.abs(middle.astype(int) - corner).max() > 20
-    (axes,) = comparison_figure({"laikago_balancing": figures}, {"laikago_balancing": still}).axes
+    (axes,) = comparison_figure({"laikago_balancing": FIGURES}, {"laikago_balancing": still}).axes
     assert axes.get_title(loc="left") == "laikago balancing"
     assert axes.texts[0].get_text() == "AUC at planning time 0.950\nfalls 40 % → 2.5 %"
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from balancing_loops import PACKAGED, standing_loop
 from drake_safety import load_assessment, load_scenario
 from drake_safety.robots.robot import Scratch
 
@@ -32,20 +31,6 @@ def test_threads_with_one_diagram_give_the_same_bits_as_one_after_the_other(name
         together = list(pool.map(lambda seed: final_values(loop, seed, ports), range(NUM_THREADS)))
     for one, other in zip(alone, together, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def test_two_contexts_in_turn_do_not_disturb_each_other():
-    loop = standing_loop(PACKAGED)
-    expected = final_values(loop, 1, PORTS)
-    first, second = loop.CreateDefaultContext(), loop.CreateDefaultContext()
-    loop.reset(first, np.random.default_rng(1))
-    loop.reset(second, np.random.default_rng(2))
-    simulators = [Simulator(loop, context) for context in (first, second)]
-    for time in np.linspace(0.01, DURATION_S, 20):
-        for simulator in simulators:
-            simulator.AdvanceTo(time)
-    found = np.concatenate([loop.GetOutputPort(name).Eval(first) for name in PORTS])
-    np.testing.assert_array_equal(found, expected)
 
 
 def test_each_thread_has_a_value_of_its_own():

@@ -97,3 +97,5 @@ def test_with_a_persistence_one_unknown_row_triggers_nothing_two_do_and_danger_d
     assert trigger([0, 1], 0.02) == TIME_S[1]
     assert math.isnan(trigger([0, 1], 0.04))
     assert trigger([7], 0.02, is_known=True) == TIME_S[7]
+    assert math.isnan(throw_study.trigger_time(log, np.full(len(TIME_S), 0.6), 0.6))
+    assert throw_study.trigger_time(log, np.full(len(TIME_S), 0.59), 0.6) == TIME_S[0]

@@ -7,7 +7,7 @@ from pydrake.math import RotationMatrix
 from drake_safety.control.observation import quaternion_of
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.scenario import load_scenario
-from drake_safety.simulation.throws import VIOLATIONS, run_throw, run_throws, trigger_time
+from drake_safety.simulation.throws import VIOLATIONS, run_throw, run_throws
 
 HARD = Throw(time_s=0.3, mass_kg=3.0, speed_m_s=8.0, direction_rad=math.pi / 2)
 SOFT = Throw(time_s=0.3, mass_kg=2.0, speed_m_s=2.5, direction_rad=math.pi / 2)
@@ -108,15 +108,3 @@ def test_throws_do_not_depend_on_the_workers_and_keep_their_order(scenario):
         other = next(found for found in two if found.index == log.index)
         assert log.push_time_s == other.push_time_s
         np.testing.assert_array_equal(log["plant_state"], other["plant_state"])
-
-
-def test_the_trigger_is_the_first_row_below_the_threshold(balancing):
-    log = run_throw(balancing, 0, seed=5, throws=[SOFT], duration_s=0.2)
-    probability = np.ones(len(log.time_s))
-    assert math.isnan(trigger_time(log, probability, 0.6))
-    probability[4:] = 0.6
-    assert math.isnan(trigger_time(log, probability, 0.6)), "Γ_thre itself is safe"
-    probability[7] = 0.59
-    assert trigger_time(log, probability, 0.6) == pytest.approx(log.time_s[7])
-    probability[2] = np.nan
-    assert trigger_time(log, probability, 0.6) == pytest.approx(log.time_s[2])

@@ -218,16 +218,3 @@ def test_hands_reach_targets_within_two_centimetres(name, hand):
         loop.start(q)
         assert reach(loop, start + offset) < 0.02
         assert loop.num_failures() == 0
-
-
-def test_an_episode_does_not_depend_on_the_one_before():
-    loop = WholeBodyLoop(robot_model("biped"), hand="head")
-    q = loop.q
-    goal = loop.controller.model.reaching_position(q) + [0.02, 0.02, -0.05]
-    reach(loop, goal, 0.2)
-    first = loop.q
-    loop.start(q, 0.05 * np.ones(loop.kinematics.num_velocities))
-    loop.simulator.AdvanceTo(0.3)
-    loop.start(q)
-    reach(loop, goal, 0.2)
-    np.testing.assert_array_equal(loop.q, first)
