@@ -1,4 +1,7 @@
-"""A scenario that is learned from in a second, for live sessions."""
+"""Scenarios that are learned from in a second, for live sessions."""
+
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.simulation.rollouts import run_episodes
 
 
 def quick(scenario):
@@ -7,3 +10,8 @@ def quick(scenario):
     parameters.epochs, parameters.ensemble_size, parameters.hidden_sizes = 20, 1, [32]
     parameters.perplexity, parameters.min_count = 5, 1
     return scenario
+
+
+def learned(scenario, num_episodes=30):
+    episodes = run_episodes(scenario, num_episodes, num_workers=1)
+    return SafetyAssessment(scenario.assessment).fit(episodes)

@@ -2,9 +2,12 @@
 
 import numpy as np
 
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.planning.goal_verdict import goal_inputs
 from drake_safety.simulation.rollouts import episodes_info
+from drake_safety.simulation.scenario import load_scenario
+from live_scenarios import quick
 
 SCENARIO = "atlas_reaching"
 BOUNDARY_M = 0.75
@@ -47,3 +50,10 @@ def made_up_episodes(loop):
             )
         )
     return Episodes(episodes_info(loop, seed=0), episodes)
+
+
+def learned_targets():
+    """An assessment of them."""
+    scenario = quick(load_scenario(SCENARIO))
+    scenario.assessment.epochs = 40
+    return SafetyAssessment(scenario.assessment).fit(made_up_episodes(scenario.make_loop()))

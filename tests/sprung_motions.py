@@ -4,25 +4,18 @@ import functools
 
 import numpy as np
 
+from cart_episodes import make_info
 from drake_safety.learning.change_detector import LEAST_MOTION_S, ChangeDetector
-from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
+from drake_safety.learning.segments import Episode, Episodes
 
 STEP_S, HORIZON, MOTION_S = 0.05, 3, 60.0
-INFO = EpisodesInfo(
-    scenario="spring",
-    scenario_hash="0" * 64,
-    variation="nominal",
-    seed=0,
+INFO = make_info(
     step_s=STEP_S,
     horizon=HORIZON,
     constraint_names=["reach"],
     state_names=["knee", "knee_rate"],
     output_names=["goal"],
     feature_names=["load", "light"],
-    versions={},
-    num_steps=0,
-    preview_stride=1,
-    monitored_states=None,
     monitored_features=["load"],
 )
 

@@ -6,6 +6,7 @@ from unittest import mock
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
+from cart_episodes import make_info
 from drake_safety.control.policy import (
     CommandLimits,
     GaitClock,
@@ -16,7 +17,6 @@ from drake_safety.control.policy import (
 from drake_safety.control.policy_network import PolicyNetwork
 from drake_safety.learning.novelty import Moments, Novelty
 from drake_safety.learning.prediction import Correction, Prediction
-from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.robots.robot_model import JointGains
 from drake_safety.systems.command_guard import CommandGuard
 from drake_safety.systems.policy_controller import PolicyController
@@ -24,18 +24,14 @@ from drake_safety.systems.policy_controller import PolicyController
 NOVELTY, STEP_S = 0.7, 0.04
 LIMITS = CommandLimits(lowest=[-1.0, -0.5, -1.0], highest=[1.0, 0.5, 1.0])
 HORIZON, OUTLOOK = 4, 3
-INFO = EpisodesInfo(
-    scenario="drift",
-    scenario_hash="hash",
+INFO = make_info(
     variation="actual",
-    seed=0,
     step_s=STEP_S,
     horizon=3,
     constraint_names=["right", "left"],
     state_names=["x"],
     output_names=["x", "y", "z"],
     feature_names=["f"],
-    versions={},
 )
 
 

@@ -15,14 +15,9 @@ from sprung_motions import INFO, STEP_S, learned, motion
 pytestmark = pytest.mark.train
 
 
-@pytest.fixture(scope="module")
-def detector():
-    return learned()
-
-
-def test_an_alarm_ends_after_five_seconds_of_low_levels(detector):
+def test_an_alarm_ends_after_five_seconds_of_low_levels():
     rows = motion(30.0, 50, slice(100, 140))
-    levels, (one,) = detector.watch([rows], INFO.state_names)
+    levels, (one,) = learned().watch([rows], INFO.state_names)
     largest = levels.max(axis=1)
     size = round(RECOVERY_S / STEP_S)
     assert one.begin == int(np.argmax(largest > 1.0))
@@ -34,11 +29,11 @@ def test_an_alarm_ends_after_five_seconds_of_low_levels(detector):
     assert one.end == ends[0]
 
 
-def test_rows_that_are_not_charted_are_no_time_without_an_alarm(detector):
+def test_rows_that_are_not_charted_are_no_time_without_an_alarm():
     rows = motion(30.0, 50, slice(100, 140))
-    ((begin, end, _),) = detector.watch([rows], INFO.state_names)[1]
+    ((begin, end, _),) = learned().watch([rows], INFO.state_names)[1]
     cut = end - 20
-    (one,) = detector.watch([rows[:cut], rows[cut:]], INFO.state_names)[1]
+    (one,) = learned().watch([rows[:cut], rows[cut:]], INFO.state_names)[1]
     assert (one.begin, one.end) == (begin, end + 2)
 
 

@@ -22,7 +22,7 @@ from drake_safety.learning.calibration import Calibration
 from drake_safety.planning.goal_verdict import assess_goal
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import load_scenario
-from reaching_targets import CAUSE, FAR, NEAR, SCENARIO, made_up_episodes
+from reaching_targets import CAUSE, FAR, NEAR, SCENARIO, learned_targets
 
 pytestmark = pytest.mark.train
 
@@ -32,12 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
     """The folder of a training, and what was trained: that targets beyond a plane are unsafe."""
-    scenario = load_scenario(SCENARIO)
-    parameters = scenario.assessment
-    parameters.epochs, parameters.ensemble_size, parameters.hidden_sizes = 40, 1, [32]
-    parameters.perplexity, parameters.min_count = 5, 1
-    folder = tmp_path_factory.mktemp("reaching")
-    assessment = SafetyAssessment(parameters).fit(made_up_episodes(scenario.make_loop()))
+    folder, assessment = tmp_path_factory.mktemp("reaching"), learned_targets()
     assessment.save(assessment_file(folder, "sharpened"))
     return folder, assessment
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from pydrake.geometry import Meshcat
 
-from drake_safety import SafetyAssessment, load_scenario, run_episodes
+from drake_safety import load_scenario
 from drake_safety.live.session import GUARD, HALT, PUSH, START, LiveSession
-from live_scenarios import quick
+from live_scenarios import learned, quick
 
 pytestmark = pytest.mark.train
 
@@ -14,9 +14,8 @@ pytestmark = pytest.mark.train
 @pytest.fixture(scope="module")
 def session():
     scenario = quick(load_scenario("go2_walking"))
-    assessment = SafetyAssessment(scenario.assessment).fit(run_episodes(scenario, 8, num_workers=1))
-    meshcat = Meshcat()
-    loop = scenario.make_loop("nominal", assessment=assessment, meshcat=meshcat, guard=True)
+    options = {"meshcat": (meshcat := Meshcat()), "guard": True}
+    loop = scenario.make_loop("nominal", assessment=learned(scenario, 8), **options)
     return LiveSession(loop, meshcat, threshold=0.5)
 
 

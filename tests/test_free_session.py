@@ -12,7 +12,7 @@ from pydrake.geometry import Meshcat
 
 from cart_pole_task import SCENARIO, CartPole
 from command_line import call
-from drake_safety import AddSafetyAssessor, SafetyAssessment, load_scenario, run_episodes
+from drake_safety import AddSafetyAssessor, load_scenario
 from drake_safety.cli.training_folder import assessment_file
 from drake_safety.live.session import BREAK_S, FORCE, PUSH, START, STOP, TICK_S, LiveSession
 from drake_safety.plants.pushes import Push
@@ -20,7 +20,7 @@ from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
 from drake_safety.simulation.motion import simulate
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import Gliding, gliding
-from live_scenarios import quick
+from live_scenarios import learned, quick
 from shuttle_task import shuttling
 
 pytestmark = pytest.mark.train
@@ -58,11 +58,6 @@ class FewPorts(Gliding):
         ports |= {name: assessor.GetOutputPort(name) for name in ASSESSMENT_PORTS}
         for name, port in ports.items():
             builder.ExportOutput(port, name)
-
-
-def learned(scenario, num_episodes=30):
-    episodes = run_episodes(scenario, num_episodes, num_workers=1)
-    return SafetyAssessment(scenario.assessment).fit(episodes)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 from pydrake.geometry import Meshcat
 
 from command_line import call
-from drake_safety import SafetyAssessment, load_scenario, run_episodes
+from drake_safety import load_scenario
 from drake_safety.cli.console import LOOPBACK, open_viewer
 from drake_safety.live.session import (
     AXES,
@@ -24,8 +24,8 @@ from drake_safety.live.session import (
     TICK_S,
     LiveSession,
 )
-from live_scenarios import quick
-from reaching_targets import NEAR, made_up_episodes
+from live_scenarios import learned, quick
+from reaching_targets import NEAR, SCENARIO, learned_targets
 
 FAR = ("0.95", "0.5", "1.05")
 
@@ -43,9 +43,8 @@ def meshcat():
 @pytest.fixture(scope="module")
 def throws_loop(meshcat):
     scenario = quick(load_scenario("laikago_balancing"))
-    episodes = run_episodes(scenario, 8, num_workers=1)
-    assessment = SafetyAssessment(scenario.assessment).fit(episodes)
-    return scenario.make_loop("nominal", assessment=assessment, meshcat=meshcat, ball=True)
+    options = {"meshcat": meshcat, "ball": True}
+    return scenario.make_loop("nominal", assessment=learned(scenario, 8), **options)
 
 
 @pytest.fixture
@@ -55,10 +54,7 @@ def throws(throws_loop, meshcat):
 
 @pytest.fixture(scope="module")
 def goals_loop(meshcat):
-    scenario = quick(load_scenario("atlas_reaching"))
-    scenario.assessment.epochs = 40
-    assessment = SafetyAssessment(scenario.assessment).fit(made_up_episodes(scenario.make_loop()))
-    return scenario.make_loop("nominal", assessment=assessment, meshcat=meshcat)
+    return load_scenario(SCENARIO).make_loop(assessment=learned_targets(), meshcat=meshcat)
 
 
 @pytest.fixture

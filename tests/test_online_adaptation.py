@@ -6,9 +6,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, EventStatus
 from pydrake.systems.primitives import ConstantVectorSource
 
+from cart_episodes import make_info
 from drake_safety import load_assessment, load_scenario, run_episode
 from drake_safety.learning.assessment import AdaptationParameters
-from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.simulation import online_adaptation
 from drake_safety.simulation.feedback import AddFeedbackRecorder
 from drake_safety.simulation.online_adaptation import OnlineAdaptation
@@ -18,19 +18,7 @@ from drake_safety.systems.feedback_recorder import FeedbackRecorder
 pytestmark = pytest.mark.train
 
 STEP_S, NUM_STEPS = 0.1, 4
-INFO = EpisodesInfo(
-    scenario="rest",
-    scenario_hash="hash",
-    variation="actual",
-    seed=0,
-    step_s=STEP_S,
-    horizon=2,
-    constraint_names=["edge"],
-    state_names=["x"],
-    output_names=["x"],
-    feature_names=[],
-    versions={},
-)
+INFO = make_info(step_s=STEP_S, constraint_names=["edge"], state_names=["x"], feature_names=[])
 PORTS = {"state": 1, "output": 1, "desired_output": 1, "desired_preview": 2, "plant_state": 2}
 
 

@@ -6,9 +6,9 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
+from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import run_episode
-from drake_safety.simulation.scenario import parse_scenario
 from studies.truth import agreement, simulate_truth
 
 
@@ -62,18 +62,6 @@ def test_a_heavier_pendulum_is_lost_where_the_nominal_one_is_held(scenario, loop
     assert not run_episode(heavy, start=start(heavy, angle, 0.0)).is_safe
 
 
-def test_an_episode_goes_on_as_its_start_says(loop):
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset(context, np.random.default_rng(3))
-    now = loop.start_of(context)
-    other = loop.CreateDefaultContext()
-    loop.reset_to(other, None, now)
-    for name in ("state", "desired_preview", "features"):
-        port = loop.GetOutputPort(name)
-        np.testing.assert_allclose(port.Eval(other), port.Eval(context), atol=1e-12)
-
-
 def test_what_a_plan_asks_of_the_motor_is_that_of_its_minimum_jerk(loop):
     context = loop.CreateDefaultContext()
     plan = loop.plan(-0.24, 0.24, 1.0)
@@ -97,20 +85,10 @@ def test_what_a_plan_asks_of_the_motor_is_that_of_its_minimum_jerk(loop):
     assert values["plan_effort_reserve_back"] == pytest.approx(0.35 - effort.max(), abs=0.01)
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("parameters: {start_angle_rad: 0.9}", "must not exceed largest_angle_rad 0.6"),
-        (
-            "variations: {nominal: {foot_friction: 0.3}}",
-            "'nominal' sets foot_friction; entries of this plant are",
-        ),
-    ],
-)
-def test_what_a_pendulum_cannot_have_is_refused(line, message):
-    text = f"task: drake_safety.diagrams.pendulum:Pendulum\n{line}\n"
-    with pytest.raises(ValueError, match=message):
-        parse_scenario(text, name="odd", folder=None).make_loop()
+def test_what_a_pendulum_cannot_have_is_refused(scenario):
+    odd = replace(scenario, variations={"nominal": PlantVariation(foot_friction=0.3)})
+    with pytest.raises(ValueError, match="'nominal' sets foot_friction; entries of this plant are"):
+        odd.make_loop()
 
 
 @pytest.mark.train

@@ -177,13 +177,10 @@ def test_what_is_accepted_is_its_own_nearest_and_what_is_outside_is_moved_in(goa
     np.testing.assert_array_equal(search(gamma, goal).goal, search(gamma, goal).goal)
 
 
-def test_where_nothing_is_accepted_with_reserve_or_asked_nothing_is_suggested():
+def test_where_nothing_is_accepted_with_reserve_nothing_is_suggested():
     for gamma in (0.0, 0.89):
         assert search(constant(gamma), INSIDE, num_candidates=4) is None
     assert search(constant(0.91), INSIDE, num_candidates=4) is not None
-    assert search(constant(1.0), np.array([math.nan, 0.0, 1.0])) is None
-    with pytest.raises(ValueError, match=r"reserve is 1\.5, expected a value in \[0, 1\]"):
-        search(constant(1.0), INSIDE, reserve=1.5)
 
 
 def test_a_goal_is_three_numbers_and_a_task_whose_plans_have_none_is_not_asked():

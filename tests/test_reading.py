@@ -2,7 +2,6 @@ from pathlib import Path
 
 import pytest
 
-from drake_safety import load_scenario
 from drake_safety.files.reading import parse_yaml, reading
 
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "\n".join(
@@ -47,11 +46,3 @@ def test_errors_gain_the_name_of_the_file_once_and_lose_their_length():
         raise KeyError("q")
     with pytest.raises(FileNotFoundError), reading(path, "log", Exception):
         path.read_text()
-
-
-@pytest.mark.parametrize("line", ["control_period_s: 1.0e-9", "time_step_s: 1.0e-8"])
-def test_an_episode_with_endless_steps_is_refused(line, tmp_path):
-    file = tmp_path / "mine.yaml"
-    file.write_text(f"task: drake_safety.diagrams.pendulum:Pendulum\n{line}\n")
-    with pytest.raises(ValueError, match=r"mine.yaml.*has more than 10000000 steps"):
-        load_scenario(file)

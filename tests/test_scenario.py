@@ -156,7 +156,6 @@ def test_a_task_beside_its_scenario_is_not_imported_where_its_code_is_not_to_run
         (BALANCING + "parameters: {push: {sharee: 1}}", "push.sharee' .* keys there are .*'share'"),
         (BALANCING + "parameters: 3", "'mine', parameters: this must be a mapping"),
         (BALANCING + "step_s: fast", "'mine': 'step_s' must be a valid number; got 'fast'"),
-        (BALANCING + "assessment: {horizon: 51}", "'mine': the assessment horizon of 51 steps"),
         (with_parameters("{failure: sneeze}"), "gliding: unknown failure 'sneeze'"),
         (task("nowhere:X"), r"no module 'nowhere'.*drake_safety\.diagrams\.balancing"),
         (task("drake_safety.diagrams.juggling:X"), r"no module 'drake_safety\.diagrams\.juggling'"),

@@ -107,7 +107,9 @@ CASES = {
     Scenario: {
         "step_s: 0": "'step_s' must be greater than 0; got 0",
         "step_s: .nan": "'step_s' must be a finite number; got nan",
-        "step_s: 1e-9": "step_s is 1e-09, so that an episode of 2.0 s has more than",
+        "step_s: 1e-9": "step_s is 1e-09, so that an episode of 2.0 s has more than 10000000 steps",
+        "control_period_s: 1.0e-9": "has more than 10000000 steps",
+        "time_step_s: 1.0e-8": "has more than 10000000 steps",
         "on_alarm: stop": "'on_alarm' must be 'unknown' or 'report'; got 'stop'",
         "assessment: {horizon: 1.5}": r"'assessment\.horizon' must be a valid integer",
         "assessment: {horzon: 3}": r"horzon' \(did you mean 'horizon'\?\)",
