@@ -36,6 +36,13 @@ def assessment(request):
     return quick_assessment(request.param)
 
 
+@pytest.fixture
+def path(assessment, tmp_path):
+    """Where the assessment is saved."""
+    assessment.save(tmp_path / "assessment.safetensors")
+    return tmp_path / "assessment.safetensors"
+
+
 def test_parameters_that_change_afterwards_change_nothing_that_was_learned():
     parameters = AssessmentParameters(hidden_sizes=[8, 8])
     learner = SafetyAssessment(parameters)
@@ -145,9 +152,7 @@ def test_predicted_margins_and_causes_name_what_will_be_violated(assessment, hel
     assert (named == held_out.cause)[is_clear].mean() > 0.9
 
 
-def test_a_loaded_assessment_runs_with_numpy_alone(assessment, held_out, tmp_path):
-    path = tmp_path / "assessment.safetensors"
-    assessment.save(path)
+def test_a_loaded_assessment_runs_with_numpy_alone(assessment, held_out, path):
     sizes = [part.shape[1] for part in inputs(held_out)]
     code = f"""
 import sys, numpy as np
@@ -283,9 +288,7 @@ def test_learning_gives_the_same_bits_for_any_number_of_threads():
     assert all(0 <= done <= total == 100 for _, done, total in seen)
 
 
-def test_what_is_saved_is_loaded_to_the_bit(assessment, held_out, tmp_path):
-    path = tmp_path / "assessment.safetensors"
-    assessment.save(path)
+def test_what_is_saved_is_loaded_to_the_bit(assessment, held_out, tmp_path, path):
     loaded = SafetyAssessment.load(path)
     assert loaded.parameters == assessment.parameters
     assert loaded.info_ == assessment.info_
@@ -311,9 +314,9 @@ def test_a_calibration_is_kept_with_the_assessment(assessment, tmp_path):
     assert SafetyAssessment.load(path).calibrations_ == {}
 
 
-def test_a_failed_save_leaves_the_earlier_file_and_nothing_else(assessment, tmp_path, monkeypatch):
-    path = tmp_path / "assessment.safetensors"
-    assessment.save(path)
+def test_a_failed_save_leaves_the_earlier_file_and_nothing_else(
+    assessment, tmp_path, monkeypatch, path
+):
     content = path.read_bytes()
 
     def full_disk(descriptor):
@@ -326,11 +329,9 @@ def test_a_failed_save_leaves_the_earlier_file_and_nothing_else(assessment, tmp_
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_path):
+def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(tmp_path, path):
     from safetensors.numpy import load_file, save_file
 
-    path = tmp_path / "assessment.safetensors"
-    assessment.save(path)
     content = path.read_bytes()
     for size in (0, 5, 200, len(content) // 2, len(content) - 1):
         (tmp_path / "short").write_bytes(content[:size])
@@ -354,9 +355,7 @@ def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(assessment, tmp_
             SafetyAssessment.load(tmp_path / "torn")
 
 
-def test_every_flipped_bit_is_noticed(assessment, tmp_path):
-    path = tmp_path / "assessment.safetensors"
-    assessment.save(path)
+def test_every_flipped_bit_is_noticed(path):
     content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
     header = int(content[:8].view(np.uint64)[0])
     rng = np.random.default_rng(0)

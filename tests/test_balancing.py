@@ -1,16 +1,12 @@
 import functools
-import math
-from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from pydrake.geometry import Role
 from pydrake.systems.analysis import Simulator
 
 from balancing_loops import PACKAGED, packaged_loop, scenario_of, standing_loop, started
 from drake_safety import load_scenario, run_episode
-from drake_safety.control.observation import stance_state
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.motion import Recorder
 from drake_safety.simulation.scenario import parse_scenario
@@ -156,17 +152,6 @@ def test_every_episode_has_noise_of_its_own():
     assert abs(np.corrcoef(errors)[0, 1]) < 0.1
 
 
-def test_the_state_is_that_of_the_plant():
-    loop = standing_loop()
-    simulator, context = started(loop)
-    simulator.AdvanceTo(0.2)
-    x = loop.GetOutputPort("plant_state").Eval(context)
-    n_q = loop.kinematics.num_positions
-    expected = stance_state(loop.kinematics, x[:n_q], x[n_q:])
-    np.testing.assert_array_equal(loop.GetOutputPort("true_state").Eval(context), expected)
-    np.testing.assert_array_equal(loop.GetOutputPort("output").Eval(context), x[4:7])
-
-
 PORTS = ("state", "true_state", "desired_output", "features", "margins")
 
 
@@ -206,60 +191,6 @@ def test_starts_are_inside_the_ranges_that_the_scenario_gives():
         )
         assert np.abs(state[3:5]).max() < 2 * sampling.tilt_rad
     assert first_steps == {0, 1}
-
-
-def test_feet_are_at_rest_in_a_moving_start():
-    scenario = scenario_of(PACKAGED)
-    text = yaml.safe_load(scenario.to_yaml())
-    text["parameters"]["start"] |= {
-        "velocity_std_m_s": [0.5, 0.3, 0.1],
-        "angular_velocity_std_rad_s": 0.4,
-    }
-    loop = parse_scenario(yaml.safe_dump(text), name="moving", folder=Path("/")).make_loop()
-    kinematics = loop.kinematics
-    for seed in range(5):
-        context = loop.CreateDefaultContext()
-        loop.reset(context, np.random.default_rng(seed))
-        x = loop.GetOutputPort("plant_state").Eval(context)
-        q, v = np.split(x, [kinematics.num_positions])
-        assert np.abs(v[:6]).max() > 0.05
-        np.testing.assert_allclose(kinematics.contact_jacobian(q) @ v, 0.0, atol=1e-6)
-        assert np.abs(kinematics.contact_positions(q)[:, 2] - kinematics.foot_radii).max() < 1e-3
-
-
-def momenta(loop, context):
-    """Momentum of the robot and of the ball [kg m/s]."""
-    plant, plant_context = loop.plant, loop.plant.GetMyContextFromRoot(context)
-    (ball,) = {
-        plant.get_body(i).model_instance()
-        for i in plant.GetFloatingBaseBodies()
-        if plant.get_body(i).model_instance() != loop.robot_instance
-    }
-    return [
-        plant.CalcTotalMass(plant_context, [instance])
-        * plant.CalcCenterOfMassTranslationalVelocityInWorld(plant_context, [instance])
-        for instance in (loop.robot_instance, ball)
-    ]
-
-
-@pytest.mark.parametrize("direction", [0.0, math.pi / 2, -2.0])
-def test_a_thrown_ball_hits_at_the_promised_time(direction):
-    loop = standing_loop(variation="nominal", ball=True)
-    simulator, context = started(loop)
-    simulator.AdvanceTo(0.2)
-    throw = Throw(mass_kg=3.0, speed_m_s=6.0, direction_rad=direction, time_s=0.3)
-    loop.throw_ball(context, throw, 0.1)
-    touch_s = 0.3
-    along = np.array([math.cos(direction), math.sin(direction), 0.0])
-    step_s = loop.scenario.time_step_s
-    simulator.AdvanceTo(touch_s - 2 * step_s)
-    robot, ball = momenta(loop, context)
-    assert ball @ along == pytest.approx(18.0, abs=0.1)
-    assert abs(robot @ along) < 0.5
-    simulator.AdvanceTo(touch_s + 4 * step_s)
-    robot, ball = momenta(loop, context)
-    assert ball @ along < 0.6 * 18.0
-    assert robot @ along > 0.3 * 18.0
 
 
 def test_a_loop_without_a_ball_says_how_to_get_one():

@@ -14,8 +14,8 @@ pytestmark = pytest.mark.train
 @pytest.fixture(scope="module")
 def session():
     scenario = quick(load_scenario("go2_walking"))
-    options = {"meshcat": (meshcat := Meshcat()), "guard": True}
-    loop = scenario.make_loop("nominal", assessment=learned(scenario, 8), **options)
+    assessment, meshcat = learned(scenario, 8), Meshcat()
+    loop = scenario.make_loop("nominal", assessment=assessment, meshcat=meshcat, guard=True)
     return LiveSession(loop, meshcat, threshold=0.5)
 
 

@@ -101,12 +101,6 @@ def test_a_path_does_not_depend_on_the_one_before():
     np.testing.assert_array_equal(preview.follow(q, one), before)
 
 
-def test_a_model_without_a_hand_is_answered_with_the_hands_there_are():
-    message = r"robot 'porter': the model must have a hand, one of \['left', 'right'\]"
-    with pytest.raises(ValueError, match=message):
-        KinematicPreview(WholeBodyModel(robot_kinematics("porter")))
-
-
 @pytest.mark.parametrize(("name", "hand"), HANDS)
 def test_the_chain_is_made_of_the_joints_that_move_the_hand(name, hand):
     model = preview_of(name, hand).model

@@ -196,14 +196,6 @@ def test_a_ball_is_refused_by_default_too_where_pushes_are_sampled():
         Violations(scenario.make_loop("mujoco", ball=False))
 
 
-def test_the_choice_of_engine_is_part_of_the_hash_and_its_default_is_not():
-    scenario = load_scenario("laikago_balancing")
-    nominal, actual = scenario.simulation_hash(), scenario.simulation_hash("actual")
-    scenario.variations["actual"].engine = "mujoco"
-    assert scenario.simulation_hash() == nominal
-    assert scenario.simulation_hash("actual") != actual
-
-
 def test_a_robot_of_ones_own_reaches_in_mujoco():
     scenario = load_scenario(reaching_loops.porter_path())
     scenario.variations["nominal"] = MUJOCO

@@ -24,12 +24,14 @@ def loop_with(shift, engine="drake"):
     return scenario.make_loop("shifted", **({} if engine == "drake" else {"ball": False}))
 
 
-def standing(shift, seconds):
-    """The diagram and its Context after standing for a while."""
+def standing(shift, seconds, height_m=0.0):
+    """The diagram and its Context after standing, or falling from a height, for a while."""
     loop = loop_with(shift)
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
-    loop.reset_to(context, None, loop.standing_start())
+    start = loop.standing_start()
+    start.q[6] += height_m
+    loop.reset_to(context, None, start)
     simulator.Initialize()
     simulator.AdvanceTo(seconds)
     return loop, context
@@ -48,20 +50,13 @@ def test_a_slope_turns_the_gravity_and_keeps_its_magnitude():
 
 def test_a_steady_force_is_as_large_as_stated_and_in_its_direction():
     force_n = np.array([-2.0, 3.0, 4.0])
-    heights = []
+    momenta = []
     for shift in (None, Shift(base_force_n=force_n.tolist())):
-        loop = loop_with(shift)
-        simulator = Simulator(loop)
-        context = simulator.get_mutable_context()
-        start = loop.standing_start()
-        start.q[6] += 5.0  # In free fall.
-        loop.reset_to(context, None, start)
-        simulator.Initialize()
-        simulator.AdvanceTo(0.2)
+        loop, context = standing(shift, 0.2, height_m=5.0)
         plant_context = loop.plant.GetMyContextFromRoot(context)
         momentum = loop.plant.CalcSpatialMomentumInWorldAboutPoint(plant_context, np.zeros(3))
-        heights.append(momentum.translational())
-    np.testing.assert_allclose((heights[1] - heights[0]) / 0.2, force_n, rtol=0.01, atol=0.02)
+        momenta.append(momentum.translational())
+    np.testing.assert_allclose((momenta[1] - momenta[0]) / 0.2, force_n, rtol=0.01, atol=0.02)
 
 
 def test_a_weak_joint_has_less_torque_and_a_soft_one_lower_gains():
@@ -115,15 +110,11 @@ def test_a_late_command_is_late():
 
 def test_swapped_joints_get_each_other_s_command_from_the_start_of_the_fault():
     knees = [KNEE, "FL_hip_joint"]
-    loop = loop_with(Shift(command_faults=[Fault(kind="swap", entries=knees, start_s=0.1)]))
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset_to(context, None, loop.standing_start())
-    simulator.Initialize()
-    system = loop.GetSubsystemByName("command_faults")
-    one, other = (loop.kinematics.joint_names.index(name) for name in knees)
+    shift = Shift(command_faults=[Fault(kind="swap", entries=knees, start_s=0.1)])
     for time_s in (0.05, 0.2):
-        simulator.AdvanceTo(time_s)
+        loop, context = standing(shift, time_s)
+        system = loop.GetSubsystemByName("command_faults")
+        one, other = (loop.kinematics.joint_names.index(name) for name in knees)
         own = system.GetMyContextFromRoot(context)
         sent, received = system.get_input_port().Eval(own), system.get_output_port().Eval(own)
         expected = sent.copy()

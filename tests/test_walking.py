@@ -11,7 +11,7 @@ from drake_safety import load_scenario, run_episode
 from drake_safety.control.observation import heading_velocity, walking_state
 from drake_safety.diagrams.walking_parameters import CommandSampling, WalkingRecovery, profile
 from drake_safety.simulation.contract import check_contract
-from drake_safety.simulation.rollouts import episode_rng, run_to_goal
+from drake_safety.simulation.rollouts import episode_rng
 
 NAMES = ["g1_walking", "go2_walking", "t1_walking"]
 
@@ -159,16 +159,6 @@ def test_evaluation_starts_without_an_offset():
             state = loop.GetOutputPort("plant_state").Eval(context)
             speeds[is_disturbed].append(np.linalg.norm(state[n_q + 3 : n_q + 5]))
     assert max(speeds[False]) < 1.6 < max(speeds[True])
-
-
-def test_a_push_accelerates_the_robot():
-    loop = load_scenario("go2_walking").make_loop()
-    push = replace(loop.pushes["side"], time_s=0.2, duration_s=0.1, force_n=[0.0, 300.0, 0.0])
-    motion = run_to_goal(loop, np.zeros(3), push=push, duration_s=0.34)
-    assert motion["output"][-1, 1] > 1.0
-    sampled = [loop.sample_push(episode_rng(0, i)) for i in range(20)]
-    low, high = loop.scenario.parameters.random_pushes.force_n
-    assert all(low <= one.strength_n <= high for one in sampled)
 
 
 @pytest.mark.parametrize(

@@ -352,14 +352,6 @@ def test_a_joint_without_an_actuator_gets_no_torque():
     assert np.abs(np.delete(solution.torques, passive)).min() > 1e-6
 
 
-def test_a_program_that_no_torque_can_satisfy_says_so():
-    model = whole_body_model("biped")
-    q, v, reference = standing_still(model)
-    assert solve_qp(build_qp(model, q, v, reference)).status == SOLVED
-    v[6:] = 200.0  # No ankle can stop a foot that spins so fast.
-    assert solve_qp(build_qp(model, q, v, reference)).status < 0
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e9])
 @pytest.mark.parametrize("where", ["quaternion", "orientation", "base", "velocity", "hand", "rate"])
 def test_a_state_or_set_point_that_is_not_finite_is_refused_not_fatal(value, where):
