@@ -69,11 +69,6 @@ def test_the_rate_is_the_derivative_of_the_desired_output():
     np.testing.assert_allclose(rate, (values[1] - values[0]) / (2 * step), atol=1e-8)
 
 
-def test_without_a_stance_the_plan_is_in_the_world():
-    planner, context = planner_at(0.5, ramp())
-    np.testing.assert_allclose(evaluated(planner, context, "desired_output"), [0.5, 1.0, 0.0])
-
-
 def test_the_preview_is_the_plan_at_now_and_the_next_samples_in_the_stance_frame():
     planner, context = planner_at(0.5, ramp(), np.array([9.0, 9.0, 1.0]), horizon=3, step_s=0.125)
     preview = evaluated(planner, context, "desired_preview").reshape(3, 3)

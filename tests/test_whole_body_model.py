@@ -133,10 +133,3 @@ def test_rest_is_what_a_point_does_that_is_given_no_rate():
     np.testing.assert_array_equal([point.rate, point.acceleration], np.zeros((2, 3)))
     with pytest.raises(ValueError, match="read-only"):
         point.rate[0] = 1.0  # Every point at rest shares it.
-
-
-def test_orientations_are_those_of_the_bodies_named_in_the_yaml():
-    model = WholeBodyModel(robot_kinematics("hexapod"))
-    assert model.body_names == ["body"]
-    (R,) = model.reference(model.kinematics.standing_positions()).orientations
-    np.testing.assert_allclose(R.matrix(), np.eye(3), atol=1e-12)
