@@ -8,13 +8,7 @@ from goal_field import FieldAssessment
 from shuttle_task import shuttling
 
 THRESHOLD = 0.5
-
-
-class SlowIsSafe(FieldAssessment):
-    """Γ falls with the speed along x."""
-
-    def __init__(self):
-        super().__init__(lambda state: np.exp(-state[:, 3]))
+SLOW_IS_SAFE = FieldAssessment(lambda state: np.exp(-state[:, 3]))
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +31,7 @@ def test_the_plan_with_the_highest_gamma_is_set_and_the_state_stays(loop, contex
     before = state(loop, context)
     plans = loop.candidate_plans(context, np.random.default_rng(0), 8)
     choice = choose_plan(
-        loop, SlowIsSafe(), context, threshold=THRESHOLD, rng=np.random.default_rng(0), num_plans=8
+        loop, SLOW_IS_SAFE, context, threshold=THRESHOLD, rng=np.random.default_rng(0), num_plans=8
     )
     slowest = min(range(8), key=lambda i: plans[i][0])
     assert choice.index == slowest != 0
@@ -70,7 +64,7 @@ def test_an_episode_can_begin_with_a_plan_that_was_chosen(loop):
 def test_a_task_that_offers_no_plans_says_so():
     loop = ClosedLoop(shuttling(), "nominal", None)
     with pytest.raises(ValueError, match="'ClosedLoop' has no plans to choose from"):
-        choose_plan(loop, SlowIsSafe(), None, threshold=0.5, rng=None)
+        choose_plan(loop, SLOW_IS_SAFE, None, threshold=0.5, rng=None)
     with pytest.raises(ValueError, match="'ClosedLoop' has no plans to choose from"):
         plan_inputs(loop, None, [])
 
