@@ -91,16 +91,6 @@ def test_what_a_user_did_wrong_is_one_line_and_no_traceback(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.train
-def test_throws_at_a_task_without_recovery_are_refused_before_anything_is_simulated(
-    monkeypatch, capsys, tmp_path
-):
-    file = tmp_path / "gliding.yaml"
-    file.write_text(SCENARIO)
-    assert call(monkeypatch, "evaluate", file, "--assessment", tmp_path, "--throws", 5) == 2
-    assert "pass --throws 0: task 'Gliding' has no ball to throw" in capsys.readouterr().out
-
-
 def test_an_unknown_option_is_answered_with_the_usage(monkeypatch, capsys):
     assert call(monkeypatch, "scenarios", "--colour") == 2
     printed = capsys.readouterr()
@@ -131,21 +121,6 @@ def test_a_training_that_is_stopped_says_what_continues_it(monkeypatch, capsys, 
     assert call(monkeypatch, "calibrate", "laikago_balancing", "--episodes", 7) == 130
     line = "continue with: drake-safety calibrate laikago_balancing --episodes 7"
     assert capsys.readouterr().out.splitlines()[-1] == line
-
-
-@pytest.mark.train
-def test_sigterm_says_what_continues_too(tmp_path):
-    program = (
-        "import os, signal; import drake_safety.simulation.rollouts as rollouts;"
-        "rollouts.run_episodes = lambda *a, **k: os.kill(os.getpid(), signal.SIGTERM);"
-        "from drake_safety.cli import main; main()"
-    )
-    arguments = ["train", "pendulum", "--out", str(tmp_path)]
-    ended = subprocess.run(
-        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=False
-    )
-    assert ended.returncode == 130
-    assert f"continue with: drake-safety train pendulum --out {tmp_path} --resume" in ended.stdout
 
 
 def test_a_command_that_keeps_nothing_is_not_continued(monkeypatch, capsys):
