@@ -307,6 +307,7 @@ NAMELESS = dict(zip(LEGS, "abcd", strict=True))
         (below(), "odd", ""),
         (below(xyz="0.02 0 0.03"), "odd", ""),
         (below(xyz="0 0 0.1"), "hips", "'odd' lies 0.10 m below the hips"),
+        (below(xyz="0 0 0.33"), "hips", "lies 0.33 m below the hips"),
         (below(xyz="0 0 0.33", mass=2.0), "hips", "lies 0.33 m below the hips"),
         (below(xyz="0.1 0 -0.6", name="imu"), "hips", "'imu' lies -0.60 m below"),
         (below(xyz="-0.3 0 0", name="hips"), "hips_", "0.30 m aside"),

@@ -29,6 +29,23 @@ def onnx(**options):
     return lambda path: save_onnx(path / "p.onnx", N_IN, N_OUT, size=SIZE, **options)
 
 
+class Gru(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(0)
+        self.rnn = torch.nn.GRU(N_IN, SIZE)
+        self.register_buffer("hidden_state", torch.zeros(1, 1, SIZE))
+
+    def forward(self, x):
+        y, h = self.rnn(x.unsqueeze(0), self.hidden_state)
+        self.hidden_state[:] = h.detach()
+        return y.squeeze(0)[:, :2]
+
+    @torch.jit.export
+    def reset(self):
+        self.hidden_state[:] = 0.0
+
+
 def checked(path):
     network = load_network(path)
     network.check("policy", N_IN, N_OUT, "terms")
@@ -42,6 +59,7 @@ def checked(path):
         (script(layers=2), 4),
         (script(seen=torch.ones(1, N_IN)), 2),
         (script(is_replaced=True), 2),
+        (lambda path: save_script(path / "p.pt", Gru()), 1),
         (lambda path: save_network(path / "p.pt", N_IN, N_OUT), 0),
         (onnx(), 0),
         (onnx(memory=LSTM), 2),

@@ -161,7 +161,7 @@ def test_state_that_a_system_keeps_in_an_attribute_is_found_and_named(kind, num_
         # The mass comes first, and differs as soon as the force does.
         A, B, D = [[0, 1], [0, 0]], [[0], [1]], np.zeros((2, 1))
         mass = builder.AddNamedSystem("mass", LinearSystem(A, B, np.eye(2), D))
-        ones = builder.AddNamedSystem("ones", ConstantVectorSource(np.ones(2)))
+        ones = builder.AddSystem(ConstantVectorSource(np.ones(2)))  # Of another name each time.
         inner = DiagramBuilder()
         keeper = inner.AddNamedSystem("keeper", Keeper(kind))
         inner.ExportInput(keeper.get_input_port(), "state")

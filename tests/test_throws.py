@@ -2,7 +2,9 @@ import math
 
 import numpy as np
 import pytest
+from pydrake.math import RotationMatrix
 
+from drake_safety.control.observation import quaternion_of
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.throws import VIOLATIONS, run_throw, run_throws
@@ -74,6 +76,28 @@ def test_recovery_intervals_hold_the_active_rows_and_no_other(balancing):
     log.ports["recovery_active"] = np.array([[1.0, 1.0, 0.0, 0.0, 1.0, 1.0]]).T
     t = log.time_s
     assert log.recovery_intervals_s == [(t[0], t[1]), (t[4], t[5])]
+
+
+def test_footholds_stay_on_their_own_side_and_within_reach(recovering):
+    log = run_throw(recovering, 1, seed=5, throws=[HARD], duration_s=2.0, trigger_time_s=0.32)
+    kinematics = recovering.kinematics
+    stretched = 0.25 + 0.25 + 0.037
+    for plant_state in log["plant_state"]:
+        feet = kinematics.contact_positions(plant_state[: kinematics.num_positions])
+        hips = [
+            kinematics.plant.CalcPointsPositions(
+                kinematics.context,
+                kinematics.plant.GetFrameByName(f"{foot}_hip"),
+                np.zeros(3),
+                kinematics.world_frame,
+            ).ravel()
+            for foot in kinematics.foot_names
+        ]
+        assert np.linalg.norm(feet - hips, axis=1).max() <= stretched + 1e-6
+        # The left feet stay to the left of the right ones, so that legs never cross.
+        sideways = RotationMatrix(quaternion_of(plant_state)).matrix()[:2, 1]
+        right, left = feet[0::2, :2], feet[1::2, :2]
+        assert np.all((left - right) @ sideways > 0.05)
 
 
 def test_throws_do_not_depend_on_the_workers_and_keep_their_order(scenario):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from contextlib import suppress
 from itertools import chain
@@ -61,6 +62,7 @@ def _hashes(system: System, root: Context) -> _Hashes:
         inner = (_hashes(one, root).items() for one in system.GetSystems())
         return dict(chain.from_iterable(inner))
     path = system.GetSystemPathname().removeprefix("::").partition("::")[2]
+    path = re.sub("@[0-9a-f]+", "", path)  # The name of one without a name has its address.
     context = system.GetMyContextFromRoot(root)
     state = context.get_discrete_state()
     values = [state.value(i).tobytes() for i in range(state.num_groups())]
