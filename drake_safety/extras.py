@@ -7,7 +7,7 @@ from importlib.util import find_spec
 MODULES = {
     "cluster": ("distributed",),
     "live": ("nicegui",),
-    "logs": ("mcap", "mcap_ros2", "pandas", "pyarrow", "rosbags"),
+    "logs": ("mcap", "pandas", "pyarrow", "rosbags"),
     "mujoco": ("mujoco",),
     "onnx": ("onnx",),
     "report": ("jinja2",),

@@ -38,7 +38,7 @@ ALLOWED |= {"extras": set(), "files": set()}
 BESIDE = ("models", "diagrams", "assessments")
 # An online run needs none of these, so importing the library must not either.
 HEAVY = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "pyarrow", "matplotlib"}
-HEAVY |= {"mcap", "mcap_ros2", "rosbags", "pandas", "mujoco", "onnx", "trimesh", "collada"}
+HEAVY |= {"mcap", "rosbags", "pandas", "mujoco", "onnx", "trimesh", "collada"}
 # Each extra and the files that may import what only it brings.
 EXTRAS = {
     "cluster": ("drake_safety/simulation/cluster",),

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drake_safety.logs.log_map import TIME_UNITS, TimeUnit
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 Wanted = Mapping[str, Sequence[str]]
 """Names of the columns or fields to read, by topic; "" is a table's."""
-_MANY = 40  # Largest number of names in a message.
 
 
 @dataclass(kw_only=True, eq=False)
@@ -21,49 +25,45 @@ class Channel:
 
     Attributes:
         topic: Topic of the messages; empty for a table.
-        time: Time in the log's unit, integers or floats, (N,).
+        time: Time in the log's unit, integers or floats, (N,); dates and durations become ns.
         time_unit: Unit of ``time``.
-        columns: The requested columns by name, (N,) floats each.
+        frame: The requested columns, N rows of floats; the index is their number in the file.
         row_name: Name of a row: "line", "row" or "message".
-        rows: Numbers of the rows in the file, (N,).
+        origin: Instant from which ``time_s`` counts, in the log's unit.
     """
 
     path: Path
-    topic: str
+    topic: str = ""
     time: np.ndarray
     time_unit: TimeUnit
     time_name: str
-    columns: dict[str, np.ndarray]
+    frame: pd.DataFrame
     row_name: str
-    rows: np.ndarray
+    origin: float | int = 0
+
+    def __post_init__(self) -> None:
+        if (kind := self.time.dtype.kind) in "mM":
+            self.time, self.time_unit = self.time.astype(f"{kind}8[ns]").astype(np.int64), "ns"
 
     def where(self, row: int, column: str = "") -> str:
         """Describes the location of a row, and of a column if given."""
-        text = f"log '{self.path}', {self.row_name} {self.rows[row]}"
+        text = f"log '{self.path}', {self.row_name} {self.frame.index[row]}"
         if self.topic:
             text += f" of topic '{self.topic}'"
         return f"{text}, column '{column}'" if column else text
 
-    def seconds_since(self, origin: float | int) -> np.ndarray:
-        """Returns the time since an instant of the log's clock, exact for integers, (N,) [s]."""
-        return (self.time - origin) / TIME_UNITS[self.time_unit]
-
-    def steps_s(self) -> np.ndarray:
-        """Returns the time between consecutive rows, (N - 1,) [s]."""
-        return np.diff(self.time) / TIME_UNITS[self.time_unit]
+    @cached_property
+    def time_s(self) -> np.ndarray:
+        """Time since the origin, exact for integers, (N,) [s]."""
+        return (self.time - self.origin) / TIME_UNITS[self.time_unit]
 
     def select(self, rows: np.ndarray | slice) -> Channel:
         """Returns some of the rows."""
-        columns = {name: values[rows] for name, values in self.columns.items()}
-        return replace(self, time=self.time[rows], columns=columns, rows=self.rows[rows])
-
-    def table(self, names: Iterable[str]) -> np.ndarray:
-        """Returns columns as an array, (N, n)."""
-        return np.stack([self.columns[name] for name in names], axis=1)
+        return replace(self, time=self.time[rows], frame=self.frame.iloc[rows])
 
 
-def listed(names: Iterable[str], many: int = _MANY) -> str:
-    """Formats names for a message, at most the first 40 or as many as given."""
+def listed(names: Iterable[str], many: int = 40) -> str:
+    """Formats names for a message, at most as many as given."""
     names = list(names)
     if len(names) <= many:
         return str(names)

@@ -1,58 +1,71 @@
-"""Plausibility checks of a log; errors name file, row and column."""
+"""Checks of a log as its map reads it: what is implausible, or contradicts itself, is refused.
+
+Velocities are compared with positions by their changes in short windows, which noise and a low rate
+spoil less than derivatives; feet that stand must not slide. An error names the reading that agrees.
+"""
 
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
+from scipy.spatial.transform import Rotation
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.observation import quaternion_of
-from drake_safety.logs.channel import Channel
-from drake_safety.logs.conversion import Source
-from drake_safety.logs.log_map import TIME_UNITS
+from drake_safety.logs.conversion import Source, common_span, values_at
+from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, ORDERS, VELOCITIES, si_units
 
-MIN_ROWS = 3
-"""Least number of rows, for derivatives."""
-_INTERVALS_S = (1e-4, 0.5)  # Range of the median time between two rows.
 _NORM_TOLERANCE = 0.01
 _MAX_TILT_RAD = math.radians(60.0)
 _FOOT_SHARE = 0.2  # Largest height of the lowest foot, relative to the standing height.
 _FAR_RAD = 0.3  # Largest excess over a joint stop by servo errors and encoder offsets.
 _REACH_SHARE = 3.0  # Largest distance of z* from the base, relative to the standing height.
+_WINDOW_S, _MANY_WINDOWS = 0.1, 400
+_LEAST = {"base_linear_velocity": 0.01, "base_angular_velocity": 0.05, "joint_velocities": 0.1}
+"""Least change in a window, and difference, that tells motion from noise [m, rad]."""
+_DISAGREES, _AGREES = 0.4, 0.25  # Of the motion, if another reading agrees.
+_WRONG, _FAR = 0.9, 3.0  # Of the motion, and of the least change, if none does.
+_FACTOR, _TURN_RAD = 1.6, math.radians(30.0)  # Least factor of a unit or rate, and turn of axes.
+_STEP_S, _NUM_STEPS = 0.05, 80  # In which a foot on the ground does not move.
+_SHORTEST_S = 0.5  # Of a log that says how feet move.
+_SLIP_M, _SLIP_FACTOR = 0.004, 3.0
+_INVERSE = "'base_orientation' is the inverse, of the world in the base"
+
+_Reading = tuple[str, np.ndarray, np.ndarray]
+"""A reading in words, and the changes by positions and by velocities in it, (M, n) each."""
+_Pose = tuple[str, bool, tuple[np.floating, np.floating]]
+"""A reading of the base's pose: whether the robot stands at first, and how its feet slide [m]."""
 
 
-def check_clock(channel: Channel) -> None:
-    """Checks that time is finite, increasing and in plausible units."""
-    time = channel.time
-    if len(time) < MIN_ROWS:
-        of = f" of topic '{channel.topic}'" if channel.topic else ""
-        raise ValueError(
-            f"log '{channel.path}'{of} has {len(time)} rows with a value and a time of their own, "
-            f"expected at least {MIN_ROWS}"
-        )
-    if not np.isfinite(time).all():
-        row = int(np.argmin(np.isfinite(time)))
-        raise ValueError(f"{channel.where(row, channel.time_name)}: the time is {time[row]}")
-    step = np.diff(time)
-    if not (step > 0).all():
-        row = int(np.argmax(step <= 0)) + 1
-        how = "runs backwards" if step[row - 1] < 0 else "stands still"
-        raise ValueError(
-            f"{channel.where(row, channel.time_name)}: time {how}, from {time[row - 1]} to "
-            f"{time[row]} {channel.time_unit}"
-        )
-    usual = float(np.median(step))
-    low, high = _INTERVALS_S
-    if not low <= usual / TIME_UNITS[channel.time_unit] <= high:
-        likely = [unit for unit, n in TIME_UNITS.items() if low <= usual / n <= high]
-        raise ValueError(
-            f"{channel.where(0, channel.time_name)}: rows are {usual:g} apart, which as "
-            f"{channel.time_unit} is implausible; 'time.unit' may rather be one of {likely}"
-        )
+def check(sources: list[Source], kinematics: RobotKinematics) -> None:
+    """Checks the first piece's start and the longest one's motion, and the values of all.
+
+    Raises:
+        ValueError: A quaternion's norm is not 1; a joint is far beyond its stops; the robot does
+            not stand on the ground z = 0 at first; z* is far from it; or velocities or feet
+            contradict the positions.
+    """
+    longest = max(sources, key=lambda one: float(np.ptp(one.at_s)))
+    for source in sources:
+        _check_norms(source)
+        if source is sources[0]:
+            _check_start(source, kinematics)
+            _check_desired_output(source, kinematics)
+        if beyond := _beyond_stops(kinematics, source.table("joint_positions")):
+            row, joint, text = beyond
+            column = source.log_map.joint_positions.column(source.joints[joint])
+            raise ValueError(f"{source.channels['joint_positions'].where(row, column)}: {text}")
+        if source is longest:
+            _check_stance(source, kinematics)
+            _check_velocities(source)
 
 
-def check_norms(source: Source) -> None:
+def _check_norms(source: Source) -> None:
     """Checks that quaternions have a norm of 1."""
     names = source.log_map.base_orientation.columns
     norms = np.linalg.norm(source.table("base_orientation"), axis=1)
@@ -65,7 +78,7 @@ def check_norms(source: Source) -> None:
         )
 
 
-def implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:
+def _implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:
     """Returns why a robot at positions (n_q,) does not stand on the ground z = 0, or ""."""
     if beyond := _beyond_stops(kinematics, q[None, 7:]):
         return beyond[2]
@@ -84,10 +97,10 @@ def _beyond_stops(kinematics: RobotKinematics, joints: np.ndarray) -> tuple[int,
     """The first row of joints (N, n_j) [rad] with one far beyond its stops, and which and where."""
     low, high = kinematics.position_limits.T
     excess = np.maximum(low - joints, joints - high)
-    if not (excess > _FAR_RAD).any():
-        return None
     row = int(np.argmax((excess > _FAR_RAD).any(axis=1)))
     joint = int(np.argmax(excess[row]))
+    if not excess[row, joint] > _FAR_RAD:
+        return None
     text = (
         f"joint '{kinematics.joint_names[joint]}' is at {joints[row, joint]:.3g} rad, far beyond "
         f"its stops {low[joint]:.3g} and {high[joint]:.3g}"
@@ -95,15 +108,35 @@ def _beyond_stops(kinematics: RobotKinematics, joints: np.ndarray) -> tuple[int,
     return row, joint, text
 
 
-def check_limits(source: Source, kinematics: RobotKinematics) -> None:
-    """Checks that joints are not far beyond their stops."""
-    if beyond := _beyond_stops(kinematics, source.table("joint_positions")):
-        row, joint, text = beyond
-        column = source.log_map.joint_positions.column(source.joints[joint])
-        raise ValueError(f"{source.channels['joint_positions'].where(row, column)}: {text}")
+def _check_start(source: Source, kinematics: RobotKinematics) -> None:
+    """Checks that the robot stands on the ground in the first row.
+
+    A wrong order or turn of the quaternion tilts it; wrong units lift its feet off the ground or
+    move joints beyond their stops. The error suggests readings that pass the check.
+    """
+
+    def wrong(read: Source) -> str:
+        return _implausible(kinematics, read.positions(source.at_s[:1])[0])
+
+    if not (reason := wrong(source)):
+        return
+    likely = []
+    for name, units in (("joint_positions", ANGLE_UNITS), ("base_position", LENGTH_UNITS)):
+        part = getattr(source.log_map, name)
+        for unit in units:
+            log_map = replace(source.log_map, **{name: replace(part, unit=unit)})
+            if unit != part.unit and not wrong(replace(source, log_map=log_map)):
+                likely.append(f"'{name}.unit' is {unit}")
+    if best := _stillest(_poses(source, kinematics), 1):
+        likely.append(best[0])
+    hint = f"; it would stand if {' or '.join(likely)}" if likely else ""
+    raise ValueError(
+        f"{source.where}: robot '{kinematics.robot.name}' does not stand on the ground z = 0 at "
+        f"the start: {reason}{hint}"
+    )
 
 
-def check_desired_output(source: Source, kinematics: RobotKinematics) -> None:
+def _check_desired_output(source: Source, kinematics: RobotKinematics) -> None:
     """Checks that the desired output, if there is one, begins near the base."""
     if "desired_output" not in source.channels:
         return
@@ -115,3 +148,191 @@ def check_desired_output(source: Source, kinematics: RobotKinematics) -> None:
             f"'{kinematics.robot.name}': check its frame and its unit, "
             f"{source.log_map.desired_output.unit}"
         )
+
+
+def _check_stance(source: Source, kinematics: RobotKinematics) -> None:
+    """Checks that feet slide no less by another reading of the base's orientation.
+
+    Both how far they move from their means (rms) and the lowest one in 0.05 s (median) count.
+    """
+    if np.ptp(source.at_s) < _SHORTEST_S:
+        return
+    given, *others = _poses(source, kinematics)
+    for i, how in enumerate(("from their means", "while the lowest one stands")):
+        what, _, slips = _stillest(others, i) or given
+        if given[2][i] > max(_SLIP_M, _SLIP_FACTOR * slips[i]):
+            raise ValueError(
+                f"{source.where} and after it: columns {source.log_map.base_orientation.columns}: "
+                f"the feet of robot '{kinematics.robot.name}' slide by {given[2][i]:.3g} m with "
+                f"the base ({how}), but only by {slips[i]:.3g} m if {what}"
+            )
+
+
+def _stillest(poses: Iterator[_Pose] | list[_Pose], i: int) -> _Pose | None:
+    """The first of the poses in which a robot stands whose feet slide least, to a millimetre."""
+    standing = [one for one in poses if one[1]]
+    least = min((slips[i] for _, _, slips in standing), default=0.0)
+    return next((one for one in standing if one[2][i] <= least + 0.001), None)
+
+
+def _poses(source: Source, kinematics: RobotKinematics) -> Iterator[_Pose]:
+    """What the pose's readings say of the feet, the map's reading first."""
+    at_s = source.at_s
+    step = max(_STEP_S, float(np.diff(at_s).max(initial=0.0)))
+    begins = np.linspace(at_s[0], max(at_s[-1] - step, at_s[0]), _NUM_STEPS)
+    q = source.positions(np.concatenate([begins, begins + step]))
+    upright = np.hstack([np.tile([1.0, *np.zeros(6)], (len(q), 1)), q[:, 7:]])
+    p_BC = np.array([kinematics.contact_positions(one) for one in upright])
+    R_WB = Rotation.from_quat(q[:, :4], scalar_first=True)
+    for what, R, p in _readings(source.log_map.base_orientation.order, R_WB, q[:, 4:7]):
+        feet = p[:, None] + np.einsum("nij,ncj->nci", R.as_matrix(), p_BC)
+        first, last = np.split(feet, 2)
+        lowest = np.argmin(first[..., 2] + last[..., 2], axis=1)
+        moved = np.linalg.norm(last - first, axis=2)[np.arange(_NUM_STEPS), lowest]
+        start = np.concatenate([R[0].as_quat(scalar_first=True), p[0], q[0, 7:]])
+        slips = np.sqrt(np.mean((feet - feet.mean(axis=0)) ** 2)), np.median(moved)
+        yield what, not _implausible(kinematics, start), slips
+
+
+def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rotation, np.ndarray]]:
+    """Readings of the base's orientation (N,) and position (N, 3)."""
+    swapped = R.as_quat(scalar_first=order == "wxyz")
+    other = Rotation.from_quat(swapped, scalar_first=order != "wxyz")
+    text = f"'base_orientation.order' is {next(one for one in ORDERS if one != order)}"
+    yield "", R, p
+    yield text, other, p
+    yield _INVERSE, R.inv(), p
+    yield f"{_INVERSE}, and {text}", other.inv(), p
+    yield "the whole pose is the inverse, of the world in the base", R.inv(), -R.inv().apply(p)
+    quarters = [one for one in Rotation.create_group("O") if one.magnitude() > 0]
+    for turn in sorted(quarters, key=lambda one: np.count_nonzero(abs(one.as_rotvec()) > 1e-6)):
+        what = f"'base_orientation' is of a sensor turned on the base by {_turn_text(turn)}"
+        yield what, R * turn.inv(), p
+    for angle in (*range(-170, 0, 10), *range(10, 180, 10)):
+        what = f"'base_orientation' is turned by {-angle}° about the vertical of the world"
+        yield what, Rotation.from_euler("z", angle, degrees=True) * R, p
+
+
+def _check_velocities(source: Source) -> None:
+    """Checks that logged velocities are the derivatives of positions, in frame, sign and unit."""
+    for name, positions in VELOCITIES.items():
+        if name not in source.channels:
+            continue
+        names = {positions, name} if "joint" in name else {positions, name, "base_orientation"}
+        channels = [source.channels[one] for one in names]
+        begin, end = common_span(channels)
+        step = max(float(np.median(np.diff(one.time_s))) for one in channels)
+        width = min(max(_WINDOW_S, 2 * step), end - begin)
+        number = 1 + int(min((end - begin - width) / step + 1e-6, _MANY_WINDOWS))
+        windows = np.linspace(begin, end - width, number) + np.array([[0.0], [width]])
+        time_s = source.channels[name].time_s
+        sums = cumulative_trapezoid(source.table(name), time_s, axis=0, initial=0.0)
+        logged = np.subtract(*(values_at(time_s, sums, at_s) for at_s in windows[::-1]))
+        moved = np.subtract(*(source.at(positions, at_s) for at_s in windows[::-1]))
+        if name == "joint_velocities":
+            _check_joints(source, moved, logged, width)
+        else:
+            _check_base(source, name, moved, logged, windows)
+
+
+def _check_base(
+    source: Source, name: str, moved: np.ndarray, logged: np.ndarray, windows: np.ndarray
+) -> None:
+    def derived(begin: Rotation, end: Rotation, middle: Rotation) -> dict[str, np.ndarray]:
+        change = moved if "linear" in name else (end * begin.inv()).as_rotvec()
+        return {"world": change, "body": middle.inv().apply(change)}
+
+    part = getattr(source.log_map, name)
+    frame, other = part.frame, "body" if part.frame == "world" else "world"
+    turns = [source.rotations_at(at_s) for at_s in (*windows, windows.mean(axis=0))]
+    changes, inverse = derived(*turns), derived(*(one.inv() for one in turns))
+    in_other = f"'{name}.frame' is {other}"
+    simple = [(in_other, changes[other], logged), (_INVERSE, inverse[frame], logged)]
+    turned: list[_Reading] = []
+    for change, also in ((changes[frame], ""), (changes[other], f" and {in_other}")):
+        simple += _scaled(source, name, change, logged, also)
+        if len(logged) > 1 and logged.any() and change.any():
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # About motion along one axis alone.
+                turn = Rotation.align_vectors(change, logged)[0]
+            if turn.magnitude() > _TURN_RAD:
+                text = f"its axes, or the base's, are turned by {_turn_text(turn)} in the "
+                turned.append((text + (other if also else frame), change, turn.apply(logged)))
+    width = float(windows[1, 0] - windows[0, 0])
+    _require(source, name, part.columns, width, ("", changes[frame], logged), simple, turned)
+
+
+def _check_joints(source: Source, moved: np.ndarray, logged: np.ndarray, width: float) -> None:
+    name, joints = "joint_velocities", source.joints
+    for i, column in enumerate(source.log_map.joint_velocities.names(joints)):
+        given = "", moved[:, [i]], logged[:, [i]]
+        readings = _scaled(source, name, *given[1:])
+        for k, joint in enumerate(joints):
+            readings.append((f"it is of joint '{joint}'", moved[:, [k]], given[2]))
+        _require(source, name, [column], width, given, readings)
+
+
+def _scaled(
+    source: Source, name: str, derived: np.ndarray, logged: np.ndarray, also: str = ""
+) -> list[_Reading]:
+    """The reading with another sign, unit or rate, if there is one."""
+    factor = float((derived * logged).sum() / max((logged**2).sum(), 1e-12))
+    if 1 / _FACTOR < factor < _FACTOR or factor == 0:
+        return []
+    units = LENGTH_UNITS if "linear" in name else ANGLE_UNITS
+    unit = si_units(getattr(source.log_map, name))
+    known = {size / unit: f"'{name}.unit' is {one}" for one, size in units.items()}
+    known[-1.0] = "its sign is reversed"
+    near = [what for one, what in known.items() if abs(factor / one - 1) < 0.2]
+    text = f"it is multiplied by {factor:.3g}: a gear ratio, a unit, or the rate of time"
+    return [([*near, text][0] + also, derived, factor * logged)]
+
+
+def _require(
+    source: Source,
+    name: str,
+    columns: list[str],
+    width_s: float,
+    given: _Reading,
+    *tiers: list[_Reading],
+) -> None:
+    """Raises if the given reading differs and one of a tier does not, or if it differs by far."""
+
+    def differs(reading: _Reading) -> tuple[float, float, str]:
+        """Median difference in the windows with motion, relative to it and absolute."""
+        what, derived, logged = reading
+        size = np.median(np.linalg.norm(derived - logged, axis=1)[moves])
+        return float(size / np.median(sizes(derived, logged)[moves])), float(size), what
+
+    def sizes(derived: np.ndarray, logged: np.ndarray) -> np.ndarray:
+        return np.linalg.norm([derived, logged], axis=2).max(axis=0)
+
+    moves, least = sizes(*given[1:]) > _LEAST[name], _LEAST[name]
+    share, size, _ = differs(given) if moves.any() else (0.0, 0.0, "")
+    if share <= _DISAGREES or size < least:
+        return
+    unit = "m/s" if "linear" in name else "rad/s"
+    text = (
+        f"log '{source.channels[name].path}', '{name}', columns {columns}: they differ from the "
+        f"derivative of '{VELOCITIES[name]}' by {size / width_s:.2f} {unit}, median where it moves"
+    )
+    for tier in tiers:
+        found = [differs(one) for one in tier]
+        best = min((one[0] for one in found), default=math.inf)
+        if best < min(_AGREES, share / 2):
+            close = [one for one in found if one[0] < best + 0.05][:2]
+            likely = " or ".join(what for _, _, what in close)
+            raise ValueError(f"{text}, but by {close[0][1] / width_s:.2f} {unit} if {likely}")
+    num_rows = 8 if "angular" in name else 4  # A gyroscope's vibrations need more to be averaged.
+    is_far = share > _WRONG and (size > _FAR * least or not given[2].any())
+    if is_far and width_s > num_rows * np.median(np.diff(source.channels[name].time_s)):
+        raise ValueError(
+            f"{text}; no other frame, sign or unit agrees: leave '{name}' out of the map, then the "
+            "derivative is used"
+        )
+
+
+def _turn_text(turn: Rotation) -> str:
+    axis = ((turn.as_rotvec() / turn.magnitude()).round(2) + 0.0).tolist()
+    vertical = " (the vertical)" if abs(axis[2]) == 1 else ""
+    return f"{math.degrees(turn.magnitude()):.0f}° about {axis}{vertical}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,50 +15,42 @@ from drake_safety.logs.log_map import VELOCITIES, LogMap, si_units
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Source:
-    """The quantities of a log in SI units, at their own rows and at any time.
+    """The quantities of a piece of a log in SI units, at their own rows and at any time.
 
     Attributes:
         joints: Names of the joints in the robot's order.
-        origin: First instant of the log, on its clock.
         channels: Columns of every quantity that is in the map, by its field of the map.
         step_s: Time between two converted rows [s]; by default those of the base's position.
     """
 
     log_map: LogMap
     joints: list[str]
-    origin: float | int
     channels: Mapping[str, Channel]
     step_s: float | None = None
 
     @cached_property
-    def times(self) -> dict[str, np.ndarray]:
-        """Times of every quantity since the origin [s]."""
-        return {name: one.seconds_since(self.origin) for name, one in self.channels.items()}
-
-    @cached_property
     def at_s(self) -> np.ndarray:
         """Times of the converted rows [s], which all quantities cover."""
-        times = self.times.values()
-        begin, end = max(one[0] for one in times), min(one[-1] for one in times)
+        begin, end = common_span(self.channels.values())
         if self.step_s is not None:
             return begin + self.step_s * np.arange(int((end - begin) / self.step_s + 1e-9) + 1)
-        base_time = self.times["base_position"]
-        return base_time[(base_time >= begin) & (base_time <= end)]
+        base_s = self.channels["base_position"].time_s
+        return base_s[(base_s >= begin) & (base_s <= end)]
 
     @property
     def where(self) -> str:
         """The location of the first converted row."""
-        row = int(np.searchsorted(self.times["base_position"], self.at_s[0]))
-        return self.channels["base_position"].where(row)
+        base = self.channels["base_position"]
+        return base.where(int(np.searchsorted(base.time_s, self.at_s[0])))
 
     def table(self, name: str) -> np.ndarray:
         """Returns a quantity's columns in the unit m or rad, per second, (N, n)."""
         part = getattr(self.log_map, name)
-        return si_units(part) * self.channels[name].table(part.names(self.joints))
+        return si_units(part) * self.channels[name].frame[part.names(self.joints)].to_numpy()
 
     def at(self, name: str, at_s: np.ndarray) -> np.ndarray:
         """Returns a quantity's columns at times (M,) [s], linearly, (M, n)."""
-        return values_at(self.times[name], self.table(name), at_s)
+        return values_at(self.channels[name].time_s, self.table(name), at_s)
 
     @cached_property
     def rotations(self) -> Rotation:
@@ -68,7 +60,7 @@ class Source:
 
     def rotations_at(self, at_s: np.ndarray) -> Rotation:
         """Returns the orientations of the base at times (M,) [s]."""
-        return rotations_at(self.times["base_orientation"], self.rotations, at_s)
+        return rotations_at(self.channels["base_orientation"].time_s, self.rotations, at_s)
 
     def positions(self, at_s: np.ndarray) -> np.ndarray:
         """Returns positions in Drake's order at times (M,) [s], (M, n_q)."""
@@ -81,7 +73,7 @@ class Source:
         parts = []
         for name in ("base_angular_velocity", "base_linear_velocity", "joint_velocities"):
             source = name if name in self.channels else VELOCITIES[name]
-            time_s, table = self.times[source], self.table(source)
+            time_s, table = self.channels[source].time_s, self.table(source)
             if source == "base_orientation":
                 table = angular_velocities(time_s, self.rotations)
             elif source != name:
@@ -90,6 +82,12 @@ class Source:
                 table = self.rotations_at(time_s).apply(table)
             parts.append(values_at(time_s, table, at_s))
         return np.hstack(parts)
+
+
+def common_span(channels: Iterable[Channel]) -> tuple[float, float]:
+    """First and last time that all channels cover [s]."""
+    spans = [channel.time_s[[0, -1]] for channel in channels]
+    return float(max(span[0] for span in spans)), float(min(span[1] for span in spans))
 
 
 def rotations_at(time_s: np.ndarray, rotations: Rotation, at_s: np.ndarray) -> Rotation:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -66,13 +66,12 @@ def cut_log(
     """
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")
-    scenario = loop.scenario
-    assessment = scenario.assessment
+    scenario, assessment = loop.scenario, loop.scenario.assessment
     shortest = assessment.preview_stride * mode_settings(assessment).shortest
-    rows = _Rows(scenario.step_s, scenario.episode_duration_s, shortest)
+    cutter = _Cutter(loop, desired_output, scenario.step_s, scenario.episode_duration_s, shortest)
     episodes: list[Episode] = []
     starts: list[EpisodeStart] = []
-    for parts in _parts(log, loop, desired_output, rows):
+    for parts in cutter.parts(log):
         found = [both for _, several in parts for both in several]
         if not found:
             longest = max((one for one, _ in parts), key=lambda one: one.duration_s)
@@ -80,9 +79,9 @@ def cut_log(
                 f"log '{longest.path}' lasts {longest.duration_s:g} s: too short for a segment of "
                 f"{shortest} steps of {scenario.step_s} s of scenario '{scenario.name}'"
             )
-        for episode, start in found:
-            episodes.append(replace(episode, index=len(episodes)))
-            starts.append(start)
+        episodes += [episode for episode, _ in found]
+        starts += [start for _, start in found]
+    episodes = [replace(episode, index=i) for i, episode in enumerate(episodes)]
     return Episodes(episodes_info(loop, seed=NOT_DRAWN), episodes), starts
 
 
@@ -106,168 +105,145 @@ def motions_from_log(
             f"the monitor reads {sorted(unlogged)}, which a log of positions and velocities does "
             "not have: write what the policy observes and commands as sequences of an .npz file"
         )
-    rows = _Rows(step_s or loop.scenario.monitor_step_s, MOTION_PIECE_S, shortest=2)
+    step_s = step_s or loop.scenario.monitor_step_s
+    cutter = _Cutter(loop, desired_output, step_s, MOTION_PIECE_S, shortest=2)
     motions: list[Episode] = []
-    for parts in _parts(log, loop, desired_output, rows):
-        for one, found in parts:
-            begin_s = one.begin_s
-            for motion, _ in found:
-                time_s = begin_s + motion.time_s
-                motions.append(replace(motion, index=len(motions), time_s=time_s))
-                begin_s = float(time_s[-1])
-    return Episodes(replace(episodes_info(loop, seed=NOT_DRAWN), step_s=rows.step_s), motions)
+    for one, found in itertools.chain.from_iterable(cutter.parts(log)):
+        begin_s = one.begin_s
+        for motion, _ in found:
+            time_s = begin_s + motion.time_s
+            motions.append(replace(motion, index=len(motions), time_s=time_s))
+            begin_s = float(time_s[-1])
+    return Episodes(replace(episodes_info(loop, seed=NOT_DRAWN), step_s=step_s), motions)
 
 
-class _Rows(NamedTuple):
-    """Rows of the episodes of a log: their distance, duration, and least number of steps."""
+@dataclass(frozen=True)
+class _Cutter:
+    """Evaluates a loop's ports at the states of logs, in rows of the given distance.
 
+    Attributes:
+        duration_s: Longest duration of an episode [s].
+        shortest: Least number of steps of a safe episode.
+    """
+
+    loop: LeggedLoop
+    desired_output: np.ndarray | None
     step_s: float
     duration_s: float
     shortest: int
 
-
-def _parts(
-    log: RobotLog | Sequence[RobotLog],
-    loop: LeggedLoop,
-    desired_output: np.ndarray | None,
-    rows: _Rows,
-) -> Iterator[list[tuple[RobotLog, list[tuple[Episode, EpisodeStart]]]]]:
-    """The pieces of each log, to where the robot leaves the safe set, and their episodes."""
-    logs = [log] if isinstance(log, RobotLog) else log
-    begins = [i for i, one in enumerate(logs) if i == 0 or one.piece == 0]
-    for begin, end in itertools.pairwise([*begins, len(logs)]):
-        parts, has_left = [], False
-        for one in logs[begin:end]:
-            if not has_left:
-                desired = _desired_output(one, loop, desired_output)
-                found, has_left = _cut(one, loop, desired, rows)
+    def parts(
+        self, log: RobotLog | Sequence[RobotLog]
+    ) -> Iterator[list[tuple[RobotLog, list[tuple[Episode, EpisodeStart]]]]]:
+        """The pieces of each log, to where the robot leaves the safe set, and their episodes."""
+        logs = [log] if isinstance(log, RobotLog) else log
+        begins = [i for i, one in enumerate(logs) if i == 0 or one.piece == 0]
+        for begin, end in itertools.pairwise([*begins, len(logs)]):
+            parts = []
+            for one in logs[begin:end]:
+                found, has_left = self._cut(one)
                 parts.append((one, found))
-        yield parts
+                if has_left:
+                    break
+            yield parts
 
+    def _cut(self, log: RobotLog) -> tuple[list[tuple[Episode, EpisodeStart]], bool]:
+        """Episodes and starts of a piece, and whether it leaves the safe set."""
+        desired = self._desired(log)
+        context = self.loop.CreateDefaultContext()
+        found: list[tuple[Episode, EpisodeStart]] = []
+        begin_s = 0.0
+        while log.duration_s - begin_s > self.step_s:
+            start = self._start(log, desired, begin_s)
+            self.loop.reset_to(context, None, start)
+            episode = self._episode(log, context, begin_s)
+            if not episode.is_safe and episode.num_steps == 0 and not found:
+                if log.piece:
+                    return [], True
+                raise ValueError(
+                    f"log '{log.path}' begins outside the safe set of scenario "
+                    f"'{self.loop.scenario.name}': the margin '{episode.cause}' is "
+                    f"{episode.margins[0].min():.3g}"
+                )
+            if not episode.is_safe or episode.num_steps >= self.shortest:
+                found.append((episode, start))
+            if not episode.is_safe:
+                return found, True
+            begin_s += float(episode.time_s[-1])
+        return found, False
 
-def _cut(
-    log: RobotLog, loop: LeggedLoop, desired: np.ndarray, rows: _Rows
-) -> tuple[list[tuple[Episode, EpisodeStart]], bool]:
-    """Episodes and starts of a piece with z* (N, n_z) [m], and whether it leaves the safe set."""
-    scenario = loop.scenario
-    context = loop.CreateDefaultContext()
-    found: list[tuple[Episode, EpisodeStart]] = []
-    begin_s = 0.0
-    while log.duration_s - begin_s > rows.step_s:
-        start = _start(log, loop, desired, begin_s, rows.duration_s)
-        loop.reset_to(context, None, start)
-        episode = _episode(log, loop, context, begin_s, rows)
-        if not episode.is_safe and episode.num_steps == 0 and not found:
-            if log.piece:
-                return [], True
+    def _desired(self, log: RobotLog) -> np.ndarray:
+        """z* of a log, its own or the given constant, (N, n_z) [m]."""
+        who, loop, given = f"log '{log.path}'", self.loop, self.desired_output
+        if log.robot != loop.robot.name:
             raise ValueError(
-                f"log '{log.path}' begins outside the safe set of scenario '{scenario.name}': "
-                f"the margin '{episode.cause}' is {episode.margins[0].min():.3g}"
+                f"{who} is of robot '{log.robot}', scenario '{loop.scenario.name}' of "
+                f"'{loop.robot.name}'"
             )
-        if not episode.is_safe or episode.num_steps >= rows.shortest:
-            found.append((episode, start))
-        if not episode.is_safe:
-            return found, True
-        begin_s += float(episode.time_s[-1])
-    return found, False
+        if log.desired_output is not None:
+            if given is not None:
+                raise ValueError(f"{who} has a desired output of its own; got another one")
+            return log.desired_output
+        if given is None:
+            raise ValueError(
+                f"{who} has no desired output, which the preview needs: map 'desired_output', or "
+                "pass a constant one"
+            )
+        size, value = len(loop.output_names), np.asarray(given, dtype=float)
+        if value.shape != (size,) or not np.isfinite(value).all():
+            raise ValueError(f"{who}: desired_output must be {size} finite numbers; got {value}")
+        return np.tile(value, (len(log.time_s), 1))
 
+    def _start(self, log: RobotLog, desired: np.ndarray, begin_s: float) -> EpisodeStart:
+        """The logged state at a time, with the later z* (N, n_z) [m] as a plan."""
+        kinematics, scenario = self.loop.kinematics, self.loop.scenario
+        begin = np.array([begin_s])
+        q, v = np.split(log.states_at(begin)[0], [kinematics.num_positions])
+        feet = None
+        if log.foot_positions is not None:
+            feet = values_at(log.time_s, log.foot_positions, begin).reshape(-1, 3)
+        hold = PiecewisePolynomial(np.zeros((desired.shape[1], 1)))
+        start = EpisodeStart(q=q, v=v, plan=hold, foot_positions=feet)
+        # Previews and outlooks of the longest episode end before.
+        end_s = begin_s + self.duration_s + scenario.episode_duration_s
+        end_s += scenario.assessment.horizon * scenario.preview_step_s
+        is_later = (log.time_s > begin_s + _ROUNDING_S) & (log.time_s <= end_s)
+        knots = np.append(begin, log.time_s[is_later])
+        points = values_at(log.time_s, desired, knots).reshape(-1, 3)
+        X_SW = planar_pose(start.stance_pose(kinematics)).inverse()
+        z = X_SW.multiply(points.T).T.reshape(len(knots), -1)
+        # A shape-preserving interpolation does not overshoot at steps of z*.
+        interpolate = PiecewisePolynomial.CubicShapePreserving
+        if len(knots) < 3:
+            interpolate = PiecewisePolynomial.FirstOrderHold
+        start.plan = interpolate(knots - begin_s, z.T)
+        return start
 
-def _desired_output(
-    log: RobotLog, loop: LeggedLoop, desired_output: np.ndarray | None
-) -> np.ndarray:
-    who = f"log '{log.path}'"
-    if log.robot != loop.robot.name:
-        raise ValueError(
-            f"{who} is of robot '{log.robot}', scenario '{loop.scenario.name}' of "
-            f"'{loop.robot.name}'"
+    def _episode(self, log: RobotLog, context: Context, begin_s: float) -> Episode:
+        loop, margins = self.loop, self.loop.GetOutputPort("margins")
+        length_s = min(self.duration_s, log.duration_s - begin_s)
+        times, ticks = (
+            period_s * np.arange(int(length_s / period_s + 1e-6) + 1)
+            for period_s in (self.step_s, loop.scenario.watch_period_s)
         )
-    size = len(loop.output_names)
-    if log.desired_output is not None:
-        if desired_output is not None:
-            raise ValueError(f"{who} has a desired output of its own; got another one")
-        return log.desired_output
-    if desired_output is None:
-        raise ValueError(
-            f"{who} has no desired output, which the preview needs: map 'desired_output', or pass "
-            "a constant one"
-        )
-    value = np.asarray(desired_output, dtype=float)
-    if value.shape != (size,) or not np.isfinite(value).all():
-        raise ValueError(f"{who}: desired_output must be {size} finite numbers; got {value}")
-    return np.tile(value, (len(log.time_s), 1))
+        is_safe = True
+        for tick_s, state in zip(ticks, log.states_at(begin_s + ticks), strict=True):
+            self._set_state(context, tick_s, state)
+            if (margins.Eval(context) < 0).any():
+                is_safe, times = False, np.append(times[times < tick_s - _ROUNDING_S], tick_s)
+                break
+        recorder = Recorder(loop)
+        context.SetTime(0.0)
+        for time_s, state in zip(times, log.states_at(begin_s + times), strict=True):
+            # What the robot was commanded is not logged: the loop's own controller says it.
+            loop.advance_control(context, float(time_s))
+            self._set_state(context, time_s, state)
+            recorder.record(context)
+        arrays: dict[str, Any] = recorder.arrays()
+        cause = "" if is_safe else loop.constraint_names[int(np.argmin(arrays["margins"][-1]))]
+        return Episode(index=0, **arrays, is_safe=is_safe, cause=cause)
 
-
-def _start(
-    log: RobotLog, loop: LeggedLoop, desired: np.ndarray, begin_s: float, duration_s: float
-) -> EpisodeStart:
-    """The logged state at a time, with the later z* as a plan."""
-    kinematics = loop.kinematics
-    begin = np.array([begin_s])
-    q, v = np.split(log.states_at(begin)[0], [kinematics.num_positions])
-    feet = None
-    if log.foot_positions is not None:
-        feet = values_at(log.time_s, log.foot_positions, begin).reshape(-1, 3)
-    scenario = loop.scenario
-    # Previews and outlooks of the longest episode end before.
-    reach_s = duration_s + scenario.episode_duration_s
-    reach_s += scenario.assessment.horizon * scenario.preview_step_s
-    later = log.time_s[(log.time_s > begin_s + _ROUNDING_S) & (log.time_s <= begin_s + reach_s)]
-    hold = PiecewisePolynomial(np.zeros((desired.shape[1], 1)))
-    start = EpisodeStart(q=q, v=v, plan=hold, foot_positions=feet)
-    X_SW = planar_pose(start.stance_pose(kinematics)).inverse()
-    knots = np.concatenate([begin, later])
-    points = values_at(log.time_s, desired, knots).reshape(-1, 3)
-    z = X_SW.multiply(points.T).T.reshape(len(knots), -1)
-    # A shape-preserving interpolation does not overshoot at steps of z*.
-    start.plan = (
-        PiecewisePolynomial.CubicShapePreserving(knots - begin_s, z.T)
-        if len(knots) > 2
-        else PiecewisePolynomial.FirstOrderHold(knots - begin_s, z.T)
-    )
-    return start
-
-
-def _episode(
-    log: RobotLog, loop: LeggedLoop, context: Context, begin_s: float, rows: _Rows
-) -> Episode:
-    length_s = min(rows.duration_s, log.duration_s - begin_s)
-    period_s = loop.scenario.watch_period_s
-    ticks = period_s * np.arange(int(length_s / period_s + 1e-6) + 1)
-    margins = _margins(log, loop, context, begin_s, ticks)
-    is_out = (margins < 0).any(axis=1)
-    times = rows.step_s * np.arange(int(length_s / rows.step_s + 1e-6) + 1)
-    if is_out.any():
-        end_s = ticks[int(np.argmax(is_out))]
-        times = np.append(times[times < end_s - _ROUNDING_S], end_s)
-    recorder = Recorder(loop)
-    context.SetTime(0.0)
-    for time_s, state in zip(times, log.states_at(begin_s + times), strict=True):
-        # What the robot was commanded is not logged: the loop's own controller says it.
-        loop.advance_control(context, float(time_s))
-        _set_state(loop, context, time_s, state)
-        recorder.record(context)
-    arrays: dict[str, Any] = recorder.arrays()
-    cause = ""
-    if is_out.any():
-        cause = loop.constraint_names[int(np.argmin(arrays["margins"][-1]))]
-    return Episode(index=0, **arrays, is_safe=cause == "", cause=cause)
-
-
-def _margins(
-    log: RobotLog, loop: LeggedLoop, context: Context, begin_s: float, ticks: np.ndarray
-) -> np.ndarray:
-    """Margins at the monitor's ticks up to the first violation, (n, n_c) [m or rad]."""
-    port = loop.GetOutputPort("margins")
-    rows = []
-    for time_s, state in zip(ticks, log.states_at(begin_s + ticks), strict=True):
-        _set_state(loop, context, time_s, state)
-        rows.append(port.Eval(context).copy())
-        if (rows[-1] < 0).any():
-            break
-    return np.array(rows)
-
-
-def _set_state(loop: LeggedLoop, context: Context, time_s: float, state: np.ndarray) -> None:
-    context.SetTime(float(time_s))
-    plant_context = loop.plant.GetMyMutableContextFromRoot(context)
-    loop.plant.SetPositionsAndVelocities(plant_context, loop.robot_instance, state)
+    def _set_state(self, context: Context, time_s: float, state: np.ndarray) -> None:
+        context.SetTime(float(time_s))
+        plant_context = self.loop.plant.GetMyMutableContextFromRoot(context)
+        self.loop.plant.SetPositionsAndVelocities(plant_context, self.loop.robot_instance, state)

@@ -1,12 +1,11 @@
-"""Readers of message logs: MCAP files, ROS 1 bags and ROS 2 bags."""
+"""Reader of message logs: MCAP files, ROS 1 bags and ROS 2 bags."""
 
 from __future__ import annotations
 
 import math
 import re
 import sqlite3
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,105 +18,81 @@ from drake_safety.files.reading import reading
 from drake_safety.logs.channel import Channel, Wanted, listed
 from drake_safety.logs.log_map import LogTime
 
-Message = tuple[str, int, Any]
-"""Topic, recording time [ns] and decoded message."""
-
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]|\.")
+_REMEDIES = {
+    ".mcap": " ('mcap recover' may mend it)",
+    ".bag": ", cut off ('rosbag reindex' mends it)",
+}
 
 
-def read_mcap(
-    path: Path, wanted: Wanted, time: LogTime, files: Sequence[Path] = ()
-) -> tuple[dict[str, Channel], str]:
-    """Reads the wanted fields, by topic, of an MCAP file with ROS 2 messages, or of several files.
+def read_messages(
+    path: Path, wanted: Wanted, time: LogTime
+) -> tuple[dict[str, Channel], list[str]]:
+    """Reads the wanted fields, by topic, of an MCAP file, a ROS 1 bag or the folder of a ROS 2 bag.
 
-    Of a file that was cut off the whole chunks are read; the text says how much that is.
+    Of a file that was cut off, other than a ROS 1 bag, what is whole is read; the text says how
+    much that is.
     """
-    require_extra("logs", f"log '{path}'", "mcap", "mcap_ros2")
-    from mcap.reader import NonSeekingReader
-    from mcap_ros2.decoder import DecoderFactory
-
-    existing: set[str] = set()
-    found: list[tuple[int, DecoderFactory, Any]] = []
-    kept, size = 0, 0
-    # A damaged file makes the reader raise errors of any kind.
-    what = "damaged ('mcap recover' may mend it), or not an MCAP file: log"
-    with reading(path, what, Exception):
-        for one in files or [path]:
-            factory, end = DecoderFactory(), 0
-            with one.open("rb") as file:
-                reader = NonSeekingReader(file, validate_crcs=True)
-                try:
-                    for record in reader.iter_messages(log_time_order=False):
-                        existing.add(record[1].topic)
-                        if record[1].topic in wanted:
-                            found.append((record[2].log_time, factory, record))
-                        end = file.tell()
-                    end = one.stat().st_size
-                except Exception:
-                    if not kept + end:
-                        raise
-            kept, size = kept + end, size + one.stat().st_size
-        _require_topics(path, wanted, existing)
-        messages = map(_decoded, sorted(found, key=lambda one: one[0]))
-        cut = f"log '{path}' is cut off: its whole chunks are read, {kept / size:.0%} of its bytes"
-        return _channels(path, messages, wanted, time), cut if kept < size else ""
-
-
-def _decoded(found: tuple[int, Any, Any]) -> Message:
-    stamp, factory, (schema, channel, message) = found
-    decode = factory.decoder_for(channel.message_encoding, schema)
-    if decode is None:
-        raise ValueError(
-            f"messages of topic '{channel.topic}' are encoded as '{channel.message_encoding}', "
-            "expected ROS 2's 'cdr'"
-        )
-    return channel.topic, stamp, decode(message.data)
-
-
-def read_bag(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Channel], str]:
-    """Reads the wanted fields, by topic, of a ROS 1 bag (a file) or a ROS 2 bag (a folder).
-
-    Of a ROS 2 bag that was cut off what is left is read; the text says how much that is.
-    """
-    require_extra("logs", f"log '{path}'", "rosbags")
-    hint = ", cut off ('rosbag reindex' mends it)" if path.suffix == ".bag" else ""
-    # A damaged bag makes the reader raise errors of any kind.
-    with reading(path, f"damaged{hint}, or not a ROS bag: log", Exception):
-        chunked, files = (sorted(path.glob(f"*.{kind}")) for kind in ("mcap", "db3"))
-        has_index = path.is_file() or (path / "metadata.yaml").is_file()
+    require_extra("logs", f"log '{path}'", "mcap", "rosbags")
+    files, has_index = [path], (path / "metadata.yaml").is_file()
+    if path.is_dir():
+        files = sorted(one for one in path.iterdir() if one.suffix in (".mcap", ".db3"))
+    if not (files or has_index):
+        raise ValueError(f"log '{path}' is a folder without the metadata.yaml of a ROS 2 bag")
+    # A damaged file makes the readers raise errors of any kind.
+    what = f"damaged{_REMEDIES.get(path.suffix, '')}, or without ROS messages: log"
+    with reading(path, what, Exception), TemporaryDirectory() as folder:
         try:
-            return _read_bags(path, [path] if has_index else chunked + files, wanted, time), ""
+            return _channels(path, [path] if has_index else files, wanted, time), []
         except Exception as error:
             if str(error).startswith(f"log '{path}'"):  # Of what the map says, not of damage.
                 raise
-            if chunked:
-                return read_mcap(path, wanted, time, chunked)
-            if not files:
+            copies = {one: Path(folder) / one.name for one in files if one.suffix != ".bag"}
+            shares = [_recover(one, copy, wanted) for one, copy in copies.items()]
+            if not any(shares):
                 raise
-            with TemporaryDirectory() as folder:
-                copies = [Path(folder) / one.name for one in files]
-                share = np.mean([_recover(*both) for both in zip(files, copies, strict=True)])
-                channels = _read_bags(path, copies, wanted, time)
-            return channels, f"log '{path}' is cut off: {share:.0%} of its bytes are left"
+        channels = _channels(path, [*copies.values()], wanted, time)
+        share = np.average(shares, weights=[one.stat().st_size for one in copies])
+        cut = f"log '{path}' is cut off: what is whole is read, {share:.0%} of its bytes"
+        return channels, [cut] if share < 1 or files[0].suffix == ".db3" else []
 
 
-def _read_bags(
-    path: Path, files: Sequence[Path], wanted: Wanted, time: LogTime
-) -> dict[str, Channel]:
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
+def _recover(source: Path, target: Path, wanted: Wanted) -> float:
+    """Copies the whole chunks of an MCAP file; returns the share of its bytes.
 
-    with AnyReader(files, default_typestore=get_typestore(Stores.LATEST)) as reader:
-        connections = [c for c in reader.connections if c.topic in wanted]
-        _require_topics(path, wanted, {c.topic for c in reader.connections})
-        messages = (
-            (connection.topic, stamp, reader.deserialize(raw, connection.msgtype))
-            for connection, stamp, raw in reader.messages(connections=connections)
+    Topics that are not ROS messages are left out: one of them makes rosbags refuse the file.
+    """
+    if source.suffix == ".db3":
+        return _recover_sqlite(source, target)
+    from mcap.reader import NonSeekingReader
+    from mcap.writer import Writer
+
+    end, ids, others = 0, dict[int, int](), dict[str, str]()
+    with source.open("rb") as old, target.open("wb") as new:
+        writer = Writer(new)
+        writer.start("ros2")
+        with suppress(Exception):
+            reader = NonSeekingReader(old, validate_crcs=True)
+            for schema, channel, message in reader.iter_messages(log_time_order=False):
+                if channel.message_encoding != "cdr" or schema is None:
+                    others[channel.topic] = channel.message_encoding
+                    continue
+                if channel.id not in ids:
+                    kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    ids[channel.id] = writer.register_channel(channel.topic, "cdr", kind)
+                times = message.log_time, message.publish_time
+                writer.add_message(ids[channel.id], times[0], message.data, times[1])
+                end = old.tell()
+            end = source.stat().st_size
+        writer.finish()
+    for topic in filter(others.get, wanted):
+        raise ValueError(
+            f"messages of topic '{topic}' are encoded as '{others[topic]}', expected ROS's 'cdr'"
         )
-        return _channels(path, messages, wanted, time)
+    return end / source.stat().st_size
 
 
-def _recover(source: Path, target: Path) -> float:
+def _recover_sqlite(source: Path, target: Path) -> float:
     """Copies an SQLite file up to the first row that is lost; returns the share of its bytes."""
     data, uri = source.read_bytes(), f"{source.resolve().as_uri()}?mode=ro"
     size = int.from_bytes(data[16:18], "big") * int.from_bytes(data[28:32], "big")
@@ -133,62 +108,65 @@ def _recover(source: Path, target: Path) -> float:
     return min(len(data) / max(size, 1), 1.0)
 
 
-def _require_topics(path: Path, wanted: Wanted, existing: set[str]) -> None:
-    there = f"its topics are {listed(sorted(existing))}"
-    if "" in wanted:
-        raise ValueError(
-            f"log '{path}' has messages: the map must name the topic of {list(wanted[''])}; {there}"
-        )
-    if missing := [topic for topic in wanted if topic not in existing]:
-        raise ValueError(f"log '{path}' has no messages of topics {missing}; {there}")
-
-
 def _channels(
-    path: Path, messages: Iterator[Message], wanted: Wanted, time: LogTime
+    path: Path, files: Sequence[Path], wanted: Wanted, time: LogTime
 ) -> dict[str, Channel]:
-    stamp_names = [time.column] if time.column else []
-    fields = {one: {n: field_of(n) for n in (*wanted[one], *stamp_names)} for one in wanted}
-    found: dict[str, list[tuple[int, float | int, list[float]]]] = {topic: [] for topic in wanted}
-    failed: dict[tuple[str, str], ValueError] = {}
-    counts: Counter[str] = Counter()
-    is_stamp = not time.column
+    import pandas as pd
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
 
-    def read(topic: str, name: str, message: Any) -> float | int:
-        """A number, or NaN if the message lacks it: others may have it."""
-        nonlocal is_stamp
+    reads = {name: field_of(name) for names in wanted.values() for name in names}
+    clock = field_of(time.column) if time.column else None
+    stamps: dict[str, list[Any]] = {topic: [] for topic in wanted}
+    rows: dict[str, list[list[float]]] = {topic: [] for topic in wanted}
+    errors: dict[tuple[str, str], ValueError] = {}
+
+    def value(name: str, read: Callable[[Any], Any]) -> Any:
+        """A value of the message, or NaN if it lacks it: others may have it."""
         try:
-            value = fields[topic][name](message)
-            is_stamp = is_stamp or hasattr(value, "sec")
-            return _number(value)
+            return _number(read(message))
         except (LookupError, TypeError) as error:
-            where = f"log '{path}', message {counts[topic]} of topic '{topic}'"
-            failed.setdefault((topic, name), ValueError(f"{where}: cannot read '{name}': {error}"))
+            where = f"log '{path}', message {len(rows[topic])} of topic '{topic}'"
+            errors.setdefault((topic, name), ValueError(f"{where}: cannot read '{name}': {error}"))
             return math.nan
 
-    for topic, recorded_ns, message in messages:
-        row = [float(read(topic, name, message)) for name in wanted[topic]]
-        stamp = read(topic, time.column, message) if time.column else recorded_ns
-        if not all(map(math.isnan, row)):  # Such as the joints of another part of the robot.
-            found[topic].append((counts[topic], stamp, row))
-        counts[topic] += 1
-    rows = {topic: np.array([row for _, _, row in found[topic]]) for topic in wanted}
-    tables = {topic: rows[topic].reshape(-1, len(names)) for topic, names in wanted.items()}
-    for (topic, name), error in failed.items():
-        if name == time.column or np.isnan(tables[topic][:, wanted[topic].index(name)]).all():
-            raise error
-    return {
-        topic: Channel(
+    with AnyReader(files, default_typestore=get_typestore(Stores.LATEST)) as reader:
+        there = f"its topics are {listed(sorted({c.topic for c in reader.connections}))}"
+        if "" in wanted:
+            raise ValueError(
+                f"log '{path}' has messages: the map must name the topic of {list(wanted[''])}; "
+                f"{there}"
+            )
+        connections = [c for c in reader.connections if c.topic in wanted]
+        if missing := wanted.keys() - {c.topic for c in connections}:
+            raise ValueError(f"log '{path}' has no messages of topics {sorted(missing)}; {there}")
+        for connection, recorded_ns, raw in reader.messages(connections=connections):
+            topic = connection.topic
+            # Some writers of MCAP omit the "msg" of "nav_msgs/msg/Odometry".
+            kind = connection.msgtype.replace("/msg/", "/").replace("/", "/msg/")
+            message = reader.deserialize(raw, kind)
+            row = [value(name, reads[name]) for name in wanted[topic]]
+            stamp = value(time.column, clock) if clock else np.timedelta64(recorded_ns, "ns")
+            rows[topic].append(row)
+            stamps[topic].append(stamp)
+    channels = {}
+    for topic, names in wanted.items():
+        frame = pd.DataFrame(rows[topic], columns=names, dtype=float)
+        empty = [name for name in names if frame[name].isna().all()]
+        for name in (time.column, *empty):
+            if (topic, name) in errors:
+                raise errors[topic, name]
+        is_known = frame.notna().any(axis=1)  # Other messages are of another part of the robot.
+        channels[topic] = Channel(
             path=path,
             topic=topic,
-            time=np.array([stamp for _, stamp, _ in found[topic]]),
-            time_unit="ns" if is_stamp else time.unit,
+            time=np.array(stamps[topic])[is_known],
+            time_unit=time.unit,
             time_name=time.column or "time of recording",
-            columns=dict(zip(names, tables[topic].T, strict=True)),
+            frame=frame[is_known],
             row_name="message",
-            rows=np.array([number for number, _, _ in found[topic]], dtype=int),
         )
-        for topic, names in wanted.items()
-    }
+    return channels
 
 
 def field_of(path: str) -> Callable[[Any], Any]:
@@ -201,42 +179,34 @@ def field_of(path: str) -> Callable[[Any], Any]:
         raise ValueError(f"'{path}' is not a field path, such as pose.position.x or q[3]")
     steps = [match.groups() for match in _STEP.finditer(path) if match.group() != "."]
 
+    def field(owner: Any, name: str) -> Any:
+        if not hasattr(owner, name):
+            existing = getattr(owner, "__slots__", None) or vars(owner)
+            existing = [key for key in existing if not key.startswith("_")]
+            raise LookupError(f"there is no field '{name}'; the fields are {listed(existing)}")
+        return getattr(owner, name)
+
     def read(message: Any) -> Any:
         value, owner = message, message
         for name, index in steps:
             if name is not None:
-                owner, value = value, _attribute(value, name)
+                owner, value = value, field(value, name)
             elif index.isdecimal():
                 value = value[int(index)]
+            elif index in (names := list(field(owner, "name"))):
+                value = value[names.index(index)]
             else:
-                value = value[_place(owner, index)]
+                raise LookupError(f"no entry is named '{index}'; the names are {listed(names)}")
         return value
 
     return read
 
 
-def _attribute(message: Any, name: str) -> Any:
-    if not hasattr(message, name):
-        existing = [key for key in getattr(message, "__slots__", None) or vars(message)]
-        existing = [key for key in existing if not key.startswith("_")]
-        raise LookupError(f"there is no field '{name}'; the fields are {listed(existing)}")
-    return getattr(message, name)
-
-
-def _place(owner: Any, name: str) -> int:
-    names = list(_attribute(owner, "name"))
-    if name not in names:
-        raise LookupError(f"no entry is named '{name}'; the names are {listed(names)}")
-    return names.index(name)
-
-
-def _number(value: Any) -> float | int:
-    """A number; a ROS stamp in nanoseconds."""
+def _number(value: Any) -> Any:
+    """A number; a ROS stamp as a duration."""
     if hasattr(value, "sec"):
         fraction = value.nanosec if hasattr(value, "nanosec") else value.nsec
-        return int(value.sec) * 1_000_000_000 + int(fraction)
-    if isinstance(value, np.number):
-        return value.item()
-    if isinstance(value, int | float):
+        return np.timedelta64(int(value.sec) * 1_000_000_000 + int(fraction), "ns")
+    if isinstance(value, np.number | int | float):
         return value
     raise TypeError(f"expected a number, got {type(value).__name__}")

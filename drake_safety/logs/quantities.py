@@ -2,18 +2,61 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
+from drake_safety.learning.segments import LARGEST
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.log_map import COMMANDS, QUANTITIES, TIME_UNITS, VELOCITIES, LogMap, si_units
 
+MIN_ROWS = 3
+"""Least number of rows, for derivatives."""
+_INTERVALS_S = (1e-4, 0.5)  # Range of the median time between two rows.
 _SPARSE = 0.9  # Share of complete rows below which every quantity has rows of its own.
 _MANY_HOLDS, _REGULAR = 5, 0.9  # Least number of holds of a value, and share of equally long ones.
 _JUMPS = {"base_position": 0.1, "base_orientation": 0.1, "joint_positions": 0.3}
 """Least change from what is logged before an estimator starts [m, 1, rad]."""
+
+
+def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
+    """Sorts rows that are a little out of order, and joins those of one time.
+
+    Returns also what is lost by that: nothing where rows of one time have values of other columns,
+    as messages have that name some joints only.
+
+    Raises:
+        ValueError: A time is not finite, or runs backwards by more than ``max_gap_s``.
+    """
+    time, clock = channel.time, channel.time_name
+    if (is_bad := ~np.isfinite(time)).any():
+        row = int(np.argmax(is_bad))
+        raise ValueError(f"{channel.where(row, clock)}: the time is {time[row]}")
+    step = np.diff(time)
+    if (is_back := step < -max_gap_s * TIME_UNITS[channel.time_unit]).any():
+        row = int(np.argmax(is_back)) + 1
+        raise ValueError(
+            f"{channel.where(row, clock)}: time runs backwards, from {time[row - 1]} to "
+            f"{time[row]} {channel.time_unit}"
+        )
+    if (step > 0).all():
+        return channel, []
+    import pandas as pd
+
+    groups = channel.frame.groupby(time)
+    num_lost = (groups.count() - 1).clip(lower=0).sum().max()
+    lost = []
+    if (is_back := step < 0).any():
+        where = channel.where(int(np.argmax(is_back)) + 1, clock)
+        lost.append(f"{where}: time runs backwards in {is_back.mean():.1%} of the rows: sorted")
+    if num_lost:
+        where = channel.where(int(np.argmax(pd.Index(time).duplicated())), clock)
+        share = num_lost / len(time)
+        lost.append(f"{where}: time stands still in {share:.1%} of the rows: the first is kept")
+    joined = channel.select(np.unique(time, return_index=True)[1])
+    return replace(joined, frame=groups.first().set_axis(joined.frame.index)), lost
 
 
 def quantities(
@@ -30,70 +73,68 @@ def quantities(
     - Commands that come rarely are valid until the next one.
     """
     notes: list[str] = []
-    columns = {name: getattr(log_map, name).names(joints) for name in QUANTITIES}
-    for name, source in VELOCITIES.items():
+    own: dict[str, Channel] = {}
+    for name in QUANTITIES:
         part = getattr(log_map, name)
-        if columns[name] and not np.nan_to_num(topics[part.topic].table(columns[name])).any():
+        if not (columns := list(dict.fromkeys(part.names(joints)))):
+            continue
+        channel = topics[part.topic]
+        channel = replace(channel, frame=channel.frame[columns])
+        if name in VELOCITIES and not channel.frame.fillna(0.0).any(axis=None):
             notes.append(
-                f"log '{topics[part.topic].path}': '{name}', column '{columns[name][0]}' and so "
-                f"on, is 0 or missing in every row: the derivative of '{source}' is used"
+                f"{_start_of(name, channel)} is 0 or missing in every row: the derivative of "
+                f"'{VELOCITIES[name]}' is used"
             )
-            log_map, columns[name] = replace(log_map, **{name: type(part)()}), []
-    sparse = set()
+            log_map = replace(log_map, **{name: type(part)()})
+        else:
+            own[name] = channel
     for topic, channel in topics.items():
-        used = {one for name in QUANTITIES for one in columns[name] if one in channel.columns}
-        # A topic of velocities that are left out is not used.
-        is_whole = ~np.isnan(channel.table(used)).any(axis=1) if used else np.ones(0)
-        if len(is_whole) and is_whole.mean() < _SPARSE:
-            sparse.add(topic)
+        used = {name: one for name, one in own.items() if getattr(log_map, name).topic == topic}
+        missing = [one.frame.isna().any(axis=1) for one in used.values()]
+        share = 1.0 - float(np.any(missing, axis=0).mean()) if missing else 1.0
+        if share < _SPARSE:
+            own |= {name: _present(one, log_map.max_gap_s) for name, one in used.items()}
             rows = f"the messages of topic '{topic}'" if topic else "the rows"
             notes.append(
-                f"log '{channel.path}': {is_whole.mean():.0%} of {rows} have every value: each "
+                f"log '{channel.path}': {share:.0%} of {rows} have every value: each "
                 "quantity is read at its own rows and resampled"
             )
-    found: dict[str, Channel] = {}
-    for name in filter(columns.get, QUANTITIES):
-        part = getattr(log_map, name)
-        own = topics[part.topic]
-        own = replace(own, columns={one: own.columns[one] for one in columns[name]})
-        if part.topic in sparse:
-            own = _present(own, log_map.max_gap_s)
-        if name not in COMMANDS:
-            own, number = _without_holds(own)
-            if number > 1:
-                notes.append(
-                    f"log '{own.path}': '{name}', column '{columns[name][0]}' and so on, changes "
-                    f"only at every {number:.3g}th row: the rows that repeat it are left out"
-                )
+    for name, channel in own.items():
+        if name in COMMANDS:
+            own[name] = _held(channel, own["base_position"], log_map.max_gap_s)
+            continue
+        own[name], number = _without_holds(channel)
+        if number > 1:
+            notes.append(
+                f"{_start_of(name, channel)} changes only at every {number:.3g}th row: the rows "
+                "that repeat it are left out"
+            )
         if name in _JUMPS:
-            own = _started(own, _JUMPS[name] / si_units(part))
-        found[name] = own
-    for name in COMMANDS:
-        if name in found:
-            found[name] = _held(found[name], found["base_position"], log_map.max_gap_s)
-    return found, log_map, notes
+            jump = _JUMPS[name] / si_units(getattr(log_map, name))
+            own[name] = _started(own[name], jump)
+    return own, log_map, notes
+
+
+def _start_of(name: str, channel: Channel) -> str:
+    return f"log '{channel.path}': '{name}', column '{channel.frame.columns[0]}' and so on,"
 
 
 def _present(channel: Channel, max_gap_s: float) -> Channel:
     """The rows with most values; a column that is missing in one of them is interpolated."""
-    import pandas as pd
-
-    frame = pd.DataFrame(channel.columns, index=channel.seconds_since(channel.time[0]))
-    if not np.isfinite(channel.time).all() or not frame.notna().any(axis=None):
+    frame = channel.frame.set_axis(channel.time_s)
+    if not (counts := frame.count()).any():
         return channel
     known_s = frame.notna().apply(lambda is_known: is_known.index.where(is_known))
     before_s, after_s = known_s.ffill(), known_s.bfill()
     filled = frame.interpolate("index").where(after_s - before_s <= max_gap_s)
-    is_covered = (before_s.notna() & after_s.notna()) | frame.isna().all()
-    most = frame.notna().sum().idxmax()
-    columns = {name: filled[name].to_numpy() for name in filled}
-    rows = is_covered.all(axis=1) & frame[most].notna()
-    return replace(channel, columns=columns).select(rows.to_numpy())
+    is_covered = (before_s.notna() & after_s.notna()) | (counts == 0)
+    rows = (is_covered.all(axis=1) & frame[counts.idxmax()].notna()).to_numpy()
+    return replace(channel, frame=filled.set_axis(channel.frame.index)).select(rows)
 
 
 def _without_holds(channel: Channel) -> tuple[Channel, float]:
     """The rows at which a value that is held for equally many rows changes, and that number."""
-    values = np.nan_to_num(channel.table(channel.columns))
+    values = np.nan_to_num(channel.frame.to_numpy())
     hold = np.append(0, np.diff(values, axis=0).any(axis=1).cumsum())
     holds = np.bincount(hold)[1:-1]  # Rows of each but the first and the last.
     if len(holds) < _MANY_HOLDS:
@@ -109,54 +150,86 @@ def _without_holds(channel: Channel) -> tuple[Channel, float]:
 
 def _started(channel: Channel, jump: float) -> Channel:
     """Makes missing what is logged before an estimator starts."""
-    values = channel.table(channel.columns)
+    values = channel.frame.to_numpy()
     is_unfilled = ~values.any(axis=1) & (values.shape[1] == 4)
-    differs = np.flatnonzero((values != values[:1]).any(axis=1))
-    first = int(differs[0]) if len(differs) else 0
+    first = int(np.argmax((values != values[:1]).any(axis=1))) if len(values) else 0
     is_known = first > 1 or (first == 1 and not values[0].any())
     if is_known and np.abs(values[first] - values[0]).max() > jump:
         is_unfilled[:first] = True
-    columns = {one: np.where(is_unfilled, np.nan, value) for one, value in channel.columns.items()}
-    return replace(channel, columns=columns)
+    frame = channel.frame
+    return replace(channel, frame=frame[~is_unfilled].reindex(frame.index))
 
 
 def _held(command: Channel, base: Channel, max_gap_s: float) -> Channel:
     """A command that comes rarely, at the base's rows from its first value on: the last value."""
-    steps = command.steps_s()
-    if len(steps) > 1 and not (steps > max_gap_s).any():
+    known = command.frame.set_axis(command.time_s).dropna()
+    steps_s = np.diff(command.time_s)
+    if known.empty or (len(steps_s) > 1 and steps_s.max() <= max_gap_s):
         return command
-    known = command.select(~np.isnan(command.table(command.columns)).any(axis=1))
-    if not len(known.time) or not len(base.time):
-        return command
-    known_s, at_s = (one.seconds_since(base.time[0]) for one in (known, base))
-    last = np.searchsorted(known_s, at_s, side="right") - 1
-    columns = {name: values[last] for name, values in known.columns.items()}
-    return replace(base, columns=columns).select(last >= 0)
+    held = known.reindex(base.time_s, method="ffill").set_axis(base.frame.index)
+    return replace(base, frame=held).select(held.notna().all(axis=1).to_numpy())
 
 
-def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
-    """Sorts rows that are a little out of order, and joins those of one time.
+def cut(
+    channels: Mapping[str, Channel], max_gap_s: float
+) -> tuple[list[dict[str, Channel]], list[str]]:
+    """Cuts quantities where a value is missing or a gap in time is longer than ``max_gap_s``.
 
-    Returns also what is lost by that: nothing where rows of one time have values of other columns,
-    as messages have that name some joints only.
+    Returns the channels of each piece in order of time, whose common time is covered by all without
+    a cut, and the reasons of the cuts.
+
+    Raises:
+        ValueError: A quantity has less than three rows, or rows that are implausibly far apart.
     """
-    step = np.diff(channel.time)
-    if (step > 0).all() or not (step >= -max_gap_s * TIME_UNITS[channel.time_unit]).all():
-        return channel, []  # In order, or of another clock, which is refused.
-    import pandas as pd
+    pieces: list[tuple[float, float, dict[str, Channel]]] = [(-math.inf, math.inf, {})]
+    reasons: dict[str, None] = {}
+    for name, channel in channels.items():
+        stretches, found = _unbroken(channel, max_gap_s)
+        reasons |= dict.fromkeys(found)
+        joined, i, k = [], 0, 0
+        while i < len(pieces) and k < len(stretches):
+            (begin, end, piece), part = pieces[i], stretches[k]
+            first, last = part.time_s[[0, -1]]
+            if min(end, last) > max(begin, first):
+                joined.append((max(begin, first), min(end, last), {**piece, name: part}))
+            i, k = (i + 1, k) if end < last else (i, k + 1)
+        pieces = joined
+    return [piece for _, _, piece in pieces], list(reasons)
 
-    groups = pd.DataFrame(channel.columns).groupby(channel.time)
-    num_lost = (groups.count() - 1).clip(lower=0).sum().max()
-    is_back, order = step < 0, np.argsort(channel.time, kind="stable")
-    lost = []
-    if is_back.any():
-        where = channel.where(int(np.argmax(is_back)) + 1, channel.time_name)
-        lost.append(f"{where}: time runs backwards in {is_back.mean():.1%} of the rows: sorted")
-    if num_lost:
-        again = order[1:][np.diff(channel.time[order]) == 0]
-        where = channel.where(int(again[0]), channel.time_name)
-        share = num_lost / len(channel.time)
-        lost.append(f"{where}: time stands still in {share:.1%} of the rows: the first is kept")
-    joined = channel.select(np.unique(channel.time, return_index=True)[1])
-    firsts = groups.first()  # Of the values that are there.
-    return replace(joined, columns={name: firsts[name].to_numpy() for name in firsts}), lost
+
+def _unbroken(channel: Channel, max_gap_s: float) -> tuple[list[Channel], list[str]]:
+    """Stretches of rows without a missing value and without a gap, and what lies between them."""
+    steps_s, clock = np.diff(channel.time_s), channel.time_name
+    if len(channel.time) < MIN_ROWS:
+        of = f" of topic '{channel.topic}'" if channel.topic else ""
+        raise ValueError(
+            f"log '{channel.path}'{of} has {len(channel.time)} rows with a value and a time of "
+            f"their own, expected at least {MIN_ROWS}"
+        )
+    low, high = _INTERVALS_S
+    if not low <= (usual_s := float(np.median(steps_s))) <= high:
+        usual = usual_s * TIME_UNITS[channel.time_unit]
+        likely = [unit for unit, n in TIME_UNITS.items() if low <= usual / n <= high]
+        raise ValueError(
+            f"{channel.where(0, clock)}: rows are {usual:g} apart, which as "
+            f"{channel.time_unit} is implausible; 'time.unit' may rather be one of {likely}"
+        )
+    # A value that is missing, not finite or absurdly large is bad.
+    bad = ~(channel.frame.abs() < LARGEST).to_numpy()
+    is_bad = bad.any(axis=1)
+    is_bad_before = np.append(False, is_bad[:-1])
+    reasons = []
+    for row in np.flatnonzero(is_bad & ~is_bad_before).tolist():
+        column = int(np.argmax(bad[row]))
+        where = channel.where(row, channel.frame.columns[column])
+        reasons.append(f"{where}: the value is {channel.frame.iat[row, column]}")
+    # The tolerance covers rounding, so that a log of 10 Hz passes a limit of 0.1 s.
+    is_after_gap = np.append(True, steps_s > max_gap_s * (1 + 1e-6))
+    reasons += [
+        f"{channel.where(row, clock)}: a gap of {steps_s[row - 1]:g} s before it, "
+        f"expected at most {max_gap_s:g} s ('max_gap_s' of the map)"
+        for row in np.flatnonzero(is_after_gap)[1:].tolist()
+    ]
+    rows = np.flatnonzero(~is_bad)
+    found = np.split(rows, np.flatnonzero((is_bad_before | is_after_gap)[rows]))
+    return [channel.select(one) for one in found if len(one) >= MIN_ROWS], reasons

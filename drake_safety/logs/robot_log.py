@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from os import PathLike
 from pathlib import Path
 
@@ -13,23 +12,21 @@ from scipy.spatial.transform import Rotation
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.extras import require_extra
 from drake_safety.files.schema import load_typed
-from drake_safety.logs import checks
-from drake_safety.logs.channel import Channel, Wanted
-from drake_safety.logs.contradictions import check_stance, check_start, check_velocities
-from drake_safety.logs.conversion import Source, rotations_at, values_at
-from drake_safety.logs.log_map import COMMANDS, QUANTITIES, LogMap, LogTime, load_log_map
-from drake_safety.logs.messages import read_bag, read_mcap
-from drake_safety.logs.pieces import cut_channels
-from drake_safety.logs.quantities import in_order, quantities
+from drake_safety.logs.channel import Wanted
+from drake_safety.logs.checks import check
+from drake_safety.logs.conversion import Source, common_span, rotations_at, values_at
+from drake_safety.logs.log_map import COMMANDS, QUANTITIES, Joints, LogMap, load_log_map
+from drake_safety.logs.messages import read_messages
+from drake_safety.logs.quantities import MIN_ROWS, cut, in_order, quantities
 from drake_safety.logs.tables import read_csv, read_parquet
 from drake_safety.robots.robot_model import RobotModel
 
-_READERS: dict[str, Callable[[Path, Wanted, LogTime], tuple[dict[str, Channel], str]]] = {
+_READERS = {
     ".csv": read_csv,
     ".tsv": read_csv,
     ".parquet": read_parquet,
-    ".mcap": read_mcap,
-    ".bag": read_bag,
+    ".mcap": read_messages,
+    ".bag": read_messages,
 }
 FORMATS = tuple(_READERS)
 """Suffixes of readable files; a folder is a ROS 2 bag."""
@@ -126,30 +123,39 @@ def read_pieces(
     kinematics = RobotKinematics(robot)
     joints = kinematics.joint_names
     require_extra("logs", f"log '{path}'", "pandas")
-    topics, cut = _read_channels(path, _wanted(log_map, kinematics), log_map)
-    lost = [cut] if cut else []
+    if not path.exists():
+        raise ValueError(f"log '{path}' does not exist")
+    suffix = ".bag" if path.is_dir() else path.suffix.lower()
+    if suffix not in _READERS:
+        raise ValueError(
+            f"log '{path}' has the suffix '{suffix}'; known are {list(FORMATS)} and the folder of "
+            "a ROS 2 bag"
+        )
+    topics, lost = _READERS[suffix](path, _wanted(log_map, kinematics), log_map.time)
     for topic, channel in topics.items():
         topics[topic], unsorted = in_order(channel, log_map.max_gap_s)
         lost += unsorted
+    origin = min((one.time[0] for one in topics.values() if len(one.time)), default=0)
+    topics = {topic: replace(channel, origin=origin) for topic, channel in topics.items()}
     channels, log_map, notes = quantities(topics, log_map, joints)
-    found, reasons = cut_channels(channels, log_map.max_gap_s)
+    found, reasons = cut(channels, log_map.max_gap_s)
     lost += reasons
-    origin = min(topics[getattr(log_map, name).topic].time[0] for name in channels)
     sources = [
-        Source(log_map=log_map, joints=joints, origin=origin, channels=part, step_s=step_s)
-        for part in found
+        Source(log_map=log_map, joints=joints, channels=part, step_s=step_s) for part in found
     ]
     sources = [source for source in sources if len(source.at_s) > 1]
     measured = {getattr(log_map, name).topic for name in channels if name not in COMMANDS}
-    spans = {topic: topics[topic].seconds_since(origin)[[0, -1]].tolist() for topic in measured}
-    begin, end = max(one[0] for one in spans.values()), min(one[1] for one in spans.values())
+    begin, end = common_span(topics[topic] for topic in measured)
     if not sources:
-        why = "; ".join(lost[:_MOST_CUTS]) if end > begin else f"its topics do not overlap: {spans}"
+        why = "; ".join(lost[:_MOST_CUTS])
+        if end <= begin:
+            spans = {topic: topics[topic].time_s[[0, -1]].tolist() for topic in sorted(measured)}
+            why = f"its topics do not overlap: {spans}"
         raise ValueError(
-            f"log '{path}' has no {checks.MIN_ROWS} rows without a missing value or a gap between "
+            f"log '{path}' has no {MIN_ROWS} rows without a missing value or a gap between "
             f"them: {why}"
         )
-    _check(sources, kinematics)
+    check(sources, kinematics)
     pieces = [
         RobotLog(
             path=path,
@@ -191,59 +197,27 @@ def read_log(
     return found.pieces[0]
 
 
-def _check(sources: list[Source], kinematics: RobotKinematics) -> None:
-    """Checks the first piece's start and the longest one's motion, and the values of all."""
-    longest = max(sources, key=lambda one: float(np.ptp(one.at_s)))
-    for source in sources:
-        checks.check_norms(source)
-        if source is sources[0]:
-            check_start(source, kinematics)
-            checks.check_desired_output(source, kinematics)
-        checks.check_limits(source, kinematics)
-        if source is longest:
-            check_stance(source, kinematics)
-            check_velocities(source)
-
-
 def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> Wanted:
     """Names of the mapped columns by topic."""
     wanted: dict[str, list[str]] = {}
     joints = kinematics.joint_names
-    for name in ("joint_positions", "joint_velocities"):
-        part = getattr(log_map, name)
-        unknown = [joint for joint in part.columns if joint not in joints]
-        named = zip(joints, part.names(joints), strict=False)
-        missing = [joint for joint, column in named if not column]
-        if unknown or missing:
-            raise ValueError(
-                f"map: '{name}' must give a column to every joint of robot "
-                f"'{kinematics.robot.name}', {joints}; it has none for {missing}, and the robot "
-                f"has no joints {unknown}"
-            )
     for name in QUANTITIES:
         part = getattr(log_map, name)
-        if columns := part.names(joints):
+        columns = part.names(joints)
+        if columns and isinstance(part, Joints):
+            unknown = [joint for joint in part.columns if joint not in joints]
+            missing = [joint for joint, column in zip(joints, columns, strict=True) if not column]
+            if unknown or missing:
+                raise ValueError(
+                    f"map: '{name}' must give a column to every joint of robot "
+                    f"'{kinematics.robot.name}', {joints}; it has none for {missing}, and the "
+                    f"robot has no joints {unknown}"
+                )
+        if name == "foot_positions" and len(columns) not in (0, 3 * kinematics.num_contacts):
+            raise ValueError(
+                f"map: 'foot_positions.columns' must be x, y, z of {kinematics.num_contacts} "
+                f"contact points of robot '{kinematics.robot.name}'; got {len(columns)} columns"
+            )
+        if columns:
             wanted.setdefault(part.topic, []).extend(columns)
-    num_feet = len(log_map.foot_positions.columns)
-    if num_feet not in (0, 3 * kinematics.num_contacts):
-        raise ValueError(
-            f"map: 'foot_positions.columns' must be x, y, z of {kinematics.num_contacts} contact "
-            f"points of robot '{kinematics.robot.name}'; got {num_feet} columns"
-        )
     return {topic: list(dict.fromkeys(names)) for topic, names in wanted.items()}
-
-
-def _read_channels(path: Path, wanted: Wanted, log_map: LogMap) -> tuple[dict[str, Channel], str]:
-    """Channels by topic, and what is said of a file that was cut off."""
-    kinds = ("metadata.yaml", "*.db3", "*.mcap")
-    is_bag = path.is_dir() and any(any(path.glob(kind)) for kind in kinds)
-    if not is_bag and not path.is_file():
-        what = "is a folder without the metadata.yaml of a ROS 2 bag"
-        raise ValueError(f"log '{path}' {what if path.is_dir() else 'does not exist'}")
-    suffix = ".bag" if is_bag else path.suffix.lower()
-    if suffix not in _READERS:
-        raise ValueError(
-            f"log '{path}' has the suffix '{suffix}'; known are {list(FORMATS)} and the folder of "
-            "a ROS 2 bag"
-        )
-    return _READERS[suffix](path, wanted, log_map.time)

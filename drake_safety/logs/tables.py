@@ -20,14 +20,15 @@ from drake_safety.logs.log_map import LogTime
 if TYPE_CHECKING:
     import pandas as pd
 
-_SEPARATORS = (",", ";", "\t", "|", " ")
+_SEPARATORS = {",": ",", ";": ";", "\t": "\t", "|": "|", " ": r"\s+"}
+"""Separators of cells, as pandas has them."""
 _NUM_HEAD_LINES = 60  # Among which the header is sought.
 _COMMENT = "#%"
-_MISSING = {"", "na", "n/a", "nan", "null", "none", "-"}
+_MISSING = ["", "na", "n/a", "nan", "null", "none", "-"]
 _UNIT = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]$")  # In brackets at the end of a name.
 
 
-def read_csv(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Channel], str]:
+def read_csv(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Channel], list[str]]:
     """Reads columns of a CSV file with a header line, and says whether its end is cut off.
 
     The header is the line among the first ones that has the most of the names, and the separator
@@ -47,29 +48,28 @@ def read_csv(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Chann
             headers, key=lambda one: sum(bool({_key(n), _bare(n)} & keys) for n in one[2])
         )
         places = _places(path, wanted, time, names)
-        # Read as text, so that errors can quote cells that are not numbers.
         frame = pd.read_csv(
             io.StringIO(text),
-            sep=r"\s+" if separator == " " else separator,
+            sep=_SEPARATORS[separator],
             skiprows=line + 1,
             names=range(len(names)),
             index_col=False,
-            dtype=str,
-            keep_default_na=False,
             skip_blank_lines=False,
             skipinitialspace=True,
             usecols=[*places.values()],
+            dtype={places[time.column]: str},  # Else nanoseconds beside an empty cell are floats.
+            low_memory=False,  # Else the chunks of a column may be of several types.
         )
-        cut = ""
-        if not text.endswith(("\n", "\r")):
-            cut = f"log '{path}' is cut off: its last line has no end and is left out"
-            frame = frame[:-1]
         frame = frame[[*places.values()]].set_axis([*places], axis=1)
-        frame = frame[~_is_remark(frame, time.column)]
-        return {"": _channel(path, frame, time, "line", line + 2)}, cut
+        frame.index += line + 2
+        cut = []
+        if not text.endswith(("\n", "\r")):
+            cut.append(f"log '{path}' is cut off: its last line has no end and is left out")
+            frame = frame[:-1]
+        return {"": _channel(path, _without_remarks(frame, time.column), time, "line")}, cut
 
 
-def read_parquet(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Channel], str]:
+def read_parquet(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Channel], list[str]]:
     """Reads columns of a Parquet file; of one that is cut off nothing can be read."""
     require_extra("logs", f"log '{path}'", "pyarrow")
     import pyarrow.parquet as pq
@@ -83,7 +83,7 @@ def read_parquet(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, C
         names = [existing[place] for place in places.values()]
         table = file.read(columns=names).select(names).rename_columns([*places])
         frame = table.to_pandas(timestamp_as_object=False, ignore_metadata=True)
-        return {"": _channel(path, frame, time, "row", 0)}, ""
+        return {"": _channel(path, frame, time, "row")}, []
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -122,37 +122,45 @@ def _places(path: Path, wanted: Wanted, time: LogTime, existing: list[str]) -> d
     return {name: among.index(_key(name)) for name, among in columns.items()}
 
 
-def _is_remark(frame: pd.DataFrame, clock: str) -> np.ndarray:
-    """Which rows (N,) are comments, units, empty, or the header once more."""
+def _without_remarks(frame: pd.DataFrame, clock: str) -> pd.DataFrame:
+    """Leaves out rows that are comments, units, empty, or the header once more."""
+    import pandas as pd
+
     stamps = frame[clock].fillna("").str.strip()
-    is_remark = np.array(stamps.str.startswith(tuple(_COMMENT)), dtype=bool)
-    for row in np.flatnonzero(~stamps.str.contains(r"\d").to_numpy(bool) | (stamps == clock)):
-        is_remark[row] |= not any(map(is_number, frame.iloc[row]))
-    return is_remark
+    is_comment = stamps.str.startswith(tuple(_COMMENT))
+    doubtful = frame[~is_comment & (~stamps.str.contains(r"\d") | (stamps == clock))]
+    has_number = doubtful.apply(pd.to_numeric, errors="coerce").notna().any(axis=1)
+    return frame[~is_comment].drop(doubtful.index[~has_number])
 
 
-def _channel(
-    path: Path, frame: pd.DataFrame, time: LogTime, row_name: str, first_row: int
-) -> Channel:
-    channel = Channel(
+def _channel(path: Path, frame: pd.DataFrame, time: LogTime, row_name: str) -> Channel:
+    def numbers(name: str, kind: str = "number") -> np.ndarray:
+        """A column as numbers; integers stay exact, as clocks in nanoseconds require."""
+        if frame[name].dtype.kind in "iuf":
+            return frame[name].to_numpy()
+        # A decimal comma is a point.
+        cells = frame[name].astype("string").str.strip().str.replace(",", ".")
+        cells = cells.mask(cells.str.lower().isin(_MISSING))
+        values = pd.to_numeric(cells.astype(object), errors="coerce")
+        if (is_bad := (values.isna() & cells.notna()).to_numpy()).any():
+            row = int(np.argmax(is_bad))
+            where = f"log '{path}', {row_name} {frame.index[row]}, column '{name}'"
+            raise ValueError(f"{where}: '{frame[name].iloc[row]}' is not a {kind}")
+        return values.to_numpy()
+
+    import pandas as pd
+
+    dates = _dates(frame[time.column])
+    stamps = numbers(time.column, "number or a date") if dates is None else dates.to_numpy()
+    columns = {name: numbers(name).astype(float) for name in frame.columns.drop(time.column)}
+    return Channel(
         path=path,
-        topic="",
-        time=np.zeros(len(frame)),
+        time=stamps,
         time_unit=time.unit,
         time_name=time.column,
-        columns={},
+        frame=pd.DataFrame(columns, index=frame.index),
         row_name=row_name,
-        rows=first_row + frame.index.to_numpy(),
     )
-    dates = _dates(frame[time.column])
-    if dates is None:
-        channel.time = _numbers(channel, frame, time.column)
-    else:
-        kind = "datetime64[ns]" if dates.dtype.kind == "M" else "timedelta64[ns]"
-        channel.time, channel.time_unit = dates.to_numpy(kind).astype(np.int64), "ns"
-    wanted = frame.columns.drop(time.column)
-    channel.columns = {name: _numbers(channel, frame, name).astype(float) for name in wanted}
-    return channel
 
 
 def _dates(stamps: pd.Series) -> pd.Series | None:
@@ -170,24 +178,5 @@ def _dates(stamps: pd.Series) -> pd.Series | None:
             warnings.simplefilter("ignore")  # That the format had to be guessed.
             dates = parse(text, errors="coerce")
         if not dates.isna().any():
-            return dates
+            return dates.dt.tz_localize(None) if dates.dtype.kind == "M" else dates
     return None
-
-
-def _numbers(channel: Channel, frame: pd.DataFrame, name: str) -> np.ndarray:
-    """A column as numbers; integers stay exact, as clocks in nanoseconds require."""
-    values = frame[name].to_numpy()
-    if values.dtype.kind in "iuf":
-        return values
-    # An empty cell is a missing value, as NaN is; a decimal comma is a point.
-    cells = ["" if one is None else str(one).strip().replace(",", ".") for one in values]
-    if name != channel.time_name:
-        cells = ["nan" if one.lower() in _MISSING else one for one in cells]
-    for kind in (np.int64, np.float64):
-        try:
-            return np.array(cells, object).astype(kind)
-        except (ValueError, TypeError, OverflowError):
-            continue
-    row = next(i for i, cell in enumerate(cells) if not is_number(cell))
-    kinds = "number or a date" if name == channel.time_name else "number"
-    raise ValueError(f"{channel.where(row, name)}: '{values[row]}' is not a {kinds}")
