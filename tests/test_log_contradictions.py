@@ -62,6 +62,8 @@ def about(axis, angle):
 
 
 WORLD, BODY = "velocity_z], frame: body", "velocity_z]"
+UNMAPPED = [(line, "") for line in TABLE_MAP.splitlines() if "velocit" in line]
+HALF = about("x", 180)
 CONTRADICTIONS = {
     # What the velocity of the base is.
     "in the world": (in_world(LINEAR), [], r"linear_velocity', columns .* by 0\.48 m/s.*, but by "
@@ -91,9 +93,15 @@ CONTRADICTIONS = {
     "one reversed": (times(RATES, *[1] * 4, -1, *[1] * 7), [],
                      rf"columns \['{RATES[4]}'\].*if its sign is reversed"),
     "two exchanged": (exchanged(RATES[1], RATES[4]), [], f"it is of joint '{JOINTS[4]}'"),
+    "encoders that stop": (
+        lambda f: f.assign(**{n: f[n].where(f.index < 150, f[n][150]) for n in ANGLES}), [],
+        r"columns \['\w+_vel'\].*no other .* agrees: 'joint_positions' stands still"),
     "one is zero": (times(RATES, *[1] * 4, 0, *[1] * 7), [], rf"'{RATES[4]}'.*no other frame"),
     # Another clock.
     "half as fast": (lambda f: f.assign(stamp=2 * f.stamp), [], "by 0.5: .*the rate of time"),
+    "stamps that jitter": (
+        lambda f: f.assign(stamp=f.stamp + np.random.default_rng(0).integers(0, 4_900_000, len(f))),
+        UNMAPPED, r"line 2, column 'stamp': .* jitter: .* of 'base_position' varies by \d+\.\d "),
     # What the orientation is, by feet that slide.
     "inverse": (oriented(lambda R: R.inv()), [], "slide .*_orientation' is the inverse"),
     "sensor turned by 90°": (oriented(lambda R: R * about("z", 90)),
@@ -106,6 +114,9 @@ CONTRADICTIONS = {
               r"line 2 and .* slide by .* 'base_orientation.order' is xyzw"),
     "upside down": (oriented(lambda R: R * about("x", 180)), [],
                     r"does not stand .* turned on the base by 180° about \[1.0, 0.0, 0.0\]"),
+    "z down": (
+        lambda f: times([BASE[1], BASE[2]], -1)(oriented(lambda R: HALF * R * HALF)(f)), [],
+        "below the ground; it would stand if world and base have z downwards$"),
     "on its side": (oriented(lambda R: R * about("y", -90)), [],
                     r"does not stand .* turned on the base by 90° about \[0.0, -1.0, 0.0\]"),
 }  # fmt: skip
@@ -156,8 +167,7 @@ def test_a_noisy_log_of_a_robot_that_stands_or_falls_is_read(index, tmp_path):
 
 def test_velocities_that_were_never_filled_in_or_are_not_mapped_are_derivatives(tmp_path):
     path = save(times([*LINEAR, *GYRO, *RATES], 0)(frame_of(walked())), tmp_path)
-    unmapped = [(line, "") for line in TABLE_MAP.splitlines() if "velocit" in line]
-    for changes, told in ([], ["linear", "angular", "joint"]), (unmapped, []):
+    for changes, told in ([], ["linear", "angular", "joint"]), (UNMAPPED, []):
         found = read(path, *changes)
         np.testing.assert_allclose(found.pieces[0].v, walked().v, atol=1e-6)
         assert [re.search("(linear|angular|joint)_veloc", one)[1] for one in found.cuts] == told

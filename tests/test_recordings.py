@@ -296,6 +296,42 @@ def test_velocities_of_a_topic_that_was_never_filled_are_derivatives(value, tmp_
     assert "'base_linear_velocity'" in found.notes[0] and "derivative" in found.notes[0]
 
 
+@pytest.mark.parametrize("format", ["ros2", "ros1", "mcap"])
+def test_velocities_that_messages_leave_empty_are_derivatives(format, tmp_path):
+    def without(message, i):
+        yield named(message, message.name, message.position, np.zeros(0)), 0
+
+    found = read(write(PLAIN, tmp_path, format, change=without))
+    assert_reads(found, atol=0.02)
+    (note,) = found.notes
+    assert "'joint_velocities'" in note and "derivative" in note
+
+
+def test_topics_that_are_no_ros_messages_do_not_matter_unless_they_are_mapped(tmp_path):
+    import mcap.reader
+    import mcap.writer
+
+    whole, path = write(PLAIN, tmp_path, "mcap").rename(tmp_path / "plain"), tmp_path / "run.mcap"
+    with whole.open("rb") as old, path.open("wb") as new:
+        writer = mcap.writer.Writer(new)
+        writer.start("ros2")
+        schema = writer.register_schema("foxglove.Log", "jsonschema", b"{}")
+        other, ids = writer.register_channel("/log", "json", schema), {}
+        for schema, channel, message in mcap.reader.make_reader(old).iter_messages():
+            if channel.id not in ids:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                ids[channel.id] = writer.register_channel(channel.topic, "cdr", kind)
+            times = message.log_time, message.publish_time
+            writer.add_message(ids[channel.id], times[0], message.data, times[1])
+            writer.add_message(other, times[0], b"{}", times[1])
+        writer.finish()
+    found = read(path)
+    assert_reads(found)
+    assert found.cuts == []
+    with pytest.raises(ValueError, match="messages of topic '/log' are encoded as 'json'"):
+        read(path, ("topic: /goal", "topic: /log"))
+
+
 @pytest.mark.parametrize(
     ("kind", "end", "message"),
     [

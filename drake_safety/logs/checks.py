@@ -32,6 +32,7 @@ _DISAGREES, _AGREES = 0.4, 0.25  # Of the motion, if another reading agrees.
 _WRONG, _FAR = 0.9, 3.0  # Of the motion, and of the least change, if none does.
 _FACTOR, _TURN_RAD = 1.6, math.radians(30.0)  # Least factor of a unit or rate, and turn of axes.
 _STEP_S, _NUM_STEPS = 0.05, 80  # In which a foot on the ground does not move.
+_UNEVEN, _MANY_CHANGES = 3.0, 20  # Times of even times' variation, of at least so many.
 _SHORTEST_S = 0.5  # Of a log that says how feet move.
 _SLIP_M, _SLIP_FACTOR = 0.004, 3.0
 _INVERSE = "'base_orientation' is the inverse, of the world in the base"
@@ -62,6 +63,7 @@ def check(sources: list[Source], kinematics: RobotKinematics) -> None:
             raise ValueError(f"{source.channels['joint_positions'].where(row, column)}: {text}")
         if source is longest:
             _check_stance(source, kinematics)
+            _check_stamps(source)
             _check_velocities(source)
 
 
@@ -204,6 +206,8 @@ def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rot
     yield _INVERSE, R.inv(), p
     yield f"{_INVERSE}, and {text}", other.inv(), p
     yield "the whole pose is the inverse, of the world in the base", R.inv(), -R.inv().apply(p)
+    flip = Rotation.from_euler("x", 180, degrees=True)
+    yield "world and base have z downwards", flip * R * flip, flip.apply(p)
     quarters = [one for one in Rotation.create_group("O") if one.magnitude() > 0]
     for turn in sorted(quarters, key=lambda one: np.count_nonzero(abs(one.as_rotvec()) > 1e-6)):
         what = f"'base_orientation' is of a sensor turned on the base by {_turn_text(turn)}"
@@ -211,6 +215,23 @@ def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rot
     for angle in (*range(-170, 0, 10), *range(10, 180, 10)):
         what = f"'base_orientation' is turned by {-angle}° about the vertical of the world"
         yield what, Rotation.from_euler("z", angle, degrees=True) * R, p
+
+
+def _check_stamps(source: Source) -> None:
+    """Checks that derivatives are no smoother with even times: then the stamps jitter."""
+    for name, positions in VELOCITIES.items():
+        channel = source.channels[positions]
+        steps_s, moved = np.diff(channel.time_s), np.diff(source.table(positions), axis=0)
+        changes = np.abs(np.diff(moved / steps_s[:, None], axis=0)).max(axis=1)
+        even = np.abs(np.diff(moved / np.median(steps_s), axis=0)).max(axis=1)
+        least, share = _LEAST[name] / _WINDOW_S, np.median(changes) / max(np.median(even), 1e-9)
+        is_rough = share > _UNEVEN and len(changes) >= _MANY_CHANGES
+        if name not in source.channels and is_rough and np.median(changes) > least:
+            raise ValueError(
+                f"{channel.where(0, channel.time_name)}: the times of the rows jitter: the "
+                f"derivative of '{positions}' varies by {share:.1f} times as much as with even "
+                f"times: log when it is measured, or '{name}'"
+            )
 
 
 def _check_velocities(source: Source) -> None:
@@ -229,10 +250,15 @@ def _check_velocities(source: Source) -> None:
         sums = cumulative_trapezoid(source.table(name), time_s, axis=0, initial=0.0)
         logged = np.subtract(*(values_at(time_s, sums, at_s) for at_s in windows[::-1]))
         moved = np.subtract(*(source.at(positions, at_s) for at_s in windows[::-1]))
-        if name == "joint_velocities":
-            _check_joints(source, moved, logged, width)
-        else:
+        if name != "joint_velocities":
             _check_base(source, name, moved, logged, windows)
+            continue
+        for i, column in enumerate(source.log_map.joint_velocities.names(source.joints)):
+            given = "", moved[:, [i]], logged[:, [i]]
+            readings = _scaled(source, name, *given[1:])
+            for k, joint in enumerate(source.joints):
+                readings.append((f"it is of joint '{joint}'", moved[:, [k]], given[2]))
+            _require(source, name, [column], width, given, readings)
 
 
 def _check_base(
@@ -260,16 +286,6 @@ def _check_base(
                 turned.append((text + (other if also else frame), change, turn.apply(logged)))
     width = float(windows[1, 0] - windows[0, 0])
     _require(source, name, part.columns, width, ("", changes[frame], logged), simple, turned)
-
-
-def _check_joints(source: Source, moved: np.ndarray, logged: np.ndarray, width: float) -> None:
-    name, joints = "joint_velocities", source.joints
-    for i, column in enumerate(source.log_map.joint_velocities.names(joints)):
-        given = "", moved[:, [i]], logged[:, [i]]
-        readings = _scaled(source, name, *given[1:])
-        for k, joint in enumerate(joints):
-            readings.append((f"it is of joint '{joint}'", moved[:, [k]], given[2]))
-        _require(source, name, [column], width, given, readings)
 
 
 def _scaled(
@@ -324,12 +340,13 @@ def _require(
             likely = " or ".join(what for _, _, what in close)
             raise ValueError(f"{text}, but by {close[0][1] / width_s:.2f} {unit} if {likely}")
     num_rows = 8 if "angular" in name else 4  # A gyroscope's vibrations need more to be averaged.
-    is_far = share > _WRONG and (size > _FAR * least or not given[2].any())
+    is_still = [not np.median(np.linalg.norm(one, axis=1)[moves]) for one in given[1:]]
+    is_far = share > _WRONG and (size > _FAR * least or any(is_still))
     if is_far and width_s > num_rows * np.median(np.diff(source.channels[name].time_s)):
-        raise ValueError(
-            f"{text}; no other frame, sign or unit agrees: leave '{name}' out of the map, then the "
-            "derivative is used"
-        )
+        remedy = f"leave '{name}' out of the map, then the derivative is used"
+        if is_still[0]:
+            remedy = f"'{VELOCITIES[name]}' stands still most of that time"
+        raise ValueError(f"{text}; no other frame, sign or unit agrees: {remedy}")
 
 
 def _turn_text(turn: Rotation) -> str:

@@ -191,6 +191,8 @@ def field_of(path: str) -> Callable[[Any], Any]:
         for name, index in steps:
             if name is not None:
                 owner, value = value, field(value, name)
+            elif not len(value):
+                return math.nan  # Not filled in, as sensor_msgs/JointState allows.
             elif index.isdecimal():
                 value = value[int(index)]
             elif index in (names := list(field(owner, "name"))):

@@ -20,8 +20,7 @@ from drake_safety.logs.log_map import LogTime
 if TYPE_CHECKING:
     import pandas as pd
 
-_SEPARATORS = {",": ",", ";": ";", "\t": "\t", "|": "|", " ": r"\s+"}
-"""Separators of cells, as pandas has them."""
+_SEPARATORS = (",", ";", "\t", "|", " ")
 _NUM_HEAD_LINES = 60  # Among which the header is sought.
 _COMMENT = "#%"
 _MISSING = ["", "na", "n/a", "nan", "null", "none", "-"]
@@ -50,7 +49,7 @@ def read_csv(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Chann
         places = _places(path, wanted, time, names)
         frame = pd.read_csv(
             io.StringIO(text),
-            sep=_SEPARATORS[separator],
+            sep=r"\s+" if separator == " " else separator,
             skiprows=line + 1,
             names=range(len(names)),
             index_col=False,
@@ -87,9 +86,7 @@ def read_parquet(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, C
 
 
 def _cells(line: str, separator: str) -> list[str]:
-    line = line.lstrip(_COMMENT + " ")
-    if separator == " ":
-        return line.split()
+    line = line.lstrip(_COMMENT + " ").rstrip(" ")
     return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
 
 
