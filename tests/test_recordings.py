@@ -119,9 +119,11 @@ def test_dates_need_no_unit(kind, suffix, tmp_path):
     assert_reads(read(path, ("unit: ns", f"unit: {unit}")), atol=1e-4)
 
 
-def test_a_date_as_the_index_of_a_parquet_file_is_a_column(tmp_path):
+@pytest.mark.parametrize("zone", [None, "Asia/Tokyo"])
+def test_a_date_as_the_index_of_a_parquet_file_is_a_column(zone, tmp_path):
     frame = frame_of(PLAIN)
-    frame = frame.assign(stamp=pd.to_datetime(frame.stamp)).set_index("stamp")
+    dates = pd.to_datetime(frame.stamp).dt.tz_localize(zone)
+    frame = frame.assign(stamp=dates).set_index("stamp")
     assert_reads(read(save(frame, tmp_path, "parquet"), ("unit: ns", "unit: s")))
 
 

@@ -25,7 +25,8 @@ class Channel:
 
     Attributes:
         topic: Topic of the messages; empty for a table.
-        time: Time in the log's unit, integers or floats, (N,); dates and durations become ns.
+        time: Time in the log's unit, integers or floats, (N,); dates and durations in ns
+            become integers.
         time_unit: Unit of ``time``.
         frame: The requested columns, N rows of floats; the index is their number in the file.
         row_name: Name of a row: "line", "row" or "message".
@@ -42,8 +43,8 @@ class Channel:
     origin: float | int = 0
 
     def __post_init__(self) -> None:
-        if (kind := self.time.dtype.kind) in "mM":
-            self.time, self.time_unit = self.time.astype(f"{kind}8[ns]").astype(np.int64), "ns"
+        if self.time.dtype.kind in "mM":
+            self.time, self.time_unit = self.time.astype(np.int64), "ns"
 
     def where(self, row: int, column: str = "") -> str:
         """Describes the location of a row, and of a column if given."""

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.observation import quaternion_of
 from drake_safety.logs.conversion import Source, common_span, values_at
-from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, ORDERS, VELOCITIES, si_units
+from drake_safety.logs.log_map import ANGLE_UNITS, LENGTH_UNITS, VELOCITIES, si_units
 
 _NORM_TOLERANCE = 0.01
 _MAX_TILT_RAD = math.radians(60.0)
@@ -39,7 +39,7 @@ _INVERSE = "'base_orientation' is the inverse, of the world in the base"
 
 _Reading = tuple[str, np.ndarray, np.ndarray]
 """A reading in words, and the changes by positions and by velocities in it, (M, n) each."""
-_Pose = tuple[str, bool, tuple[np.floating, np.floating]]
+_Pose = tuple[str, bool, list[float]]
 """A reading of the base's pose: whether the robot stands at first, and how its feet slide [m]."""
 
 
@@ -53,7 +53,14 @@ def check(sources: list[Source], kinematics: RobotKinematics) -> None:
     """
     longest = max(sources, key=lambda one: float(np.ptp(one.at_s)))
     for source in sources:
-        _check_norms(source)
+        names = source.log_map.base_orientation.columns
+        norms = np.linalg.norm(source.table("base_orientation"), axis=1)
+        if (is_bad := np.abs(norms - 1.0) > _NORM_TOLERANCE).any():
+            row = int(np.argmax(is_bad))
+            raise ValueError(
+                f"{source.channels['base_orientation'].where(row)}, columns {names}: the "
+                f"quaternion has a norm of {norms[row]:g}, expected 1"
+            )
         if source is sources[0]:
             _check_start(source, kinematics)
             _check_desired_output(source, kinematics)
@@ -63,21 +70,7 @@ def check(sources: list[Source], kinematics: RobotKinematics) -> None:
             raise ValueError(f"{source.channels['joint_positions'].where(row, column)}: {text}")
         if source is longest:
             _check_stance(source, kinematics)
-            _check_stamps(source)
             _check_velocities(source)
-
-
-def _check_norms(source: Source) -> None:
-    """Checks that quaternions have a norm of 1."""
-    names = source.log_map.base_orientation.columns
-    norms = np.linalg.norm(source.table("base_orientation"), axis=1)
-    is_bad = np.abs(norms - 1.0) > _NORM_TOLERANCE
-    if is_bad.any():
-        row = int(np.argmax(is_bad))
-        raise ValueError(
-            f"{source.channels['base_orientation'].where(row)}, columns {names}: the quaternion "
-            f"has a norm of {norms[row]:g}, expected 1"
-        )
 
 
 def _implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:
@@ -192,15 +185,15 @@ def _poses(source: Source, kinematics: RobotKinematics) -> Iterator[_Pose]:
         lowest = np.argmin(first[..., 2] + last[..., 2], axis=1)
         moved = np.linalg.norm(last - first, axis=2)[np.arange(_NUM_STEPS), lowest]
         start = np.concatenate([R[0].as_quat(scalar_first=True), p[0], q[0, 7:]])
-        slips = np.sqrt(np.mean((feet - feet.mean(axis=0)) ** 2)), np.median(moved)
-        yield what, not _implausible(kinematics, start), slips
+        slips = [np.sqrt(np.mean((feet - feet.mean(axis=0)) ** 2)), np.median(moved)]
+        yield what, not _implausible(kinematics, start), list(map(float, slips))
 
 
 def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rotation, np.ndarray]]:
     """Readings of the base's orientation (N,) and position (N, 3)."""
     swapped = R.as_quat(scalar_first=order == "wxyz")
     other = Rotation.from_quat(swapped, scalar_first=order != "wxyz")
-    text = f"'base_orientation.order' is {next(one for one in ORDERS if one != order)}"
+    text = f"'base_orientation.order' is {'xyzw' if order == 'wxyz' else 'wxyz'}"
     yield "", R, p
     yield text, other, p
     yield _INVERSE, R.inv(), p
@@ -217,27 +210,28 @@ def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rot
         yield what, Rotation.from_euler("z", angle, degrees=True) * R, p
 
 
-def _check_stamps(source: Source) -> None:
-    """Checks that derivatives are no smoother with even times: then the stamps jitter."""
-    for name, positions in VELOCITIES.items():
-        channel = source.channels[positions]
-        steps_s, moved = np.diff(channel.time_s), np.diff(source.table(positions), axis=0)
-        changes = np.abs(np.diff(moved / steps_s[:, None], axis=0)).max(axis=1)
-        even = np.abs(np.diff(moved / np.median(steps_s), axis=0)).max(axis=1)
-        least, share = _LEAST[name] / _WINDOW_S, np.median(changes) / max(np.median(even), 1e-9)
-        is_rough = share > _UNEVEN and len(changes) >= _MANY_CHANGES
-        if name not in source.channels and is_rough and np.median(changes) > least:
-            raise ValueError(
-                f"{channel.where(0, channel.time_name)}: the times of the rows jitter: the "
-                f"derivative of '{positions}' varies by {share:.1f} times as much as with even "
-                f"times: log when it is measured, or '{name}'"
-            )
+def _check_stamps(source: Source, name: str, positions: str) -> None:
+    """Checks that a derivative would not be smoother with even times: then the stamps jitter."""
+    channel, moved = source.channels[positions], np.diff(source.table(positions), axis=0)
+    steps_s = np.diff(channel.time_s)
+    given, even = (
+        np.median(np.abs(np.diff(moved / step_s, axis=0)).max(axis=1))
+        for step_s in (steps_s[:, None], np.median(steps_s))
+    )
+    share = given / max(even, 1e-9)
+    if share > _UNEVEN and given > _LEAST[name] / _WINDOW_S and len(moved) > _MANY_CHANGES:
+        raise ValueError(
+            f"{channel.where(0, channel.time_name)}: the times of the rows jitter: the derivative "
+            f"of '{positions}' varies by {share:.1f} times as much as with even times: log when "
+            f"it is measured, or '{name}'"
+        )
 
 
 def _check_velocities(source: Source) -> None:
     """Checks that logged velocities are the derivatives of positions, in frame, sign and unit."""
     for name, positions in VELOCITIES.items():
         if name not in source.channels:
+            _check_stamps(source, name, positions)
             continue
         names = {positions, name} if "joint" in name else {positions, name, "base_orientation"}
         channels = [source.channels[one] for one in names]

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal
 
 from drake_safety.files.schema import Positive, load_typed_file, schema
 
@@ -28,8 +28,6 @@ COMMANDS = ("desired_output", "foot_positions")
 """What a log may have that is valid until its next value."""
 QUANTITIES = (*VELOCITIES.values(), *VELOCITIES, *COMMANDS)
 """Fields of a LogMap that name columns."""
-ORDERS = get_args(Order)
-"""Orders of a quaternion's columns."""
 _NO_POSITION = (
     ": a log of joints and an inertial measurement unit has none; a state estimator for legged "
     "robots adds it, such as MUSE, Pronto or invariant-ekf (docs/logs.md, 'Logs without a base "

@@ -89,7 +89,7 @@ def _recover(source: Path, target: Path, wanted: Wanted) -> float:
         raise ValueError(
             f"messages of topic '{topic}' are encoded as '{others[topic]}', expected ROS's 'cdr'"
         )
-    return end / source.stat().st_size
+    return end / max(source.stat().st_size, 1)
 
 
 def _recover_sqlite(source: Path, target: Path) -> float:
@@ -181,8 +181,7 @@ def field_of(path: str) -> Callable[[Any], Any]:
 
     def field(owner: Any, name: str) -> Any:
         if not hasattr(owner, name):
-            existing = getattr(owner, "__slots__", None) or vars(owner)
-            existing = [key for key in existing if not key.startswith("_")]
+            existing = [key for key in getattr(owner, "__dict__", ()) if key[0] != "_"]
             raise LookupError(f"there is no field '{name}'; the fields are {listed(existing)}")
         return getattr(owner, name)
 
@@ -206,9 +205,8 @@ def field_of(path: str) -> Callable[[Any], Any]:
 
 def _number(value: Any) -> Any:
     """A number; a ROS stamp as a duration."""
-    if hasattr(value, "sec"):
-        fraction = value.nanosec if hasattr(value, "nanosec") else value.nsec
-        return np.timedelta64(int(value.sec) * 1_000_000_000 + int(fraction), "ns")
+    if hasattr(value, "nanosec"):
+        return np.timedelta64(int(value.sec) * 1_000_000_000 + int(value.nanosec), "ns")
     if isinstance(value, np.number | int | float):
         return value
     raise TypeError(f"expected a number, got {type(value).__name__}")

@@ -147,8 +147,10 @@ def _channel(path: Path, frame: pd.DataFrame, time: LogTime, row_name: str) -> C
 
     import pandas as pd
 
-    dates = _dates(frame[time.column])
-    stamps = numbers(time.column, "number or a date") if dates is None else dates.to_numpy()
+    if (dates := _dates(frame[time.column])) is None:
+        stamps = numbers(time.column, "number or a date")
+    else:
+        stamps = dates.to_numpy(f"{dates.dtype.kind}8[ns]")
     columns = {name: numbers(name).astype(float) for name in frame.columns.drop(time.column)}
     return Channel(
         path=path,
@@ -175,5 +177,5 @@ def _dates(stamps: pd.Series) -> pd.Series | None:
             warnings.simplefilter("ignore")  # That the format had to be guessed.
             dates = parse(text, errors="coerce")
         if not dates.isna().any():
-            return dates.dt.tz_localize(None) if dates.dtype.kind == "M" else dates
+            return dates
     return None
