@@ -91,7 +91,7 @@ def quantities(
     for topic, channel in topics.items():
         used = {name: one for name, one in own.items() if getattr(log_map, name).topic == topic}
         missing = [one.frame.isna().any(axis=1) for one in used.values()]
-        share = 1.0 - float(np.any(missing, axis=0).mean()) if missing else 1.0
+        share = 1.0 - np.any(missing, axis=0).sum() / max(len(channel.time), 1)
         if share < _SPARSE:
             own |= {name: _present(one, log_map.max_gap_s) for name, one in used.items()}
             rows = f"the messages of topic '{topic}'" if topic else "the rows"
