@@ -35,6 +35,7 @@ from studies.harness import (
     Arrays,
     CalibrationOption,
     EpisodesOption,
+    ReleaseOption,
     SeedOption,
     fingerprint,
     kept,
@@ -57,6 +58,7 @@ def ablate(
     calibration_episodes: CalibrationOption = 300,
     only: Annotated[str, typer.Option(help="Part of the names of the variants.")] = "",
     seed: SeedOption = EVALUATION.first,
+    release: ReleaseOption = False,
     workers: WorkersOption = None,
 ) -> None:
     """Train Γ with one choice changed at a time, and evaluate it on the same episodes.
@@ -69,6 +71,7 @@ def ablate(
         scenario,
         assessment,
         seed=seed,
+        release=release,
         workers=workers,
         plotted=lambda row: row.metric in ("auc", "brier", "auc_gain"),
     ) as study:

@@ -34,7 +34,7 @@ from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.worker_processes import map_items
 from studies.adaptation_figure import adaptation_figure
 from studies.baselines import DirectClassifier
-from studies.harness import open_study
+from studies.harness import ReleaseOption, open_study
 
 SIZES = (40, 80, 120, 160, 400)
 """Numbers of pairs of episodes after which an assessment is evaluated."""
@@ -74,6 +74,7 @@ def adaptation(
     seed: Annotated[
         int, typer.Option(help="First of the seeds of fresh simulations.")
     ] = ADAPTATION.first,
+    release: ReleaseOption = False,
     workers: WorkersOption = None,
 ) -> None:
     """Evaluate Γ before and after feedback of a simulated plant, on independent pools.
@@ -89,6 +90,7 @@ def adaptation(
         scenario,
         learned.path,
         seed=seed,
+        release=release,
         workers=workers,
         out=folder,
         plotted=lambda row: (
@@ -97,7 +99,7 @@ def adaptation(
         ),
     ) as study:
         loaded, stages = study.scenario, study.stages
-        seeds = [ADAPTATION.seeds(seed + _POOL_STRIDE * i) for i in range(pools)]
+        seeds = [ADAPTATION.seeds(study.seed + _POOL_STRIDE * i) for i in range(pools)]
         spent = [one for block in seeds for one in block.values()]
         priors = {mode: study.load(mode, spent) for mode in MODES}
         plant = ActualPlant(loaded, variation, learned.out, workers, stages)

@@ -38,7 +38,7 @@ from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.worker_processes import Progress
 from studies.alarms import equal_share_threshold
 from studies.gru_monitor import GruMonitor
-from studies.harness import CalibrationOption, Study, open_study
+from studies.harness import CalibrationOption, ReleaseOption, Study, open_study
 from studies.injections import (
     EPISODE_S,
     ONSET_S,
@@ -70,6 +70,7 @@ def anomalies(
         float, typer.Option(help="Motion of `train`, from which the others learn [min].", min=2.0)
     ] = 120.0,
     seed: Annotated[int, typer.Option(help="First of the seeds of motion.")] = ANOMALIES.first,
+    release: ReleaseOption = False,
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results; that of ASSESSMENT by default.")
     ] = None,
@@ -81,10 +82,11 @@ def anomalies(
     OUT/anomalies.json.
     """
     learned = assessment_folder(load_scenario(scenario), assessment)
-    out, seeds = out or learned.out, ANOMALIES.seeds(seed)
+    out = out or learned.out
     with open_study(
-        "anomalies", scenario, learned.path, seed=seed, workers=workers, out=out
+        "anomalies", scenario, learned.path, seed=seed, release=release, workers=workers, out=out
     ) as study:
+        seeds = ANOMALIES.seeds(study.seed)
         detector = study.load(MODES[0], seeds.values()).detector_
         seeds["training"] = MOTION.first
         loop: Any = study.scenario.make_loop()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -158,7 +160,11 @@ class DirectClassifier:
 
 
 def classifier_scorers(
-    episodes: Episodes, progress: StageProgress, *, shortest: int | None = None
+    episodes: Episodes,
+    progress: StageProgress,
+    *,
+    shortest: int | None = None,
+    seeds: Sequence[int] = (0,),
 ) -> list[Scorer]:
     """The baseline classifiers, trained on the training episodes of the assessment.
 
@@ -166,11 +172,13 @@ def classifier_scorers(
         episodes: Training episodes.
         progress: Called with a stage, the number done and the number wanted.
         shortest: Minimum length of a segment of a safe episode [steps]; the horizon by default.
+        seeds: Seeds of the training; with several, a scorer is named after its kind and seed.
     """
     scorers = []
-    for i, kind in enumerate(KINDS):
-        progress("baseline classifiers", i, len(KINDS))
-        classifier = DirectClassifier(kind, shortest=shortest).fit(episodes)
+    wanted = list(itertools.product(KINDS, seeds))
+    for i, (kind, seed) in enumerate(wanted):
+        progress("baseline classifiers", i, len(wanted))
+        classifier = DirectClassifier(kind, seed=seed, shortest=shortest).fit(episodes)
 
         def probability(
             *inputs: np.ndarray, predict_unsafe: Any = classifier.predict_unsafe
@@ -178,8 +186,9 @@ def classifier_scorers(
             return 1.0 - predict_unsafe(*inputs)
 
         used = [UsedEpisodes.of("training", episodes.info, len(episodes))]
-        scorers.append(Scorer(name=kind, probability=probability, used=used))
-    progress("baseline classifiers", len(KINDS), len(KINDS))
+        name = kind if len(seeds) == 1 else f"{kind}_{seed}"
+        scorers.append(Scorer(name=name, probability=probability, used=used))
+    progress("baseline classifiers", len(wanted), len(wanted))
     return scorers
 
 

@@ -22,7 +22,7 @@ from drake_safety.learning.feedback import EpisodePair, pair_episodes
 from drake_safety.learning.seeds import ADAPTATION, EVALUATION
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.capabilities import HasGoals, is_fair
-from studies.harness import CalibrationOption, EpisodesOption, SeedOption, open_study
+from studies.harness import CalibrationOption, EpisodesOption, ReleaseOption, SeedOption, open_study
 
 
 def converged(
@@ -35,6 +35,7 @@ def converged(
         int, typer.Option(help="Pairs of the actual plant, the feedback before throws.", min=0)
     ] = 160,
     seed: SeedOption = EVALUATION.first,
+    release: ReleaseOption = False,
     workers: WorkersOption = None,
 ) -> None:
     """Evaluate the paper's mode at its threshold 0.6, before and after its adaptation.
@@ -42,7 +43,9 @@ def converged(
     Nominal episodes are judged after feedback from other nominal episodes, those for thresholds,
     throws at the actual plant after feedback from it. Writes ASSESSMENT/converged.json.
     """
-    with open_study("converged", scenario, assessment, seed=seed, workers=workers) as study:
+    with open_study(
+        "converged", scenario, assessment, seed=seed, release=release, workers=workers
+    ) as study:
         prior = study.load("paper")
         loop, stages = study.scenario.make_loop(), study.stages
         test, other = study.fresh(episodes), study.fresh(calibration_episodes, "thresholds")
@@ -61,7 +64,7 @@ def converged(
         }
         if throws:
             plant = ActualPlant(study.scenario, "actual", assessment, workers, stages)
-            run = plant.pairs(pairs, ADAPTATION.first)
+            run = plant.pairs(pairs, ADAPTATION.first_beside(study.seed))
             literal = {"before": prior, "converged": prior.adapt(run.feedback(), method="paper")}
             thrown, _ = evaluate_throws(
                 study.scenario,

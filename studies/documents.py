@@ -24,6 +24,7 @@ from drake_safety.evaluation.tables import Column, Row, Table
 from drake_safety.evaluation.verdict_tables import INPUTS, verdict_table
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import SCHEMA_VERSION
+from drake_safety.learning.seeds import use_of
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.scenario import Scenario
 from studies.plans import SAFE_RECALL, UNSAFE_RECALL
@@ -60,7 +61,7 @@ def render(kind: str, results: Results, **more: Any) -> str:
     )
     environment.filters |= {name: _column("", "", name).text for name in _FORMATS}
     environment.filters |= {"gain": _gain, "markdown": markdown, "narrow": narrow}
-    environment.filters["today"] = partial(today, results)
+    environment.filters |= {"today": partial(today, results), "origin": origin}
     environment.globals |= {
         "r": results,
         "entries": results.entries,
@@ -76,10 +77,17 @@ def render(kind: str, results: Results, **more: Any) -> str:
     return re.sub(r"\n{3,}", "\n\n", text).strip()
 
 
+def origin(seed: int) -> str:
+    """A seed, and whether it is one of development or of a release's figures."""
+    return f"{seed} ({use_of(seed)})"
+
+
 def today(results: Results, command: str) -> str:
     """A stored command by its present name: the studies evaluate beside baselines."""
     is_beside = any(row.method == "gradient_boosting" for row in results.values())
     old = "drake-safety evaluate "
+    # Alarms need no thresholds any more.
+    command = re.sub(r"^(python -m studies walking .*) --calibration-tours \d+", r"\1", command)
     return command.replace(old, "python -m studies evaluate ") if is_beside else command
 
 

@@ -33,7 +33,7 @@ from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
-from drake_safety.learning.seeds import EVALUATION, SHIFTS
+from drake_safety.learning.seeds import EVALUATION, RELEASE, SHIFTS
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.capabilities import (
     CanBePushed,
@@ -56,7 +56,7 @@ from studies.alarms import (
     threshold_alarms,
 )
 from studies.baselines import KINDS, auc_difference, classifier_scorers
-from studies.harness import CalibrationOption, EpisodesOption
+from studies.harness import CalibrationOption, EpisodesOption, ReleaseOption
 from studies.plans import Plans, Rule, evaluate_plans, plans_of, reachability_rule, scorer_rule
 from studies.pushed_motions import run_pushed_motions
 from studies.reachability import BASELINES, Reachability
@@ -93,6 +93,7 @@ def evaluate(
         int, typer.Option(help="Motions of each shift, instead of all else.", min=0)
     ] = 0,
     seed: Annotated[int | None, typer.Option(help="First of the seeds.")] = None,
+    release: ReleaseOption = False,
     out: Annotated[Path | None, typer.Option(help="Folder; ASSESSMENT's by default.")] = None,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
@@ -100,9 +101,11 @@ def evaluate(
     """Evaluate Γ beside baselines, trained on the same episodes, for README and docs."""
     loaded, folder = load_scenario(scenario), out or assessment
     check_writable(assessment, folder)
+    block = SHIFTS if shifts else EVALUATION
+    first = (block.first if seed is None else seed) + RELEASE * release
     if shifts:
         with evaluating(
-            loaded, assessment, folder, SHIFTS, seed, workers, program=_PROGRAM
+            loaded, assessment, folder, block, first, workers, program=_PROGRAM
         ) as evaluation:
             add_all_shifts(evaluation, shifts, episodes)
         return
@@ -113,7 +116,7 @@ def evaluate(
         require(loop, CanBePushed)
     training = load_episodes(episodes_folder(assessment))
     with evaluating(
-        loaded, assessment, folder, EVALUATION, seed, workers, _tables, _PROGRAM
+        loaded, assessment, folder, block, first, workers, _tables, _PROGRAM
     ) as evaluation:
         evaluation.entries["calibration_episodes"] = calibration_episodes
         test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")

@@ -29,7 +29,7 @@ from drake_safety.evaluation.tables import Column, Table, rows_of
 from drake_safety.files.atomic import replacing
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.seeds import EVALUATION
+from drake_safety.learning.seeds import EVALUATION, RELEASE, use_of
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.scenario import Scenario, load_scenario
 from drake_safety.simulation.worker_processes import Progress, map_items
@@ -38,6 +38,9 @@ EpisodesOption = Annotated[int, typer.Option(help="Fresh nominal episodes.", min
 CalibrationOption = Annotated[int, typer.Option(help="Other ones, for thresholds.", min=20)]
 SeedOption = Annotated[
     int, typer.Option(help="First seed of the fresh ones: that of `evaluate` by default.")
+]
+ReleaseOption = Annotated[
+    bool, typer.Option("--release", help="Use the release's seeds: once, for published figures.")
 ]
 Arrays = dict[str, np.ndarray]
 
@@ -94,6 +97,7 @@ class Study:
         """The rows, and what made them."""
         made = made_by(self.scenario.name, "python -m studies")
         made |= {"scenario_hash": self.scenario.simulation_hash(), "seed": self.seed}
+        made["seed_use"] = use_of(self.seed)
         return Results(self.rows, made | self.entries)
 
 
@@ -104,6 +108,7 @@ def open_study(
     folder: Path,
     *,
     seed: int = EVALUATION.first,
+    release: bool = False,
     workers: int | None = None,
     out: Path | None = None,
     plotted: Callable[[Result], bool] | None = None,
@@ -115,11 +120,12 @@ def open_study(
         scenario: Name or path of the scenario.
         folder: Folder of the training.
         seed: First seed of the fresh episodes.
+        release: Whether `RELEASE` is added to it.
         workers: Number of worker processes; None for one a core.
         out: Folder of the files; that of the training by default.
         plotted: Whether a row is in the plot; there is none by default.
     """
-    loaded = load_scenario(scenario)
+    loaded, seed = load_scenario(scenario), seed + RELEASE * release
     with open_stages() as stages:
         study = Study(
             name=name, scenario=loaded, folder=folder, seed=seed, workers=workers, stages=stages

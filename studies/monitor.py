@@ -22,7 +22,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import FRESH_MOTION, SHIFTS
 from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import Scenario
-from studies.harness import Arrays, fingerprint, kept, open_study
+from studies.harness import Arrays, ReleaseOption, fingerprint, kept, open_study
 
 _NOMINAL = "nominal"
 
@@ -33,13 +33,17 @@ def monitor(
     motions: Annotated[int, typer.Option(help="Undisturbed motions of each shift.", min=2)] = 24,
     hours: Annotated[float, typer.Option(help="Hours of other nominal motion.", min=0.0)] = 5.0,
     seed: Annotated[int, typer.Option(help="Seed of the shifts' motions.")] = SHIFTS.first,
+    release: ReleaseOption = False,
     workers: WorkersOption = None,
 ) -> None:
     """Evaluate the monitor: alarms under each shift, Γ's confident errors, false alarms an hour.
 
     Writes ASSESSMENT/monitor.json. What is simulated is kept: a stopped study continues.
     """
-    with open_study("monitor", scenario, assessment, seed=seed, workers=workers) as study:
+    with open_study(
+        "monitor", scenario, assessment, seed=seed, release=release, workers=workers
+    ) as study:
+        seed, fresh_seed = study.seed, FRESH_MOTION.first_beside(study.seed)
         gamma, loaded = study.load("sharpened", [seed]), study.scenario
         shifts = plant_shifts(loaded, loaded.make_loop())
         promise = gamma.calibrations_.get(calibration.MOTION)
@@ -64,9 +68,9 @@ def monitor(
             usual = run_motions(
                 loaded,
                 3600.0 * hours,
-                seed=FRESH_MOTION.first,
+                seed=fresh_seed,
                 num_workers=workers,
-                path=fresh_episodes_folder(study.folder, "motion", FRESH_MOTION.first, {}),
+                path=fresh_episodes_folder(study.folder, "motion", fresh_seed, {}),
                 progress=partial(study.stages, "hours of nominal motion"),
             )
             alarms = {"false_alarms_per_hour": false_alarms(usual, gamma.detector_)}

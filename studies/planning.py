@@ -27,7 +27,7 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import episode_rng, run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario, load_scenario
 from drake_safety.simulation.worker_processes import Progress
-from studies.harness import Arrays, kept, open_study
+from studies.harness import Arrays, ReleaseOption, kept, open_study
 
 _MAX_TRIES = 100
 _CANDIDATES = 1  # Second spawn key of the generator of an episode's candidates.
@@ -41,6 +41,7 @@ def plan_study(
         int, typer.Option(help="Plans of each start, all of them simulated.", min=2)
     ] = 9,
     seed: Annotated[int, typer.Option(help="Seed of the starts.")] = PLANNING.first,
+    release: ReleaseOption = False,
     mode: Annotated[str, typer.Option(help="'sharpened' or 'paper'.")] = "sharpened",
     out: Annotated[
         Path | None,
@@ -61,18 +62,19 @@ def plan_study(
         scenario,
         learned.path,
         seed=seed,
+        release=release,
         workers=workers,
         out=out or learned.out,
         plotted=lambda row: row.metric == "safe",
     ) as study:
-        gamma = study.load(mode, [seed])
+        gamma = study.load(mode, [study.seed])
         rule = goal_threshold(learned.path, gamma)
         say(f"threshold {rule.threshold:.3f}, {rule.origin}")
         trials = run_trials(
             study.scenario,
             episodes,
             num_plans=candidates,
-            seed=seed,
+            seed=study.seed,
             num_workers=workers,
             path=learned.out / "planning",
             progress=partial(study.stages, "starts"),

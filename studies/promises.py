@@ -21,7 +21,7 @@ from drake_safety.learning.calibration import (
 )
 from drake_safety.learning.seeds import CALIBRATION
 from drake_safety.learning.segments import split
-from studies.harness import EpisodesOption, open_study
+from studies.harness import EpisodesOption, ReleaseOption, open_study
 
 MISS_RATES = (0.01, 0.05, 0.1)
 """Promised miss rates."""
@@ -34,16 +34,20 @@ def promises(
     splits: Annotated[int, typer.Option(help="Number of splits.", min=1)] = 200,
     confidence: Annotated[float | None, typer.Option(help="Confidence of the promise.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the episodes.")] = CALIBRATION.first,
+    release: ReleaseOption = False,
     workers: WorkersOption = None,
 ) -> None:
     """Check promised miss rates: calibrated on one half of the episodes, tested on the other.
 
     Writes ASSESSMENT/promises.json.
     """
-    with open_study("promises", scenario, assessment, seed=seed, workers=workers) as study:
+    with open_study(
+        "promises", scenario, assessment, seed=seed, release=release, workers=workers
+    ) as study:
         scorer = assessment_scorer(MODES[0], study.load(MODES[0], []))
         segments = split(study.fresh(episodes), stride=1, discount=1.0, shortest=1)
         score = scorer.unsafe_score(segments)
+        seed = study.seed
         options: dict[str, Any] = {"confidence": confidence, "num_splits": splits, "seed": seed}
         study.entries |= {"splits": splits, "confidence": confidence}
         for kind in KINDS:

@@ -23,6 +23,7 @@ from studies.converged import judged_rules, nominal_feedback, recalls
 from studies.harness import (
     CalibrationOption,
     EpisodesOption,
+    ReleaseOption,
     SeedOption,
     Study,
     open_study,
@@ -146,6 +147,7 @@ def readings(
     ] = "",
     only: Annotated[str, typer.Option(help="Part of the names of the readings.")] = "",
     seed: SeedOption = EVALUATION.first,
+    release: ReleaseOption = False,
     workers: WorkersOption = None,
 ) -> None:
     """Train the paper's mode under every reading, and judge it on fresh episodes.
@@ -154,7 +156,9 @@ def readings(
     Episodes of readings with data of their own are kept in ASSESSMENT/readings. Writes
     ASSESSMENT/readings.json.
     """
-    with open_study("readings", scenario, assessment, seed=seed, workers=workers) as study:
+    with open_study(
+        "readings", scenario, assessment, seed=seed, release=release, workers=workers
+    ) as study:
         base = study.scenario.assessment = replace(study.scenario.assessment, mode="paper")
         readings = readings_of(study.scenario)
         chosen = [one for one in readings if only in one.name]

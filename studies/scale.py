@@ -25,6 +25,7 @@ from studies.baselines import auc_difference
 from studies.harness import (
     Arrays,
     EpisodesOption,
+    ReleaseOption,
     SeedOption,
     fingerprint,
     kept,
@@ -46,6 +47,7 @@ def scale(
     mode: Annotated[str, typer.Option(help="The mode.")] = "paper",
     episodes: EpisodesOption = 600,
     seed: SeedOption = EVALUATION.first,
+    release: ReleaseOption = False,
     workers: WorkersOption = None,
 ) -> None:
     """Learn from more and more segments: CPU time by stage, peak memory, size of the file, AUC.
@@ -60,6 +62,7 @@ def scale(
         scenario,
         assessment,
         seed=seed,
+        release=release,
         workers=workers,
         plotted=lambda row: row.metric in ("ms a segment", "peak GB", "auc"),
     ) as study:

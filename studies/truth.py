@@ -35,7 +35,7 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import Progress, map_items
-from studies.harness import EpisodesOption, SeedOption, open_study
+from studies.harness import EpisodesOption, ReleaseOption, SeedOption, open_study
 
 THRESHOLD = 0.5
 """Lowest Γ that is classified safe."""
@@ -49,18 +49,21 @@ def truth(
         int, typer.Option(help="Starts simulated along either axis of a state plane.", min=2)
     ] = 41,
     seed: SeedOption = EVALUATION.first,
+    release: ReleaseOption = False,
     workers: WorkersOption = None,
 ) -> None:
     """Compare Γ of both modes with the truth on state planes and on random plans, at k = 0.
 
     Writes ASSESSMENT/known_truth.json and a figure for each mode.
     """
-    with open_study("known_truth", scenario, assessment, seed=seed, workers=workers) as study:
+    with open_study(
+        "known_truth", scenario, assessment, seed=seed, release=release, workers=workers
+    ) as study:
         loop = study.scenario.make_loop()
         planes = getattr(loop, "state_planes", {})
         if not planes:
             raise ValueError(f"truth: task '{type(loop).__name__}' has no state planes")
-        assessments = {mode: study.load(mode, [seed]) for mode in MODES}
+        assessments = {mode: study.load(mode, [study.seed]) for mode in MODES}
         fresh = study.fresh(episodes)
         truths = [
             simulate_truth(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any
@@ -12,42 +12,35 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption
+from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption, say
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
-from drake_safety.evaluation.metrics import Estimate, median, proportion, rate_per_hour
+from drake_safety.evaluation.figure_style import save
+from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
+from drake_safety.learning.seeds import WALKING
 from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import Scenario
-from studies.alarms import (
-    Alarm,
-    first_alarm,
-    lowest_value,
-    scorer_alarm,
-    threshold_alarms,
-)
-from studies.baselines import classifier_scorers
-from studies.harness import open_study
+from studies.alarm_curves import EARLY_S, Watched, alarm_figure, equal_cost_estimates
+from studies.alarms import Alarm, scorer_alarm, threshold_alarms
+from studies.baselines import KINDS, classifier_scorers
+from studies.harness import ReleaseOption, open_study
 from studies.walking_motions import run_motions
 
-EARLY_S = 0.2
-"""Time before a fall that an alarm should leave [s]."""
 _LEAST = 1e-6  # Of a probability and its complement, in logits.
 _DURATIONS_S = {"tour": 60.0, "push": 5.0, "command": 4.0}
 _SPEED_S = 12.0
-_SEEDS = {"calibration": 6_000_000, "tour": 6_000_001, "push": 6_000_002, "command": 6_000_004}
+_CLASSIFIER_SEEDS = (0, 1, 2)
+_RIVALS = ("gradient_boosting", "capture_point_margin")
 
 
 def walking(
     scenario: ScenarioArgument,
     assessment: TrainingOption,
     tours: Annotated[int, typer.Option(help="Undisturbed tours of a minute.", min=1)] = 300,
-    calibration_tours: Annotated[
-        int, typer.Option(help="Others, on which thresholds are chosen.", min=1)
-    ] = 60,
     pushes: Annotated[int, typer.Option(help="Pushed motions.", min=1)] = 600,
     commands: Annotated[int, typer.Option(help="Commands past the policy's ranges.", min=0)] = 300,
     guarded_tours: Annotated[int, typer.Option(help="Tours with the guard.", min=0)] = 20,
@@ -56,16 +49,25 @@ def walking(
     ] = 150,
     speeds: Annotated[int, typer.Option(help="Commands simulated in MuJoCo too.", min=0)] = 20,
     variation: Annotated[str, typer.Option(help="The plant.")] = "nominal",
+    release: ReleaseOption = False,
     workers: WorkersOption = None,
 ) -> None:
     """Judge a walking robot: falls on tours, alarms on pushes, guard, recovery, MuJoCo.
 
-    Alarms have the highest thresholds that give none on the calibration tours, less a reserve.
-    Motions are kept in ASSESSMENT/walking: a stopped study continues. With more tours, only those
-    are simulated that are not there yet.
+    Alarms are compared at the same share of pushed motions that they alarm without need. Motions
+    are kept in ASSESSMENT/walking: a stopped study continues. With more tours, only those are
+    simulated that are not there yet.
     """
-    with open_study("walking", scenario, assessment, workers=workers) as study:
-        walker, gamma = study.scenario, study.load(MODES[0], [])
+    with open_study(
+        "walking",
+        scenario,
+        assessment,
+        seed=WALKING.first,
+        release=release,
+        workers=workers,
+    ) as study:
+        seeds_of = WALKING.seeds(study.seed)
+        walker, gamma = study.scenario, study.load(MODES[0], seeds_of.values())
         sha256 = file_hash(assessment_file(assessment, MODES[0]))
 
         def run(
@@ -83,7 +85,7 @@ def walking(
                 recovery = replace(walker.parameters.recovery, branch=branch)
                 which = copy.copy(walker)
                 which.parameters = replace(walker.parameters, recovery=recovery)
-            seed = _SEEDS[seeds or kind]
+            seed = seeds_of[seeds or kind]
             seconds = duration_s or _DURATIONS_S[kind]
             by = sha256[:12] if options else ""  # Γ, where it has a say.
             parts = (seeds or kind, plant, branch, *options, f"{seconds:g}s", by)
@@ -103,18 +105,13 @@ def walking(
             )
 
         train_set = load_episodes(episodes_folder(assessment))
-        alarms = walking_alarms(walker, gamma, classifier_scorers(train_set, study.stages))
-        calm = run("tour", range(calibration_tours), "calibration")
-        thresholds = alarm_thresholds(alarms, calm)
-        study.entries |= {
-            "variation": variation,
-            "seeds": _SEEDS,
-            "assessment_sha256": sha256,
-            "thresholds": thresholds,
-        }
+        classifiers = classifier_scorers(train_set, study.stages, seeds=_CLASSIFIER_SEEDS)
+        alarms = walking_alarms(walker, gamma, classifiers)
+        study.entries |= {"variation": variation, "seeds": seeds_of, "assessment_sha256": sha256}
+        study.entries["alarms"] = list(alarms)
         pushed = run("push", range(pushes))
         push_s = walker.parameters.random_pushes.duration_s
-        study.rows |= alarm_estimates(alarms, thresholds, pushed, push_s)
+        study.rows |= push_estimates(pushed, push_s)
         if recovered:
             fallen = [m.index for m in pushed if m.fall_time_s >= m.push_time_s and m.has_fallen]
             fallen = fallen[:recovered]
@@ -133,27 +130,50 @@ def walking(
                 for plant in ("nominal", "mujoco")
             )
             study.rows |= speed_estimates(ours, theirs)
-        study.rows |= tour_estimates(alarms, thresholds, run("tour", range(tours)))
+        toured = run("tour", range(tours))
+        study.rows |= tour_estimates(toured)
+        # A motion that leaves the safe set before the push is not judged.
+        pushed = [motion for motion in pushed if not motion.leave_time_s < motion.push_time_s]
+        calm = [motion for motion in toured if not motion.has_left]
+        watched = {
+            name: [Watched.of(alarm, pushed, calm) for alarm in seeds]
+            for name, seeds in alarms.items()
+        }
+        rivals = [name for name in _RIVALS if name in watched]
+        study.rows |= equal_cost_estimates(watched, MODES[0], rivals)
+        for picture in save(alarm_figure(watched), assessment / "walking_alarms"):
+            say("picture", picture)
 
 
 def walking_alarms(
     scenario: Scenario, assessment: SafetyAssessment, classifiers: Sequence[Scorer]
-) -> list[Alarm]:
-    """Alarms on Γ, classifiers, tilt, capture point and the policy's own change of action."""
+) -> dict[str, list[Alarm]]:
+    """Alarms on Γ, classifiers, tilt, capture point and the policy's own change of action.
+
+    Args:
+        scenario: A scenario of the walking task.
+        assessment: Γ.
+        classifiers: Those of each kind, one for each seed.
+
+    Returns:
+        By method; one for each seed of a kind.
+    """
     loop = scenario.make_loop()
     watched = require(loop, CanFall).watched_features
-    scorers = [assessment_scorer("sharpened", assessment), *classifiers]
-    alarms = [
-        *(_in_logits(scorer_alarm(scorer)) for scorer in scorers),
-        *threshold_alarms(loop.state_names, loop.feature_names, watched),
-    ]
+    alarms = {MODES[0]: [_in_logits(assessment_scorer(MODES[0], assessment))]}
+    for kind in KINDS:
+        seeds = [_in_logits(one) for one in classifiers if one.name.startswith(kind)]
+        alarms |= {kind: seeds} if seeds else {}
+    for alarm in threshold_alarms(loop.state_names, loop.feature_names, watched):
+        alarms[alarm.name] = [alarm]
     column = loop.feature_names.index("action_change")
-    alarms.append(Alarm(name="action_change", value=lambda one: -one["features"][:, column]))
-    return alarms
+    action_change = Alarm(name="action_change", value=lambda one: -one["features"][:, column])
+    return alarms | {action_change.name: [action_change]}
 
 
-def _in_logits(alarm: Alarm) -> Alarm:
+def _in_logits(scorer: Scorer) -> Alarm:
     """An alarm on the logit of a probability, whose lowest values are spread."""
+    alarm = scorer_alarm(scorer)
 
     def value(motion: Motion) -> np.ndarray:
         p = np.clip(alarm.value(motion), _LEAST, 1.0 - _LEAST)
@@ -162,104 +182,31 @@ def _in_logits(alarm: Alarm) -> Alarm:
     return Alarm(name=alarm.name, value=value)
 
 
-def _values(alarm: Alarm, motion: Motion) -> np.ndarray:
-    """The alarm's value of each row; NaN, "don't know", is below every threshold."""
-    return np.nan_to_num(alarm.value(motion), nan=-math.inf)
-
-
-def alarm_thresholds(alarms: Sequence[Alarm], calm: Sequence[Motion]) -> dict[str, float]:
-    """Thresholds that give no alarm on undisturbed tours, with a reserve.
-
-    The reserve below the lowest value is half of its distance to the median of the tours' lowest
-    values, as many more hours have lower ones.
+def push_estimates(pushed: Sequence[Motion], push_s: float) -> dict[str, Estimate]:
+    """Share of pushed motions with a fall, and its time after the push.
 
     Args:
-        alarms: The alarms.
-        calm: Tours; those that leave the safe set are left out.
-
-    Raises:
-        ValueError: Every tour does.
-    """
-    calm = [motion for motion in calm if not motion.has_left]
-    if not calm:
-        raise ValueError("walking: the robot leaves its safe set on every calibration tour")
-    thresholds = {}
-    for alarm in alarms:
-        lowest = [lowest_value(motion, _values(alarm, motion)) for motion in calm]
-        thresholds[alarm.name] = float(min(lowest) - 0.5 * (np.median(lowest) - min(lowest)))
-    return thresholds
-
-
-def alarm_estimates(
-    alarms: Sequence[Alarm],
-    thresholds: Mapping[str, float],
-    pushed: Sequence[Motion],
-    push_s: float,
-) -> dict[str, Estimate]:
-    """Shares of falls announced, lead times, and alarms in motions without a fall.
-
-    Args:
-        alarms: The alarms.
-        thresholds: By alarm.
-        pushed: Motions with a push.
+        pushed: Motions with a push; those that leave the safe set before are left out.
         push_s: Duration of a push [s].
     """
     judged = [motion for motion in pushed if not motion.leave_time_s < motion.push_time_s]
     fallen = [motion for motion in judged if motion.has_fallen]
-    safe = [motion for motion in judged if not motion.has_left]
     until = np.array([motion.fall_time_s - motion.push_time_s for motion in fallen])
-    estimates = {
+    return {
         "pushes.fallen": proportion(len(fallen), len(judged)),
         "pushes.push_to_fall_s": median(until),
         "pushes.fallen_soon": proportion(int(np.sum(until < push_s + EARLY_S)), len(fallen)),
     }
-    for alarm in alarms:
-        threshold = thresholds[alarm.name]
-        lead = np.array([_lead(alarm, motion, threshold) for motion in fallen])
-        false = sum(
-            math.isfinite(first_alarm(motion, _values(alarm, motion), threshold)) for motion in safe
-        )
-        key = f"alarm.{alarm.name}"
-        estimates |= {
-            f"{key}.announced": proportion(int(np.sum(lead >= EARLY_S - 1e-9)), len(fallen)),
-            f"{key}.lead_s": median(lead),
-            f"{key}.alarms_without_leaving": proportion(false, len(safe)),
-        }
-    return estimates
 
 
-def _lead(alarm: Alarm, motion: Motion, threshold: float) -> float:
-    since = motion.push_time_s
-    alarm_s = first_alarm(motion, _values(alarm, motion), threshold, since_s=since)
-    return motion.fall_time_s - alarm_s if alarm_s <= motion.fall_time_s else -math.inf
-
-
-def tour_estimates(
-    alarms: Sequence[Alarm], thresholds: Mapping[str, float], tours: Sequence[Motion]
-) -> dict[str, Estimate]:
-    """Shares of tours with a fall, and false alarms an hour on the others.
-
-    Args:
-        alarms: The alarms.
-        thresholds: By alarm.
-        tours: Undisturbed tours.
-    """
+def tour_estimates(tours: Sequence[Motion]) -> dict[str, Estimate]:
+    """Share of undisturbed tours without a fall, and the hours of those that stay safe."""
     calm = [motion for motion in tours if not motion.has_left]
-    duration_s = sum(float(motion.time_s[-1]) for motion in calm)
-    estimates = {
+    hours = sum(float(motion.time_s[-1]) for motion in calm) / 3600.0
+    return {
         "tours.without_fall": proportion(sum(not m.has_fallen for m in tours), len(tours)),
-        "tours.hours": Estimate.exact(duration_s / 3600.0, len(calm)),
+        "tours.hours": Estimate.exact(hours, len(calm)),
     }
-    for alarm in alarms:
-        threshold = thresholds[alarm.name]
-        count = 0
-        for motion in calm:
-            is_below = ~(_values(alarm, motion) >= threshold)
-            count += int(np.sum(np.diff(is_below.astype(int), prepend=0) > 0))
-        estimates[f"tours.{alarm.name}.false_alarms_per_hour"] = rate_per_hour(
-            count, duration_s, len(calm)
-        )
-    return estimates
 
 
 def recovery_estimates(

@@ -3,7 +3,9 @@ import inspect
 from itertools import combinations
 
 import pytest
+import typer
 
+from drake_safety import __version__
 from drake_safety.cli import adapt, calibrate, evaluate, play, prepare, run, train
 from drake_safety.evaluation.episode_study import evaluate_episodes
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
@@ -16,12 +18,16 @@ from drake_safety.learning.seeds import (
     DEMONSTRATION,
     FRESH_MOTION,
     NOT_DRAWN,
+    RELEASE,
+    SHIFTS,
     UsedEpisodes,
     check_unused,
+    use_of,
 )
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.feedback import run_pairs
 from lip_episodes import make_episodes
+from studies.__main__ import app as studies
 from studies.ablation import ablate
 from studies.planning import plan_study
 
@@ -66,6 +72,25 @@ def test_no_two_purposes_have_a_seed_in_common_whatever_their_sizes():
     for one, other in combinations(BLOCKS, 2):
         least = 100_000 if FRESH_MOTION in (one, other) else 1_000_000
         assert abs(one.first - other.first) >= least
+
+
+def test_the_seeds_of_a_release_are_far_from_those_of_development():
+    highest = max(seed for block in BLOCKS for seed in block.seeds().values())
+    assert highest + 1_000_000 < RELEASE
+    assert use_of(highest) == use_of(0) == "development"
+    for block in (SHIFTS, FRESH_MOTION):
+        assert use_of(block.first + RELEASE) == f"release {__version__.removesuffix('.dev0')}"
+        assert block.first_beside(SHIFTS.first) == block.first
+        assert block.first_beside(SHIFTS.first + RELEASE) == block.first + RELEASE
+
+
+def test_every_study_with_seeds_has_those_of_the_release():
+    group = typer.main.get_command(studies)
+    for name, command in group.commands.items():
+        options = {parameter.name for parameter in command.params}
+        if name not in ("animation", "walking"):  # A picture, and one without a first seed.
+            assert ("seed" in options) == ("release" in options), name
+    assert "release" in {parameter.name for parameter in group.commands["walking"].params}
 
 
 def test_every_command_takes_its_default_seed_from_the_table():

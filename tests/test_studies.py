@@ -229,17 +229,18 @@ def test_walking_is_judged_on_tours_pushes_commands_and_engines(monkeypatch, tmp
     shutil.copy(assessment_file(shipped_folder("go2_walking"), MODES[0]), tmp_path)
     # Baselines need training episodes, which do not ship.
     monkeypatch.setattr("studies.walking.load_episodes", lambda path: None)
-    monkeypatch.setattr("studies.walking.classifier_scorers", lambda *_: [])
+    monkeypatch.setattr("studies.walking.classifier_scorers", lambda *_, **__: [])
     monkeypatch.setattr("studies.walking._DURATIONS_S", {"tour": 0.4, "push": 0.4, "command": 0.4})
     monkeypatch.setattr("studies.walking._SPEED_S", 0.4)
-    counts = ("tours", "calibration-tours", "pushes", "commands", "guarded-tours", "speeds")
+    counts = ("tours", "pushes", "commands", "guarded-tours", "speeds")
     options = itertools.chain.from_iterable((f"--{name}", 1) for name in counts)
     arguments = ("go2_walking", "--assessment", tmp_path, "--workers", 1, *options)
-    rows = "tours.without_fall, tours.sharpened.false_alarms_per_hour, pushes.fallen, "
-    rows += "alarm.sharpened.alarms_without_leaving, guard.falls_with, guard.unchanged_inside, "
-    rows += "speed.difference_to_mujoco_m_s"
+    rows = "tours.without_fall, tours.hours, pushes.fallen, "
+    rows += "alarm.without_leaving.sharpened.announced_at_5, guard.falls_with, "
+    rows += "guard.unchanged_inside, speed.difference_to_mujoco_m_s"
     assert study(monkeypatch, "walking", *arguments) == 0
     results_of(tmp_path / "walking.json", rows)
+    assert (tmp_path / "walking_alarms.png").is_file()
 
 
 def frames_of(path):

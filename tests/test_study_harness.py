@@ -4,6 +4,7 @@ import pytest
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import AssessmentParameters
+from drake_safety.learning.seeds import RELEASE
 from studies.harness import fingerprint, kept, open_study, parse_sizes
 
 CALLS = []
@@ -39,6 +40,14 @@ def test_what_is_kept_is_not_called_again_and_a_stopped_study_goes_on(tmp_path):
     (tmp_path / "0.npz").write_bytes(b"nothing")
     with pytest.raises(ValueError, match=r"0\.npz is damaged .*: remove it"):
         kept(tmp_path, work, squared, workers=1)
+
+
+def test_a_study_says_whether_its_seeds_are_those_of_the_release(tmp_path):
+    for release, use in ((False, "development"), (True, "release")):
+        with open_study("tried", "pendulum", tmp_path, seed=5, release=release) as study:
+            assert study.seeds["evaluation"] == study.seed == 5 + RELEASE * release
+        entries = Results.read(tmp_path / "tried.json").entries
+        assert entries["seed"] == study.seed and entries["seed_use"].split()[0] == use
 
 
 def test_rows_are_written_printed_and_plotted(tmp_path, capsys):

@@ -5,18 +5,14 @@ import pytest
 
 from drake_safety import load_scenario
 from drake_safety.simulation.motion import Motion
-from studies.alarms import Alarm
 from studies.walking import (
-    alarm_estimates,
-    alarm_thresholds,
     guard_estimates,
+    push_estimates,
     recovery_estimates,
     speed_estimates,
     tour_estimates,
 )
 from studies.walking_motions import run_motions, run_push, unusual_command
-
-ALARM = Alarm(name="value", value=lambda motion: motion["features"][:, 0])
 
 
 def motion(values, *, push_s=math.inf, leave_s=math.inf, fall_s=math.inf, changed=0.0, impact=0.0):
@@ -36,38 +32,21 @@ def motion(values, *, push_s=math.inf, leave_s=math.inf, fall_s=math.inf, change
     )
 
 
-def test_thresholds_lie_below_the_lowest_values_of_calm_tours_by_half_their_spread():
-    calm = [motion([1.0, value, value, 1.0]) for value in (0.6, 0.8, 0.9)]
-    fallen = motion([0.0, 0.0], leave_s=0.1)
-    assert alarm_thresholds([ALARM], [*calm, fallen])["value"] == pytest.approx(0.5)
-    with pytest.raises(ValueError, match="every calibration tour"):
-        alarm_thresholds([ALARM], [fallen])
-
-
-def test_a_fall_is_announced_by_a_row_below_the_threshold_between_push_and_fall():
-    in_time = motion([1, 1, 1, 0, 0, 0, 0, 0], push_s=0.2, leave_s=0.6, fall_s=0.7)
-    late = motion([1, 1, 1, 1, 1, 1, 0, 0], push_s=0.2, leave_s=0.6, fall_s=0.7)
-    never = motion([0, 1, 1, 1, 1, 1, 0, 1], push_s=0.2, leave_s=0.6, fall_s=0.7)
-    false = motion([1, 0, 0, 1, 1, 1], push_s=0.1)
+def test_falls_and_their_times_are_those_of_motions_that_leave_after_the_push():
+    falls = motion([1] * 8, push_s=0.2, leave_s=0.6, fall_s=0.7)
     before_push = motion([1, 1], push_s=0.5, leave_s=0.1, fall_s=0.1)
-    pushed = [in_time, late, never, false, motion([1] * 6), before_push]
-    found = alarm_estimates([ALARM], {"value": 0.5}, pushed, push_s=0.2)
-    assert found["pushes.fallen"].value == pytest.approx(3 / 5)
+    pushed = [falls, falls, motion([1] * 6, push_s=0.1), before_push]
+    found = push_estimates(pushed, push_s=0.2)
+    assert found["pushes.fallen"].value == pytest.approx(2 / 3)
     assert found["pushes.push_to_fall_s"].value == pytest.approx(0.5)
     assert found["pushes.fallen_soon"].value == 0.0
-    assert alarm_estimates([], {}, pushed, push_s=0.4)["pushes.fallen_soon"].value == 1.0
-    assert found["alarm.value.announced"].value == pytest.approx(1 / 3)
-    assert found["alarm.value.lead_s"].value == pytest.approx(0.1)
-    assert found["alarm.value.alarms_without_leaving"].value == pytest.approx(1 / 2)
+    assert push_estimates(pushed, push_s=0.4)["pushes.fallen_soon"].value == 1.0
 
 
-def test_false_alarms_are_counted_once_each_on_tours_that_stay_safe():
-    twice = motion([1, 0, 0, 0, 1, 0, 0])
-    fallen = motion([0, 0, 0], leave_s=0.2, fall_s=0.2)
-    found = tour_estimates([ALARM], {"value": 0.5}, [twice, fallen])
+def test_the_hours_of_tours_are_those_that_stay_safe():
+    found = tour_estimates([motion([1] * 7), motion([1] * 3, leave_s=0.2, fall_s=0.2)])
     assert found["tours.without_fall"].value == 0.5
     assert found["tours.hours"].value == pytest.approx(0.6 / 3600)
-    assert found["tours.value.false_alarms_per_hour"].value == pytest.approx(2 * 3600 / 0.6)
 
 
 def test_guard_recovery_and_speeds_compare_the_same_motions():

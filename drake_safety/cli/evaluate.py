@@ -33,7 +33,7 @@ from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import MOTION, PLAN, episode_scores
-from drake_safety.learning.seeds import EVALUATION, FRESH_MOTION, SHIFTS, SeedBlock
+from drake_safety.learning.seeds import EVALUATION, FRESH_MOTION, SHIFTS, SeedBlock, use_of
 from drake_safety.learning.segments import Episode, Episodes, Segments, split
 from drake_safety.simulation.capabilities import HasBall, HasGoals, require
 from drake_safety.simulation.motion import Motion
@@ -173,6 +173,7 @@ def evaluating(
     made = console.made_by(scenario.name, program) | {
         "scenario_hash": sharpened.info_.scenario_hash,
         "seed": next(iter(seeds.values())),
+        "seed_use": use_of(next(iter(seeds.values()))),
         "training_seed": trained.seed,
         "training_episodes": trained.num_episodes,
         "assessment_sha256": hashes,
@@ -289,12 +290,13 @@ def add_shifts(
     stages("shifted motions", len(shifts), len(shifts))
     sets |= others(nominal[:num_motions])
     found |= shift_study.evaluate_shifts(sets, judges, stages, more)
+    fresh_seed = FRESH_MOTION.first_beside(seed)
     usual = run_motions(
         scenario,
         num_nominal * scenario.episode_duration_s,
-        seed=FRESH_MOTION.first,
+        seed=fresh_seed,
         num_workers=workers,
-        path=folders.fresh_episodes_folder(folder, "motion", FRESH_MOTION.first, {}),
+        path=folders.fresh_episodes_folder(folder, "motion", fresh_seed, {}),
         progress=partial(stages, "undisturbed nominal motion"),
     )
     key = "shifts.nominal.monitor.false_alarms_per_hour"

@@ -130,8 +130,11 @@ def quantile(values: np.ndarray, share: float, *, bootstrap: Bootstrap) -> Estim
     return bootstrap.over_values(statistic, values)
 
 
-def rate_per_hour(count: int, duration_s: float, n: int) -> Estimate:
-    """Events per hour, with the exact interval of a Poisson process, observed on n motions."""
+def rate_per_hour(count: float, duration_s: float, n: int) -> Estimate:
+    """Events per hour, with the exact interval of a Poisson process, observed on n motions.
+
+    The count of events may be the mean of several.
+    """
     from scipy.stats import chi2
 
     if not duration_s > 0:

@@ -3,6 +3,9 @@
 Episode i of a set draws from `SeedSequence(seed, spawn_key=(i,))`: sets with one seed start in the
 same states for every plant, with and without balls. Episodes for evaluation must not share a seed
 with those used for training, calibration or adaptation. The default seeds of two purposes differ.
+
+Choices are made on the default seeds, so that these are no test. The figures that a release
+publishes are of other ones, `RELEASE` above them, which nothing looks at before.
 """
 
 from __future__ import annotations
@@ -15,6 +18,10 @@ from drake_safety.learning.segments import EpisodesInfo
 
 NOT_DRAWN = -1
 """Seed of recorded episodes, whose starts no other set shares."""
+_SPAN = 20_000_000  # More than the seeds of development.
+_RELEASES = {"0.1.0": _SPAN}  # Added for a version's figures; a span a version.
+RELEASE = max(_RELEASES.values())
+"""Added to a seed for the figures of the newest version."""
 
 
 class SeedBlock(NamedTuple):
@@ -32,6 +39,10 @@ class SeedBlock(NamedTuple):
         """Returns the seed of each purpose, starting at `first` or the default."""
         start = self.first if first is None else first
         return {purpose: start + i for i, purpose in enumerate(self.purposes)}
+
+    def first_beside(self, seed: int) -> int:
+        """Returns the default first seed, of the same release as a seed if it is of one."""
+        return self.first + _RELEASES.get(_version(seed), 0)
 
 
 TRAINING = SeedBlock(0, ("training",))
@@ -51,12 +62,24 @@ MOTION = SeedBlock(9_000_000, ("motion", "motion of the actual robot"))
 """Undisturbed motion, of which a monitor learns what is usual."""
 FRESH_MOTION = SeedBlock(9_100_000, ("fresh motion",))
 """Undisturbed motion that shows how often the monitor alarms."""
+WALKING = SeedBlock(6_000_000, ("calibration", "tour", "push", "command"))
+"""Motions of walking robots; of the first, velocities are compared between engines."""
 ANOMALIES = SeedBlock(10_000_000, ("unperturbed", "perturbed", "thresholds"))
 """Motion with and without an anomaly, and that for thresholds."""
 BLOCKS = (
     *(TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION),
-    *(DEMONSTRATION, SHIFTS, MOTION, FRESH_MOTION, ANOMALIES),
+    *(DEMONSTRATION, SHIFTS, MOTION, FRESH_MOTION, ANOMALIES, WALKING),
 )
+
+
+def use_of(seed: int) -> str:
+    """Returns "development", or "release" with the version whose figures a seed is for."""
+    version = _version(seed)
+    return f"release {version}" if version else "development"
+
+
+def _version(seed: int) -> str:
+    return next((v for v, added in _RELEASES.items() if added <= seed < added + _SPAN), "")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,140 @@
+import math
+
+import numpy as np
+import pytest
+
+from drake_safety.simulation.motion import Motion
+from studies.alarm_curves import COSTS, SHARES, Watched, alarm_figure, equal_cost_estimates
+from studies.alarms import Alarm, first_alarm
+
+ALARM = Alarm(name="value", value=lambda motion: motion["value"])
+STEP_S = 0.1
+
+
+def motion(values, *, push_s=math.inf, leave_s=math.inf, fall_s=math.inf):
+    return Motion(
+        index=0,
+        push_time_s=push_s,
+        leave_time_s=leave_s,
+        fall_time_s=fall_s,
+        time_s=STEP_S * np.arange(len(values)),
+        ports={"value": np.array(values, dtype=float)},
+    )
+
+
+def random_motions(rng, num=60):
+    """Pushed at 0.2 s: a third falls at 0.8 s, a third leaves the safe set, a third does not."""
+    found = []
+    for i in range(num):
+        values = rng.normal(size=9) - 0.5 * (i % 3 == 0)
+        values[rng.random(9) < 0.03] = np.nan
+        ends = ({"leave_s": 0.5, "fall_s": 0.8}, {"leave_s": 0.5}, {})[i % 3]
+        found.append(motion(values, push_s=0.2, **ends))
+    return found
+
+
+TOURS = [motion([1, 0, 0, 0, 1, 0, 0]), motion([0, 1, 1, 2])]
+
+
+def watched(pushed, tours=TOURS):
+    return Watched.of(ALARM, pushed, tours)
+
+
+def announced(one, cost, share):
+    return one.announced(cost, share)(np.ones(len(one.lowest)))
+
+
+def test_a_fall_is_announced_by_a_row_between_the_push_and_0_2_s_before_the_fall():
+    ends = {"push_s": 0.2, "leave_s": 0.6, "fall_s": 0.7}
+    in_time = motion([1, 1, 1, 1, 1, 0, 1, 1], **ends)
+    late = motion([1, 1, 1, 1, 1, 1, 0, 0], **ends)
+    too_early = motion([1, 0, 1, 1, 1, 1, 1, 1], **ends)
+    at_once = motion([0, 0], push_s=0.0, leave_s=0.1, fall_s=0.1)
+    survives = motion([1, 0.5, 1], push_s=0.1)
+    found = watched([in_time, late, too_early, at_once, survives])
+    np.testing.assert_array_equal(found.warning, [0, 1, 1, math.inf, math.inf])
+    np.testing.assert_array_equal(found.lowest, [0, 0, 0, 0, 0.5])
+    # Only the first has a lower value than the survivor.
+    assert announced(found, "without_fall", 0.0) == 1 / 4
+    np.testing.assert_array_equal(found.share_costs("without_fall"), [0, 1, 1, math.inf])
+
+
+def test_who_leaves_the_safe_set_and_does_not_fall_counts_only_among_those_that_do_not_fall():
+    falls = motion([1, 0.2, 1, 1, 1], push_s=0.1, leave_s=0.3, fall_s=0.4)
+    leaves = motion([1, 0.1, 1], push_s=0.1, leave_s=0.1)
+    found = watched([falls, leaves, motion([1, 0.3], push_s=0.1)])
+    assert announced(found, "without_leaving", 0.0) == 1.0
+    assert announced(found, "without_fall", 0.0) == 0.0
+    assert announced(found, "without_fall", 0.5) == 1.0
+
+
+@pytest.mark.parametrize("cost", COSTS)
+def test_at_every_share_the_highest_allowed_threshold_is_applied(cost):
+    pushed = random_motions(np.random.default_rng(1))
+    found = watched(pushed)
+    costs = found.share_costs(cost)
+    for share in (0.0, *SHARES, 0.97):
+        threshold = found.threshold(cost, share)
+        others = found.lowest[found.others[cost]]
+        assert np.mean(others < threshold) <= share < np.mean(others <= threshold)
+        fallen = []
+        for one in pushed[::3]:
+            value = np.nan_to_num(one["value"], nan=-math.inf)
+            alarm_s = first_alarm(one, value, threshold, since_s=0.2)
+            fallen.append(one.fall_time_s - alarm_s >= 0.2 - 1e-9)
+        assert announced(found, cost, share) == pytest.approx(np.mean(fallen))
+        # The curve goes through it.
+        assert np.searchsorted(costs, share, side="right") == sum(fallen)
+
+
+def test_weights_count_motions_as_often():
+    pushed = random_motions(np.random.default_rng(2))
+    weight = np.random.default_rng(3).integers(0, 3, size=len(pushed))
+    repeated = watched([m for m, n in zip(pushed, weight, strict=True) for _ in range(n)])
+    for share in SHARES:
+        weighted = watched(pushed).announced("without_fall", share)(weight)
+        assert weighted == pytest.approx(announced(repeated, "without_fall", share))
+    assert math.isnan(watched(pushed).announced("without_fall", 0.1)(np.zeros(len(pushed))))
+
+
+def test_a_false_alarm_is_a_row_below_the_threshold_after_one_that_is_not():
+    found = watched([motion([0.5] * 9, push_s=0.2, leave_s=0.5, fall_s=0.8)])
+    assert found.undisturbed_s == pytest.approx(0.9) and found.num_undisturbed == 2
+    np.testing.assert_array_equal(found.num_false_alarms(np.array([0, 0.5, 1.5, 3])), [0, 3, 2, 2])
+    unknown = watched([], [motion([1, np.nan, 1])])
+    assert unknown.num_false_alarms(-1e9) == 1
+    # The fall is announced by thresholds above 0.5.
+    np.testing.assert_allclose(found.rate_costs(), [3 * 3600 / 0.9])
+
+
+def test_differences_are_paired_and_seeds_averaged():
+    rng = np.random.default_rng(4)
+    sets = [watched(random_motions(rng)) for _ in range(3)]
+    methods = {"sharpened": sets[:1], "same": sets[:1], "other": sets[1:]}
+    found = equal_cost_estimates(methods, "sharpened", ["same", "other"])
+    key = "alarm.without_fall.{}.announced_at_20"
+    same = found[key.format("sharpened_minus_same")]
+    assert (same.value, same.low, same.high) == (0.0, 0.0, 0.0)
+    ours, mean, *each = (
+        found[key.format(name)].value for name in ("sharpened", "other", "other_0", "other_1")
+    )
+    assert mean == pytest.approx(np.mean(each))
+    difference = found[key.format("sharpened_minus_other")]
+    assert difference.value == pytest.approx(ours - mean)
+    assert difference.low < difference.value < difference.high
+    rate = found["alarm.without_leaving.sharpened.false_alarms_per_hour_at_50"]
+    threshold = sets[0].threshold("without_leaving", 0.5)
+    assert rate.value == pytest.approx(sets[0].num_false_alarms(threshold) * 3600 / 0.9)
+
+
+def test_the_figure_has_a_curve_for_each_method_in_each_panel():
+    rng = np.random.default_rng(5)
+    sets = [watched(random_motions(rng)) for _ in range(3)]
+    figure = alarm_figure({"sharpened": sets[:1], "gradient_boosting": sets[1:]})
+    assert len(figure.axes) == 3
+    for axes in figure.axes:
+        labels = [line.get_label() for line in axes.lines if not line.get_label().startswith("_")]
+        assert labels == ["Γ", "gradient boosting"]
+        assert len(axes.lines) == 4  # And one for each seed.
+        heights = axes.lines[0].get_ydata()
+        assert np.all(np.diff(heights) >= 0) and heights[0] >= 0 and heights[-1] <= 1
