@@ -212,6 +212,7 @@ def alarm_figure(watched: Mapping[str, Sequence[Watched]]) -> Figure:
         watched: Values by method, as in `equal_cost_estimates`; the first six are drawn.
     """
     grid = np.linspace(0.0, _MOST_SHARE, 601)
+    any_one = next(iter(watched.values()))[0]
     with style.drawing_style():
         fig = style.new_figure(12.0, 4.6)
         *panels, last = fig.subplots(1, len(COSTS) + 1, sharey=True)
@@ -220,8 +221,8 @@ def alarm_figure(watched: Mapping[str, Sequence[Watched]]) -> Figure:
                 name: [one.share_costs(cost) for one in seeds] for name, seeds in watched.items()
             }
             _draw(axes, costs, grid)
-            num = int(next(iter(watched.values()))[0].others[cost].sum())
-            axes.set_xlabel(f"alarmed of the {num} pushes that {what} [%]")
+            axes.set_title(f"{any_one.others[cost].sum()} pushes that {what}")
+            axes.set_xlabel("share of them with an alarm [%]")
             axes.set_xticks(SHARES, [f"{100 * share:.0f}" for share in SHARES])
             axes.set_xlim(0.0, _MOST_SHARE)
         rates = np.concatenate([[0.0], np.geomspace(0.01, _MOST_RATE, 600)])
@@ -230,8 +231,10 @@ def alarm_figure(watched: Mapping[str, Sequence[Watched]]) -> Figure:
         last.set_xscale("symlog", linthresh=1.0)
         last.set_xlim(0.0, _MOST_RATE)
         last.set_xticks([0, 1, 10, 100], ["0", "1", "10", "100"])
-        last.set_xlabel("false alarms an hour of undisturbed walking")
-        panels[0].set_ylabel(f"falls announced ≥ {EARLY_S} s ahead [%]")
+        last.set_title(f"{any_one.undisturbed_s / 3600.0:.1f} h undisturbed")
+        last.set_xlabel("false alarms an hour")
+        num_falls = any_one.is_fall.sum()
+        panels[0].set_ylabel(f"announced ≥ {EARLY_S} s ahead of {num_falls} falls [%]")
         panels[0].set_ylim(0.0, 1.02)
         panels[0].set_yticks(np.linspace(0, 1, 6), [f"{y:.0f}" for y in np.linspace(0, 100, 6)])
         fig.legend(

@@ -236,8 +236,8 @@ def test_walking_is_judged_on_tours_pushes_commands_and_engines(monkeypatch, tmp
     options = itertools.chain.from_iterable((f"--{name}", 1) for name in counts)
     arguments = ("go2_walking", "--assessment", tmp_path, "--workers", 1, *options)
     rows = "tours.without_fall, tours.hours, pushes.fallen, "
-    rows += "alarm.without_leaving.sharpened.announced_at_5, guard.falls_with, "
-    rows += "guard.unchanged_inside, speed.difference_to_mujoco_m_s"
+    rows += "alarm.without_leaving.sharpened.false_alarms_per_hour_at_5, "
+    rows += "guard.falls_with, guard.unchanged_inside, speed.difference_to_mujoco_m_s"
     assert study(monkeypatch, "walking", *arguments) == 0
     results_of(tmp_path / "walking.json", rows)
     assert (tmp_path / "walking_alarms.png").is_file()

@@ -53,7 +53,7 @@ class Column:
             return ""
         scale = _SCALES.get(self.unit, 1.0)
         low, high = (f"{scale * end:.{self.digits}f}" for end in (estimate.low, estimate.high))
-        return f"({low}–{high})"
+        return f"({low} to {high})" if estimate.low < 0.0 else f"({low}–{high})"
 
     def text(self, estimate: Estimate | None) -> str:
         """The value and interval of an estimate."""
