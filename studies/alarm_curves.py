@@ -8,6 +8,7 @@ the same cost.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ COSTS = {
     "without_fall": "do not fall",
 }
 """Other motions by key, and what is said of them."""
+_LABELS = {"sharpened": "Γ", "fall": "Γ, of a fall"}
 _BOOTSTRAP = Bootstrap()
 _SLACK_S = 1e-9
 _MOST_SHARE, _MOST_RATE = 0.6, 100.0  # Ends of the figure's axes; the rate an hour.
@@ -153,7 +155,7 @@ def _values(alarm: Alarm, motion: Motion) -> np.ndarray:
 
 
 def equal_cost_estimates(
-    watched: Mapping[str, Sequence[Watched]], ours: str, rivals: Sequence[str]
+    watched: Mapping[str, Sequence[Watched]], ours: Sequence[str], rivals: Sequence[str]
 ) -> dict[str, Estimate]:
     """Shares of falls announced at equal cost, their differences, and false alarms an hour.
 
@@ -162,8 +164,8 @@ def equal_cost_estimates(
     Args:
         watched: Values by method, the same motions for all; one for each seed of the method, of
             which the mean counts.
-        ours: The method that is compared.
-        rivals: Those it is compared with.
+        ours: The methods that are compared.
+        rivals: Those they are compared with.
     """
     estimates: dict[str, Estimate] = {}
     for cost in COSTS:
@@ -183,11 +185,9 @@ def equal_cost_estimates(
                 )
                 for i, one in enumerate(each if len(each) > 1 else ()):
                     estimates[f"{key}_{i}.announced_{at}"] = _over_motions(seeds[0], [one])
-            for rival in rivals:
-                key = f"alarm.{cost}.{ours}_minus_{rival}.announced_{at}"
-                estimates[key] = _over_motions(
-                    watched[ours][0], statistics[ours], statistics[rival]
-                )
+            for own, rival in itertools.product(ours, rivals):
+                key = f"alarm.{cost}.{own}_minus_{rival}.announced_{at}"
+                estimates[key] = _over_motions(watched[own][0], statistics[own], statistics[rival])
     return estimates
 
 
@@ -255,6 +255,6 @@ def _draw(axes: Axes, costs: Mapping[str, Sequence[np.ndarray]], grid: np.ndarra
             color=colour,
             linestyle=dashes,
             linewidth=2.4 if name == "sharpened" else 1.6,
-            label="Γ" if name == "sharpened" else style.label_of(name),
+            label=_LABELS.get(name, style.label_of(name)),
         )
     axes.grid(color="#eceef0", linewidth=0.7)

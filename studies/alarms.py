@@ -39,7 +39,8 @@ ALARMS: Kind = (
 )
 """The table of the set "monitoring"."""
 _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
-_TRACKING = "tracking_error_"
+TRACKING = "tracking_error_"
+"""Beginning of the names of features."""
 _SLACK_S = 1e-9
 
 
@@ -87,7 +88,7 @@ def threshold_alarms(
         Alarm(name=name, value=of_feature(features.index(feature)))
         for name, feature in watched.items()
     ]
-    tracking = [i for i, name in enumerate(features) if name.startswith(_TRACKING)]
+    tracking = [i for i, name in enumerate(features) if name.startswith(TRACKING)]
     if tracking:
         alarms.append(
             Alarm(

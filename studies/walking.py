@@ -27,13 +27,15 @@ from drake_safety.simulation.scenario import Scenario
 from studies.alarm_curves import EARLY_S, Watched, alarm_figure, equal_cost_estimates
 from studies.alarms import Alarm, scorer_alarm, threshold_alarms
 from studies.baselines import KINDS, classifier_scorers
+from studies.fall_alarm import fit_fall_alarm
 from studies.harness import ReleaseOption, open_study
 from studies.walking_motions import run_motions
 
 _LEAST = 1e-6  # Of a probability and its complement, in logits.
-_DURATIONS_S = {"tour": 60.0, "push": 5.0, "command": 4.0}
+_DURATIONS_S = {"tour": 60.0, "push": 5.0, "command": 4.0, "start": 2.6}
 _SPEED_S = 12.0
 _CLASSIFIER_SEEDS = (0, 1, 2)
+_OURS = (MODES[0], "fall")
 _RIVALS = ("gradient_boosting", "capture_point_margin")
 
 
@@ -42,6 +44,9 @@ def walking(
     assessment: TrainingOption,
     tours: Annotated[int, typer.Option(help="Undisturbed tours of a minute.", min=1)] = 300,
     pushes: Annotated[int, typer.Option(help="Pushed motions.", min=1)] = 600,
+    starts: Annotated[
+        int, typer.Option(help="Episodes that the probability of a fall is fitted to.", min=0)
+    ] = 500,
     commands: Annotated[int, typer.Option(help="Commands past the policy's ranges.", min=0)] = 300,
     guarded_tours: Annotated[int, typer.Option(help="Tours with the guard.", min=0)] = 20,
     recovered: Annotated[
@@ -108,6 +113,11 @@ def walking(
         classifiers = classifier_scorers(train_set, study.stages, seeds=_CLASSIFIER_SEEDS)
         alarms = walking_alarms(walker, gamma, classifiers)
         study.entries |= {"variation": variation, "seeds": seeds_of, "assessment_sha256": sha256}
+        if starts:
+            loop = walker.make_loop()
+            features = loop.feature_names, require(loop, CanFall).watched_features
+            fall = fit_fall_alarm(gamma, run("start", range(starts)), *features)
+            alarms = {MODES[0]: alarms.pop(MODES[0]), fall.name: [fall], **alarms}
         study.entries["alarms"] = list(alarms)
         pushed = run("push", range(pushes))
         push_s = walker.parameters.random_pushes.duration_s
@@ -139,8 +149,8 @@ def walking(
             name: [Watched.of(alarm, pushed, calm) for alarm in seeds]
             for name, seeds in alarms.items()
         }
-        rivals = [name for name in _RIVALS if name in watched]
-        study.rows |= equal_cost_estimates(watched, MODES[0], rivals)
+        ours, rivals = ([n for n in names if n in watched] for names in (_OURS, _RIVALS))
+        study.rows |= equal_cost_estimates(watched, ours, rivals)
         for picture in save(alarm_figure(watched), assessment / "walking_alarms"):
             say("picture", picture)
 

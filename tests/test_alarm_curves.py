@@ -111,7 +111,7 @@ def test_differences_are_paired_and_seeds_averaged():
     rng = np.random.default_rng(4)
     sets = [watched(random_motions(rng)) for _ in range(3)]
     methods = {"sharpened": sets[:1], "same": sets[:1], "other": sets[1:]}
-    found = equal_cost_estimates(methods, "sharpened", ["same", "other"])
+    found = equal_cost_estimates(methods, ["sharpened"], ["same", "other"])
     key = "alarm.without_fall.{}.announced_at_20"
     same = found[key.format("sharpened_minus_same")]
     assert (same.value, same.low, same.high) == (0.0, 0.0, 0.0)

@@ -62,8 +62,9 @@ MOTION = SeedBlock(9_000_000, ("motion", "motion of the actual robot"))
 """Undisturbed motion, of which a monitor learns what is usual."""
 FRESH_MOTION = SeedBlock(9_100_000, ("fresh motion",))
 """Undisturbed motion that shows how often the monitor alarms."""
-WALKING = SeedBlock(6_000_000, ("calibration", "tour", "push", "command"))
-"""Motions of walking robots; of the first, velocities are compared between engines."""
+WALKING = SeedBlock(6_000_000, ("calibration", "tour", "push", "command", "start"))
+"""Motions of walking robots; of the first, velocities are compared between engines, and the last
+show when a robot falls."""
 ANOMALIES = SeedBlock(10_000_000, ("unperturbed", "perturbed", "thresholds"))
 """Motion with and without an anomaly, and that for thresholds."""
 BLOCKS = (
