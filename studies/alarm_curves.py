@@ -31,7 +31,7 @@ COSTS = {
     "without_fall": "do not fall",
 }
 """Other motions by key, and what is said of them."""
-_LABELS = {"sharpened": "Γ", "fall": "Γ, of a fall"}
+_LABELS = {"sharpened": "Γ", "fall": "probability of a fall"}
 _BOOTSTRAP = Bootstrap()
 _SLACK_S = 1e-9
 _MOST_SHARE, _MOST_RATE = 0.6, 100.0  # Ends of the figure's axes; the rate an hour.

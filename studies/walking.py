@@ -149,8 +149,8 @@ def walking(
             name: [Watched.of(alarm, pushed, calm) for alarm in seeds]
             for name, seeds in alarms.items()
         }
-        ours, rivals = ([n for n in names if n in watched] for names in (_OURS, _RIVALS))
-        study.rows |= equal_cost_estimates(watched, ours, rivals)
+        pairs = ([name for name in names if name in watched] for names in (_OURS, _RIVALS))
+        study.rows |= equal_cost_estimates(watched, *pairs)
         for picture in save(alarm_figure(watched), assessment / "walking_alarms"):
             say("picture", picture)
 
