@@ -89,6 +89,10 @@ WITHOUT_MOTOR = {
     "'FL_calf_joint' (a spring of 900 N·m/rad)": quadruped(above=SPRING),
     "(no transmission, as others have, a spring of 900": quadruped(above=MOTORS + SPRING),
     "a spring of 30 N·m/rad": quadruped({KNEE: KNEE + '<dynamics spring_stiffness="30"/>'}),
+    "['x'] carry all legs: the base floats without them": quadruped(
+        root=link("odom") + joint("x", "odom", "trunk", "0 0 0", "1 0 0", LIMIT.format(-9, 9)),
+        above=each(ROS1, DRIVEN + KNEES),
+    ),
     "have equal limits: 'FL_hip_joint' (0)": quadruped({STOPS: 'lower="0" upper="0"'}),
 }
 WITHOUT_FEET = {
@@ -135,9 +139,12 @@ def framed(kind, form):
 GRIPPER = chain("trunk", ("finger", 0.1, "", "0 0 0.1", "0 1 0", ARM)) + ROS1.format("finger_joint")
 
 
-def with_moments(change):
-    moment = re.compile('(ixx|iyy|izz)="([^"]*)"')
+def with_moments(change, names="ixx|iyy|izz"):
+    moment = re.compile(f'({names})="([^"]*)"')
     return moment.sub(lambda found: f'{found[1]}="{change(float(found[2]))}"', quadruped())
+
+
+MASSES, THIGH_MASS = "mass value|ixx|iyy|izz", '<mass value="0.24"/>'
 
 
 @pytest.mark.parametrize(
@@ -153,6 +160,16 @@ def with_moments(change):
         (with_moments(lambda moment: 1.0), "links have inertias that no body"),
         (with_moments(lambda moment: 1e6 * moment), "17 links have inertias"),
         (with_moments(lambda moment: 1e-6), "at 4.8 kg, a radius of gyration of 0.00046 m"),
+        (with_moments(lambda mass: 1e3 * mass, MASSES), "no robot of 0.67 m has 8.16e+03 kg"),
+        (
+            with_moments(lambda mass: 1e-3 * mass, MASSES),
+            "has 0.00816 kg (grams or tonnes?)",
+        ),
+        (
+            quadruped({THIGH_MASS: f'<origin xyz="0 0 -100"/>{THIGH_MASS}'}),
+            "the centre of mass of link 'FL_thigh' is 100 m from it; the centre of mass",
+        ),
+        (quadruped({STOPS: 'lower="-45" upper="45"'}), "limits in degrees instead of radians?"),
         *(
             (framed(kind, form), f"the {kind} of link 'frame' is a {words}: it is left out")
             for kind in ("collision", "visual")
@@ -172,7 +189,8 @@ def test_what_is_changed_or_odd_is_told_at_once_and_nothing_else(text, note, tmp
     written = robot_of(text, tmp_path)
     warnings, remedy = written.copy.warnings, warned(written).get("inertias", "")
     assert len(warnings) == bool(note) and all(note in one for one in warnings)
-    assert ("correct <inertia>" in remedy) == ("inertias" in "".join(warnings))
+    of_masses = re.search("inertias|centre of mass|grams", "".join(warnings))
+    assert ("correct <inertia>" in remedy) == bool(of_masses)
 
 
 def test_a_speed_limit_of_zero_is_none(tmp_path):
@@ -193,6 +211,8 @@ def test_a_speed_limit_of_zero_is_none(tmp_path):
 def test_a_joint_of_an_arm_that_cannot_be_held_is_fixed_and_told(limit, note, tmp_path):
     written = robot_of(quadruped(above=arm(ARM, ARM, limit, ARM)), tmp_path)
     assert "arm2_joint" not in written.joints and "arm3_joint" in written.joints
+    (hand,) = load_robot_file(written.files[1]).reaching_frames.values()
+    assert hand.joints == ["arm0_joint", "arm1_joint", "arm3_joint"]
     (found,) = written.copy.warnings
     assert f"joints ['arm2_joint'{note}" in found
 
@@ -213,6 +233,20 @@ def test_coupled_joints_that_are_fixed_keep_their_coupling(tmp_path):
     assert "mimic" not in written.files[0].read_text()
     pose = written.survey.pose("arm1").rotation().ToRollPitchYaw().vector()
     np.testing.assert_allclose(pose, [0, 0.3, 0], atol=1e-6)
+
+
+def test_feet_on_a_line_are_no_matter_of_gains(tmp_path):
+    found = {f.item: f.remedy for f in problems(robot_of(biped(FOOT), tmp_path))}
+    assert "along a line" in found["stands for 1 s"]
+    assert "along a line" in found["centre of mass over the feet"]
+
+
+def test_a_joint_that_only_drake_knows_is_fixed_if_it_moves_no_limb(tmp_path):
+    lift = joint("lift", "trunk", "nut", "0 0 0", "0 0 1", LIMIT.format(0, 1))
+    screw = re.sub("(</?)joint", r"\1drake:joint", lift).replace("revolute", "screw")
+    text = quadruped(above=link("nut", 0.1) + screw)
+    text = text.replace("<robot", '<robot xmlns:drake="http://drake.mit.edu"')
+    assert "lift" not in robot_of(text, tmp_path).joints
 
 
 CYLINDER = 'cylinder radius="0.08" length="0.04"'

@@ -8,8 +8,12 @@ from typer.testing import CliRunner
 
 from drake_safety.cli import make_app
 from drake_safety.control.policy import PolicyParameters
-from drake_safety.control.policy_metadata import PolicyMetadata, read_metadata
-from drake_safety.control.policy_network import PolicyNetwork, load_network
+from drake_safety.control.policy_network import (
+    PolicyMetadata,
+    PolicyNetwork,
+    load_network,
+    read_metadata,
+)
 from drake_safety.control.policy_template import PolicyTemplate, survey_policy
 from drake_safety.files.schema import load_typed
 from drake_safety.simulation.scenario import load_scenario

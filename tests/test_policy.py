@@ -17,8 +17,7 @@ from drake_safety.control.policy import (
     network_file,
     observation_term,
 )
-from drake_safety.control.policy_metadata import read_metadata
-from drake_safety.control.policy_network import load_network, network_files
+from drake_safety.control.policy_network import load_network, network_files, read_metadata
 from drake_safety.extras import MissingExtraError
 from drake_safety.robots.robot_model import JointGains
 from policy_networks import save_network, save_onnx

@@ -18,6 +18,7 @@ torch = pytest.importorskip("torch")
 N_IN, N_OUT, SIZE = 5, 2, 4
 LSTM = [("h_in", "h_out"), ("c_in", "c_out")]
 OTHER = [("h0", "hn"), ("c0", "cn")]
+RLLIB = [(f"state_in_{i}", f"state_out_{i}") for i in (0, 1)]
 
 
 def script(seen=None, **options):
@@ -65,6 +66,7 @@ def checked(path):
         (onnx(memory=LSTM), 2),
         (onnx(memory=LSTM[:1]), 1),
         (onnx(memory=OTHER, shape=[1, "time", N_IN]), 2),
+        (onnx(memory=RLLIB), 2),
     ],
 )
 def test_a_network_remembers_only_what_it_is_given(tmp_path, save, num_memories):

@@ -9,9 +9,9 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.robots.joint_drives import read_drives
 from drake_safety.robots.meshes import mesh_points
 from drake_safety.robots.simulatable_urdf import simulatable_copy
+from drake_safety.robots.urdf_copy import read_drives
 from urdf_files import GOOD, LINK, mesh, stl, written
 
 TRIANGLE = [[0, 0, 0], [2, 0, 0], [0, 1, 4]]
@@ -43,12 +43,21 @@ def loaded_quietly(copy, folder, caplog):
     return plant
 
 
-@pytest.mark.parametrize("name", ["hull", "hull[1]"])
-def test_a_mesh_that_drake_shows_goes_along_as_it_is(name, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "url"),
+    [
+        ("hull", "package://bot_description/hull.obj"),
+        ("hull[1]", "package://bot_description/hull[1].obj"),
+        ("hull", "package:///hull.obj"),
+        ("a hull", "package://bot_description/a%20hull.obj"),
+        ("hull", "..\\hull.obj"),
+    ],
+)
+def test_a_mesh_that_drake_shows_goes_along_as_it_is(name, url, tmp_path):
     source = tmp_path / "bot_description" / "urdf"
     source.mkdir(parents=True)
     (source.parent / f"{name}.obj").write_text("v 0 0 0\n")
-    copy, folder = copy_of(source, mesh("visual", f"package://bot_description/{name}.obj"))
+    copy, folder = copy_of(source, mesh("visual", url))
     assert meshes_of(folder) == [f"meshes/{name}.obj"]
     assert (folder / "meshes" / f"{name}.obj").read_text() == "v 0 0 0\n"
     assert copy.notes == []
@@ -118,7 +127,7 @@ def test_a_collision_mesh_becomes_its_hull_turned_and_scaled(tmp_path, kind):
     np.testing.assert_allclose(hull.bounds, [[-1, 0, 1], [0, 2, 9]], atol=1e-6)
     (name,) = meshes_of(folder)
     np.testing.assert_allclose(mesh_points(folder / name).max(axis=0), [0, 2, 9], atol=1e-6)
-    assert copy.bare_links() == [] and len(copy.notes) == 1
+    assert copy.bare_links == [] and len(copy.notes) == 1
 
 
 def test_friction_and_impossible_inertias_are_corrected_and_told(tmp_path):
@@ -202,3 +211,12 @@ def test_a_material_of_two_colours_becomes_two(tmp_path, caplog):
     assert [one.get("name") for one in copy.root.iter("material")] == ["black", "black", "black_1"]
     loaded_quietly(copy, tmp_path, caplog)
     assert copy.notes == ["the material 'black' has 2 colours; now each has its own name"]
+
+
+def test_a_material_without_a_colour_takes_a_later_one_or_is_left_out(tmp_path, caplog):
+    grey = '<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>'
+    box = '<visual><geometry><box size="1 1 1"/></geometry>{}</visual>'
+    shapes = box.format('<material name="grey"/>') + box.format('<material name="gazebo"/>')
+    copy, folder = copy_of(tmp_path, shapes + box.format(grey))
+    assert [one.get("name") for one in copy.root.iter("material")] == ["grey", "grey"]
+    loaded_quietly(copy, folder, caplog)

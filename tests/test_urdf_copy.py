@@ -5,7 +5,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.robots.urdf_copy import read_urdf
+from drake_safety.robots.urdf_copy import FIXED_MIMIC, read_urdf
 from urdf_files import GOOD, LINK, mesh, stl, written
 
 RED = '<material name="red"><color rgba="1 0 0 1"/></material>'
@@ -19,8 +19,8 @@ def red_seat(url):
 
 def test_a_file_that_needs_no_change_is_said_to_be_the_same(tmp_path):
     copy = read_urdf(written(tmp_path, red_seat("seat.obj")))
-    copy.free_fixed_joints()
-    copy.drop_collisions()
+    copy.remove(*FIXED_MIMIC)
+    copy.remove("link", "collision")
     copy.convert_visual_meshes()
     assert not copy.is_changed
 
@@ -47,7 +47,7 @@ def test_a_mesh_is_replaced_with_its_colour_in_it(tmp_path):
 def test_collisions_go_and_visuals_stay(tmp_path):
     shapes = mesh("collision", "a.obj") + mesh("visual", "b.obj")
     copy = read_urdf(written(tmp_path, LINK.format("a", GOOD, shapes)))
-    copy.drop_collisions()
+    copy.remove("link", "collision")
     assert [element.get("filename") for element in copy.root.iter("mesh")] == ["b.obj"]
 
 

@@ -91,11 +91,11 @@ def new(
         )
     for what in (*written.copy.warnings, *written.copy.left_out):
         console.say(f"note  {what}", style="yellow")
-    if written.bare:
+    if bare := written.copy.bare_links:
         console.say(
-            f"WARNING  {len(written.bare)} links have lost their collision meshes, which are "
+            f"WARNING  {len(bare)} links have lost their collision meshes, which are "
             "missing or cannot be read: everything passes through "
-            f"{', '.join(written.bare)}. Add boxes or capsules to {files[0]}; `check` reminds you",
+            f"{', '.join(bare)}. Add boxes or capsules to {files[0]}; `check` reminds you",
             style="bold red",
         )
     for what in asked:

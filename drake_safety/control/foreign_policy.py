@@ -4,31 +4,24 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
+from pydantic import Field, FiniteFloat
 
-from drake_safety.control.policy import PolicyParameters
-from drake_safety.control.policy_metadata import TERM_NAMES, limit
-from drake_safety.control.policy_network import load_network
-from drake_safety.control.policy_terms import registered_terms
+from drake_safety.control.policy import PolicyParameters, registered_terms
+from drake_safety.control.policy_network import TERM_NAMES, limit, load_network
 from drake_safety.files.reading import YamlLoader, parse_yaml, reading
-from drake_safety.files.schema import load_typed
+from drake_safety.files.schema import Pair, load_typed
 from drake_safety.robots.robot_model import by_pattern
 
-_THREE = ("base_lin_vel", "base_ang_vel", "projected_gravity", "velocity_commands")
-_PER_JOINT = ("joint_pos_rel", "joint_vel_rel", "last_action")
-
 _EXPORTED = ("policy.onnx", "../exported/policy.onnx", "policy.pt", "../exported/policy.pt")
-_DEPLOY_KEYS = (
-    *("joint_ids_map", "joint_names", "step_dt", "stiffness", "damping", "default_joint_pos"),
-    *("commands", "actions", "observations"),
-)
-_TERM_KEYS = ("params", "clip", "scale", "history_length", "scale_first")
+_DEPLOY_KEYS = """joint_ids_map joint_names step_dt stiffness damping default_joint_pos commands
+actions observations"""
+_TERM_KEYS = "params clip scale history_length scale_first"
 _GROUP_SWITCHES = ("use_gym_history", "scale_first")
-
 _RL_SAR_TERMS = {
     "lin_vel": ("base_lin_vel", "lin_vel_scale"),
     "ang_vel": ("base_ang_vel", "ang_vel_scale"),
@@ -40,18 +33,13 @@ _RL_SAR_TERMS = {
     "dof_vel": ("joint_vel_rel", "dof_vel_scale"),
     "actions": ("last_action", ""),
 }
-_RL_SAR_KEYS = (
-    *("model_name", "num_observations", "observations", "observations_history"),
-    *("observations_history_priority", "clip_obs", "clip_actions_lower", "clip_actions_upper"),
-    *("rl_kp", "rl_kd", "num_of_dofs", "action_scale", "wheel_indices", "lin_vel_scale"),
-    *("ang_vel_scale", "dof_pos_scale", "dof_vel_scale", "commands_scale", "default_dof_pos"),
-    *("joint_names", "joint_mapping", "dt", "decimation", "framework"),
-    *("hip_scale_reduction", "hip_scale_reduction_indices"),
-    # Of its own controllers and robots, without effect on the policy.
-    *("fixed_kp", "fixed_kd", "torque_limits", "joint_controller_names"),
-    *("command_mapping", "state_mapping", "rows", "cols"),
-)
-_PHASE = re.compile(r"\w+_phase")
+# The last lines are of its own controllers and robots, without effect on the policy.
+_RL_SAR_KEYS = """model_name num_observations observations observations_history
+observations_history_priority clip_obs clip_actions_lower clip_actions_upper rl_kp rl_kd num_of_dofs
+action_scale wheel_indices lin_vel_scale ang_vel_scale dof_pos_scale dof_vel_scale commands_scale
+default_dof_pos joint_names joint_mapping dt decimation framework hip_scale_reduction
+hip_scale_reduction_indices
+fixed_kp fixed_kd torque_limits joint_controller_names command_mapping state_mapping rows cols"""
 
 
 def converted_policy(path: Path, motors: Sequence[str] = ()) -> dict[str, Any]:
@@ -65,10 +53,11 @@ def converted_policy(path: Path, motors: Sequence[str] = ()) -> dict[str, Any]:
         The keys. ``network`` is an absolute path, ``gait`` may lack its period.
     """
     with reading(path):
-        raw = _parsed(path)
-        if isinstance(raw, dict) and {"joint_ids_map", "observations"} <= raw.keys():
+        content = _parsed(path)
+        raw = content if isinstance(content, dict) else {}
+        if {"joint_ids_map", "observations"} <= raw.keys():
             found = _from_unitree(_Entries(raw, str(path)), path, motors)
-        elif isinstance(raw, dict) and any(
+        elif any(
             isinstance(section, dict) and {"rl_kp", "num_observations"} & section.keys()
             for section in raw.values()
         ):
@@ -77,7 +66,7 @@ def converted_policy(path: Path, motors: Sequence[str] = ()) -> dict[str, Any]:
             raise ValueError(
                 f"'{path}' is neither a deploy.yaml of unitree_rl_lab (joint_ids_map, "
                 "observations, ...) nor a config.yaml of rl_sar (rl_kp, num_observations, ...); "
-                f"its keys are {list(raw) if isinstance(raw, dict) else raw}"
+                f"its keys are {list(raw) or content}"
             )
         count = len(found["default_positions"])
         names = found["joints"] or load_network(Path(found["network"])).metadata.joints
@@ -86,14 +75,13 @@ def converted_policy(path: Path, motors: Sequence[str] = ()) -> dict[str, Any]:
                 f"'{path}' has {count} joints; got {len(names)} names: {names}. A deploy.yaml "
                 "numbers the motors: name their joints in that order by --motors"
             )
-        keys = [re.escape(name) for name in names]
-        found["joints"] = list(names)
-        found["gains"] = [
-            {"stiffness": stiffness, "damping": damping}
-            for stiffness, damping in zip(found.pop("kp"), found.pop("kd"), strict=True)
-        ]
+        gains = zip(found.pop("kp"), found.pop("kd"), strict=True)
+        found |= {
+            "joints": list(names),
+            "gains": [{"stiffness": p, "damping": d} for p, d in gains],
+        }
         for key in ("default_positions", "action_scale", "gains"):
-            found[key] = dict(zip(keys, found[key], strict=True))
+            found[key] = dict(zip(map(re.escape, names), found[key], strict=True))
         load_typed(PolicyParameters, found, str(path))
     return found
 
@@ -120,81 +108,71 @@ def _parsed(path: Path) -> Any:
 class _Entries:
     """A mapping of a file, with errors that name the file and the entry."""
 
-    def __init__(self, raw: Any, who: str):
+    def __init__(self, raw: Any, who: str, known: str = ""):
         if not isinstance(raw, dict):
             raise ValueError(f"{who} must be a mapping; got {raw}")
         self.raw, self.who = raw, who
+        unknown = [key for key in raw if known and key not in known.split()]
+        self.refuse(
+            bool(unknown),
+            f"it has unknown keys {unknown}; known are {sorted(known.split())}. Delete them if the "
+            "policy does not depend on them",
+        )
+
+    def refuse(self, is_wrong: bool, what: str) -> None:
+        if is_wrong:
+            raise ValueError(f"{self.who}: {what}")
 
     def __contains__(self, key: str) -> bool:
         return self.raw.get(key) is not None
 
-    def only(self, known: Iterable[str]) -> None:
-        unknown = [key for key in self.raw if key not in known]
-        if unknown:
-            raise ValueError(
-                f"{self.who} has unknown keys {unknown}; known are {sorted(known)}. Delete them "
-                "if the policy does not depend on them"
-            )
+    def get(self, key: str, kind: Any = Any) -> Any:
+        """A value, of a type that pydantic checks."""
+        self.refuse(key not in self, f"it has no '{key}'; it has {list(self.raw)}")
+        return load_typed(kind, self.raw[key], f"{self.who}: '{key}'")
 
-    def get(self, key: str) -> Any:
-        if key not in self:
-            raise ValueError(f"{self.who} has no '{key}'; it has {list(self.raw)}")
-        return self.raw[key]
+    def inner(self, key: str, known: str = "") -> _Entries:
+        return _Entries(self.get(key), f"{self.who}, {key},", known)
 
-    def inner(self, key: str) -> _Entries:
-        return _Entries(self.get(key), f"{self.who}, {key},")
+    def number(self, key: str) -> float:
+        return float(self.get(key, FiniteFloat))
 
     def numbers(self, key: str, count: int | None = None, names: Sequence[str] = ()) -> list[float]:
         """``count`` numbers, one for all, or by regular expression over names.
 
         Without ``count`` any number of them.
         """
-        stated = self.get(key)
-        if isinstance(stated, dict) and names:
-            stated = [by_pattern(stated, name, key, self.who) for name in names]
-        values = stated if isinstance(stated, list) else [stated] * (count or 1)
-        if not all(type(value) in (int, float) and math.isfinite(value) for value in values):
-            raise ValueError(f"{self.who}: '{key}' must be finite numbers; got {stated}")
-        if count is not None and len(values) != count:
-            raise ValueError(f"{self.who}: '{key}' must have {count} entries; got {len(values)}")
-        return [float(value) for value in values]
+        values = self.get(key)
+        if isinstance(values, dict) and names:
+            values = [by_pattern(values, name, key, self.who) for name in names]
+        elif not isinstance(values, list):
+            values = [values] * (count or 1)
+        is_wrong = count is not None and len(values) != count
+        self.refuse(is_wrong, f"'{key}' must have {count} entries; got {len(values)}")
+        return load_typed(list[FiniteFloat], values, f"{self.who}: '{key}'")
 
-    def number(self, key: str) -> float:
-        return self.numbers(key, 1)[0]
-
-    def indices(self, key: str, below: float = math.inf) -> list[int]:
+    def indices(self, key: str, below: int | None = None) -> list[int]:
         """Different integers from 0 on."""
-        values = self.get(key)
-        if not (
-            isinstance(values, list)
-            and all(type(i) is int and 0 <= i < below for i in values)
-            and len(set(values)) == len(values)
-        ):
-            raise ValueError(
-                f"{self.who}: '{key}' must be different integers from 0 to {below - 1}; got "
-                f"{values}"
-            )
-        return values
-
-    def texts(self, key: str) -> list[str]:
-        values = self.get(key)
-        if not isinstance(values, list) or not all(isinstance(x, str) for x in values):
-            raise ValueError(f"{self.who}: '{key}' must be a list of names; got {values}")
+        values = self.get(key, list[Annotated[int, Field(ge=0, lt=below)]])
+        is_wrong = len(set(values)) != len(values)
+        self.refuse(is_wrong, f"'{key}' must be different integers; got {values}")
         return values
 
 
-def _shortest(scale: list[float]) -> list[float]:
+def _scale(entries: _Entries, key: str, size: int) -> list[float]:
     """One factor if all are the same."""
+    scale = entries.numbers(key, size)
     return scale[:1] if len(set(scale)) == 1 else scale
 
 
 def _width(term: str, count: int) -> int:
     """Entries of a term of a policy with ``count`` joints; 0 for terms of users."""
-    sizes = {**dict.fromkeys(_THREE, 3), **dict.fromkeys(_PER_JOINT, count), "gait_phase": 2}
-    return sizes.get(term, 0)
+    three = ("base_lin_vel", "base_ang_vel", "projected_gravity", "velocity_commands")
+    per_joint = ("joint_pos_rel", "joint_vel_rel", "last_action")
+    return 3 * (term in three) + count * (term in per_joint) + 2 * (term == "gait_phase")
 
 
-def _network(path: Path, names: Iterable[str]) -> str:
+def _network(path: Path, *names: str) -> str:
     for name in names:
         if (path.parent / name).is_file():
             return str((path.parent / name).resolve())
@@ -203,45 +181,39 @@ def _network(path: Path, names: Iterable[str]) -> str:
 
 def _from_unitree(file: _Entries, path: Path, motors: Sequence[str]) -> dict[str, Any]:
     """Gains are in the order of the motors, everything else in that of the network."""
-    file.only(_DEPLOY_KEYS)
+    _Entries(file.raw, file.who, _DEPLOY_KEYS)
     motor_of = file.indices("joint_ids_map")
     count, last = len(motor_of), max(motor_of, default=0)
-    names = motors or (file.texts("joint_names") if "joint_names" in file else [])
+    names = motors or (file.get("joint_names", list[str]) if "joint_names" in file else [])
     joints = [names[i] for i in motor_of] if len(names) > last else []
     gains = {
         key: file.numbers(key, None if isinstance(file.get(key), list) else last + 1, names)
         for key in ("stiffness", "damping")
     }
     for what, values in {"names of motors": names, **gains}.items():
-        if values and len(values) <= last:
-            raise ValueError(
-                f"{path}: '{what}' must have an entry for each motor, up to {last} of "
-                f"joint_ids_map; got {values}"
-            )
+        file.refuse(
+            0 < len(values) <= last,
+            f"'{what}' must have an entry for each motor, up to {last} of joint_ids_map; got "
+            f"{values}",
+        )
     positions = file.numbers("default_joint_pos", count, joints)
-    file.inner("actions").only(["JointPositionAction"])
-    action = file.inner("actions").inner("JointPositionAction")
-    action.only(["clip", "joint_names", "scale", "offset", "joint_ids"])
+    actions = file.inner("actions", "JointPositionAction")
+    action = actions.inner("JointPositionAction", "clip joint_names scale offset joint_ids")
     _check_all_joints(action, count)
     offset = action.numbers("offset", count, joints) if "offset" in action else positions
-    if any(abs(one - other) > 1e-6 for one, other in zip(offset, positions, strict=True)):
-        raise ValueError(
-            f"{action.who}: offset must equal default_joint_pos, from which joints are observed; "
-            f"got {offset} and {positions}"
-        )
-    limits = action.raw.get("clip")
-    if limits is not None and not (
-        isinstance(limits, list)
-        and len(limits) == count
-        and all(isinstance(pair, list) and len(pair) == 2 for pair in limits)
-        and all(low <= -2 * math.pi and high >= 2 * math.pi for low, high in limits)
-    ):
-        raise ValueError(
-            f"{action.who}: clip of joint positions must be null or beyond ±2π for {count} joints, "
-            f"as this limit is not supported; got {limits}"
-        )
+    action.refuse(
+        any(abs(one - other) > 1e-6 for one, other in zip(offset, positions, strict=True)),
+        "offset must equal default_joint_pos, from which joints are observed; got "
+        f"{offset} and {positions}",
+    )
+    limits = action.get("clip", list[Pair[float]]) if "clip" in action else []
+    action.refuse(
+        any(low > -2 * math.pi or high < 2 * math.pi for low, high in limits),
+        f"clip of joint positions must be null or beyond ±2π for {count} joints, as this limit is "
+        f"not supported; got {limits}",
+    )
     found = {
-        "network": _network(path, _EXPORTED),
+        "network": _network(path, *_EXPORTED),
         "joints": joints,
         "default_positions": positions,
         "action_scale": action.numbers("scale", count, joints),
@@ -260,11 +232,12 @@ def _from_unitree(file: _Entries, path: Path, motors: Sequence[str]) -> dict[str
 
 
 def _check_all_joints(entries: _Entries, count: int) -> None:
-    if "joint_ids" in entries and entries.raw["joint_ids"] != list(range(count)):
-        raise ValueError(
-            f"{entries.who}: joint_ids must be all {count} joints in the network's order, as a "
-            f"policy observes the joints that it moves; got {entries.raw['joint_ids']}"
-        )
+    joint_ids = entries.raw.get("joint_ids")
+    entries.refuse(
+        joint_ids not in (None, list(range(count))),
+        f"joint_ids must be all {count} joints in the network's order, as a policy observes the "
+        f"joints that it moves; got {joint_ids}",
+    )
 
 
 def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
@@ -272,31 +245,26 @@ def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
         key
         for key, value in terms.raw.items()
         if isinstance(value, dict)
-        and not any(name in value for name in _TERM_KEYS if name != "scale_first")
+        and not {*_TERM_KEYS.split()} - {"scale_first"} & value.keys()
         and any(isinstance(one, dict) for one in value.values())
     ]
-    if len(groups) > 1:
-        raise ValueError(f"{terms.who} a policy has one input; got the groups {groups}")
+    terms.refuse(len(groups) > 1, f"a policy has one input; got the groups {groups}")
     if groups:
         terms = terms.inner(groups[0])
     observation: list[dict[str, Any]] = []
     found: dict[str, Any] = {"observation": observation}
-    for name in terms.raw:
-        if name in _GROUP_SWITCHES:
-            continue
-        spec = terms.inner(name)
-        spec.only(_TERM_KEYS)
+    for name in (name for name in terms.raw if name not in _GROUP_SWITCHES):
+        spec = terms.inner(name, _TERM_KEYS)
         entry: dict[str, Any] = {"name": TERM_NAMES.get(name, str(name))}
         if "scale" in spec:
             scale = spec.raw["scale"]
             size = _width(entry["name"], count) or (len(scale) if isinstance(scale, list) else 1)
-            entry["scale"] = _shortest(spec.numbers("scale", size))
+            entry["scale"] = _scale(spec, "scale", size)
         entry["clip"] = math.inf
         if "clip" in spec:
             is_scaled = spec.raw.get("scale_first", terms.raw.get("scale_first", False))
             factors = [1.0] if is_scaled else entry.get("scale", [1.0])
-            lowest, highest = spec.numbers("clip", 2)
-            entry["clip"] = limit(lowest, highest, factors, spec.who)
+            entry["clip"] = limit(*spec.numbers("clip", 2), factors, spec.who)
         length = int(spec.number("history_length")) if "history_length" in spec else 1
         entry["history"] = max(length, 1)
         if entry["name"] == "gait_phase":
@@ -307,13 +275,9 @@ def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
         observation.append(entry)
     if terms.raw.get("use_gym_history", False):
         lengths = {entry.pop("history") for entry in observation}
-        if len(lengths) != 1:
-            raise ValueError(
-                f"{terms.who} use_gym_history needs terms of one history_length; got "
-                f"{sorted(lengths)}"
-            )
-        length = lengths.pop()
-        if length > 1:
+        what = f"use_gym_history needs one history_length; got {sorted(lengths)}"
+        terms.refuse(len(lengths) != 1, what)
+        if (length := lengths.pop()) > 1:
             found["history"] = {"ages": list(range(length))[::-1], "by": "time"}
     return found
 
@@ -329,19 +293,16 @@ def _from_rl_sar(raw: dict[str, Any], path: Path) -> dict[str, Any]:
     if base is not None:
         with reading(base):
             of_robot = _Entries(_parsed(base), str(base)).raw.get(str(section).partition("/")[0])
-    file = _Entries({**(of_robot or {}), **own}, str(path))
-    file.only(_RL_SAR_KEYS)
-    if "rows" in file and file.raw.get("framework") == "isaacsim":
-        raise ValueError(
-            f"{path}: the reordering by rows and cols of old files with framework isaacsim is not "
-            "supported; put the lists in the network's order, and delete rows and cols"
-        )
-    if file.raw.get("wheel_indices"):
-        raise ValueError(
-            f"{path}: wheels are not supported; got wheel_indices {file.raw['wheel_indices']}"
-        )
+    file = _Entries({**(of_robot or {}), **own}, str(path), _RL_SAR_KEYS)
+    file.refuse(
+        "rows" in file and file.raw.get("framework") == "isaacsim",
+        "the reordering by rows and cols of old files with framework isaacsim is not supported; "
+        "put the lists in the network's order, and delete rows and cols",
+    )
+    wheels = file.raw.get("wheel_indices")
+    file.refuse(bool(wheels), f"wheels are not supported; got wheel_indices {wheels}")
     count = int(file.number("num_of_dofs"))
-    names = file.texts("joint_names") if "joint_names" in file else []
+    names = file.get("joint_names", list[str]) if "joint_names" in file else []
     if names and "joint_mapping" in file:
         names = [names[i] for i in file.indices("joint_mapping", len(names))]
     scale = file.numbers("action_scale", count)
@@ -352,14 +313,14 @@ def _from_rl_sar(raw: dict[str, Any], path: Path) -> dict[str, Any]:
     clips = ("clip_actions_lower", "clip_actions_upper")
     if any(file.raw.get(key) for key in clips):
         low, high = (file.numbers(key, count) for key in clips)
-        if set(high) != {-x for x in low} or len(set(high)) != 1:
-            raise ValueError(
-                f"{path}: limits of actions that differ between joints or signs are not supported; "
-                f"got {low} and {high}. Write one for all"
-            )
+        file.refuse(
+            set(high) != {-x for x in low} or len(set(high)) != 1,
+            "limits of actions that differ between joints or signs are not supported; got "
+            f"{low} and {high}. Write one for all",
+        )
         action_clip = high[0]
     return {
-        "network": _network(path, [str(file.get("model_name"))]),
+        "network": _network(path, str(file.get("model_name"))),
         "joints": names,
         "default_positions": file.numbers("default_dof_pos", count),
         "action_scale": scale,
@@ -373,26 +334,23 @@ def _from_rl_sar(raw: dict[str, Any], path: Path) -> dict[str, Any]:
 
 def _rl_sar_observation(file: _Entries, count: int) -> dict[str, Any]:
     clip = file.number("clip_obs") if "clip_obs" in file else math.inf
-    observation: list[dict[str, Any]] = []
-    found: dict[str, Any] = {"observation": observation}
+    found: dict[str, Any] = {"observation": []}
     widths = []
-    for name in file.texts("observations"):
+    for name in file.get("observations", list[str]):
         term, key = _RL_SAR_TERMS.get(name, (name, ""))
-        if name not in registered_terms() and _PHASE.fullmatch(name) and "mimic" not in name:
+        if name not in registered_terms() and re.fullmatch(r"(?!.*mimic)\w+_phase", name):
             # Its period is in the project's code.
             term = "gait_phase"
             found["gait"] = {"offsets": [0.0], "standing_below": 0.0}
         widths.append(_width(term, count))
-        entry: dict[str, Any] = {"name": term, "clip": clip}
-        if key:
-            entry["scale"] = _shortest(file.numbers(key, widths[-1]))
-        observation.append(entry)
-    is_wrong = "num_observations" in file and sum(widths) != file.number("num_observations")
-    if is_wrong and all(widths):
-        raise ValueError(
-            f"{file.who}: num_observations is {file.raw['num_observations']}, but its observations "
-            f"{file.raw['observations']} have {sum(widths)} entries with {count} joints"
-        )
+        scale = {"scale": _scale(file, key, widths[-1])} if key else {}
+        found["observation"].append({"name": term, "clip": clip, **scale})
+    num = file.number("num_observations") if "num_observations" in file else sum(widths)
+    file.refuse(
+        num != sum(widths) and all(widths),
+        f"num_observations is {num:g}, but its observations {file.raw['observations']} have "
+        f"{sum(widths)} entries with {count} joints",
+    )
     if file.raw.get("observations_history"):
         found["history"] = {
             "ages": file.indices("observations_history"),

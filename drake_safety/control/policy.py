@@ -1,7 +1,8 @@
 """Locomotion policies as data: observation terms, actions, gait clock and command limits."""
 
 import math
-from dataclasses import field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,11 +13,74 @@ from pydrake.math import RotationMatrix
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.observation import quaternion_of
 from drake_safety.control.policy_network import PolicyNetwork, load_network
-from drake_safety.control.policy_terms import TERMS, PolicyInput, Term, registered_terms
-from drake_safety.control.policy_terms import observation_term as observation_term
 from drake_safety.files.schema import Count, Pattern, Positive, Triple, load_typed_file, schema
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern
+
+_DOWN = np.array([0.0, 0.0, -1.0])
+
+
+@dataclass(kw_only=True, eq=False)
+class PolicyInput:
+    """What observation terms are functions of.
+
+    Attributes:
+        R_WB: Orientation of the base, (3, 3).
+        w_WB: Angular velocity of the base in the world, (3,) [rad/s].
+        v_WB: Velocity of the base in the world, (3,) [m/s].
+        positions: Joint positions less those of zero action, in the policy's order, (n_a,) [rad].
+        rates: Joint rates, (n_a,) [rad/s].
+        command: (v_x, v_y, ω_z), (3,) [m/s, rad/s].
+        action: The last action, (n_a,).
+        phases: Phases of the gait clock, in [-π, π], (n_p,) [rad].
+    """
+
+    R_WB: np.ndarray
+    w_WB: np.ndarray
+    v_WB: np.ndarray
+    positions: np.ndarray
+    rates: np.ndarray
+    command: np.ndarray
+    action: np.ndarray
+    phases: np.ndarray
+
+
+Term = Callable[[PolicyInput], np.ndarray]
+TERMS: dict[str, Term] = {}
+"""Registered terms by name."""
+
+
+def observation_term(name: str) -> Callable[[Term], Term]:
+    """Registers a function of a :class:`PolicyInput` as an observation term."""
+
+    def register(term: Term) -> Term:
+        if TERMS.setdefault(name, term) is not term:
+            raise ValueError(f"observation term '{name}' is already registered")
+        return term
+
+    return register
+
+
+def registered_terms() -> list[str]:
+    """Names of all registered observation terms."""
+    return sorted(TERMS)
+
+
+# Names of Isaac Lab; those of the gait clock and of the parts of the command are Holosoma's.
+observation_term("base_lin_vel")(lambda seen: seen.R_WB.T @ seen.v_WB)
+observation_term("base_ang_vel")(lambda seen: seen.R_WB.T @ seen.w_WB)
+observation_term("projected_gravity")(lambda seen: seen.R_WB.T @ _DOWN)
+observation_term("velocity_commands")(lambda seen: seen.command)
+observation_term("command_lin_vel")(lambda seen: seen.command[:2])
+observation_term("command_ang_vel")(lambda seen: seen.command[2:])
+observation_term("joint_pos_rel")(lambda seen: seen.positions)
+observation_term("joint_vel_rel")(lambda seen: seen.rates)
+observation_term("last_action")(lambda seen: seen.action)
+observation_term("sin_phase")(lambda seen: np.sin(seen.phases))
+observation_term("cos_phase")(lambda seen: np.cos(seen.phases))
+observation_term("gait_phase")(
+    lambda seen: np.concatenate([np.sin(seen.phases), np.cos(seen.phases)])
+)
 
 
 @schema(kw_only=True)
@@ -162,11 +226,10 @@ class Policy:
             return found
 
         positions = by_joint("default_positions", joint_names)
-        scales = by_joint("action_scale", names)
-        stiffness, damping = by_joint("stiffness", names), by_joint("damping", names)
+        scales, damping = by_joint("action_scale", names), by_joint("damping", names)
         servos = {
-            name: JointGains(stiffness=stiffness[name], damping=damping[name])
-            for name in stiffness
+            name: JointGains(stiffness=stiffness, damping=damping[name])
+            for name, stiffness in by_joint("stiffness", names).items()
             if name in damping
         }
         self.gains: dict[str, JointGains] = servos | by_joint("gains", names)
@@ -195,7 +258,13 @@ class Policy:
         self.initial_phases = (
             _wrapped(2 * math.pi * np.array(gait.offsets)) if gait.period_s else np.zeros(0)
         )
-        self._terms = self._registered(who)
+        unknown = [one.name for one in parameters.observation if one.name not in TERMS]
+        if unknown:
+            raise ValueError(
+                f"{who}: observation has unknown terms {unknown}; registered are "
+                f"{registered_terms()}"
+            )
+        self._terms = [(TERMS[one.name], one) for one in parameters.observation]
         q = np.concatenate([np.eye(1, NUM_BASE_POSITIONS)[0], self.default_positions])
         v = np.zeros(NUM_BASE_VELOCITIES + len(joint_names))
         still = self.see(q, v, np.zeros(3), np.zeros(len(names)), self.initial_phases)
@@ -215,22 +284,11 @@ class Policy:
             samples = [ages] * len(widths)
         self.sizes = [w * len(one) for w, one in zip(widths, samples, strict=True)]
         self._lay_out(widths, samples, by_time=bool(ages) and parameters.history.by == "time")
-        self.network.check(who, sum(self.sizes), len(names), self._described(widths))
-
-    def _registered(self, who: str) -> list[tuple[Term, ObservationTerm]]:
-        unknown = [one.name for one in self.parameters.observation if one.name not in TERMS]
-        if unknown:
-            raise ValueError(
-                f"{who}: observation has unknown terms {unknown}; registered are "
-                f"{registered_terms()}"
-            )
-        return [(TERMS[one.name], one) for one in self.parameters.observation]
-
-    def _described(self, widths: list[int]) -> str:
-        return ", ".join(
-            f"{spec.name} {width}" + (f" x {size // width}" if size > width else "")
-            for width, size, (_, spec) in zip(widths, self.sizes, self._terms, strict=True)
+        described = ", ".join(
+            f"{spec.name} {width}" + f" x {len(ages)}" * (len(ages) > 1)
+            for (_, spec), width, ages in zip(self._terms, widths, samples, strict=True)
         )
+        self.network.check(who, sum(self.sizes), len(names), described)
 
     def _lay_out(self, widths: list[int], samples: list[list[int]], *, by_time: bool) -> None:
         """Sets, for each entry of the network's input, where it comes from.
@@ -238,17 +296,15 @@ class Policy:
         ``_entries`` is the entry of the present observation, ``_earlier`` that of the last input
         which is one period younger; -1 for the newest samples.
         """
-        firsts = np.concatenate([[0], np.cumsum(widths[:-1])]).astype(int)
+        ends = np.cumsum(widths)
         terms = range(len(widths))
         blocks = [(term, age) for term in terms for age in samples[term]]
         if by_time:
             blocks = [(term, age) for age in samples[0] for term in terms]
-        places: dict[tuple[int, int], int] = {}
-        for term, age in blocks:
-            for i in range(firsts[term], firsts[term] + widths[term]):
-                places[i, age] = len(places)
-        self._entries = np.array([entry for entry, _ in places], dtype=int)
-        self._earlier = np.array([places.get((i, age - 1), -1) for i, age in places], dtype=int)
+        order = [(i, age) for k, age in blocks for i in range(ends[k] - widths[k], ends[k])]
+        places = {one: place for place, one in enumerate(order)}
+        self._entries = np.array([entry for entry, _ in order], dtype=int)
+        self._earlier = np.array([places.get((i, age - 1), -1) for i, age in order], dtype=int)
 
     def see(
         self,
@@ -273,12 +329,8 @@ class Policy:
 
     def observe(self, seen: PolicyInput, history: np.ndarray) -> np.ndarray:
         """The network's input; ``history`` is its last one, (n_o,), NaN before the first."""
-        present = np.concatenate(
-            [
-                np.clip(term(seen) * np.asarray(spec.scale), -spec.clip, spec.clip)
-                for term, spec in self._terms
-            ]
-        )
+        scaled = ((term(seen) * np.asarray(spec.scale), spec.clip) for term, spec in self._terms)
+        present = np.concatenate([np.clip(values, -most, most) for values, most in scaled])
         observation = present[self._entries]
         if np.isfinite(history).all():
             aged = self._earlier >= 0
@@ -311,7 +363,7 @@ class Policy:
     def next_command(self, applied: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         """Returns the command of the next period, of limited change, (3,)."""
         change = np.asarray(self.parameters.command.change)
-        return np.minimum(np.maximum(wanted, applied - change), applied + change)
+        return np.clip(wanted, applied - change, applied + change)
 
 
 def network_file(parameters: PolicyParameters, folder: str = "") -> Path:

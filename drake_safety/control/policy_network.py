@@ -1,18 +1,23 @@
-"""Networks of locomotion policies: ONNX and TorchScript files, with or without a memory."""
+"""Networks of locomotion policies: ONNX and TorchScript files, and what they say of policies."""
 
 from __future__ import annotations
 
+import ast
+import json
+import math
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import FiniteFloat
 
-from drake_safety.control.policy_metadata import PolicyMetadata, read_metadata
 from drake_safety.extras import require_extra
+from drake_safety.files.schema import Bounds, load_typed
 
 _MOST = 1_000_000_000  # Bytes of a file.
 _SUPPORTED = (
@@ -20,6 +25,131 @@ _SUPPORTED = (
     "pairs of one shape, such as h_in and h_out, or buffers of TorchScript"
 )
 _Memory = Mapping[str, np.ndarray]
+
+
+@dataclass(kw_only=True)
+class PolicyMetadata:
+    """What an ONNX file says of its policy; empty where it says nothing.
+
+    Attributes:
+        joints: Joint names in the network's order.
+        stiffness, damping: Servo gains by regular expression [N·m/rad, N·m·s/rad].
+        default_positions, action_scale: As in ``policy.yaml``, by regular expression [rad].
+        observation: As in ``policy.yaml``, but terms have only the keys that the file states.
+        command: Lowest and highest v_x, v_y and ω_z by name [m/s, rad/s].
+        unread: Entries that do not fit, and why.
+    """
+
+    joints: list[str] = field(default_factory=list)
+    stiffness: dict[str, float] = field(default_factory=dict)
+    damping: dict[str, float] = field(default_factory=dict)
+    default_positions: dict[str, float] = field(default_factory=dict)
+    action_scale: dict[str, float] = field(default_factory=dict)
+    observation: list[dict[str, Any]] = field(default_factory=list)
+    command: dict[str, list[float]] = field(default_factory=dict)
+    unread: list[str] = field(default_factory=list)
+
+
+# Keys of Holosoma, then of Isaac Lab and mjlab.
+_KEYS = {
+    "stiffness": ("kp", "joint_stiffness"),
+    "damping": ("kd", "joint_damping"),
+    "default_positions": ("default_joint_pos",),
+    "action_scale": ("action_scale",),
+    "scale": ("observation_terms_scale",),
+    "clip": ("observation_terms_clip",),
+    "history": ("observation_history_lengths", "observation_terms_history_length"),
+    "command": ("command_ranges",),
+}
+_VELOCITIES = ("lin_vel_x", "lin_vel_y", "ang_vel_z", "ang_vel_yaw")
+TERM_NAMES = {
+    "command": "velocity_commands",
+    "keyboard_velocity_commands": "velocity_commands",
+    "joint_pos": "joint_pos_rel",
+    "joint_vel": "joint_vel_rel",
+    "actions": "last_action",
+}
+"""Registered terms by the names of Isaac Lab's and mjlab's tasks, where these differ."""
+
+
+def read_metadata(raw: Mapping[str, str]) -> PolicyMetadata:
+    """Reads the entries of an ONNX file's metadata that describe its policy.
+
+    Values are JSON, Python's, or words and numbers between commas. Numbers are one for all joints,
+    one for each, or by regular expression.
+    """
+    joints = _words(raw.get("dof_names", raw.get("joint_names", "")))
+    names = _words(raw.get("observation_names", ""))
+    terms: list[dict[str, Any]] = [{"name": TERM_NAMES.get(name, name)} for name in names]
+    found = PolicyMetadata(joints=joints, observation=terms)
+    for name, keys in _KEYS.items():
+        text = next((raw[key] for key in keys if raw.get(key)), "")
+        value = _parsed(text)
+        expected = f"a value for each of the terms {names}"
+        try:
+            if text and name == "command":
+                expected = "the lowest and highest velocity by name"
+                stated = {key: pair for key, pair in dict(value).items() if key in _VELOCITIES}
+                found.command = load_typed(dict[str, Bounds[FiniteFloat]], stated, name)
+            elif text and hasattr(found, name):
+                expected = f"a number for each of the joints {joints}, one for all or by regular "
+                expected += "expression"
+                setattr(found, name, _by_joint(value, joints))
+            elif text and names:
+                values = _by_term(value, names, terms, name)
+                for term, one in list(zip(terms, values, strict=True)):
+                    term[name] = one
+        except (KeyError, TypeError, ValueError, re.error):
+            found.unread.append(f"its metadata '{name}' must be {expected}; got {value}")
+    return found
+
+
+def _by_joint(value: Any, joints: list[str]) -> dict[str, float]:
+    if isinstance(value, list):
+        value = dict(zip(map(re.escape, joints), value, strict=True))
+    elif not isinstance(value, dict):
+        value = {".*": value}
+    numbers = {re.compile(pattern).pattern: float(number) for pattern, number in value.items()}
+    if not all(map(math.isfinite, numbers.values())):
+        raise ValueError(value)
+    return numbers
+
+
+def _by_term(value: Any, names: list[str], terms: list[dict[str, Any]], key: str) -> list[Any]:
+    """Values of a key of ``policy.yaml``; several numbers of a term are between semicolons."""
+    value = [value[name] for name in names] if isinstance(value, dict) else value
+    texts = value if isinstance(value, list) else [value]
+    numbers = [[float(x) for x in str(text).split(";")] for text in texts]
+    if key == "history":
+        return [max(1, int(length)) for (length,) in numbers]
+    if key == "clip":
+        clips = zip(terms, numbers, strict=True)
+        return [limit(low, high, term.get("scale", [1.0])) for term, (low, high) in clips]
+    return numbers
+
+
+def limit(low: float, high: float, factors: list[float], who: str = "") -> float:
+    """Returns the largest absolute value after scaling by factors, of limits before it."""
+    limits = {abs(high * factor) for factor in factors}
+    if low != -high or len(limits) != 1:
+        raise ValueError(
+            f"{who} clip must be symmetric, with one scale; got {[low, high]} and {factors}"
+        )
+    return limits.pop()
+
+
+def _words(text: str) -> list[str]:
+    """Names between commas, or in a list."""
+    words = (word.strip(" \n\"'") for word in text.strip("[] \n").split(","))
+    return [word for word in words if word]
+
+
+def _parsed(text: str) -> Any:
+    for read in (json.loads, ast.literal_eval):
+        with suppress(TypeError, ValueError, SyntaxError, MemoryError, RecursionError):
+            value = read(text)
+            return list(value) if isinstance(value, tuple) else value
+    return text.split(",")
 
 
 class PolicyNetwork:
@@ -111,14 +241,13 @@ def load_network(path: Path) -> PolicyNetwork:
         MissingExtraError: The package that evaluates it is not installed.
         ValueError: The file does not exist, is of another kind, or cannot be read.
     """
-    loaders = {".onnx": _load_onnx, ".pt": _load_torchscript, ".jit": _load_torchscript}
-    if path.suffix not in loaders:
+    if path.suffix not in LOADERS:
         raise ValueError(
-            f"{path}: a policy's network is one of {list(loaders)}; got '{path.suffix}'"
+            f"{path}: a policy's network is one of {list(LOADERS)}; got '{path.suffix}'"
         )
     if not path.is_file() or path.stat().st_size > _MOST:
         raise ValueError(f"{path}: the policy's network does not exist")
-    return loaders[path.suffix](path)
+    return LOADERS[path.suffix](path)
 
 
 def network_files(path: Path) -> list[Path]:
@@ -171,11 +300,12 @@ def _load_onnx(path: Path) -> PolicyNetwork:
     inputs, outputs = session.get_inputs(), session.get_outputs()
     shapes = {one.name: _shape(one) for one in outputs}
     # Such as h_out after h_in, or hn after h0.
-    after = {one.name: re.sub("0$", "n", one.name.replace("_in", "_out")) for one in inputs}
-    memory = [one for one in inputs if shapes.get(after[one.name]) == _shape(one)]
-    seen = [one for one in inputs if one not in memory]
-    names = [after[one.name] for one in memory]
-    acting = [one for one in outputs if one.name not in names]
+    pairs = ((one, one.name.replace("_in", "_out")) for one in inputs)
+    names = [(one, name) for one, out in pairs for name in (out, re.sub("0$", "n", out))]
+    after = {one.name: name for one, name in names if shapes.get(name) == _shape(one)}
+    memory = [one for one in inputs if one.name in after]
+    seen = [one for one in inputs if one.name not in after]
+    acting = [one for one in outputs if one.name not in after.values()]
     if len(seen) != 1 or not acting:
         raise ValueError(
             f"{path}: got inputs {[f'{one.name} {one.shape} {one.type}' for one in inputs]} and "
@@ -183,19 +313,16 @@ def _load_onnx(path: Path) -> PolicyNetwork:
         )
     (observed,) = seen
     start = {one.name: np.zeros(_shape(one), np.float32) for one in memory}
+    lasts = (one.shape[-1] if one.shape else None for one in (observed, acting[0]))
+    num_seen, num_acting = (size if isinstance(size, int) else None for size in lasts)
 
     def evaluate(batch: np.ndarray, parts: _Memory) -> tuple[np.ndarray, _Memory]:
         given = {**start, **parts, observed.name: batch.reshape(*_shape(observed)[:-1], -1)}
-        action, *new = session.run([acting[0].name, *names], given)
+        action, *new = session.run([acting[0].name, *after.values()], given)
         return action, dict(zip(start, new, strict=True))
 
-    return PolicyNetwork(
-        path,
-        evaluate,
-        (_width(observed.shape), _width(acting[0].shape)),
-        read_metadata(session.get_modelmeta().custom_metadata_map),
-        start,
-    )
+    metadata = read_metadata(session.get_modelmeta().custom_metadata_map)
+    return PolicyNetwork(path, evaluate, (num_seen, num_acting), metadata, start)
 
 
 def _shape(one: Any) -> list[int]:
@@ -237,5 +364,9 @@ def _load_torchscript(path: Path) -> PolicyNetwork:
     return PolicyNetwork(path, evaluate, (None, None), start=start)
 
 
-def _width(shape: list[Any]) -> int | None:
-    return shape[-1] if shape and isinstance(shape[-1], int) else None
+LOADERS: dict[str, Callable[[Path], PolicyNetwork]] = {
+    ".onnx": _load_onnx,
+    ".pt": _load_torchscript,
+    ".jit": _load_torchscript,
+}
+"""Readers of networks by the ends of their files' names."""

@@ -12,12 +12,15 @@ from typing import Any
 import yaml
 
 from drake_safety.control.foreign_policy import converted_policy
-from drake_safety.control.policy_network import PolicyNetwork, load_network, network_files
-from drake_safety.control.policy_terms import registered_terms
+from drake_safety.control.policy import registered_terms
+from drake_safety.control.policy_network import (
+    LOADERS,
+    PolicyNetwork,
+    load_network,
+    network_files,
+)
 from drake_safety.files.reading import yaml_text
 from drake_safety.robots.robot_model import as_pattern
-
-_NETWORKS = (".onnx", ".pt", ".jit")
 
 
 @dataclass(kw_only=True)
@@ -53,14 +56,13 @@ class PolicyTemplate:
 
     def yaml(self, robot_joints: list[str], posture: dict[str, float]) -> tuple[str, list[str]]:
         """Returns the text of ``policy.yaml``, and what the user must supply."""
-        metadata = self.network.metadata
-        found = dict(self.found)
+        metadata, found = self.network.metadata, dict(self.found)
         lines: list[str] = []
         asked: list[str] = []
 
         def ask(line: str, what: str) -> None:
             lines.append(f"# {line}  # ASK {what}")
-            asked.append(f"policy.yaml: {what}")
+            asked.append(what)
 
         names = f"joints: [{', '.join(map(yaml_text, robot_joints))}]"
         missing = [name for name in self.joints if name not in robot_joints]
@@ -69,28 +71,30 @@ class PolicyTemplate:
             ask(names, f"the robot's joints in the network's order; {missing} are none of them")
         elif not self.joints:
             ask(names, "the joints that the network moves, in its order")
-        if not metadata.default_positions and "default_positions" not in found:
-            keys = {yaml_text(as_pattern(name)): value for name, value in posture.items() if value}
-            values = ", ".join(f"{key}: {value:g}" for key, value in keys.items())
-            ask(f"default_positions: {{{values}}}", "joint positions at zero action [rad]")
-        if not metadata.action_scale and "action_scale" not in found:
-            ask("action_scale: {.*: 0.25}", "joint positions per unit of action [rad]")
-        if not (metadata.stiffness and metadata.damping) and "gains" not in found:
-            ask(
+        keys = {yaml_text(as_pattern(name)): value for name, value in posture.items() if value}
+        values = ", ".join(f"{key}: {value:g}" for key, value in keys.items())
+        said = vars(metadata) | {"gains": metadata.stiffness and metadata.damping} | found
+        for line, what in (
+            (f"default_positions: {{{values}}}", "joint positions at zero action [rad]"),
+            ("action_scale: {.*: 0.25}", "joint positions per unit of action [rad]"),
+            (
                 "gains: {.*: {stiffness: 20.0, damping: 0.5}}",
                 "the servos' gains of training [N·m/rad, N·m·s/rad]",
-            )
+            ),
+        ):
+            if not said[line.partition(":")[0]]:
+                ask(line, what)
         lines.append("# rotor_inertia: {.*: 0.01}  # that of training, if it had any [kg·m²]")
         if "period_s" not in found:
             lines.append("period_s: 0.02  # ASK the time between two actions [s]")
-            asked.append("policy.yaml: the time between two actions [s]; 0.02 is assumed")
+            asked.append("the time between two actions [s]; 0.02 is assumed")
         if metadata.observation and "observation" not in found:
             without = {"name": "", "clip": math.inf}
             found["observation"] = [without | term for term in metadata.observation]
             unstated = [k for k in ("scale", "history") if k not in metadata.observation[0]]
             if unstated:
                 what = f"{' and '.join(unstated)} of the terms of the observation"
-                asked.append(f"policy.yaml: {what}; 1 is assumed, as the network only names them")
+                asked.append(f"{what}; 1 is assumed, as the network only names them")
         if "observation" not in found:
             width, _ = self.network.widths
             entries = "" if width is None else f", {width} entries"
@@ -102,15 +106,21 @@ class PolicyTemplate:
                 f"# registered terms: {', '.join(registered_terms())}",
             ]
         stated = {term["name"] for term in found.get("observation", [])}
-        unknown = sorted(stated - set(registered_terms()))
-        if unknown:
-            asked.append(f"policy.yaml: functions of the terms {unknown}, by @observation_term")
+        if unknown := sorted(stated - set(registered_terms())):
+            asked.append(f"functions of the terms {unknown}, by @observation_term")
         if "gait" in found and "period_s" not in found["gait"]:
             gait = {"period_s": 0.8, **found.pop("gait")}
             ask(f"gait: {gait}".replace("'", ""), "the period of the gait's clock [s]")
         if "command" not in found:
-            lines += self._command(asked)
-        asked += [f"policy.yaml: {what}" for what in metadata.unread]
+            ranges, words = metadata.command, ""
+            yaw = "ang_vel_z" if "ang_vel_z" in ranges else "ang_vel_yaw"
+            pairs = [ranges.get(key) for key in ("lin_vel_x", "lin_vel_y", yaw)]
+            if None in pairs:
+                what = "the ranges of commands in training [m/s, m/s, rad/s]"
+                pairs, words = [[-1.0, 1.0]] * 3, f"  # ASK {what}"
+                asked.append(f"{what}; ±1 is assumed")
+            lowest, highest = ([pair[i] for pair in pairs if pair] for i in (0, 1))
+            lines += [f"command:{words}", f"  lowest: {lowest}", f"  highest: {highest}"]
         head = [
             f"# Written from {self.source}. Commented lines marked ASK have values that it lacks:",
             "# correct them, and delete the sign. docs/walking.md has all keys.",
@@ -119,22 +129,8 @@ class PolicyTemplate:
         if found:
             text = yaml.safe_dump(found, default_flow_style=None, sort_keys=False, width=100)
             head.append(text.rstrip())
+        asked = [f"policy.yaml: {what}" for what in (*asked, *metadata.unread)]
         return "\n".join([*head, *lines]) + "\n", asked
-
-    def _command(self, asked: list[str]) -> list[str]:
-        ranges = self.network.metadata.command
-        yaw = "ang_vel_z" if "ang_vel_z" in ranges else "ang_vel_yaw"
-        keys = ("lin_vel_x", "lin_vel_y", yaw)
-        ask = ""
-        pairs: list[list[float]] = [[-1.0, 1.0]] * 3
-        if all(key in ranges for key in keys):
-            pairs = [ranges[key] for key in keys]
-        else:
-            what = "the ranges of commands in training [m/s, m/s, rad/s]"
-            ask = f"  # ASK {what}"
-            asked.append(f"policy.yaml: {what}; ±1 is assumed")
-        lowest, highest = ([pair[i] for pair in pairs] for i in (0, 1))
-        return [f"command:{ask}", f"  lowest: {lowest}", f"  highest: {highest}"]
 
 
 def survey_policy(path: Path, motors: Sequence[str] = ()) -> PolicyTemplate:
@@ -145,6 +141,6 @@ def survey_policy(path: Path, motors: Sequence[str] = ()) -> PolicyTemplate:
             ``config.yaml`` of rl_sar.
         motors: Joints in the order of the robot's motors, which a ``deploy.yaml`` numbers.
     """
-    found = {} if path.suffix in _NETWORKS else converted_policy(path, motors)
+    found = {} if path.suffix in LOADERS else converted_policy(path, motors)
     network = load_network(Path(found.pop("network", path)))
     return PolicyTemplate(network=network, found=found, source=path.name)

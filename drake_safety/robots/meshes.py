@@ -37,23 +37,17 @@ def cache_folder() -> Path:
     return Path(os.environ.get(CACHE_VARIABLE) or Path(base, "drake_safety"))
 
 
+@lru_cache(maxsize=1024)
 def is_shown(path: Path) -> bool:
     """Whether Drake renders a mesh without conversion.
 
     OBJ files by MeshLab may declare opaque materials fully transparent, and Drake renders them so.
     """
-    if path.suffix.lower() not in SHOWN_FORMATS:
-        return False
-    return path.suffix.lower() != ".obj" or not _is_transparent(path.with_suffix(".mtl"))
-
-
-@lru_cache(maxsize=1024)
-def _is_transparent(materials: Path) -> bool:
-    """Whether all materials of an MTL file are fully transparent."""
-    if not materials.is_file():
-        return False
+    materials = path.with_suffix(".mtl")
+    if path.suffix.lower() != ".obj" or not materials.is_file():
+        return path.suffix.lower() in SHOWN_FORMATS
     found = _TRANSPARENCY.findall(materials.read_text("utf-8", "replace"))
-    return bool(found) and min(map(float, found)) >= 1.0
+    return not found or min(map(float, found)) < 1.0
 
 
 def shown_mesh(path: Path, rgba: str = "") -> Path:

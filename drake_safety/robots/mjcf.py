@@ -8,7 +8,6 @@ import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -136,14 +135,11 @@ class _Robot:
         gains = {j: np.zeros(2) for j in self.joints}
         armature = {j: float(model.joint(j).armature[0]) for j in self.joints}
         others: dict[int, int] = {}  # Joints of actuators that are no motors.
+        of_joint = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
         for i in range(model.nu):
             one, j = model.actuator(i), int(model.actuator_trnid[i, 0])
-            if int(one.trntype[0]) not in (
-                mujoco.mjtTrn.mjTRN_JOINT,
-                mujoco.mjtTrn.mjTRN_JOINTINPARENT,
-            ):
-                others[i] = -1
-                continue
+            if int(one.trntype[0]) not in of_joint:
+                others[i] = j = -1
             if j not in self.joints:
                 continue
             gear, bias = abs(float(one.gear[0])), one.biastype[0]
@@ -196,14 +192,10 @@ class _Robot:
     def _add_link(self, body: int) -> None:
         one, inside = self.model.body(body), []
         if one.mass[0] > 0:
-            X_BI = _pose(one.ipos, one.iquat)
-            R_BI = X_BI.rotation().matrix()
-            moments = R_BI @ np.diag(one.inertia) @ R_BI.T
-            pairs = combinations_with_replacement(range(3), 2)
-            inertia = {f"i{'xyz'[i]}{'xyz'[j]}": moments[i, j] for i, j in pairs}
-            origin = _origin(RigidTransform(X_BI.translation()))
-            mass, inertia_tag = _tag("mass", value=one.mass), _tag("inertia", **inertia)
-            inside.append(_tag("inertial", origin, mass, inertia_tag))
+            names = dict(zip(("ixx", "iyy", "izz"), one.inertia, strict=True))
+            inertia = _tag("inertia", **names, **dict.fromkeys(("ixy", "ixz", "iyz"), 0.0))
+            mass, origin = _tag("mass", value=one.mass), _origin(_pose(one.ipos, one.iquat))
+            inside.append(_tag("inertial", origin, mass, inertia))
         for geom in range(one.geomadr[0], one.geomadr[0] + one.geomnum[0]):
             inside += self._shapes(geom, self.bodies[body])
         self.parts.append(_tag("link", *inside, name=self.bodies[body]))

@@ -1,10 +1,11 @@
 """Adds a robot to a MultibodyPlant, with plant variations that model a reality gap."""
 
+import operator
 import re
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import field
-from typing import Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 from pydrake.geometry import ProximityProperties, RoleAssign, SceneGraph, Sphere
@@ -82,17 +83,16 @@ _FRICTION_SUFFIX = "_friction"  # Suffix of actuators that model dry friction.
 _FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
 
 
-def _require(robot: RobotModel, what: str, name: str, known: list[str]) -> None:
-    if name not in known:
-        raise ValueError(f"robot '{robot.name}' has no {what} '{name}'; it has {known}")
-
-
-def _require_joints(
-    robot: RobotModel, what: str, patterns: Iterable[str], known: list[str]
+def _require(
+    robot: RobotModel,
+    what: str,
+    names: Iterable[str],
+    known: list[str],
+    fits: Callable[[str, str], Any] = operator.eq,
 ) -> None:
-    for pattern in patterns:
-        if not any(re.fullmatch(pattern, name) for name in known):
-            _require(robot, f"joint for {what}", pattern, known)
+    for name in names:
+        if not any(fits(name, one) for one in known):
+            raise ValueError(f"robot '{robot.name}' has no {what} '{name}'; it has {known}")
 
 
 def servo_joints(plant: MultibodyPlant, robot: RobotModel) -> list[str]:
@@ -115,16 +115,15 @@ def _set_friction(
     instance = plant.GetModelInstanceByName(robot.name)
     for foot in robot.feet.values():
         body = plant.GetBodyByName(foot.body, instance)
-        points = np.array(foot.contact_points)
         for geometry_id in plant.GetCollisionGeometriesForBody(body):
             centre = inspector.GetPoseInFrame(geometry_id).translation()
-            is_contact = np.linalg.norm(points - centre, axis=1).min() < 1e-3
-            if not is_contact or not isinstance(inspector.GetShape(geometry_id), Sphere):
-                continue
-            properties = ProximityProperties(inspector.GetProximityProperties(geometry_id))
-            properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(mu, mu))
-            source = plant.get_source_id()
-            scene_graph.AssignRole(source, geometry_id, properties, RoleAssign.kReplace)
+            offsets = np.linalg.norm(np.array(foot.contact_points) - centre, axis=1)
+            if offsets.min() < 1e-3 and isinstance(inspector.GetShape(geometry_id), Sphere):
+                properties = ProximityProperties(inspector.GetProximityProperties(geometry_id))
+                properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(mu, mu))
+                scene_graph.AssignRole(
+                    plant.get_source_id(), geometry_id, properties, RoleAssign.kReplace
+                )
 
 
 def add_robot(
@@ -153,24 +152,22 @@ def add_robot(
     """
     variation = variation or PlantVariation()
     instance = add_description(plant, robot)
-    if variation.shift is not None:
-        _require_joints(robot, "shift", variation.shift.joints, servo_joints(plant, robot))
-        _add_base_force(plant, robot, variation.shift)
+    shifts, joint_names = variation.shift or Shift(), servo_joints(plant, robot)
+    _require(robot, "joint for shift", shifts.joints, joint_names, re.fullmatch)
+    _add_base_force(plant, robot, shifts)
     bodies = [plant.get_body(i).name() for i in plant.GetBodyIndices(instance)]
     joints = [plant.get_joint(i).name() for i in plant.GetJointIndices(instance)]
-    ends = [limb.body for limb in robot.limbs()]
-    for name in (robot.base, *ends, *robot.whole_body.orientation):
-        _require(robot, "body", name, bodies)
-    for name in (name for limb in robot.limbs() for name in limb.joints):
-        _require(robot, "joint", name, joints)
-    robot.mirror_partners(servo_joints(plant, robot))
+    ends = (limb.body for limb in robot.limbs())
+    _require(robot, "body", (robot.base, *ends, *robot.whole_body.orientation), bodies)
+    _require(robot, "joint", (name for limb in robot.limbs() for name in limb.joints), joints)
+    robot.mirror_partners(joint_names)
     if robot.collision == "stated" and plant.geometry_source_is_registered():
         add_stated_shapes(plant, robot, instance)
 
     # Before Finalize, the plant cannot list actuators by model instance.
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
     actuated = {one.joint().name(): one for one in actuators if one.model_instance() == instance}
-    for name in servo_joints(plant, robot):
+    for name in joint_names:
         joint = plant.GetJointByName(name, instance)
         actuator: JointActuator | None = actuated.get(name)
         limit = by_pattern(robot.effort_limits, name, "effort limit", robot.name)
@@ -181,7 +178,7 @@ def add_robot(
             actuated[name] = actuator
         elif limit is not None and np.isinf(actuator.effort_limit()):
             actuator.set_effort_limit(limit)
-        shift = _joint_shift(robot, variation, name)
+        shift = by_pattern(shifts.joints, name, "shift", robot.name) or JointShift()
         if shift.effort_scale != 1.0:
             actuator.set_effort_limit(shift.effort_scale * actuator.effort_limit())
         gains = by_pattern(robot.joint_gains, name, "gains", robot.name)
@@ -212,11 +209,6 @@ def add_robot(
     return instance
 
 
-def _joint_shift(robot: RobotModel, variation: PlantVariation, joint: str) -> JointShift:
-    shifts = {} if variation.shift is None else variation.shift.joints
-    return by_pattern(shifts, joint, "shift", robot.name) or JointShift()
-
-
 def _add_base_force(plant: MultibodyPlant, robot: RobotModel, shift: Shift) -> None:
     """Adds a steady force: a spring so long that motion hardly changes its force or direction."""
     force_n = np.linalg.norm(shift.base_force_n)
@@ -226,17 +218,8 @@ def _add_base_force(plant: MultibodyPlant, robot: RobotModel, shift: Shift) -> N
     base = plant.GetBodyByName(robot.base, plant.GetModelInstanceByName(robot.name))
     rest_m = 1e-3 * _SPRING_LENGTH_M
     stiffness = force_n / (_SPRING_LENGTH_M - rest_m)
-    plant.AddForceElement(
-        LinearSpringDamper(
-            bodyA=plant.world_body(),
-            p_AP=far,
-            bodyB=base,
-            p_BQ=np.zeros(3),
-            free_length=rest_m,
-            stiffness=stiffness,
-            damping=0.0,
-        )
-    )
+    ends = plant.world_body(), far, base, np.zeros(3)
+    plant.AddForceElement(LinearSpringDamper(*ends, rest_m, stiffness, damping=0.0))
 
 
 def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
@@ -246,9 +229,8 @@ def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
     for a joint in ``effort_limits``.
     """
     instance = plant.GetModelInstanceByName(robot.name)
-    driven = {
-        plant.get_joint_actuator(i).joint().name() for i in plant.GetJointActuatorIndices(instance)
-    }
+    actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices(instance))
+    driven = {actuator.joint().name() for actuator in actuators}
     names = dict.fromkeys(name for limb in robot.limbs() for name in limb.joints)
     # Limbs may leave out their joints; then all joints are checked.
     without = [name for name in names or servo_joints(plant, robot) if name not in driven]
@@ -264,7 +246,7 @@ def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
 def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, float]:
     """Returns the standing position [rad] of every servo joint; zero if robot.yaml has none."""
     names = servo_joints(plant, robot)
-    _require_joints(robot, "posture pattern", robot.posture, names)
+    _require(robot, "joint for posture pattern", robot.posture, names, re.fullmatch)
     return {name: by_pattern(robot.posture, name, "posture", robot.name) or 0.0 for name in names}
 
 
@@ -281,7 +263,7 @@ def actuation_matrix(
     matrix = np.zeros((len(actuators), len(joint_names)))
     for row, actuator in enumerate(actuators):
         name = actuator.joint().name()
-        _require(robot, "joint", name, joint_names)
+        _require(robot, "joint", [name], joint_names)
         if actuator.name() != f"{name}{_FRICTION_SUFFIX}":
             matrix[row, joint_names.index(name)] = 1.0
     return matrix
@@ -303,7 +285,7 @@ def apply_masses(
     if payload is None:
         return
     name = payload.body or robot.base
-    _require(robot, "body", name, [body.name() for body in bodies])
+    _require(robot, "body", [name], [body.name() for body in bodies])
     body = plant.GetBodyByName(name, instance)
     p_PcmBo_B = -np.array(payload.position_m)
     M_PBo_B = SpatialInertia.SolidSphereWithMass(payload.mass_kg, PAYLOAD_RADIUS_M).Shift(p_PcmBo_B)

@@ -6,14 +6,13 @@ import logging
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from itertools import chain
 
 import numpy as np
 from pydrake.geometry import (
     Box,
     Capsule,
     CollisionFilterDeclaration,
-    GeometryId,
     GeometrySet,
     SceneGraph,
     Shape,
@@ -21,11 +20,11 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
+from pydrake.multibody.tree import ModelInstanceIndex
 
 from drake_safety.robots.model_files import model_file, package_parser
 from drake_safety.robots.robot_model import CollisionShape, RobotModel, by_pattern
-from drake_safety.robots.urdf_copy import UrdfCopy, read_urdf
+from drake_safety.robots.urdf_copy import FIXED_MIMIC, read_urdf
 
 _logger = logging.getLogger("drake_safety")
 _SHAPE_FRICTION = 0.2  # Of all shapes but the feet.
@@ -38,32 +37,26 @@ def add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIn
     urdf = None
     if path.suffix == ".urdf":
         urdf = read_urdf(path)
-        urdf.free_fixed_joints()
+        urdf.remove(*FIXED_MIMIC)
         if robot.collision == "stated":
-            urdf.drop_collisions()
+            urdf.remove("link", "collision")
         if plant.geometry_source_is_registered():
             urdf.convert_visual_meshes()
-    with _quiet_about(robot), _named_conditions(path, urdf):
-        if urdf is not None and urdf.is_changed:
-            urdf.anchor_meshes()
-            (instance,) = parser.AddModelsFromString(urdf.text(), "urdf")
-        elif robot.urdf.startswith("package://"):
-            (instance,) = parser.AddModels(url=robot.urdf)
-        else:
-            (instance,) = parser.AddModels(str(path))
-    plant.RenameModelInstance(instance, robot.name)
-    return instance
-
-
-@contextmanager
-def _named_conditions(path: Path, urdf: UrdfCopy | None) -> Iterator[None]:
-    """Where a condition of Drake's C++ fails, pydrake raises SystemExit: names file and links."""
     try:
-        yield
-    except SystemExit as error:
+        with _quiet_about(robot):
+            if urdf is not None and urdf.is_changed:
+                urdf.anchor_meshes()
+                (instance,) = parser.AddModelsFromString(urdf.text(), "urdf")
+            elif robot.urdf.startswith("package://"):
+                (instance,) = parser.AddModels(url=robot.urdf)
+            else:
+                (instance,) = parser.AddModels(str(path))
+    except SystemExit as error:  # pydrake raises it where a condition of Drake's C++ fails.
         shapes = [] if urdf is None else [words for _, _, words in urdf.empty_shapes()]
         what = [f"Drake cannot build '{path}'", *shapes, str(error)]
         raise ValueError("; ".join(what)) from error
+    plant.RenameModelInstance(instance, robot.name)
+    return instance
 
 
 @contextmanager
@@ -73,10 +66,9 @@ def _quiet_about(robot: RobotModel) -> Iterator[None]:
     Users cannot change these files, and every worker process would repeat the warnings.
     """
     drake = logging.getLogger("drake")
-    is_own = not robot.urdf.startswith("package://")
 
     def pass_on(record: logging.LogRecord) -> bool:
-        if is_own or record.levelno > logging.WARNING:
+        if not robot.urdf.startswith("package://") or record.levelno > logging.WARNING:
             return True
         _logger.debug("%s: %s", robot.name, record.getMessage())
         return False
@@ -93,6 +85,9 @@ def add_stated_shapes(
 ) -> None:
     """Adds the collision geometry of robot.yaml: contact points and shapes."""
     names = [plant.get_body(index).name() for index in plant.GetBodyIndices(instance)]
+    unused = [one for one in robot.shapes if not any(re.fullmatch(one, body) for body in names)]
+    if unused:
+        raise ValueError(f"robot '{robot.name}' has no body for shapes {unused}; it has {names}")
 
     def add(body: str, name: str, X_BG: RigidTransform, shape: Shape, mu: float) -> None:
         plant.RegisterCollisionGeometry(
@@ -103,9 +98,6 @@ def add_stated_shapes(
         shapes = by_pattern(robot.shapes, body, "shapes", robot.name, "body") or []
         for i, stated in enumerate(shapes):
             add(body, f"{body}_shape_{i}", *_shape_of(stated), _SHAPE_FRICTION)
-    unused = [one for one in robot.shapes if not any(re.fullmatch(one, body) for body in names)]
-    if unused:
-        raise ValueError(f"robot '{robot.name}' has no body for shapes {unused}; it has {names}")
     for name, foot in robot.feet.items():
         for i, point in enumerate(foot.contact_points):
             X_BG, sphere = RigidTransform(point), Sphere(foot.radius_m)
@@ -123,13 +115,10 @@ def ignore_neighbours(
         ends = joint.parent_body(), joint.child_body()
         sides = [plant.GetBodiesWeldedTo(body) for body in ends]
         if joint.num_velocities() and any(len(side) > 1 for side in sides):
-            parent, child = (GeometrySet(_geometries(plant, side)) for side in sides)
+            shapes = (map(plant.GetCollisionGeometriesForBody, side) for side in sides)
+            parent, child = (GeometrySet([*chain.from_iterable(side)]) for side in shapes)
             apart = CollisionFilterDeclaration().ExcludeBetween(parent, child)
             scene_graph.collision_filter_manager().Apply(apart)
-
-
-def _geometries(plant: MultibodyPlant, bodies: list[RigidBody]) -> list[GeometryId]:
-    return [one for body in bodies for one in plant.GetCollisionGeometriesForBody(body)]
 
 
 def _shape_of(stated: CollisionShape) -> tuple[RigidTransform, Shape]:

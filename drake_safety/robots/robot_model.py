@@ -198,14 +198,12 @@ class RobotModel:
         Raises:
             ValueError: A pattern matches no joint, or maps a joint to a missing one or to two.
         """
-        names = list(joint_names)
-        partners: dict[str, str] = {}
+        who, names, partners = f"robot '{self.name}'", list(joint_names), dict[str, str]()
         for pattern, template in self.mirror.items():
             matches = [match for name in names if (match := re.fullmatch(pattern, name))]
             if not matches:
                 raise ValueError(
-                    f"robot '{self.name}' has no joint for mirror pattern '{pattern}'; "
-                    f"it has {names}"
+                    f"{who} has no joint for mirror pattern '{pattern}'; it has {names}"
                 )
             for match in matches:
                 name = match.string
@@ -213,19 +211,18 @@ class RobotModel:
                     partner = match.expand(template)
                 except (re.error, IndexError) as error:
                     raise ValueError(
-                        f"robot '{self.name}': mirror pattern '{pattern}' cannot be replaced by "
-                        f"'{template}': {error}"
+                        f"{who}: mirror pattern '{pattern}' cannot be replaced by '{template}': "
+                        f"{error}"
                     ) from error
                 if partner not in names:
                     raise ValueError(
-                        f"robot '{self.name}' has no joint '{partner}', the mirror of '{name}'; "
-                        f"it has {names}"
+                        f"{who} has no joint '{partner}', the mirror of '{name}'; it has {names}"
                     )
                 for one, other in ((name, partner), (partner, name)):
                     if partners.setdefault(one, other) != other:
                         raise ValueError(
-                            f"robot '{self.name}': mirror pairs joint '{one}' with "
-                            f"'{partners[one]}' and with '{other}'"
+                            f"{who}: mirror pairs joint '{one}' with '{partners[one]}' and with "
+                            f"'{other}'"
                         )
         return {name: partners.get(name, name) for name in names}
 

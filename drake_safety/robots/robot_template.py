@@ -12,16 +12,16 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from pydrake.math import RigidTransform
 
 from drake_safety.files.reading import yaml_text
-from drake_safety.robots.joint_drives import JointDrives, read_drives
 from drake_safety.robots.meshes import above
 from drake_safety.robots.mjcf import ModelFacts, is_mjcf, mjcf_to_urdf
 from drake_safety.robots.robot_model import as_pattern, load_robot_file
 from drake_safety.robots.scenario_template import TASKS, Sizes, scenario_yaml
 from drake_safety.robots.simulatable_urdf import simulatable_copy
 from drake_safety.robots.standing_posture import standing_posture
-from drake_safety.robots.urdf_copy import UrdfCopy, read_urdf
+from drake_safety.robots.urdf_copy import UrdfCopy
 from drake_safety.robots.urdf_requirements import (
     listed,
     mirrored,
@@ -30,7 +30,7 @@ from drake_safety.robots.urdf_requirements import (
     require_shapes,
     upright_base,
 )
-from drake_safety.robots.urdf_survey import Limb, Survey, odd_inertias
+from drake_safety.robots.urdf_survey import WITHOUT_STOPS_RAD, Limb, Survey, odd_inertias
 
 # Servo gains in proportion to mass times height, from `BALANCING_REFERENCE`.
 _STIFFNESS = 28.0  # [1/s² · N·m/(rad kg m)]
@@ -54,7 +54,6 @@ class NewRobot:
     task: str
     folder: Path
     copy: UrdfCopy
-    drives: JointDrives
     facts: ModelFacts
     survey: Survey = field(init=False)
     legs: list[Limb] = field(default_factory=list)
@@ -70,7 +69,7 @@ class NewRobot:
     def renew_survey(self) -> None:
         """Writes the URDF, and surveys what is written."""
         self.copy.write(self.files[0])
-        self.survey = Survey(self.files[0], self.copy.source, self.drives)
+        self.survey = Survey(self.files[0], self.copy.source, self.copy.drives)
 
     @property
     def files(self) -> list[Path]:
@@ -87,11 +86,6 @@ class NewRobot:
     def num_hulls(self) -> int:
         """Number of convex hulls that replace collision meshes."""
         return sum(map(len, self.copy.hulls.values()))
-
-    @property
-    def bare(self) -> list[str]:
-        """Links whose collision meshes the copy lacks, and that have no other shape."""
-        return self.copy.bare_links()
 
     @property
     def foot_friction(self) -> float:
@@ -165,17 +159,16 @@ def write_robot(
             urdf = Path(scratch) / "mjcf" / f"{name}.urdf"
             urdf.parent.mkdir()
             facts = mjcf_to_urdf(model, urdf)
-        copy, drives = simulatable_copy(urdf), read_drives(read_urdf(urdf).root)
+        copy = simulatable_copy(urdf)
         copy.source = model
         copy.left_out = facts.left_out + copy.left_out
         copy.notes += [f"it is converted from '{model.name}'", *facts.left_out][urdf == model :]
-        at = Path(scratch)
-        found = NewRobot(name=name, task=task, folder=at, copy=copy, drives=drives, facts=facts)
-        _find_limbs(found, urdf, feet, moved or ())
+        found = NewRobot(name=name, task=task, folder=Path(scratch), copy=copy, facts=facts)
+        _find_limbs(found, feet, moved or ())
         _fix_joints(found, moved)
         _stand(found)
         # Copied to the target only when complete.
-        found.folder = at / "robot"
+        found.folder = Path(scratch) / "robot"
         found.folder.mkdir()
         description, robot, readme, scenario = found.files
         copy.write(description)
@@ -189,37 +182,37 @@ def write_robot(
     return found
 
 
-def _find_limbs(
-    found: NewRobot, urdf: Path, feet: list[str] | None, moved: Collection[str]
-) -> None:
-    _set_base(found, found.survey.limbs(), is_up=False)
-    require_shapes(found.survey, found.copy, urdf, are_feet_named=feet is not None)
-    _set_base(found, found.survey.legs(feet), is_up=True)
+def _find_limbs(found: NewRobot, feet: list[str] | None, moved: Collection[str]) -> None:
+    copy = found.copy
+
+    def set_base(limbs: list[Limb], *, is_up: bool) -> None:
+        old = found.survey.base
+        pose, why = upright_base(found.survey, limbs, is_up=is_up)
+        if pose is not None:
+            base = copy.add_root("hips", old, pose)
+            copy.warn(f"the root link '{old}' {why}; the base is a new link '{base}'")
+            found.renew_survey()
+        elif why:
+            copy.warn(f"the robot {why} of '{old}'")
+
+    set_base(found.survey.limbs(), is_up=False)
+    require_shapes(found.survey, copy, are_feet_named=feet is not None)
+    set_base(found.survey.legs(feet), is_up=True)
     found.legs = found.survey.legs(feet)
     require_motors(found.survey, found.legs, moved)
     found.arms = found.survey.arms(found.legs)
     if found.task == "reaching" and not found.arms:
         raise ValueError(
-            f"new: '{found.copy.source}' has no arm (a limb of four joints or more that is not a "
-            "leg) to reach with; use --task balancing"
+            f"new: '{copy.source}' has no arm (a limb of four joints or more that is not a leg) to "
+            "reach with; use --task balancing"
         )
     found.wheels = found.survey.wheels(found.legs)
 
 
-def _set_base(found: NewRobot, limbs: list[Limb], *, is_up: bool) -> None:
-    copy, old = found.copy, found.survey.base
-    pose, why = upright_base(found.survey, limbs, is_up=is_up)
-    if pose is not None:
-        base = copy.add_root("hips", old, pose)
-        copy.warn(f"the root link '{old}' {why}; the base is a new link '{base}'")
-        found.renew_survey()
-    elif why:
-        copy.warn(f"the robot {why} of '{old}'")
-
-
 def _fix_joints(found: NewRobot, moved: Collection[str] | None) -> None:
     """Fixes what moves no foot or hand, and tells of couplings, motors, springs and wheels."""
-    survey, copy, drives, stated = found.survey, found.copy, found.drives, set(moved or ())
+    survey, copy, stated = found.survey, found.copy, set(moved or ())
+    drives = copy.drives
     legged, armed = (
         {joint for limb in limbs for joint in survey.chain(limb.body)}
         for limbs in (found.legs, found.arms)
@@ -236,11 +229,17 @@ def _fix_joints(found: NewRobot, moved: Collection[str] | None) -> None:
     passive = drives.passive(sorted(used - legged - coupled - leaders - stated))
     used = used - set(passive) | leaders
     loose = {name for name, (leader, *_) in drives.mimics.items() if leader in used} - used
+    spans = {name: high - low for name, (low, high) in survey.limits.items() if name in legged}
+    turns = [name for name, span in spans.items() if 1.1 * WITHOUT_STOPS_RAD < span < 720]
     for names, note in (
         (coupled, "follow others by <mimic>, in the posture too"),
         (loose, "follow joints that move, by <mimic>, but move no foot or hand and are fixed"),
         (passive, f"have no motor and are fixed: {listed(passive)}"),
         (used & set(drives.springs), "have springs beside their motors, which are left out"),
+        (
+            {*turns} - {*found.wheels},
+            "of legs turn more than twice: are their limits in degrees instead of radians?",
+        ),
         (
             found.wheels,
             "turn wheels: position servos hold them, so that they neither roll nor drive",
@@ -254,9 +253,14 @@ def _fix_joints(found: NewRobot, moved: Collection[str] | None) -> None:
         elif limb.body in copy.hulls:
             copy.set_hulls(limb.body, [])
             copy.notes.append(f"foot '{limb.body}' has no hull: its spheres alone touch")
-    idle = {joint.name(): joint for joint in survey.joints if joint.name() not in used}
-    coupled_poses = {name: survey.joint_pose(idle[name]) for name in idle if name in drives.mimics}
-    copy.fix_joints(dict.fromkeys(idle) | coupled_poses)
+    poses: dict[str, RigidTransform | None] = {}
+    for joint in (one for one in survey.joints if one.name() not in used):
+        ends = joint.parent_body(), joint.child_body()
+        X_BP, X_BC = (survey.pose(body.name()) for body in ends)
+        poses[joint.name()] = X_BP.inverse() @ X_BC if joint.name() in drives.mimics else None
+    copy.fix_joints(poses)
+    for limb in (*found.legs, *found.arms):
+        limb.joints = [name for name in limb.joints if name not in poses]
     found.renew_survey()
 
 
@@ -270,7 +274,15 @@ def _stand(found: NewRobot) -> None:
         )
     except ValueError as error:
         raise ValueError(". ".join([f"{error}", *copy.warnings, *copy.left_out])) from error
-    _lift_hulls(copy, found.survey, found.legs)
+    for limb in found.legs:
+        # Hulls welded to a foot end at the height of its contact points, which alone touch.
+        lowest = float(found.survey.positions(limb)[:, 2].min())
+        for link in set(found.survey.welded(limb.body)) & set(copy.hulls):
+            X_LW = found.survey.pose(link).inverse()
+            up = X_LW.rotation().col(2)
+            height = lowest + float(X_LW.translation() @ up)
+            parts = [above(hull, up, height) for hull in copy.hulls[link]]
+            copy.set_hulls(link, [part for part in parts if part is not None])
     found.renew_survey()
     survey = found.survey
     survey.set_joints(found.posture)
@@ -299,18 +311,6 @@ def _stand(found: NewRobot) -> None:
         )
 
 
-def _lift_hulls(copy: UrdfCopy, survey: Survey, legs: list[Limb]) -> None:
-    """Cuts hulls welded to a foot at the height of its contact points, which alone touch."""
-    for limb in legs:
-        lowest = float(survey.positions(limb)[:, 2].min())
-        for link in set(survey.welded(limb.body)) & set(copy.hulls):
-            X_LW = survey.pose(link).inverse()
-            up = X_LW.rotation().col(2)
-            height = lowest + float(X_LW.translation() @ up)
-            parts = [above(hull, up, height) for hull in copy.hulls[link]]
-            copy.set_hulls(link, [part for part in parts if part is not None])
-
-
 def _robot_yaml(found: NewRobot) -> str:
     sizes, facts, names, source = found.sizes, found.facts, found.joints, found.copy.source.name
     base, keys = yaml_text(sizes.base), {name: yaml_text(as_pattern(name)) for name in names}
@@ -321,9 +321,16 @@ def _robot_yaml(found: NewRobot) -> str:
         f"name: {found.name}",
         f"urdf: {found.name}.urdf",
         f"base: {base}  # {sizes.mass_kg:.2f} kg in all, {sizes.height_m:.3f} m high [m]",
-        *_block(f"posture:  # standing, {found.posture_source} [rad]", posture, always=True),
+        f"posture:  # standing, {found.posture_source} [rad]",
+        *_indented(posture),
         "feet:  # contact_points are centres of spheres, in the body's frame [m]",
     ]
+
+    def ask(title: str, entries: list[str], what: str = "") -> None:
+        """Adds a block, unless it is empty."""
+        lines.extend([title, *_indented(entries)] if entries else [])
+        found.asked.extend([what] if entries and what else [])
+
     for limb in found.legs:
         points = [[round(float(value), 5) for value in point] for point in limb.points]
         about = [f"contact_points: {points}", f"radius_m: {float(f'{limb.radius_m:.5g}')}"]
@@ -338,72 +345,60 @@ def _robot_yaml(found: NewRobot) -> str:
         ]
         lines += _limb_lines(limb, about)
         found.asked.append(f"the point of hand '{limb.body}' that reaches, and its size [m]")
-    lines += _gain_lines(found, keys)
+    gains, guessed = [], [name for name in names if name not in facts.gains]
+    legs = {name for limb in found.legs for name in limb.joints}
+    for name, key in keys.items():
+        stiffness = _STIFFNESS * sizes.load * (1.0 if name in legs else 0.5)
+        stiffness, damping = facts.gains.get(name, (stiffness, _DAMPING_S * stiffness))
+        origin = f"  # of {source}" if name in facts.gains else ""
+        gains.append(f"{key}: {{stiffness: {stiffness:.4g}, damping: {damping:.4g}}}{origin}")
+    note = "ASK the maker's; these grow with mass times height " if guessed else ""
+    lines += [f"joint_gains:  # {note}[N·m/rad, N·m·s/rad]", *_indented(gains)]
+    if guessed:
+        which = f" of {len(guessed)} joints" if len(guessed) < len(keys) else ""
+        found.asked.append(
+            f"the maker's servo gains{which} [N·m/rad, N·m·s/rad]; estimated from the mass"
+        )
     rotors = [f"{keys[j]}: {facts.rotor_inertia[j]:.4g}" for j in names if j in facts.rotor_inertia]
-    lines += _block(f"rotor_inertia:  # of {source} [kg·m²]", rotors)
-    lines += _effort_lines(found, keys)
+    ask(f"rotor_inertia:  # of {source} [kg·m²]", rotors)
+    plant, efforts = found.survey.plant, []
+    indices = plant.GetJointActuatorIndices(found.survey.instance)
+    motors = [*map(plant.get_joint_actuator, indices)]
+    driven = {one.joint().name() for one in motors if math.isfinite(one.effort_limit())}
+    for name in (name for name in names if name not in driven):
+        limit, note = found.copy.drives.efforts[name], ""
+        if not 0 < limit < math.inf:
+            limit = float(f"{4 * sizes.load:.3g}")
+            note = "  # ASK the motor's largest torque [N·m]"
+            found.asked.append(f"the largest torque of joint '{name}' [N·m]")
+        efforts.append(f"{keys[name]}: {limit:g}{note}")
+    ask("effort_limits:  # where the file has no motor, or none with a limit [N·m]", efforts)
     mu = found.foot_friction or 0.6
     origin = f"that of {source}" if found.foot_friction else "assumed"
     lines.append(f"foot_friction: {mu:g}  # ASK Coulomb's coefficient of feet on your ground [1]")
     found.asked.append(f"the friction of feet on your ground [1]; {mu:g} is {origin}")
     partners = {keys[one]: other.replace("\\", r"\\") for one, other in mirrored(names).items()}
-    lines += _block("mirror:", [f"{key}: {yaml_text(other)}" for key, other in partners.items()])
-    title = "without_collision:  # ASK shapes in place of these links' lost meshes [m]"
-    lines += _block(title, [f"- {yaml_text(link)}" for link in found.bare])
-    if found.bare:
-        found.asked.append(
-            f"collision shapes of the {len(found.bare)} links under 'without_collision' in "
-            "robot.yaml [m]"
-        )
-    lines += _block("whole_body:", [f"orientation: {{{base}: {{weight: 20.0}}}}"])
+    ask("mirror:", [f"{key}: {yaml_text(other)}" for key, other in partners.items()])
+    bare = found.copy.bare_links
+    ask(
+        "without_collision:  # ASK shapes in place of these links' lost meshes [m]",
+        [f"- {yaml_text(link)}" for link in bare],
+        f"collision shapes of the {len(bare)} links under 'without_collision' in robot.yaml [m]",
+    )
+    lines += ["whole_body:", f"  orientation: {{{base}: {{weight: 20.0}}}}"]
     if found.task == "balancing" and len(found.legs) > 2:
         lines.append("  posture: {weight: 0.001}")
     return "\n".join(lines) + "\n"
 
 
-def _block(title: str, entries: list[str], *, always: bool = False) -> list[str]:
-    return [title, *(f"  {entry}" for entry in entries)] if entries or always else []
+def _indented(entries: list[str]) -> list[str]:
+    return [f"  {entry}" for entry in entries]
 
 
 def _limb_lines(limb: Limb, about: list[str], note: str = "") -> list[str]:
     body, joints = yaml_text(limb.body), ", ".join(map(yaml_text, limb.joints))
     entries = [f"body: {body}", *about, f"joints: [{joints}]"]
-    return [f"  {body}:{note}", *(f"    {entry}" for entry in entries)]
-
-
-def _gain_lines(found: NewRobot, keys: dict[str, str]) -> list[str]:
-    known, source, lines = found.facts.gains, found.copy.source.name, []
-    legs = {name for limb in found.legs for name in limb.joints}
-    for name, key in keys.items():
-        stiffness = _STIFFNESS * found.sizes.load * (1.0 if name in legs else 0.5)
-        stiffness, damping = known.get(name, (stiffness, _DAMPING_S * stiffness))
-        origin = f"  # of {source}" if name in known else ""
-        lines.append(f"{key}: {{stiffness: {stiffness:.4g}, damping: {damping:.4g}}}{origin}")
-    num_guessed, ask = len(keys.keys() - known.keys()), ""
-    if num_guessed:
-        ask = "ASK the maker's; these grow with mass times height "
-        which = f" of {num_guessed} joints" if num_guessed < len(keys) else ""
-        found.asked.append(
-            f"the maker's servo gains{which} [N·m/rad, N·m·s/rad]; estimated from the mass"
-        )
-    return _block(f"joint_gains:  # {ask}[N·m/rad, N·m·s/rad]", lines, always=True)
-
-
-def _effort_lines(found: NewRobot, keys: dict[str, str]) -> list[str]:
-    plant, lines = found.survey.plant, []
-    indices = plant.GetJointActuatorIndices(found.survey.instance)
-    motors = [*map(plant.get_joint_actuator, indices)]
-    driven = {one.joint().name() for one in motors if math.isfinite(one.effort_limit())}
-    for name in (name for name in keys if name not in driven):
-        limit, note = found.drives.efforts[name], ""
-        if not 0 < limit < math.inf:
-            limit = float(f"{4 * found.sizes.load:.3g}")
-            note = "  # ASK the motor's largest torque [N·m]"
-            found.asked.append(f"the largest torque of joint '{name}' [N·m]")
-        lines.append(f"{keys[name]}: {limit:g}{note}")
-    return _block(
-        "effort_limits:  # where the file has no motor, or none with a limit [N·m]", lines
-    )
+    return [f"  {body}:{note}", *_indented(_indented(entries))]
 
 
 def _readme(found: NewRobot) -> str:

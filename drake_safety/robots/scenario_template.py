@@ -37,13 +37,6 @@ def _numbers(values: Sequence[float]) -> str:
     return "[" + ", ".join(f"{value:.3g}" for value in values) + "]"
 
 
-def _ball(time_s: float, mass_kg: float, speed_m_s: float, direction_rad: float) -> str:
-    return (
-        f"{{time_s: {time_s:g}, mass_kg: {mass_kg:.3g}, speed_m_s: {speed_m_s:.3g}, "
-        f"direction_rad: {direction_rad:g}}}"
-    )
-
-
 def _variations(sizes: Sizes, mass_scale: float, position: float, velocity: float) -> str:
     friction = sizes.joint_friction_nm
     if friction is None:
@@ -62,7 +55,10 @@ def _variations(sizes: Sizes, mass_scale: float, position: float, velocity: floa
 
 def _balancing(sizes: Sizes) -> str:
     scale = sizes.factors(BALANCING_REFERENCE)
-    heavy, sideways = scale["mass"], scale["speed_y"]
+    weak, strong = (
+        f"mass_kg: {mass * scale['mass']:.3g}, speed_m_s: {speed * scale['speed_y']:.3g}"
+        for mass, speed in ((2.0, 3.5), (3.0, 9.0))
+    )
     return f"""# Balancing: {sizes.mass_kg:.1f} kg, a base {sizes.height_m:.3f} m high.
 task: drake_safety.diagrams.balancing:Balancing
 robot: robot.yaml
@@ -72,8 +68,8 @@ robot: robot.yaml
   scale_to_robot: true
   push: {{share: 0.35}}  # of episodes that begin with the impact of a ball
   demonstration:  # ASK the balls of `run --push ball`: a weak one and a strong one, towards [rad]
-    - {_ball(0.6, 2.0 * heavy, 3.5 * sideways, 1.5708)}
-    - {_ball(1.68, 3.0 * heavy, 9.0 * sideways, -1.2)}
+    - {{time_s: 0.6, {weak}, direction_rad: 1.5708}}
+    - {{time_s: 1.68, {strong}, direction_rad: -1.2}}
   recovery:
     threshold: 0.4  # of the probability, not tuned to this robot
     step:

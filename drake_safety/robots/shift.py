@@ -8,17 +8,9 @@ from pydantic import Field, FiniteFloat
 
 from drake_safety.files.schema import NotNegative, Positive, Triple, schema
 
-FAULTS = {
-    "bias": True,
-    "drift": True,
-    "zero": False,
-    "scale": True,
-    "swap": False,
-    "noise": True,
-    "delay": True,
-    "half_rate": False,
-    "freeze": False,
-}
+_WITHOUT_VALUE = ("zero", "swap", "half_rate", "freeze")
+_KINDS = ("bias", "drift", "zero", "scale", "swap", "noise", "delay", "half_rate", "freeze")
+FAULTS = {kind: kind not in _WITHOUT_VALUE for kind in _KINDS}
 """Kinds of faults, and whether they have a value."""
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -16,13 +17,27 @@ from drake_safety.extras import MissingExtraError
 from drake_safety.files.reading import is_number
 from drake_safety.robots.meshes import SHOWN_FORMATS, convex_hull, mesh_points, shown_mesh
 from drake_safety.robots.model_files import model_file
-from drake_safety.robots.urdf_copy import UrdfCopy, as_number, number, pose_of, read_urdf, remove
+from drake_safety.robots.urdf_copy import (
+    FIXED_MIMIC,
+    UrdfCopy,
+    as_number,
+    joint_elements,
+    number,
+    pose_of,
+    read_urdf,
+    remove,
+)
 
 if TYPE_CHECKING:
     import trimesh
 
-_Mesh = TypeVar("_Mesh")
-_IGNORED = ("calibration", "safety_controller")  # By Drake, with a warning.
+_IGNORED = (  # By Drake, with a warning, or rejected: places and tags.
+    FIXED_MIMIC,
+    (".", "gazebo"),
+    ("joint", "calibration"),
+    ("joint", "safety_controller"),
+    ("transmission/actuator", "mechanicalReduction"),
+)
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ROWS, _COLUMNS = np.triu_indices(3)
 _ROUNDING = 1e-6  # Of the digits of moments of inertia.
@@ -40,67 +55,38 @@ def simulatable_copy(path: Path) -> UrdfCopy:
         ValueError: The file does not exist or is not a URDF.
     """
     copy = read_urdf(path)
-    remove(copy.root, "gazebo")
-    for joint in copy.root.findall("joint"):
-        for tag in _IGNORED:
-            remove(joint, tag)
-    copy.free_fixed_joints()
+    for place, tag in _IGNORED:
+        copy.remove(place, tag)
     copy.drop_world()
-    _drop_zeros(copy)
-    _drop_transmissions(copy)
-    _drop_friction(copy)
-    _fix_inertias(copy)
-    _tell_materials_apart(copy)
-    lost: dict[str, list[str]] = {}  # Names by the reason.
-    _gather_visual_meshes(copy, lost)
-    hulls = _gather_collision_meshes(copy, lost)
-    copy.left_out = [f"{reason}: {_listed(names)}" for reason, names in lost.items()]
-    copy.notes += copy.left_out
-    for link in copy.root.findall("link"):
-        if link.find("visual") is None:
-            # Links without visuals show their collision shapes.
-            for shape in link.findall("collision"):
-                visual = ET.SubElement(link, "visual")
-                visual.extend(part for part in shape if part.tag in ("origin", "geometry"))
-    for name, of_link in hulls.items():
-        copy.set_hulls(name, of_link)
-    return copy
-
-
-def _drop_zeros(copy: UrdfCopy) -> None:
-    """Removes shapes without extent, and speed limits of zero, at which no joint would move."""
     for link, shape, words in copy.empty_shapes():
         link.remove(shape)
         copy.warn(f"{words}: it is left out")
+    _simplify_joints(copy)
+    _fix_inertias(copy)
+    _tell_materials_apart(copy)
+    _gather_meshes(copy)
+    return copy
+
+
+def _simplify_joints(copy: UrdfCopy) -> None:
+    """Removes speed limits of zero, dry friction, and transmissions that Drake ignores."""
     zeros = []
-    for joint in copy.root.findall("joint"):
-        for limit in joint.findall("limit"):
-            if joint.get("type") != "fixed" and number(limit, "velocity") == 0:
-                del limit.attrib["velocity"]
-                zeros.append(joint.get("name"))
+    for joint in joint_elements(copy.root):
+        name, limit, dynamics = joint.get("name", ""), joint.find("limit"), joint.find("dynamics")
+        if limit is not None and joint.get("type") != "fixed" and number(limit, "velocity") == 0:
+            del limit.attrib["velocity"]  # At which no joint would move.
+            zeros.append(name)
+        friction = None if dynamics is None else dynamics.attrib.pop("friction", None)
+        if as_number(friction) > 0:
+            copy.joint_friction[name] = as_number(friction)
     if zeros:
         copy.warn(f'velocity="0" of joints {zeros} is read as no limit')
-
-
-def _drop_transmissions(copy: UrdfCopy) -> None:
-    """Removes transmissions that Drake ignores with a warning, and their reductions."""
     fixed = {joint.get("name") for joint in copy.root.findall("joint[@type='fixed']")}
     for transmission in copy.root.findall("transmission"):
         kind, joint = transmission.findtext("type", "").strip(), transmission.find("joint")
         is_simple = kind.rpartition("/")[2] == "SimpleTransmission"
         if not is_simple or (joint is not None and joint.get("name") in fixed):
             copy.root.remove(transmission)
-        for actuator in transmission.findall("actuator"):
-            remove(actuator, "mechanicalReduction")
-
-
-def _drop_friction(copy: UrdfCopy) -> None:
-    """Removes dry friction, which Drake does not simulate from a URDF."""
-    for joint in copy.root.iter("joint"):
-        for dynamics in joint.findall("dynamics[@friction]"):
-            friction = as_number(dynamics.attrib.pop("friction"))
-            if friction > 0:
-                copy.joint_friction[joint.get("name", "")] = friction
     if copy.joint_friction:
         copy.notes.append(
             f"the dry friction of {len(copy.joint_friction)} joints is left out; the scenario sets "
@@ -144,14 +130,24 @@ def _fix_inertias(copy: UrdfCopy) -> None:
 
 
 def _tell_materials_apart(copy: UrdfCopy) -> None:
-    """Renames materials that share a name but not a colour."""
+    """Renames materials that share a name but not a colour, and drops those without any."""
+    stated = {one.get("name"): one for one in copy.root.iter("material") if len(one)}
+    known = {one.get("name") for one in copy.root.findall("material")}
+    for visual in copy.root.findall("link/visual"):
+        for material in visual.findall("material"):
+            name = material.get("name")
+            if not len(material) and name not in known:  # Drake knows those that came before.
+                material.extend(stated.get(name, []))
+            if not len(material) and name not in known:
+                visual.remove(material)
+            known.add(name)
     seen: dict[str, list[list[str]]] = {}
     for material in copy.root.iter("material"):
-        values = " ".join(value for part in material for value in part.attrib.values())
+        values = " ".join(value for part in material for value in part.attrib.values()).split()
         if not values:
             continue  # A reference to a material.
         # 0 and 0.0 are equal.
-        content = [f"{float(v):g}" if is_number(v) else v for v in values.split()]
+        content = [f"{float(v):g}" if is_number(v) else v for v in values]
         name = material.get("name", "")
         known = seen.setdefault(name, [])
         if content not in known:
@@ -165,104 +161,85 @@ def _tell_materials_apart(copy: UrdfCopy) -> None:
     ]
 
 
-def _gather_visual_meshes(copy: UrdfCopy, lost: dict[str, list[str]]) -> None:
-    converted: list[str] = []
-
-    def shown(url: str, rgba: str) -> str:
-        file = _mesh_file(url, copy.source)
-        mesh = _converted("visual", url, file, lambda file: shown_mesh(file, rgba), lost)
-        if file is None or mesh is None:
-            return ""
-        if mesh == file:
-            return _gather(copy, file, file.name)
-        converted.append(file.name)
-        return _gather(copy, mesh, f"{file.stem}.gltf")
-
-    copy.replace_visual_meshes(shown)
-    if converted:
-        copy.notes.append(f"visual meshes are converted to glTF: {_listed(converted)}")
-
-
-def _gather_collision_meshes(
-    copy: UrdfCopy, lost: dict[str, list[str]]
-) -> dict[str, list[trimesh.Trimesh]]:
-    """Convex hulls by link, in its frame, of the meshes that Drake does not read."""
-    replaced: list[str] = []
+def _gather_meshes(copy: UrdfCopy) -> None:
+    """Adds the meshes to the copy: as they are, as glTF, or as convex hulls."""
+    done: dict[str, list[str]] = {}  # Names of meshes by what became of them.
+    lost: dict[str, list[str]] = {}
     hulls: dict[str, list[trimesh.Trimesh]] = {}
-    for link in copy.root.findall("link"):
-        name = link.get("name", "")
-        for shape in link.findall("collision"):
-            mesh = shape.find("geometry/mesh")
-            if mesh is None:
-                continue
-            url = mesh.get("filename", "")
-            file = _mesh_file(url, copy.source)
-            if file is not None and file.suffix.lower() in SHOWN_FORMATS:
-                mesh.set("filename", _gather(copy, file, file.name))
-                continue
+
+    def added(file: Path, name: str) -> str:
+        """The name of a mesh in the copy; equal names get separate folders."""
+        folders = chain(["meshes"], (f"meshes/{index}" for index in count(1)))
+        targets = (f"{folder}/{name}" for folder in folders)
+        return next(target for target in targets if copy.meshes.setdefault(target, file) == file)
+
+    def converted(kind: str, url: str, convert: Callable[[Path], str]) -> str:
+        """What a mesh becomes; "", with the reason in ``lost``, if it is left out."""
+        file = _mesh_file(url, copy.source)
+        name, why, until = url if file is None else file.name, "are not where the URDF says", ""
+        try:
+            if file is not None:
+                return convert(file)
+        except MissingExtraError as error:
+            why = "Drake does not read"
+            until = f", until you `pip install '{error.needs}'` and write the folder again"
+        except ValueError as error:
+            why, name = "cannot be read", str(error) if name in str(error) else f"{name}: {error}"
+        lost.setdefault(f"{kind} meshes that {why} are left out{until}", []).append(name)
+        return ""
+
+    def shown(rgba: str, file: Path) -> str:
+        mesh = shown_mesh(file, rgba)
+        if mesh == file:
+            return added(file, file.name)
+        done.setdefault("visual meshes are converted to glTF", []).append(file.name)
+        return added(mesh, f"{file.stem}.gltf")
+
+    def touched(link: str, shape: ET.Element, mesh: ET.Element, file: Path) -> str:
+        if file.suffix.lower() in SHOWN_FORMATS:
+            return added(file, file.name)
+        points = mesh_points(file) * [*map(float, mesh.get("scale", "1 1 1").split())]
+        hulls.setdefault(link, []).append(convex_hull((pose_of(shape) @ points.T).T))
+        what = "collision meshes that Drake does not read are replaced by convex hulls"
+        done.setdefault(what, []).append(file.name)
+        return "hull"
+
+    copy.replace_visual_meshes(lambda url, rgba: converted("visual", url, partial(shown, rgba)))
+    for link, shape, mesh in copy.shape_meshes("collision"):
+        name, url = link.get("name", ""), mesh.get("filename", "")
+        copy.mesh_urls.setdefault(name, []).append(url)
+        found = converted("collision", url, partial(touched, name, shape, mesh))
+        mesh.set("filename", found)
+        if found in ("", "hull"):
             link.remove(shape)
-            hull = _converted("collision", url, file, partial(_hull, shape, mesh), lost)
-            if file is None or hull is None:
-                copy.lost_links.setdefault(name, []).append(url)
-            else:
-                hulls.setdefault(name, []).append(hull)
-                replaced.append(file.name)
-    if replaced:
-        copy.notes.append(
-            "collision meshes that Drake does not read are replaced by convex hulls: "
-            f"{_listed(replaced)}"
-        )
-    return hulls
-
-
-def _hull(shape: ET.Element, mesh: ET.Element, file: Path) -> trimesh.Trimesh:
-    """The convex hull of a collision mesh in the link's frame."""
-    scale = [float(word) for word in mesh.get("scale", "1 1 1").split()]
-    X_LM = pose_of(shape)
-    return convex_hull((X_LM @ (mesh_points(file) * scale).T).T)
-
-
-def _converted(
-    kind: str,
-    url: str,
-    file: Path | None,
-    convert: Callable[[Path], _Mesh],
-    lost: dict[str, list[str]],
-) -> _Mesh | None:
-    """A mesh that Drake reads; None, with the reason in ``lost``, if it is left out."""
-    name, why, until = url if file is None else file.name, "are not where the URDF says", ""
-    try:
-        if file is not None:
-            return convert(file)
-    except MissingExtraError as error:
-        why = "Drake does not read"
-        until = f", until you `pip install '{error.needs}'` and write the folder again"
-    except ValueError as error:
-        why, name = "cannot be read", str(error) if name in str(error) else f"{name}: {error}"
-    lost.setdefault(f"{kind} meshes that {why} are left out{until}", []).append(name)
-    return None
-
-
-def _gather(copy: UrdfCopy, file: Path, name: str) -> str:
-    """Adds a mesh to the copy and returns its name; equal names get separate folders."""
-    folders = chain(["meshes"], (f"meshes/{index}" for index in count(1)))
-    targets = (f"{folder}/{name}" for folder in folders)
-    return next(target for target in targets if copy.meshes.setdefault(target, file) == file)
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(dict.fromkeys(names))
+        if not found:
+            copy.lost_links.add(name)
+    told, copy.left_out = (
+        [f"{what}: {', '.join(dict.fromkeys(names))}" for what, names in one.items()]
+        for one in (done, lost)
+    )
+    copy.notes += [*told, *copy.left_out]
+    for link in copy.root.findall("link"):
+        if link.find("visual") is None:
+            # Links without visuals show their collision shapes.
+            for shape in link.findall("collision"):
+                visual = ET.SubElement(link, "visual")
+                visual.extend(part for part in shape if part.tag in ("origin", "geometry"))
+    for name, of_link in hulls.items():
+        copy.set_hulls(name, of_link)
 
 
 def _mesh_file(url: str, source: Path) -> Path | None:
     """The file of a mesh's URL: in a ROS package around the URDF, or in an installed package."""
     scheme, _, rest = url.rpartition("://")
-    if scheme not in ("", "package", "file", "model"):
-        return None
-    candidates = [source.parent / rest]
-    if scheme in ("package", "model"):
-        candidates = [folder / rest for folder in source.resolve().parents]
-        if scheme == "package":
-            with contextlib.suppress(ValueError):
-                candidates.append(model_file(url))
+    candidates: list[Path] = []
+    for name in (rest, unquote(rest.replace("\\", "/"))):  # As written, or as of Windows.
+        if scheme in ("", "file"):
+            candidates.append(source.parent / name)
+        elif scheme in ("package", "model"):
+            folders = source.resolve().parents
+            candidates += [folder / name.lstrip("/") for folder in folders]
+    if scheme == "package":
+        with contextlib.suppress(ValueError):
+            candidates.append(model_file(url))
     return next((file for file in candidates if file.is_file()), None)

@@ -1,4 +1,4 @@
-"""An editable copy of a URDF, with a record of its changes."""
+"""An editable copy of a URDF, with what it says of drives and a record of its changes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 import shutil
 import xml.etree.ElementTree as ET
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,12 +24,56 @@ if TYPE_CHECKING:
 
 DRAKE = "http://drake.mit.edu"
 """Namespace of Drake's elements."""
-MOVABLE = ("revolute", "continuous", "prismatic")
-"""Types of joints with one degree of freedom."""
+FIXED_MIMIC = "joint[@type='fixed']", "mimic"
+"""Place and tag of what Drake rejects."""
+_MOVABLE = ("revolute", "continuous", "prismatic", "screw")
 _PREFIX = re.compile(rb"""(xmlns:drake\s*=\s*)["'][^"']*["']""")
 ET.register_namespace("drake", DRAKE)
 _SIZES = ("size", "radius", "length", "scale")  # Attributes of shapes.
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointDrives:
+    """Drives of the joints of a URDF.
+
+    Attributes:
+        mimics: Coupled joints: the joint that each follows, multiplier and offset [rad, m].
+        listed: Joints with a transmission (ROS 1) or a command interface (``<ros2_control>``).
+        springs: Stiffness of joints with a spring [N·m/rad].
+        efforts: Effort limits [N·m]; NaN without one.
+    """
+
+    mimics: dict[str, tuple[str, float, float]] = field(default_factory=dict)
+    listed: set[str] = field(default_factory=set)
+    springs: dict[str, float] = field(default_factory=dict)
+    efforts: dict[str, float] = field(default_factory=dict)
+
+    def passive(self, names: Collection[str]) -> dict[str, str]:
+        """Returns those of some joints that have no motor, and the evidence."""
+        listed = self.listed.intersection(names)
+        has_efforts = any(self.efforts[name] > 0 for name in names)
+        found = {}
+        for name in names:
+            spring = self.springs.get(name, 0.0)
+            evidence = {
+                "no transmission, as others have": listed and name not in listed,
+                'effort="0"': not listed and has_efforts and self.efforts[name] == 0,
+                f"a spring of {spring:g} N·m/rad": (
+                    spring and name not in listed and len(self.springs) < len(names)
+                ),
+            }
+            if any(evidence.values()):
+                found[name] = ", ".join(words for words, holds in evidence.items() if holds)
+        return found
+
+    def coupled(self, positions: Mapping[str, float]) -> dict[str, float]:
+        """Returns joint positions in which coupled joints follow the others [rad, m]."""
+        found = dict(positions)
+        for _ in self.mimics:  # They may follow each other.
+            for name, (leader, multiplier, offset) in self.mimics.items():
+                if name in found and leader in found:
+                    found[name] = multiplier * found[leader] + offset
+        return found
 
 
 @dataclass(kw_only=True)
@@ -37,10 +81,12 @@ class UrdfCopy:
     """An editable copy of a URDF file.
 
     Attributes:
+        drives: Those of the file.
         notes: Descriptions of the changes, one sentence each.
         warnings: Those of them that the user should see at once.
         left_out: Notes about meshes that were removed.
-        lost_links: Links of removed collision meshes, and their files.
+        mesh_urls: Collision meshes of the file by link.
+        lost_links: Links of collision meshes that were removed.
         joint_friction: Removed dry friction by joint [N·m].
         meshes: Meshes of the copy: name relative to the copy -> original file.
         hulls: Convex hulls in place of collision meshes, by link, in its frame [m].
@@ -48,10 +94,12 @@ class UrdfCopy:
 
     source: Path
     root: ET.Element
+    drives: JointDrives
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    lost_links: dict[str, list[str]] = field(default_factory=dict)
+    mesh_urls: dict[str, list[str]] = field(default_factory=dict)
+    lost_links: set[str] = field(default_factory=set)
     joint_friction: dict[str, float] = field(default_factory=dict)
     meshes: dict[str, Path] = field(default_factory=dict)
     hulls: dict[str, list[trimesh.Trimesh]] = field(default_factory=dict)
@@ -77,13 +125,11 @@ class UrdfCopy:
         """Returns a link's element."""
         return next(link for link in self.root.iter("link") if link.get("name") == name)
 
+    @property
     def bare_links(self) -> list[str]:
-        """Returns the links whose collision meshes were removed and that have no other shape."""
-        return [
-            link.get("name", "")
-            for link in self.root.findall("link")
-            if link.get("name") in self.lost_links and link.find("collision") is None
-        ]
+        """Links whose collision meshes were removed and that have no other shape."""
+        links = (link for link in self.root.findall("link") if link.find("collision") is None)
+        return [name for link in links if (name := link.get("name", "")) in self.lost_links]
 
     def empty_shapes(self) -> list[tuple[ET.Element, ET.Element, str]]:
         """Returns shapes without extent: link, shape, and both in words."""
@@ -92,9 +138,9 @@ class UrdfCopy:
             for shape in (*link.findall("visual"), *link.findall("collision")):
                 for part in shape.findall("geometry/*"):
                     stated = {key: part.get(key, "") for key in _SIZES if key in part.attrib}
-                    sizes = [float(word) for word in _NUMBER.findall(" ".join(stated.values()))]
+                    sizes = [*map(as_number, " ".join(stated.values()).split())]
                     # Meshes may be mirrored by a negative scale.
-                    if 0.0 in sizes or ("scale" not in stated and min(sizes, default=0.0) < 0):
+                    if 0.0 in sizes or ("scale" not in stated and any(x < 0 for x in sizes)):
                         words = f"the {shape.tag} of link '{link.get('name')}' is a "
                         words += f"{part.tag.rpartition('}')[2]} of "
                         words += ", ".join(f"{key} {text}" for key, text in stated.items())
@@ -103,11 +149,12 @@ class UrdfCopy:
 
     def drop_world(self) -> None:
         """Removes a root link 'world', and root links under which the robot floats."""
-        joints = self.root.findall("joint")
-        carried = {_end(joint, "child") for joint in joints}
+        joints = joint_elements(self.root)
+        carried = {child.get("link") for joint in joints for child in joint.findall("child")}
         for link in self.root.findall("link"):
             name = link.get("name")
-            below = [joint for joint in joints if _end(joint, "parent") == name]
+            ends = ((joint, end) for joint in joints for end in joint.findall("parent"))
+            below = [joint for joint, end in ends if end.get("link") == name]
             kinds = {joint.get("type") for joint in below}
             is_world = name == "world" and kinds == {"fixed"}
             if name not in carried and (is_world or kinds & {"floating", "planar"}):
@@ -123,18 +170,22 @@ class UrdfCopy:
         joint = ET.SubElement(self.root, "joint", name=f"{name}_fixed", type="fixed")
         ET.SubElement(joint, "parent", link=name)
         ET.SubElement(joint, "child", link=below)
-        set_pose(joint, pose.inverse())
+        _set_pose(joint, pose.inverse())
         return name
 
-    def free_fixed_joints(self) -> None:
-        """Removes <mimic> from fixed joints, where Drake rejects it."""
-        for joint in self.root.findall("joint[@type='fixed']"):
-            remove(joint, "mimic")
+    def remove(self, place: str, tag: str) -> None:
+        """Removes the children with a tag of all elements at a path from the root."""
+        for element in self.root.findall(place):
+            remove(element, tag)
 
-    def drop_collisions(self) -> None:
-        """Removes all collision shapes."""
-        for link in self.root.findall("link"):
-            remove(link, "collision")
+    def shape_meshes(self, kind: str) -> list[tuple[ET.Element, ET.Element, ET.Element]]:
+        """Returns the meshes of ``visual`` or ``collision`` shapes: link, shape, mesh."""
+        return [
+            (link, shape, mesh)
+            for link in self.root.findall("link")
+            for shape in link.findall(kind)
+            for mesh in shape.findall("geometry/mesh")
+        ]
 
     def replace_visual_meshes(self, shown: Callable[[str, str], str]) -> None:
         """Replaces visual meshes by ``shown(url, rgba)``, or removes them where that is "".
@@ -142,26 +193,20 @@ class UrdfCopy:
         The material of a converted mesh is removed: the mesh has its own, and Drake warns of two.
         """
         shared = {one.get("name"): _colour(one) for one in self.root.findall("material")}
-        for link in self.root.findall("link"):
-            for visual in link.findall("visual"):
-                material, mesh = visual.find("material"), visual.find("geometry/mesh")
-                if mesh is None:
-                    continue
-                url = mesh.get("filename", "")
-                name = None if material is None else material.get("name")
-                replacement = shown(url, _colour(material) or shared.get(name, ""))
-                mesh.set("filename", replacement)
-                if not replacement:
-                    link.remove(visual)
-                elif Path(replacement).suffix != Path(url).suffix:
-                    remove(visual, "material")
+        for link, visual, mesh in self.shape_meshes("visual"):
+            material, url = visual.find("material"), mesh.get("filename", "")
+            name = None if material is None else material.get("name")
+            mesh.set("filename", shown(url, _colour(material) or shared.get(name, "")))
+            if not mesh.get("filename"):
+                link.remove(visual)
+            elif Path(mesh.get("filename", "")).suffix != Path(url).suffix:
+                remove(visual, "material")
 
     def convert_visual_meshes(self) -> None:
         """Replaces visual meshes that Drake does not render by glTF files in the user's cache."""
-        folder = str(self.source.parent)
 
         def shown(url: str, rgba: str) -> str:
-            path = model_file(url, folder)
+            path = model_file(url, str(self.source.parent))
             return url if is_shown(path) else shown_mesh(path, rgba).resolve().as_uri()
 
         self.replace_visual_meshes(shown)
@@ -175,11 +220,12 @@ class UrdfCopy:
 
     def fix_joints(self, poses: Mapping[str, RigidTransform | None]) -> None:
         """Fixes joints at zero, or at the pose of the child in the parent."""
-        for joint in self.root.findall("joint"):
+        for joint in joint_elements(self.root):
             if joint.get("name") in poses:
                 pose = poses[joint.get("name", "")]
                 if pose is not None:
-                    set_pose(joint, pose)
+                    _set_pose(joint, pose)
+                joint.tag = "joint"
                 joint.set("type", "fixed")
                 remove(joint, "mimic")
         for transmission in self.root.findall("transmission[joint]"):
@@ -214,7 +260,7 @@ class UrdfCopy:
                 link.remove(shape)
         self.hulls[link_name] = hulls
         if not hulls:
-            self.lost_links.setdefault(link_name, [])
+            self.lost_links.add(link_name)
         for index in range(len(hulls)):
             shape = ET.SubElement(link, "collision", name=f"{link_name}_hull_{index}")
             geometry = ET.SubElement(shape, "geometry")
@@ -238,22 +284,25 @@ class UrdfCopy:
         tree = ET.ElementTree(self.root)
         ET.indent(tree)
         tree.write(path, encoding="utf-8", xml_declaration=True)
+        for name in (*self.meshes, *(_hull_file(link, 0) for link in self.hulls)):
+            (path.parent / name).parent.mkdir(parents=True, exist_ok=True)
         for link, hulls in self.hulls.items():
             for index, hull in enumerate(hulls):
                 target = path.parent / _hull_file(link, index)
-                target.parent.mkdir(parents=True, exist_ok=True)
                 hull.export(target, include_normals=False, header=None)
         for name, mesh in self.meshes.items():
-            target = path.parent / name
-            target.parent.mkdir(parents=True, exist_ok=True)
             for file in mesh.parent.glob(f"{glob.escape(mesh.stem)}.*"):
                 # Material files and textures have the mesh's stem.
                 if file.suffix in (mesh.suffix, ".mtl", ".png", ".bin"):
-                    shutil.copyfile(file, target.with_suffix(file.suffix))
+                    shutil.copyfile(file, (path.parent / name).with_suffix(file.suffix))
 
 
 def read_urdf(path: Path) -> UrdfCopy:
-    """Reads a URDF as an editable copy."""
+    """Reads a URDF as an editable copy.
+
+    Raises:
+        ValueError: The file does not exist, is not a URDF, or has masses or limits that none has.
+    """
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"URDF '{path}' does not exist")
@@ -274,33 +323,25 @@ def read_urdf(path: Path) -> UrdfCopy:
     if not root.findall("link"):
         raise ValueError(f"'{path}' has no links")
     for link in root.iter("link"):
-        element = link.find("inertial/mass")
-        mass = number(element, "value")
+        mass = number(element := link.find("inertial/mass"), "value")
         # Drake warns, and simulates a body of another mass.
         if element is not None and not 0.0 <= mass < math.inf:
             raise ValueError(
                 f"'{path}': link '{link.get('name')}' has a mass of {mass:g} kg, expected a finite "
                 "number that is not negative"
             )
-    for joint in root.findall("joint[limit]"):
-        kind, limit = joint.get("type"), joint.findall("limit")[0]
+    for joint in joint_elements(root):
+        kind, limit = joint.get("type"), joint.find("limit")
         wrong = [key for key in ("effort", "velocity") if number(limit, key) < 0]
         if number(limit, "lower") > number(limit, "upper") and kind in ("revolute", "prismatic"):
             wrong = ["lower", "upper"]
-        if wrong and kind != "fixed":
+        if limit is not None and wrong and kind != "fixed":
             stated = " ".join(f'{key}="{limit.get(key)}"' for key in wrong)
             raise ValueError(
                 f"'{path}': joint '{joint.get('name')}' has {stated}; expected lower below upper, "
                 "and positive limits of effort and velocity"
             )
-    return UrdfCopy(source=path, root=root)
-
-
-def _end(joint: ET.Element, tag: str) -> str | None:
-    element = joint.find(tag)
-    if element is None:
-        raise ValueError(f"joint '{joint.get('name')}' of the URDF has no <{tag} link=...>")
-    return element.get("link")
+    return UrdfCopy(source=path, root=root, drives=read_drives(root))
 
 
 def pose_of(element: ET.Element) -> RigidTransform:
@@ -311,14 +352,12 @@ def pose_of(element: ET.Element) -> RigidTransform:
     return RigidTransform(RollPitchYaw(rpy), xyz)
 
 
-def set_pose(element: ET.Element, pose: RigidTransform) -> None:
-    """Sets an element's <origin>."""
+def _set_pose(element: ET.Element, pose: RigidTransform) -> None:
     origin = element.find("origin")
     if origin is None:
         origin = ET.SubElement(element, "origin")
-    rpy = pose.rotation().ToRollPitchYaw().vector()
-    for key, values in (("xyz", pose.translation()), ("rpy", rpy)):
-        origin.set(key, as_text(values))
+    origin.set("xyz", as_text(pose.translation()))
+    origin.set("rpy", as_text(pose.rotation().ToRollPitchYaw().vector()))
 
 
 def as_text(values: Iterable[float]) -> str:
@@ -342,6 +381,54 @@ def remove(element: ET.Element, tag: str) -> None:
 def _colour(material: ET.Element | None) -> str:
     colour = None if material is None else material.find("color")
     return "" if colour is None else colour.get("rgba", "")
+
+
+def joint_elements(root: ET.Element) -> list[ET.Element]:
+    """Returns the joints of a URDF, with those that only Drake knows."""
+    return [one for one in root if one.tag in ("joint", f"{{{DRAKE}}}joint")]
+
+
+def read_drives(root: ET.Element) -> JointDrives:
+    """Reads the drives of a URDF, also those that only Gazebo and ROS know."""
+    movable = [joint for joint in joint_elements(root) if joint.get("type") in _MOVABLE]
+    joints = {joint.get("name", ""): joint for joint in movable}
+    motors = "transmission//joint", "ros2_control/joint[command_interface]"
+    stated: dict[str, Mapping[str, str | None]] = {}  # Couplings; <mimic> comes last.
+    for plugin in root.findall("gazebo/plugin[mimicJoint]"):
+        one = {part.tag: part.text for part in plugin}
+        stated[(one.get("joint") or "").strip()] = one | {"joint": one["mimicJoint"]}
+    for joint in root.findall("ros2_control/joint"):
+        one = {part.get("name", ""): part.text for part in joint.findall("param")}
+        if "mimic" in one:
+            stated[joint.get("name", "")] = one | {"joint": one["mimic"]}
+    for name, joint in joints.items():
+        if (mimic := joint.find("mimic")) is not None:
+            stated[name] = mimic.attrib
+    springs = {name: _stiffness(joint) for name, joint in joints.items()}
+    for gazebo in root.findall("gazebo"):
+        name = gazebo.get("reference", "")
+        springs[name] = max(springs.get(name, 0.0), _stiffness(gazebo))
+    return JointDrives(
+        mimics={
+            name: (
+                (one.get("joint") or "").strip(),
+                as_number(one.get("multiplier"), 1.0),
+                as_number(one.get("offset"), 0.0),
+            )
+            for name, one in stated.items()
+            if name in joints
+        },
+        listed={one.get("name", "") for place in motors for one in root.findall(place)},
+        springs={name: springs[name] for name in joints if springs[name] > 0},
+        efforts={name: number(one.find("limit"), "effort") for name, one in joints.items()},
+    )
+
+
+def _stiffness(element: ET.Element) -> float:
+    """The largest, whatever they are called: springStiffness, spring_stiffness, stiffness."""
+    parts = ({**part.attrib, part.tag: part.text} for part in element.iter())
+    stated = (text for one in parts for key, text in one.items() if "stiffness" in key.lower())
+    return max((as_number(text, 0.0) for text in stated), default=0.0)
 
 
 def number(element: ET.Element | None, key: str) -> float:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping
-from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_safety.robots.urdf_copy import UrdfCopy, read_urdf
-from drake_safety.robots.urdf_survey import Limb, Survey
+from drake_safety.robots.urdf_copy import UrdfCopy
+from drake_safety.robots.urdf_survey import Limb, Survey, extent
 
 _LEAST_INERTIA = 1e-10  # Of what a joint moves [kg·m², kg].
 _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("L", "R"), ("l", "r"))
@@ -18,27 +17,27 @@ _Y = np.array([0.0, 1.0, 0.0])
 _Z = np.array([0.0, 0.0, 1.0])
 
 
-def require_shapes(survey: Survey, copy: UrdfCopy, urdf: Path, *, are_feet_named: bool) -> None:
+def require_shapes(survey: Survey, copy: UrdfCopy, *, are_feet_named: bool) -> None:
     """Refuses shapes of another order of magnitude, and to guess feet whose meshes were not found.
 
     Raises:
         ValueError: It names the links and the files of their meshes.
     """
-    for link, size in survey.oversized().items():
-        files = [mesh.get("filename") for mesh in read_urdf(urdf).link(link).iter("mesh")]
+    robot_m = extent(survey.plant, survey.context, survey.instance)
+    for link, size in survey.oversized(10 * robot_m).items():
         raise ValueError(
-            f"new: '{survey.source}': a collision shape of link '{link}' {files or ''} is "
-            f"{size:.3g} m large, in a robot of {survey.extent():.2g} m; in millimetres? State "
-            'sizes in metres, or scale="0.001 0.001 0.001"'
+            f"new: '{survey.source}': a collision shape of link '{link}' "
+            f"{copy.mesh_urls.get(link, '')} is {size:.3g} m large, in a robot of "
+            f"{robot_m:.2g} m; in millimetres? State sizes in metres, or "
+            'scale="0.001 0.001 0.001"'
         )
     groups = [group for group in survey.leaves() if len(survey.chain(group[0])) >= 2]
-    lowest = [survey.lowest(group) for group in groups]
-    floor, bare = min(lowest, default=0.0), copy.bare_links()
+    floor = min(map(survey.lowest, groups), default=0.0)
     lost = [
-        f"'{name}' ({', '.join(copy.lost_links[name])})"
-        for group, z in zip(groups, lowest, strict=True)
+        f"'{name}' ({', '.join(copy.mesh_urls[name])})"
+        for group, z in zip(groups, map(survey.lowest, groups), strict=True)
         for name in group
-        if name in bare
+        if name in copy.bare_links
         and z < 0.4 * floor
         # What is left reaches lower than the link that was lost, such as a foot's cover.
         and (survey.pose(name).translation()[2] < z - 0.25 * floor or not survey.collides(name))
@@ -59,13 +58,17 @@ def require_motors(survey: Survey, legs: list[Limb], moved: Collection[str]) -> 
         ValueError: It names the joints and what the file says of them.
     """
     drives = survey.drives
-    joints = list(dict.fromkeys(joint for limb in legs for joint in survey.chain(limb.body)))
+    chains = [survey.chain(limb.body) for limb in legs]
+    joints = list(dict.fromkeys(joint for one in chains for joint in one))
     mimics = {name: drives.mimics[name] for name in joints if name in drives.mimics}
     coupled = {name: "= {1:g} · '{0}' + {2:g}".format(*one) for name, one in mimics.items()}
     passive = {name: why for name, why in drives.passive(joints).items() if name not in moved}
-    limits = {name: survey.limits[name] for name in survey.limits if name in joints}
-    stuck = {name: f"{low:g}" for name, (low, high) in limits.items() if low == high}
+    limits = ((name, *survey.limits[name]) for name in survey.limits if name in joints)
+    stuck = {name: f"{low:g}" for name, low, high in limits if low == high}
     fix = 'or fix them (type="fixed")'
+    shared = [name for name in passive if all(name in one for one in chains)]
+    if shared:
+        fix += f"; {shared} carry all legs: the base floats without them and the links above"
     for found, what, remedy in (
         (coupled, "follow others by <mimic>", "remove <mimic> if each has a motor of its own"),
         (passive, "have no motor", f"add a <transmission> if they have one, {fix}"),

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Box, Capsule, Cylinder, GeometryId, Obb, Shape, Sphere
+from pydrake.geometry import Box, Capsule, Cylinder, Shape, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.multibody.tree import Joint, ModelInstanceIndex, RevoluteJoint
+from pydrake.multibody.tree import Joint, ModelInstanceIndex, RevoluteJoint, ScrewJoint
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from drake_safety.robots.joint_drives import JointDrives
 from drake_safety.robots.model_files import package_parser
+from drake_safety.robots.urdf_copy import JointDrives
 
 WITHOUT_STOPS_RAD = 4 * math.pi
 """Range of a joint from which it may turn a wheel."""
@@ -26,6 +26,7 @@ _STOP_RAD = 0.05  # Distance from a stop of a joint that cannot be at zero.
 _ROUND = 0.15  # Of a wheel's radius, by which it may be out of round.
 _MATTERS = 1e-4  # Moment of inertia that matters, by the robot's mass times extent squared.
 _POINT = 0.005  # Least radius of gyration, by the robot's extent.
+_AIR_KG_M3, _LEAD_KG_M3 = 1.2, 11_300.0  # Density of the cube that is as large as the robot.
 _FLAT_M = 1e-3  # Height over a sole's lowest part within which other parts touch as well.
 _LEVEL_M = 0.005  # Height over the lowest sphere within which others count as contacts.
 
@@ -71,7 +72,7 @@ class Survey:
         self.source, self.drives = source or path, drives or JointDrives()
         builder = DiagramBuilder()
         plant: MultibodyPlant
-        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+        plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         try:
             (self.instance,) = package_parser(plant).AddModels(str(path))
             plant.Finalize()
@@ -79,8 +80,7 @@ class Survey:
         except (RuntimeError, ValueError, SystemExit) as error:
             reason = re.sub(rf"{re.escape(str(path))}:\d+: ", "", str(error))
             raise ValueError(f"Drake cannot read '{self.source}': {reason}") from error
-        self.plant, self._scene_graph = plant, scene_graph
-        self._diagram = builder.Build()
+        self.plant, self._diagram = plant, builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self.context = plant.GetMyMutableContextFromRoot(self._root)
         bodies = [*map(plant.get_body, plant.GetBodyIndices(self.instance))]
@@ -93,9 +93,9 @@ class Survey:
             )
         (self.base,) = floating
         joints = [plant.get_joint(i) for i in plant.GetJointIndices(self.instance)]
-        odd = [j.name() for j in joints if 1 < j.num_velocities() < 6]
-        if odd:
+        if odd := [j.name() for j in joints if 1 < j.num_velocities() < 6]:
             raise ValueError(f"'{self.source}': joints {odd} have more than one degree of freedom")
+        self._above = {joint.child_body().name(): joint for joint in joints}
         single = (joint for joint in joints if joint.num_velocities() == 1)
         self.joints: list[Joint] = sorted(single, key=lambda joint: joint.position_start())
         self.limits = {
@@ -103,28 +103,30 @@ class Survey:
             for joint in self.joints
         }
         self._index = {joint.name(): joint.position_start() for joint in self.joints}
-        neutral = {name: _near_zero(*limits) for name, limits in self.limits.items()}
+        neutral = {}
+        for name, (low, high) in self.limits.items():
+            # The position nearest to zero that is not beyond a stop, nor at one unless zero is.
+            room = 0.0 if low <= 0.0 <= high else min(_STOP_RAD, 0.1 * (high - low))
+            neutral[name] = float(np.clip(0.0, low + room, high - room))
         self._neutral = self.drives.coupled(neutral)
-        self._above = {joint.child_body().name(): joint for joint in joints}
         self.set_joints({})
         self.total_mass = plant.CalcTotalMass(self.context, [self.instance])
 
-    def set_joints(self, values: dict[str, float]) -> None:
+    def set_joints(self, values: Mapping[str, float]) -> None:
         """Sets joint positions [rad]; other joints are as close to zero as their limits allow."""
         q = self.plant.GetPositions(self.context)
         for name, value in {**self._neutral, **values}.items():
             q[self._index[name]] = value
         self.plant.SetPositions(self.context, q)
 
-    def rest_joints(self, values: dict[str, float]) -> None:
+    def rest_joints(self, values: Mapping[str, float]) -> None:
         """Sets the positions [rad] of joints that are not set otherwise, within their limits."""
-        for name in self._index.keys() & values.keys():
+        for name in self.limits.keys() & values.keys():
             self._neutral[name] = np.clip(values[name], *self.limits[name])
 
     def posture(self) -> dict[str, float]:
         """Returns the present joint positions by name [rad]."""
-        q = self.plant.GetPositions(self.context)
-        return {name: float(q[index]) for name, index in self._index.items()}
+        return {joint.name(): joint.GetOnePosition(self.context) for joint in self.joints}
 
     def center_of_mass(self) -> np.ndarray:
         """Returns the centre of mass in the base's frame, (3,) [m]."""
@@ -149,21 +151,13 @@ class Survey:
         frame = self.plant.GetJointByName(joint, self.instance).frame_on_child()
         return frame.CalcPoseInWorld(self.context).translation()
 
-    def joint_pose(self, joint: Joint) -> RigidTransform:
-        """Returns the present pose of a joint's child in its parent."""
-        X_BP, X_BC = map(self.pose, (joint.parent_body().name(), joint.child_body().name()))
-        return X_BP.inverse() @ X_BC
-
     def joint_axis(self, joint: str) -> np.ndarray:
         """Returns the direction of a joint's axis in the base's frame, (3,)."""
         one = self.plant.GetJointByName(joint, self.instance)
-        axis = one.revolute_axis() if isinstance(one, RevoluteJoint) else one.translation_axis()
+        kinds = {RevoluteJoint: "revolute_axis", ScrewJoint: "screw_axis"}
+        axis = getattr(one, kinds.get(type(one), "translation_axis"))()
         R_BJ = one.frame_on_parent().CalcPoseInWorld(self.context).rotation()
         return R_BJ.matrix() @ axis
-
-    def extent(self) -> float:
-        """Returns the diagonal of the box around the origins of all bodies [m]."""
-        return extent(self.plant, self.context, self.instance)
 
     def positions(self, limb: Limb) -> np.ndarray:
         """Returns a limb's contact points in the base's frame, (n, 3) [m]."""
@@ -182,7 +176,7 @@ class Survey:
 
     def collides(self, body: str) -> bool:
         """Whether a body or one welded to it has collision geometry."""
-        return any(True for _ in self._geometries(self.welded(body)))
+        return bool([*self._geometries(self.welded(body))])
 
     def limbs(self) -> list[Limb]:
         """Returns the limbs of two joints or more."""
@@ -222,23 +216,27 @@ class Survey:
     def arms(self, legs: list[Limb]) -> list[Limb]:
         """Returns other limbs of four joints or more; a hand's fingers are no limbs."""
         feet = {limb.body for limb in legs}
-        arms: dict[tuple[str, ...], list[tuple[list[str], str]]] = {}
+        # Ends of limbs by their first four joints: chains and bodies.
+        hands: dict[tuple[str, ...], list[tuple[list[str], str]]] = {}
         for group in self.leaves():
             chain = self.chain(group[0])
             if len(chain) >= 4 and not feet & set(group):
-                arms.setdefault(tuple(chain[:4]), []).append((chain, group[-1]))
-        found = []
-        for start, members in arms.items():
-            shared, body = members[0]
-            if len(members) > 1:
-                steps = zip(*(chain for chain, _ in members), strict=False)
-                shared = [names[0] for names in steps if len(set(names)) == 1]
-                joint = self.plant.GetJointByName(shared[-1], self.instance)
+                hands.setdefault(tuple(chain[:4]), []).append((chain, group[-1]))
+        arms = []
+        for fingers in hands.values():
+            chain, body = fingers[0]
+            if len(fingers) > 1:
+                steps = zip(*(chain for chain, _ in fingers), strict=False)
+                chain = [names[0] for names in steps if len(set(names)) == 1]
+                joint = self.plant.GetJointByName(chain[-1], self.instance)
                 body = joint.child_body().name()
-            # Joints of the torso are shared between arms.
-            others = {name for other in arms if other != start for name in arms[other][0][0]}
-            found.append(Limb(body=body, joints=[name for name in shared if name not in others]))
-        return found
+            arms.append(Limb(body=body, joints=chain))
+        # Joints of the torso are shared between arms.
+        chains = {arm.body: {*arm.joints} for arm in arms}
+        for arm in arms:
+            others = (joints for body, joints in chains.items() if body != arm.body)
+            arm.joints = [name for name in arm.joints if name not in set().union(*others)]
+        return arms
 
     def wheels(self, legs: list[Limb]) -> list[str]:
         """Returns joints without stops that turn a round body at a leg's end.
@@ -248,62 +246,58 @@ class Survey:
         found = []
         for limb in legs:
             low, high = self.limits[limb.joints[-1]]
-            wheel = self._wheel(limb) if high - low > WITHOUT_STOPS_RAD else None
-            if wheel is not None:
-                found.append(limb.joints[-1])
-                if not limb.is_own_shape:
-                    limb.points, limb.radius_m = wheel
+            axis, origin = self.joint_axis(limb.joints[-1]), self.joint_origin(limb.joints[-1])
+            group = self.welded(limb.body) if high - low > WITHOUT_STOPS_RAD else []
+            for _, shape, _, X_WO, half in self._geometries(group):
+                along = np.abs(X_WO.rotation().matrix().T @ axis)
+                across = np.delete(half, np.argmax(along))
+                radius, center = float(across.max()), X_WO.translation()
+                is_low = center[2] - 1.5 * radius < self.lowest(group)
+                is_turned = along.max() > 0.95 or isinstance(shape, Sphere)
+                offset = max(np.ptp(across), np.linalg.norm(np.cross(axis, center - origin)))
+                is_round = not isinstance(shape, Box) and offset < _ROUND * radius
+                if is_low and is_turned and is_round:
+                    found.append(limb.joints[-1])
+                    if not limb.is_own_shape:
+                        limb.points = (self.pose(limb.body).inverse() @ center)[None]
+                        limb.radius_m = radius
+                    break
         return found
 
-    def _wheel(self, limb: Limb) -> tuple[np.ndarray, float] | None:
-        """Centre (1, 3) and radius of what touches the ground, if round about the last joint."""
-        axis, origin = self.joint_axis(limb.joints[-1]), self.joint_origin(limb.joints[-1])
-        group = self.welded(limb.body)
-        lowest = self.lowest(group)
-        for _, _, shape, X_WG, box in self._geometries(group):
-            if box is None or isinstance(shape, Box):
-                continue
-            X_WO = X_WG @ box.pose()
-            along = np.abs(X_WO.rotation().matrix().T @ axis)
-            across = np.delete(box.half_width(), np.argmax(along))
-            radius, center = float(across.max()), X_WO.translation()
-            is_low = center[2] - 1.5 * radius < lowest
-            is_turned = along.max() > 0.95 or isinstance(shape, Sphere)
-            offset = max(np.ptp(across), np.linalg.norm(np.cross(axis, center - origin)))
-            if is_low and is_turned and offset < _ROUND * radius:
-                return (self.pose(limb.body).inverse() @ center)[None], radius
-        return None
-
-    def oversized(self) -> dict[str, float]:
-        """Returns links with a collision shape beyond ten times the robot's extent; sizes [m]."""
-        boxes = ((name, box) for name, _, _, _, box in self._geometries(self.bodies) if box)
-        sizes = {name: 2 * max(box.half_width()) for name, box in boxes}
-        return {name: size for name, size in sizes.items() if size > 10 * self.extent()}
+    def oversized(self, most_m: float) -> dict[str, float]:
+        """Returns links with a collision shape beyond a size, and their sizes [m]."""
+        sizes = {name: 2 * max(half) for name, *_, half in self._geometries(self.bodies)}
+        return {name: size for name, size in sizes.items() if size > most_m}
 
     def _geometries(
         self, bodies: list[str]
-    ) -> Iterator[tuple[str, GeometryId, Shape, RigidTransform, Obb | None]]:
-        """The collision shapes of bodies: body, id, shape, pose, and the box in its frame."""
+    ) -> Iterator[tuple[str, Shape, RigidTransform, RigidTransform, np.ndarray]]:
+        """The collision shapes of bodies: body, shape, its pose, its box's pose and half edges."""
         inspector = self._scene_graph.model_inspector()
         for name in bodies:
             body = self.plant.GetBodyByName(name, self.instance)
             for one in self.plant.GetCollisionGeometriesForBody(body):
                 X_WG = self.pose(name) @ inspector.GetPoseInFrame(one)
-                box = inspector.GetObbInGeometryFrame(one)
-                yield name, one, inspector.GetShape(one), X_WG, box
+                hull, box = inspector.GetConvexHull(one), inspector.GetObbInGeometryFrame(one)
+                if hull is not None:
+                    middle, edges = hull.CalcBoundingBox()
+                    X_GO, half = RigidTransform(middle), np.array(edges) / 2
+                elif box is not None:
+                    X_GO, half = box.pose(), np.array(box.half_width())
+                else:  # It is boundless.
+                    continue
+                yield name, inspector.GetShape(one), X_WG, X_WG @ X_GO, half
 
     def overlaps(self) -> set[tuple[str, str]]:
-        """Returns pairs of links that overlap in the present posture."""
-        query = self._scene_graph.get_query_output_port().Eval(
-            self._scene_graph.GetMyContextFromRoot(self._root)
-        )
-        inspector = query.inspector()
-
-        def link(geometry: GeometryId) -> str:
-            return self.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).name()
-
-        pairs = [(link(one.id_A), link(one.id_B)) for one in query.ComputePointPairPenetration()]
-        return {(min(pair), max(pair)) for pair in pairs}
+        """Returns pairs of links that overlap in the present posture, in alphabetical order."""
+        context = self._scene_graph.GetMyContextFromRoot(self._root)
+        query = self._scene_graph.get_query_output_port().Eval(context)
+        frame_of, found = query.inspector().GetFrameId, set()
+        for one in query.ComputePointPairPenetration():
+            frames = frame_of(one.id_A), frame_of(one.id_B)
+            low, high = sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
+            found.add((low, high))
+        return found
 
     def lowest(self, group: list[str]) -> float:
         """Returns the height of bodies' lowest point over the base [m]."""
@@ -311,26 +305,25 @@ class Survey:
         return min(lowest or [float(self.pose(name).translation()[2]) for name in group])
 
     def _leg(self, group: list[str]) -> Limb:
-        joints = self.chain(group[0])
-        shapes = self._shapes(group)
+        joints, shapes = self.chain(group[0]), self._shapes(group)
         if not shapes:
             # A body whose name contains "foot", or the last one.
             body = max(group, key=lambda name: ("foot" in name.lower(), group.index(name)))
             return Limb(body=body, joints=joints)
         # A sphere of the URDF's rather than what is hardly lower, such as the shank at its height.
         foot = min(shapes, key=lambda one: one.lowest_m - (_LEVEL_M if one.is_sphere else 0.0))
-        lowest_m = min(shape.lowest_m for shape in shapes)
         # A sole may be several shapes.
-        level_m = lowest_m + _LEVEL_M if foot.is_sphere else foot.lowest_m + _FLAT_M
-        centers = np.concatenate(
-            [
-                one.centers
-                for one in shapes
-                if (one.body, one.is_sphere) == (foot.body, foot.is_sphere)
-                and abs(one.radius_m - foot.radius_m) < 1e-6
-                and one.lowest_m < level_m
-            ]
+        level_m = foot.lowest_m + _FLAT_M
+        if foot.is_sphere:
+            level_m = min(shape.lowest_m for shape in shapes) + _LEVEL_M
+        alike = (
+            one.centers
+            for one in shapes
+            if (one.body, one.is_sphere) == (foot.body, foot.is_sphere)
+            and abs(one.radius_m - foot.radius_m) < 1e-6
+            and one.lowest_m < level_m
         )
+        centers = np.concatenate([*alike])
         centers = centers[centers[:, 2] < centers[:, 2].min() + _LEVEL_M + foot.radius_m]
         return Limb(
             body=foot.body,
@@ -343,39 +336,22 @@ class Survey:
 
     def _shapes(self, group: list[str]) -> list[_Shape]:
         found = []
-        for name, geometry, shape, X_WG, box in self._geometries(group):
-            hull = self._scene_graph.model_inspector().GetConvexHull(geometry)
+        for name, shape, X_WG, X_WO, half in self._geometries(group):
+            # A flat cylinder that lies on the ground is a sole.
+            is_flat = isinstance(shape, Cylinder) and shape.length() < 2 * shape.radius()
+            is_plate = is_flat and abs(X_WG.rotation().matrix()[2, 2]) > 0.7
             if isinstance(shape, Sphere):
-                found.append(_Shape(name, X_WG.translation()[None], shape.radius(), True))
-            elif isinstance(shape, Cylinder) and _is_plate(X_WG, shape):
-                half = np.array([*2 * [math.sqrt(0.5) * shape.radius()], shape.length() / 2])
-                found.append(_Shape(name, *_corners(X_WG, half)))
-            elif isinstance(shape, Capsule | Cylinder):
+                spheres = X_WG.translation()[None], shape.radius()
+            elif isinstance(shape, Capsule | Cylinder) and not is_plate:
                 radius = shape.radius()
-                half = shape.length() / 2 - (0 if isinstance(shape, Capsule) else radius)
-                ends = np.array([[0, 0, -half], [0, 0, half]]) if half > 0 else np.zeros((1, 3))
-                found.append(_Shape(name, (X_WG @ ends.T).T, radius))
-            elif hull is not None:
-                middle, edges = hull.CalcBoundingBox()
-                X_WO = X_WG @ RigidTransform(middle)
-                found.append(_Shape(name, *_corners(X_WO, np.array(edges) / 2)))
-            elif box is not None:
-                X_WO = X_WG @ box.pose()
-                found.append(_Shape(name, *_corners(X_WO, np.array(box.half_width()))))
+                rise = shape.length() / 2 - (0 if isinstance(shape, Capsule) else radius)
+                ends = np.array([[0, 0, -rise], [0, 0, rise]]) if rise > 0 else np.zeros((1, 3))
+                spheres = (X_WG @ ends.T).T, radius
+            else:
+                # The largest square in a round plate.
+                spheres = _corners(X_WO, half * ([*2 * [math.sqrt(0.5)], 1] if is_plate else 1))
+            found.append(_Shape(name, *spheres, isinstance(shape, Sphere)))
         return found
-
-
-def _near_zero(low: float, high: float) -> float:
-    """The position nearest to zero that is not beyond a stop, nor at one unless zero is."""
-    if low <= 0.0 <= high:
-        return 0.0
-    room = min(_STOP_RAD, 0.1 * (high - low))
-    return low + room if low > 0.0 else high - room
-
-
-def _is_plate(X_WG: RigidTransform, shape: Cylinder) -> bool:
-    """Whether a cylinder is flat and lies on the ground, as a sole does."""
-    return shape.length() < 2 * shape.radius() and abs(X_WG.rotation().matrix()[2, 2]) > 0.7
 
 
 def extent(plant: MultibodyPlant, context: Context, instance: ModelInstanceIndex) -> float:
@@ -386,15 +362,17 @@ def extent(plant: MultibodyPlant, context: Context, instance: ModelInstanceIndex
 
 
 def odd_inertias(plant: MultibodyPlant, context: Context, instance: ModelInstanceIndex) -> str:
-    """Names links with an inertia that no body of a robot of this size has; "" if there is none.
+    """Names links with masses that no body of a robot of this size has; "" if there is none.
 
-    The radius of gyration √(I/m) is beyond the robot's extent, or a heavy link's is below 1/200.
+    The radius of gyration √(I/m) or the distance of the centre of mass is beyond the robot's
+    extent, a heavy link's radius is below 1/200 of it, or the robot is lighter than air or heavier
+    than lead.
     """
     size, total = extent(plant, context, instance), plant.CalcTotalMass(context, [instance])
-    found = []
+    found, told = [], []
     for body in map(plant.get_body, plant.GetBodyIndices(instance)):
         M_BBo = body.default_spatial_inertia()
-        mass = M_BBo.get_mass()
+        mass, away = M_BBo.get_mass(), float(np.linalg.norm(M_BBo.get_com()))
         if not mass > 0:
             continue
         G_BBcm = M_BBo.get_unit_inertia().ShiftToCenterOfMass(M_BBo.get_com())
@@ -405,12 +383,17 @@ def odd_inertias(plant: MultibodyPlant, context: Context, instance: ModelInstanc
                 f"'{body.name()}' {mass * radius**2:.3g} kg·m² at {mass:.3g} kg, a radius of "
                 f"gyration of {radius:.2g} m"
             )
-    if not found:
-        return ""
-    return (
-        f"{len(found)} links have inertias that no body of a robot of {size:.2g} m has (kg·mm² or "
-        f"g·mm² instead of kg·m²?): {'; '.join(found[:4])}{' ...' * (len(found) > 4)}"
-    )
+        if away > 2 * size:
+            told.append(f"the centre of mass of link '{body.name()}' is {away:.3g} m from it")
+    if found:
+        told.insert(
+            0,
+            f"{len(found)} links have inertias that no body of a robot of {size:.2g} m has (kg·mm² "
+            f"or g·mm² instead of kg·m²?): {'; '.join(found[:4])}{' ...' * (len(found) > 4)}",
+        )
+    if not _AIR_KG_M3 < total / size**3 < _LEAD_KG_M3:
+        told.append(f"no robot of {size:.2g} m has {total:.3g} kg (grams or tonnes?)")
+    return "; ".join(told)
 
 
 def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]:
@@ -423,9 +406,10 @@ def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]
         point = np.zeros(3)
         point[axis] = math.copysign(half[axis] - min(radius, half[axis]), down[axis])
         return (X_WG @ point)[None], radius
-    inner = np.maximum(half - _CORNER_RADIUS_M, 0.0)
     # A thin sole's spheres rise above it.
-    inner[axis] = half[axis] - _CORNER_RADIUS_M
+    inner = np.where(
+        np.arange(3) == axis, half - _CORNER_RADIUS_M, np.maximum(half - _CORNER_RADIUS_M, 0.0)
+    )
     signs = np.array(np.meshgrid(*3 * [[-1, 1]])).reshape(3, -1).T
     signs = signs[signs[:, axis] * down[axis] > 0]
     return (X_WG @ (signs * inner).T).T, _CORNER_RADIUS_M

@@ -19,7 +19,6 @@ from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polyg
 from drake_safety.files.progress import StageProgress, ignore
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.models import load_robot, robot_files
-from drake_safety.robots.joint_drives import read_drives
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.robots.urdf_copy import read_urdf
@@ -38,6 +37,14 @@ _SINK_SHARE = 0.1  # Share of the standing height by which a robot may sink.
 _LEVEL_M = 2e-3  # Largest difference of the feet's heights.
 _MATCH_M = 1e-3
 _UNSAFE_SHARES = (0.1, 0.9)
+_LINE_REMEDY = (
+    "the feet touch along a line, over which no servos balance: state soles as 'contact_points' "
+    "under 'feet' in robot.yaml [m], or take a policy (new --task walking)"
+)
+_GAINS_REMEDY = (
+    "if it sinks, raise 'joint_gains' in robot.yaml, such as twofold [N·m/rad, N·m·s/rad]; if it "
+    "trembles, halve them; look for shapes that overlap by `check --picture FILE`"
+)
 _EFFORT_REMEDY = "state their largest torques under 'effort_limits' in robot.yaml [N·m]"
 
 
@@ -198,8 +205,10 @@ def _posture(kinematics: RobotKinematics) -> _Check:
             f"{100 * distance:.1f} cm inside their polygon",
             f"{-100 * distance:.1f} cm outside their polygon, at ({x:+.3f}, {y:+.3f}) m in x and y "
             "from its centre",
-            "change 'posture' [rad] or 'contact_points' under 'feet' [m] in robot.yaml, so that "
-            "the feet surround it, or correct the masses in the URDF [kg]",
+            _LINE_REMEDY
+            if len(corners) < 3
+            else "change 'posture' [rad] or 'contact_points' under 'feet' [m] in robot.yaml, so "
+            "that the feet surround it, or correct the masses in the URDF [kg]",
         )
 
 
@@ -260,7 +269,7 @@ def _model_file(kinematics: RobotKinematics) -> _Check:
     """Checks couplings, wheels and inertias; nothing is said of what is in order."""
     robot, plant = kinematics.robot, kinematics.plant
     path = model_file(robot.urdf, robot.source_dir, robot.requires)
-    mimics = read_drives(read_urdf(path).root).mimics if path.suffix == ".urdf" else {}
+    mimics = read_urdf(path).drives.mimics if path.suffix == ".urdf" else {}
     coupled = [name for foot in robot.feet.values() for name in foot.joints if name in mimics]
     if coupled:
         yield failed(
@@ -281,7 +290,8 @@ def _model_file(kinematics: RobotKinematics) -> _Check:
     kinematics.set_positions(kinematics.standing_positions())
     instance = plant.GetModelInstanceByName(robot.name)
     if odd := odd_inertias(plant, kinematics.context, instance):
-        yield passed("inertias", odd, f"correct <inertia> of these links [kg·m²] in {path.name}")
+        remedy = "correct <inertia>, <mass> and <origin> of these links [kg·m², kg, m] in"
+        yield passed("inertias", odd, f"{remedy} {path.name}")
 
 
 def _collisions(robot: RobotModel) -> _Check:
@@ -380,13 +390,14 @@ def _stands(loop: LeggedLoop) -> _Check:
         f"after 1 s it has sunk {100 * sunk:.1f} cm, {touching} of {kinematics.num_contacts} "
         f"contact points touch, the fastest joint turns at {speed:.2f} rad/s"
     )
+    standing = kinematics.contact_positions(kinematics.standing_positions())
+    corners = convex_hull(standing[:, :2].tolist())
     yield _judged(
         _STANDS,
         abs(sunk) <= _SINK_SHARE * height and speed <= 1.0 and touching > 0,
         message,
         message,
-        "if it sinks, raise 'joint_gains' in robot.yaml, such as twofold [N·m/rad, N·m·s/rad]; if "
-        "it trembles, halve them; look for shapes that overlap by `check --picture FILE`",
+        _LINE_REMEDY if len(corners) < 3 else _GAINS_REMEDY,
     )
 
 
