@@ -216,7 +216,7 @@ def test_a_material_of_two_colours_becomes_two(tmp_path, caplog):
 def test_a_material_without_a_colour_takes_a_later_one_or_is_left_out(tmp_path, caplog):
     grey = '<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>'
     box = '<visual><geometry><box size="1 1 1"/></geometry>{}</visual>'
-    shapes = box.format('<material name="grey"/>') + box.format('<material name="gazebo"/>')
+    shapes = box.format('<material name="grey"/>') + 2 * box.format('<material name="gazebo"/>')
     copy, folder = copy_of(tmp_path, shapes + box.format(grey))
     assert [one.get("name") for one in copy.root.iter("material")] == ["grey", "grey"]
     loaded_quietly(copy, folder, caplog)

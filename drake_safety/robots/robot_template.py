@@ -22,15 +22,19 @@ from drake_safety.robots.scenario_template import TASKS, Sizes, scenario_yaml
 from drake_safety.robots.simulatable_urdf import simulatable_copy
 from drake_safety.robots.standing_posture import standing_posture
 from drake_safety.robots.urdf_copy import UrdfCopy
-from drake_safety.robots.urdf_requirements import (
+from drake_safety.robots.urdf_survey import (
+    WITHOUT_STOPS_RAD,
+    Limb,
+    Survey,
+    extent,
     listed,
     mirrored,
+    odd_inertias,
     require_masses,
     require_motors,
     require_shapes,
     upright_base,
 )
-from drake_safety.robots.urdf_survey import WITHOUT_STOPS_RAD, Limb, Survey, odd_inertias
 
 # Servo gains in proportion to mass times height, from `BALANCING_REFERENCE`.
 _STIFFNESS = 28.0  # [1/s² · N·m/(rad kg m)]
@@ -230,7 +234,7 @@ def _fix_joints(found: NewRobot, moved: Collection[str] | None) -> None:
     used = used - set(passive) | leaders
     loose = {name for name, (leader, *_) in drives.mimics.items() if leader in used} - used
     spans = {name: high - low for name, (low, high) in survey.limits.items() if name in legged}
-    turns = [name for name, span in spans.items() if 1.1 * WITHOUT_STOPS_RAD < span < 720]
+    turns = [name for name, span in spans.items() if 2 * WITHOUT_STOPS_RAD < span < 720]
     for names, note in (
         (coupled, "follow others by <mimic>, in the posture too"),
         (loose, "follow joints that move, by <mimic>, but move no foot or hand and are fixed"),
@@ -238,7 +242,7 @@ def _fix_joints(found: NewRobot, moved: Collection[str] | None) -> None:
         (used & set(drives.springs), "have springs beside their motors, which are left out"),
         (
             {*turns} - {*found.wheels},
-            "of legs turn more than twice: are their limits in degrees instead of radians?",
+            "of legs turn more than four times: are their limits in degrees instead of radians?",
         ),
         (
             found.wheels,
@@ -273,7 +277,9 @@ def _stand(found: NewRobot) -> None:
             found.survey, found.legs, found.facts.postures
         )
     except ValueError as error:
-        raise ValueError(". ".join([f"{error}", *copy.warnings, *copy.left_out])) from error
+        plant, context = found.survey.plant, found.survey.context
+        size = f"The robot is {extent(plant, context, found.survey.instance):.2g} m large"
+        raise ValueError(". ".join([f"{error}", size, *copy.warnings, *copy.left_out])) from error
     for limb in found.legs:
         # Hulls welded to a foot end at the height of its contact points, which alone touch.
         lowest = float(found.survey.positions(limb)[:, 2].min())

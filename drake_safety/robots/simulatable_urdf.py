@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from functools import partial
@@ -41,6 +42,7 @@ _IGNORED = (  # By Drake, with a warning, or rejected: places and tags.
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ROWS, _COLUMNS = np.triu_indices(3)
 _ROUNDING = 1e-6  # Of the digits of moments of inertia.
+_MOST_RAD = 7.0  # Of an angle in rpy, beyond a turn.
 _NOISE = 1e-12  # Of moments of inertia that should be zero [kg·m²].
 _WATER_KG_M3 = 1000.0  # Density of the ball in place of a body whose inertia is negative.
 
@@ -61,6 +63,14 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     for link, shape, words in copy.empty_shapes():
         link.remove(shape)
         copy.warn(f"{words}: it is left out")
+    turned = [
+        owner.get("name")
+        for owner in (*copy.root.findall("link"), *joint_elements(copy.root))
+        for origin in owner.iter("origin")
+        if max(map(abs, map(float, origin.get("rpy", "0").split())), default=0.0) > _MOST_RAD
+    ]
+    if turned:
+        copy.warn(f"rpy of {turned} is beyond a turn: degrees instead of radians?")
     _simplify_joints(copy)
     _fix_inertias(copy)
     _tell_materials_apart(copy)
@@ -83,9 +93,9 @@ def _simplify_joints(copy: UrdfCopy) -> None:
         copy.warn(f'velocity="0" of joints {zeros} is read as no limit')
     fixed = {joint.get("name") for joint in copy.root.findall("joint[@type='fixed']")}
     for transmission in copy.root.findall("transmission"):
-        kind, joint = transmission.findtext("type", "").strip(), transmission.find("joint")
+        kind, driven = transmission.findtext("type", "").strip(), transmission.find("joint")
         is_simple = kind.rpartition("/")[2] == "SimpleTransmission"
-        if not is_simple or (joint is not None and joint.get("name") in fixed):
+        if not is_simple or (driven is not None and driven.get("name") in fixed):
             copy.root.remove(transmission)
     if copy.joint_friction:
         copy.notes.append(
@@ -100,7 +110,9 @@ def _fix_inertias(copy: UrdfCopy) -> None:
         inertia, mass = link.find("inertial/inertia"), number(link.find("inertial/mass"), "value")
         if inertia is None:
             continue
-        if not mass > 0:  # Or not stated.
+        if not mass > 0:
+            if math.isnan(mass):
+                copy.warn(f"link '{link.get('name')}' has an inertia but no mass: it has neither")
             remove(link, "inertial")
             continue
         moments = np.zeros((3, 3))
@@ -132,15 +144,15 @@ def _fix_inertias(copy: UrdfCopy) -> None:
 def _tell_materials_apart(copy: UrdfCopy) -> None:
     """Renames materials that share a name but not a colour, and drops those without any."""
     stated = {one.get("name"): one for one in copy.root.iter("material") if len(one)}
-    known = {one.get("name") for one in copy.root.findall("material")}
+    before = {one.get("name") for one in copy.root.findall("material") if len(one)}
     for visual in copy.root.findall("link/visual"):
         for material in visual.findall("material"):
-            name = material.get("name")
-            if not len(material) and name not in known:  # Drake knows those that came before.
-                material.extend(stated.get(name, []))
-            if not len(material) and name not in known:
-                visual.remove(material)
-            known.add(name)
+            if material.get("name") not in before:  # Drake knows those that came before.
+                material.extend([] if len(material) else stated.get(material.get("name"), []))
+                if not len(material):
+                    visual.remove(material)
+                    continue
+            before.add(material.get("name"))
     seen: dict[str, list[list[str]]] = {}
     for material in copy.root.iter("material"):
         values = " ".join(value for part in material for value in part.attrib.values()).split()

@@ -8,7 +8,7 @@ import re
 import shutil
 import xml.etree.ElementTree as ET
 import zlib
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from drake_safety.files.reading import is_number
 from drake_safety.robots.meshes import is_shown, shown_mesh
 from drake_safety.robots.model_files import model_file
 
@@ -29,6 +30,7 @@ FIXED_MIMIC = "joint[@type='fixed']", "mimic"
 _MOVABLE = ("revolute", "continuous", "prismatic", "screw")
 _PREFIX = re.compile(rb"""(xmlns:drake\s*=\s*)["'][^"']*["']""")
 ET.register_namespace("drake", DRAKE)
+_VECTORS = {"xyz", "rpy", "size", "scale", "radius", "length"}
 _SIZES = ("size", "radius", "length", "scale")  # Attributes of shapes.
 
 
@@ -322,26 +324,42 @@ def read_urdf(path: Path) -> UrdfCopy:
         raise ValueError(f"'{path}' is not expanded yet: run `xacro {path.name} > robot.urdf`")
     if not root.findall("link"):
         raise ValueError(f"'{path}' has no links")
-    for link in root.iter("link"):
+    for fault in _faults(root):
+        raise ValueError(f"'{path}': {fault}")
+    return UrdfCopy(source=path, root=root, drives=read_drives(root))
+
+
+def _faults(root: ET.Element) -> Iterator[str]:
+    """What Drake reads as something else, or refuses without the name of its link or joint."""
+    links, joints = root.findall("link"), joint_elements(root)
+    for link in links:
         mass = number(element := link.find("inertial/mass"), "value")
-        # Drake warns, and simulates a body of another mass.
         if element is not None and not 0.0 <= mass < math.inf:
-            raise ValueError(
-                f"'{path}': link '{link.get('name')}' has a mass of {mass:g} kg, expected a finite "
-                "number that is not negative"
-            )
-    for joint in joint_elements(root):
+            what = f"link '{link.get('name')}' has a mass of {mass:g} kg"
+            yield f"{what}, expected a finite number that is not negative"
+    parents: dict[str | None, list[str | None]] = {}
+    for joint in joints:
+        for child in joint.findall("child"):
+            parents.setdefault(child.get("link"), []).append(joint.get("name"))
+    for name, several in parents.items():
+        if len(several) > 1:
+            what = f"link '{name}' is the child of joints {several}"
+            yield f"{what}; expected one, as a URDF is a tree: remove the others"
+    for owner in (*links, *joints):
+        for part in owner.iter():
+            for key, text in part.attrib.items():
+                if key in _VECTORS and not all(map(is_number, text.split())):
+                    what = f"{owner.tag} '{owner.get('name')}' has {key}=\"{text}\""
+                    yield f"{what} in <{part.tag}>; expected numbers"
+    for joint in joints:
         kind, limit = joint.get("type"), joint.find("limit")
         wrong = [key for key in ("effort", "velocity") if number(limit, key) < 0]
         if number(limit, "lower") > number(limit, "upper") and kind in ("revolute", "prismatic"):
             wrong = ["lower", "upper"]
         if limit is not None and wrong and kind != "fixed":
             stated = " ".join(f'{key}="{limit.get(key)}"' for key in wrong)
-            raise ValueError(
-                f"'{path}': joint '{joint.get('name')}' has {stated}; expected lower below upper, "
-                "and positive limits of effort and velocity"
-            )
-    return UrdfCopy(source=path, root=root, drives=read_drives(root))
+            what = f"joint '{joint.get('name')}' has {stated}"
+            yield f"{what}; expected lower below upper, and positive limits of effort and velocity"
 
 
 def pose_of(element: ET.Element) -> RigidTransform:
