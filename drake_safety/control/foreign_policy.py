@@ -264,7 +264,8 @@ def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
         if "clip" in spec:
             is_scaled = spec.raw.get("scale_first", terms.raw.get("scale_first", False))
             factors = [1.0] if is_scaled else entry.get("scale", [1.0])
-            entry["clip"] = limit(*spec.numbers("clip", 2), factors, spec.who)
+            lowest, highest = spec.numbers("clip", 2)
+            entry["clip"] = limit(lowest, highest, factors, spec.who)
         length = int(spec.number("history_length")) if "history_length" in spec else 1
         entry["history"] = max(length, 1)
         if entry["name"] == "gait_phase":
