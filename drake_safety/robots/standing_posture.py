@@ -100,7 +100,7 @@ def _solved(survey: Survey, solvers: list[_Leg]) -> dict[str, float]:
             if angles is None:
                 reach[solver.limb.body] = share
                 break
-            solved |= solver.named(angles)
+            solved |= dict(zip(solver.limb.joints, angles.tolist(), strict=True))
         else:
             survey.set_joints(solved)
             return {name: round(value, 4) for name, value in survey.posture().items()}
@@ -135,16 +135,15 @@ class _Leg:
             self.target = self.hip[:2] + 0.5 * self.length * outwards
         self._forwards = 1.0 if num_legs == 2 else -1.0
 
-    def named(self, angles: np.ndarray) -> dict[str, float]:
-        """Angles by the names of the leg's joints [rad]."""
-        return dict(zip(self.limb.joints, angles.tolist(), strict=True))
+    def _set(self, angles: np.ndarray) -> None:
+        self._survey.set_joints(dict(zip(self.limb.joints, angles.tolist(), strict=True)))
 
     def solve(self, ground: float) -> np.ndarray | None:
         """Solves for angles that put the spheres' lowest points on the ground, under the hip."""
         from scipy.optimize import least_squares
 
         def errors(angles: np.ndarray) -> np.ndarray:
-            self._survey.set_joints(self.named(angles))
+            self._set(angles)
             points = self._survey.positions(self.limb)
             heights = points[:, 2] - self.limb.radius_m - ground
             parts = [points[:, :2].mean(axis=0) - self.target, heights]
@@ -171,7 +170,7 @@ class _Leg:
         return min(solutions, key=self._penalty, default=None)
 
     def _penalty(self, angles: np.ndarray) -> float:
-        self._survey.set_joints(self.named(angles))
+        self._set(angles)
         hip, knee = map(self._survey.joint_origin, self._hip_and_knee)
         bend = (knee - hip) / self.length
         wanted = bend[2] if self.is_spread else self._forwards * bend[0]

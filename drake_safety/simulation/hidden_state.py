@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from itertools import chain
 
-from pydrake.systems.framework import Context, Diagram, PortDataType, System
+from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
 
 from drake_safety.learning.segments import Episode
 from drake_safety.simulation.dataset import is_same
@@ -67,12 +67,11 @@ def _hashes(system: System, root: Context) -> _Hashes:
     state = context.get_discrete_state()
     values = [state.value(i).tobytes() for i in range(state.num_groups())]
     found = {(path, "state", ""): hash(b"".join(values))}
-    for kind, number in (
-        ("input", system.num_input_ports()),
-        ("output", system.num_output_ports()),
-    ):
-        for port in map(getattr(system, f"get_{kind}_port"), range(number)):
-            if port.get_data_type() == PortDataType.kVectorValued:
-                with suppress(Exception):  # Such as that of a port without an input.
-                    found[path, kind, port.get_name()] = hash(port.Eval(context).tobytes())
+    inputs = map(system.get_input_port, range(system.num_input_ports()))
+    outputs = map(system.get_output_port, range(system.num_output_ports()))
+    for port in (*inputs, *outputs):
+        if port.get_data_type() == PortDataType.kVectorValued:
+            with suppress(Exception):  # Such as that of a port without an input.
+                key = path, "output" if isinstance(port, OutputPort) else "input", port.get_name()
+                found[key] = hash(port.Eval(context).tobytes())
     return found
