@@ -14,7 +14,6 @@ from drake_safety.diagrams.balancing_parameters import BalancingParameters
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.physics import ENGINES_WITH_BALLS, Scene
-from drake_safety.robots.robot_model import by_pattern
 from drake_safety.simulation.closed_loop import Purpose
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -98,16 +97,10 @@ class Balancing(LeggedLoop):
             recovery_active = switch.GetOutputPort("recovery_active")
             builder.ExportOutput(recovery_active, "recovery_active")
 
-        robot = self.robot
-        stiffness = [
-            getattr(by_pattern(robot.joint_gains, name, "gains", robot.name), "stiffness", 0.0)
-            for name in kinematics.joint_names
-        ]
         controller = builder.AddNamedSystem(
             "inverse_kinematics_controller",
             InverseKinematicsController(
                 kinematics,
-                np.array(stiffness),
                 period_s=scenario.control_period_s,
                 offset_s=self._control_offset_s,
             ),
@@ -122,10 +115,14 @@ class Balancing(LeggedLoop):
         physics.connect_servos(builder, kinematics.joint_names, command)
 
         safe_set = BalanceSafeSet(kinematics, parameters.safe_set)
-        gravity = self._add_gravity(builder)
-        loads = self._add_servo_load(builder, controller.GetOutputPort("desired_joint_state"))
-        self._watch(builder, safe_set, gravity, loads, outlook=desired.pop("desired_outlook"))
-        self.monitored = {"features": loads[1]}
+        self._watch(
+            builder,
+            safe_set,
+            outlook=desired.pop("desired_outlook"),
+            command=controller.GetOutputPort("desired_joint_state"),
+            has_gravity=True,
+        )
+        self.monitored = {"features": self.feature_names[-kinematics.num_joints :]}
         assessor = self.export(
             builder,
             desired,

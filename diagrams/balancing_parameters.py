@@ -12,7 +12,6 @@ from drake_safety.control.safe_sets import BalanceLimits
 from drake_safety.files.schema import schema
 from drake_safety.models import load_robot
 from drake_safety.plants.balls import Throw
-from drake_safety.robots.robot_model import by_pattern
 from drake_safety.robots.robot_size import (
     BALANCING_REFERENCE,
     GRAVITY_M_S2,
@@ -117,10 +116,7 @@ def fitted_to_robot(stated: dict[str, Any], kinematics: RobotKinematics) -> dict
 def largest_twist(kinematics: RobotKinematics) -> float:
     """Largest yaw twist of the standing base by half of its legs before their feet slip [rad]."""
     robot = kinematics.robot
-    stiffness = [
-        getattr(by_pattern(robot.joint_gains, name, "gains", robot.name), "stiffness", 0.0)
-        for name in kinematics.joint_names
-    ]
+    stiffness = [getattr(robot.gains_of(name), "stiffness", 0.0) for name in kinematics.joint_names]
     J = kinematics.contact_jacobian(kinematics.standing_positions())
     joints_per_yaw = np.linalg.lstsq(J[:, NUM_BASE_VELOCITIES:], J[:, 2], rcond=None)[0]
     torque_per_yaw = 0.5 * float(np.square(joints_per_yaw) @ stiffness)

@@ -122,7 +122,8 @@ class Reaching(LeggedLoop):
             controller.model, clearance, parameters.safe_set, is_mirrored=self.mirror is not None
         )
         self.angular_constraints = self.safe_set.angular_names
-        self._watch(builder, self.safe_set, self._add_gravity(builder))
+        outlook = planner.GetOutputPort("desired_outlook")
+        self._watch(builder, self.safe_set, outlook=outlook, has_gravity=True)
         self.monitored = {"features": []}  # Its controller follows the preview.
         ports = {
             "desired_preview": desired_preview,

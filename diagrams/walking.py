@@ -130,16 +130,14 @@ class Walking(LeggedLoop):
         self._watch(
             builder,
             safe_set,
-            (controller.GetOutputPort("action_state"), controller.action_names),
             outlook=desired.pop("desired_outlook"),
+            memory=(controller.GetOutputPort("action_state"), controller.action_names),
         )
         ports = {**desired, "controller_status": controller.GetOutputPort("status")}
         if guard_system is not None:
             ports["guard_active"] = guard_system.GetOutputPort("is_changed")
-            builder.Connect(
-                self._assessor_observer.GetOutputPort("state"), guard_system.GetInputPort("state")
-            )
-            builder.Connect(self._features, guard_system.GetInputPort("features"))
+            for name in ("state", "features"):
+                builder.Connect(self._seen[name], guard_system.GetInputPort(name))
         assessor = self.export(builder, ports, period_s=parameters.assessment_period_s)
         if trigger is not None and assessor is not None:
             for name in ("safety_probability", "belief"):

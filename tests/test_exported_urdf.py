@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.robots.robot_model import by_pattern, load_robot_file
+from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.robots.robot_template import write_robot
 from drake_safety.robots.simulatable_urdf import simulatable_copy
 from drake_safety.robots.urdf_survey import Survey
@@ -418,7 +418,7 @@ def test_names_are_data(pattern, tmp_path):
     assert kinematics.standing_height == pytest.approx(written.sizes.height_m, abs=1e-4)
     for name, position in zip(written.joints, kinematics.posture, strict=True):
         assert position == written.posture[name]
-        assert by_pattern(robot.joint_gains, name, "gains", "q") is not None
+        assert robot.gains_of(name) is not None
 
 
 def test_a_robot_with_names_of_every_kind_passes_its_check(tmp_path):

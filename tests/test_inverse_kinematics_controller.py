@@ -22,13 +22,14 @@ def base_over(kinematics, stance_pose=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0)):
 
 
 class Commanded(Bench):
-    """A controller alone, of a robot that stands."""
+    """A controller alone, of a robot that stands at a stance pose."""
 
-    def __init__(self, name, stiffness=STIFFNESS, desired=None):
+    def __init__(self, name, stiffness=STIFFNESS, desired=None, stance_pose=(0.0, 0.0, 0.0)):
         self.kinematics = k = robot_kinematics(name)
         gains = np.full(k.num_joints, stiffness)
         super().__init__(InverseKinematicsController(k, gains, period_s=PERIOD_S))
-        q = k.positions_at(RigidTransform([0, 0, k.standing_height]), k.posture)
+        R_WB = RotationMatrix.MakeZRotation(stance_pose[2])
+        q = k.positions_at(RigidTransform(R_WB, base_over(k, stance_pose)), k.posture)
         self.fix(plant_state=np.append(q, np.zeros(k.num_velocities)))
         self.fix(desired_output=base_over(k) if desired is None else desired)
 
@@ -55,9 +56,13 @@ def test_the_set_point_carries_the_base_over_the_feet_wherever_they_stand(name, 
     kinematics = robot_kinematics(name)
     shift = (0.01, -0.01, -0.02)
     desired = base_over(kinematics, stance_pose, shift)
-    bench = Commanded(name, stiffness=1e9, desired=desired)  # So stiff that there is no offset.
+    # So stiff that there is no offset.
+    bench = Commanded(name, stiffness=1e9, desired=desired, stance_pose=stance_pose)
     feet = standing_feet(kinematics, stance_pose)
-    bench.system.set_foot_positions(bench.context, feet)
+    bench.simulator.Initialize()
+    # The feet of the first state are kept.
+    standing = kinematics.standing_positions()
+    bench.fix(plant_state=np.append(standing, np.zeros(kinematics.num_velocities)))
     bench.simulator.Initialize()
     position, _ = bench.command()
     X_WB = RigidTransform(RotationMatrix.MakeZRotation(stance_pose[2]), desired)
@@ -65,12 +70,14 @@ def test_the_set_point_carries_the_base_over_the_feet_wherever_they_stand(name, 
     np.testing.assert_allclose(reached, feet, atol=1.1e-4)
 
 
-@pytest.mark.parametrize(("lift_m", "yaw"), [(0.04, 0.0), (0.0, 0.1)])
-def test_connected_feet_override_the_parameter_and_a_yaw_that_of_the_feet(lift_m, yaw):
+@pytest.mark.parametrize(("lift_m", "yaw"), [(0.04, 0.0), (0.03, 0.0), (0.0, 0.1)])
+def test_given_or_connected_feet_override_those_seen_and_a_yaw_that_of_the_feet(lift_m, yaw):
     bench = Commanded("laikago", stiffness=1e9)
     kinematics = bench.kinematics
     feet = standing_feet(kinematics) + np.array([0.0, 0.0, lift_m])
-    if lift_m:
+    if lift_m == 0.03:
+        bench.system.set_foot_positions(bench.context, feet)
+    elif lift_m:
         bench.fix(desired_foot_positions=feet)
     else:
         bench.fix(desired_yaw=yaw)
@@ -117,6 +124,25 @@ def test_commands_stay_within_the_joints_limits(name, height):
     lowest, highest = kinematics.position_limits.T
     assert np.all((position >= lowest) & (position <= highest))
     assert np.all(np.abs(rate) <= kinematics.velocity_limits)
+
+
+def test_the_stiffness_is_that_of_the_robots_description_by_default():
+    kinematics = robot_kinematics("laikago")
+    default, given = (
+        Bench(InverseKinematicsController(kinematics, stiffness, period_s=PERIOD_S))
+        for stiffness in (
+            None,
+            [kinematics.robot.gains_of(n).stiffness for n in kinematics.joint_names],
+        )
+    )
+    q = kinematics.standing_positions()
+    for bench in (default, given):
+        bench.fix(plant_state=np.append(q, np.zeros(kinematics.num_velocities)))
+        bench.fix(desired_output=q[4:7])
+        bench.begin()
+    np.testing.assert_array_equal(
+        default.get("desired_joint_state"), given.get("desired_joint_state")
+    )
 
 
 @pytest.mark.parametrize("stiffness", [np.zeros(12), np.ones(3), -np.ones(12)])

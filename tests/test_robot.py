@@ -19,7 +19,7 @@ from drake_safety.robots.robot import (
     require_motors,
     servo_joints,
 )
-from drake_safety.robots.robot_model import by_pattern, load_robot_file
+from drake_safety.robots.robot_model import load_robot_file
 from legged_robots import ROBOT_NAMES, edited, robot_model, write_biped
 
 
@@ -99,7 +99,7 @@ def test_every_joint_has_a_servo_with_the_gains_of_the_yaml(name):
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
     assert sorted(a.joint().name() for a in actuators) == sorted(servo_joints(plant, robot))
     for actuator in actuators:
-        gains = by_pattern(robot.joint_gains, actuator.joint().name(), "gains", name)
+        gains = robot.gains_of(actuator.joint().name())
         assert actuator.get_controller_gains().p == gains.stiffness
         assert actuator.get_controller_gains().d == gains.damping
 

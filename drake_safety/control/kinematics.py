@@ -150,6 +150,12 @@ class RobotKinematics:
         instant.positions, instant.contacts = key, p_WC
         return p_WC
 
+    def planted_contacts(self, q: np.ndarray) -> np.ndarray:
+        """Returns :meth:`contact_positions` put down on level ground, (n_c, 3) [m]."""
+        p_WC = self.contact_positions(q).copy()
+        p_WC[:, 2] = self.foot_radii
+        return p_WC
+
     def contact_jacobian(self, q: np.ndarray) -> np.ndarray:
         """Returns the Jacobian of the contact points in the velocities, (3 n_c, n_v)."""
         self.set_positions(q)

@@ -12,7 +12,7 @@ import numpy as np
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS
 from drake_safety.robots.robot import ObservationNoise, Payload, PlantVariation
-from drake_safety.robots.robot_model import as_pattern, by_pattern
+from drake_safety.robots.robot_model import as_pattern
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 from drake_safety.robots.shift import Fault, JointShift, Shift
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -69,7 +69,7 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
         "late_command": Shift(command_delay_s=late_s),
         "hole": Shift(holes_m={foot: 0.07 * kinematics.standing_height}),
     }
-    if by_pattern(robot.joint_gains, joint, "gains", robot.name) is not None:
+    if robot.gains_of(joint) is not None:
         lasting["soft_joint"] = Shift(joints={key: JointShift(stiffness_scale=0.5)})
     names = [as_pattern(name) for name in plant.GetStateNames(add_model_instance_prefix=False)]
     n_q, period_s = kinematics.num_positions, scenario.control_period_s

@@ -119,6 +119,11 @@ class SafetyAssessment:
         """Whether x contains the features, as in the sharpened mode."""
         return self.settings.uses_features
 
+    @property
+    def feature_names(self) -> list[str]:
+        """Names of the features that the training episodes have, in their order, (n_f,)."""
+        return self.info_.feature_names
+
     def fit(
         self,
         episodes: Episodes,

@@ -23,7 +23,7 @@ from pydrake.multibody.tree import BodyIndex
 from drake_safety.extras import require_extra
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot import PAYLOAD_RADIUS_M, PlantVariation, servo_joints
-from drake_safety.robots.robot_model import RobotModel, by_pattern
+from drake_safety.robots.robot_model import RobotModel
 
 if TYPE_CHECKING:
     import mujoco
@@ -125,7 +125,7 @@ def _add_actuators(
         is_limited = np.isfinite(limits[name])
         joint.actfrclimited = is_limited
         joint.actfrcrange = [-limits[name], limits[name]] if is_limited else [0.0, 0.0]
-        gains = by_pattern(robot.joint_gains, name, "gains", robot.name)
+        gains = robot.gains_of(name)
         if not servos:
             add("torque", name, 1.0, [0.0, 0.0, 0.0], row)
         elif gains is not None:

@@ -297,7 +297,7 @@ def add_robot(
         shift = by_pattern(shifts.joints, name, "shift", robot.name) or JointShift()
         if shift.effort_scale != 1.0:
             actuator.set_effort_limit(shift.effort_scale * actuator.effort_limit())
-        gains = by_pattern(robot.joint_gains, name, "gains", robot.name)
+        gains = robot.gains_of(name)
         if gains is not None and servos:
             p, d = shift.stiffness_scale * gains.stiffness, shift.stiffness_scale * gains.damping
             actuator.set_controller_gains(PdControllerGains(p=p, d=shift.damping_scale * d))

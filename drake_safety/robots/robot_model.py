@@ -173,6 +173,14 @@ class RobotModel:
         if self.collision == "model_file" and self.shapes:
             raise ValueError(f"shapes {list(self.shapes)} need collision: stated")
 
+    def gains_of(self, joint_name: str) -> JointGains | None:
+        """Returns a joint's servo gains, by the pattern that it matches; None without one.
+
+        Raises:
+            ValueError: Several patterns match.
+        """
+        return by_pattern(self.joint_gains, joint_name, "gains", self.name)
+
     def limbs(self) -> list[Foot | ReachingFrame]:
         """Returns all feet and reaching frames."""
         return [*self.feet.values(), *self.reaching_frames.values()]

@@ -39,9 +39,7 @@ class EpisodeStart:
         """Foot positions, (n_c, 3) [m]."""
         if self.foot_positions is not None:
             return self.foot_positions
-        p_WC = kinematics.contact_positions(self.q).copy()
-        p_WC[:, 2] = kinematics.foot_radii
-        return p_WC
+        return kinematics.planted_contacts(self.q)
 
     def stance_pose(self, kinematics: RobotKinematics) -> np.ndarray:
         """Pose of the plan's frame, [x, y, yaw] in the world (3,) [m, rad]."""

@@ -9,10 +9,9 @@ import numpy as np
 from pydantic import Field
 from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import ConstantVectorSource, MatrixGain, Multiplexer
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
+from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.files.schema import Positive, schema
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
@@ -25,7 +24,7 @@ from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.observers import Observers, add_faults, combined
 from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.systems.gravity_features import GravityFeatures
+from drake_safety.systems.assessor_inputs import AssessorInputs
 from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet
@@ -135,8 +134,8 @@ class LeggedLoop(PlannedLoop):
         faults = (self._plant_variation.shift or Shift()).sensor_faults
         self._assessor_observer = self._observers.add("assessor_observer", seen_noise, faults)
         self._true_observer = self._observers.add("true_observer", ObservationNoise())
-        self.state_names = self._assessor_observer.state_names
-        self.output_names = self._assessor_observer.output_names
+        self.output_names = self._observer.output_names
+        self._assessor_options = {key: options[key] for key in options if key != "hand"}
         return self._observer.GetOutputPort("measured_plant_state")
 
     def _as_received(
@@ -162,60 +161,45 @@ class LeggedLoop(PlannedLoop):
         self,
         builder: DiagramBuilder,
         safe_set: LeggedSafeSet,
-        *features: tuple[OutputPort, list[str]],
-        outlook: OutputPort | None = None,
+        *,
+        outlook: OutputPort,
+        command: OutputPort | None = None,
+        has_gravity: bool = False,
+        memory: tuple[OutputPort, list[str]] | None = None,
     ) -> None:
-        """Adds monitor and features: the safe set's, and others with their names."""
+        """Adds the monitor of the true state, and the assessor's inputs.
+
+        With ``command``, desired joint states (2 n_j,), features are the servos' loads; ``memory``
+        is a port with the names of its entries.
+        """
         self.fall_name = safe_set.fall_name
         self.watched_features = safe_set.watched_features
         self.rate_features = safe_set.rate_features
-        self._add_safe_set(
-            builder,
-            safe_set,
-            (self.kinematics.num_positions, self.kinematics.num_velocities),
-            plant_state=self._physics.state,
-            seen_state=self._assessor_observer.GetOutputPort("measured_plant_state"),
-            outlook=outlook,
+        sizes = self.kinematics.num_positions, self.kinematics.num_velocities
+        self._add_monitor(builder, safe_set, sizes, self._physics.state)
+        inputs = builder.AddNamedSystem(
+            "assessor_inputs",
+            AssessorInputs(
+                self.kinematics,
+                safe_set,
+                num_outlook=self._num_outlook,
+                gravity=self.plant.gravity_field().gravity_vector() if has_gravity else None,
+                servo_loads=command is not None,
+                memory=memory[1] if memory else (),
+                **self._assessor_options,
+            ),
         )
-        parts = [(self._features, self.feature_names), *features]
-        joined = builder.AddNamedSystem("features", Multiplexer([p.size() for p, _ in parts]))
-        for i, (port, _) in enumerate(parts):
-            builder.Connect(port, joined.get_input_port(i))
-        self._features = joined.get_output_port(0)
-        self.feature_names = [name for _, names in parts for name in names]
-
-    def _add_gravity(self, builder: DiagramBuilder) -> tuple[OutputPort, list[str]]:
-        """Adds gravity in the plane of the feet; returns the port and the names of its entries."""
-        system = builder.AddNamedSystem(
-            "gravity_features", GravityFeatures(self.kinematics, mirror=self._observers.mirror)
-        )
-        gravity = builder.AddNamedSystem(
-            "gravity", ConstantVectorSource(self.plant.gravity_field().gravity_vector())
-        )
-        builder.Connect(gravity.get_output_port(), system.GetInputPort("gravity"))
-        measured = self._assessor_observer.GetOutputPort("measured_plant_state")
-        builder.Connect(measured, system.GetInputPort("plant_state"))
-        return system.GetOutputPort("features"), system.feature_names
-
-    def _add_servo_load(
-        self, builder: DiagramBuilder, command: OutputPort
-    ) -> tuple[OutputPort, list[str]]:
-        """Adds commanded minus measured joint positions, to which loads are proportional."""
-        names = self.kinematics.joint_names
-        measured = self._assessor_observer.GetOutputPort("measured_plant_state")
-        joints = np.eye(len(names))
-        gain = np.zeros((len(names), command.size() + measured.size()))
-        gain[:, : len(names)] = joints
-        first = command.size() + NUM_BASE_POSITIONS
-        gain[:, first : first + len(names)] = -joints
-        both = builder.AddNamedSystem(
-            "command_and_state", Multiplexer([command.size(), measured.size()])
-        )
-        difference = builder.AddNamedSystem("servo_load", MatrixGain(gain))
-        builder.Connect(command, both.get_input_port(0))
-        builder.Connect(measured, both.get_input_port(1))
-        builder.Connect(both.get_output_port(0), difference.get_input_port())
-        return difference.get_output_port(), [f"servo_load_{name}" for name in names]
+        given = {
+            "plant_state": self._assessor_observer.GetOutputPort("measured_plant_state"),
+            "desired_outlook": outlook,
+            "desired_joint_state": command,
+            "controller_memory": memory and memory[0],
+        }
+        for name, port in given.items():
+            if port is not None:
+                builder.Connect(port, inputs.GetInputPort(name))
+        self._seen = {name: inputs.GetOutputPort(name) for name in ("state", "features", "margins")}
+        self.state_names, self.feature_names = inputs.state_names, inputs.feature_names
 
     def _add_push_source(self, builder: DiagramBuilder) -> None:
         """Adds the source of a push on the robot, which :meth:`set_push` sets."""
@@ -246,7 +230,7 @@ class LeggedLoop(PlannedLoop):
     ) -> SafetyAssessor | None:
         """Exports ports, and those of the robot; see :meth:`PlannedLoop.export`."""
         of_robot = {
-            "state": self._assessor_observer.GetOutputPort("state"),
+            "state": self._seen["state"],
             "true_state": self._true_observer.GetOutputPort("state"),
             "output": self._observer.GetOutputPort("output"),
         }

@@ -12,7 +12,6 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import RandomSource
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.control.mirror import Mirror
 from drake_safety.robots.robot import ObservationNoise
 from drake_safety.robots.shift import Fault
 from drake_safety.systems.sensor_faults import SensorFaults
@@ -35,7 +34,6 @@ class Observers:
         self._plant_state = plant_state
         self._period_s = period_s
         self._options = options
-        self.mirror: Mirror | None = options.get("mirror")
         self._observers: dict[tuple[float, float], StateObserver] = {}
         self._sources: list[RandomSource] = []
         self._faults: list[SensorFaults] = []

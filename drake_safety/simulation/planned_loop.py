@@ -71,30 +71,34 @@ class PlannedLoop(ClosedLoop):
         builder: DiagramBuilder,
         safe_set: FeaturedSafeSet,
         sizes: tuple[int, int],
-        *,
         plant_state: OutputPort,
-        seen_state: OutputPort | None = None,
-        outlook: OutputPort | None = None,
     ) -> None:
-        """Adds monitor and features; the latter see the state and outlook that are given."""
-        self.plant_state_sizes = sizes
-        self._plant_state = plant_state
-        self._monitor = builder.AddNamedSystem("safety_monitor", SafetyMonitor(safe_set, *sizes))
-        builder.Connect(plant_state, self._monitor.GetInputPort("plant_state"))
-        self._seen_margins = self._monitor.GetOutputPort("margins")
-        if seen_state is not None and self.assessment is not None:
-            seen = builder.AddNamedSystem("seen_margins", SafetyMonitor(safe_set, *sizes))
-            builder.Connect(seen_state, seen.GetInputPort("plant_state"))
-            self._seen_margins = seen.GetOutputPort("margins")
+        """Adds monitor and features of a state that is measured exactly."""
+        self._add_monitor(builder, safe_set, sizes, plant_state)
         features = builder.AddNamedSystem(
             "plan_features", PlanFeatures(safe_set, *sizes, horizon=self._num_outlook)
         )
-        builder.Connect(seen_state or plant_state, features.GetInputPort("plant_state"))
+        builder.Connect(plant_state, features.GetInputPort("plant_state"))
         # The features cover the whole plan: safety depends on its end, beyond the H steps.
-        outlook = outlook or self._planner.GetOutputPort("desired_outlook")
+        outlook = self._planner.GetOutputPort("desired_outlook")
         builder.Connect(outlook, features.GetInputPort("desired_preview"))
-        self._features = features.GetOutputPort("features")
+        self._seen = {
+            "features": features.GetOutputPort("features"),
+            "margins": self._monitor.GetOutputPort("margins"),
+        }
         self.feature_names = features.feature_names
+
+    def _add_monitor(
+        self,
+        builder: DiagramBuilder,
+        safe_set: FeaturedSafeSet,
+        sizes: tuple[int, int],
+        plant_state: OutputPort,
+    ) -> None:
+        """Adds the monitor of the true state."""
+        self.plant_state_sizes, self._plant_state = sizes, plant_state
+        self._monitor = builder.AddNamedSystem("safety_monitor", SafetyMonitor(safe_set, *sizes))
+        builder.Connect(plant_state, self._monitor.GetInputPort("plant_state"))
         self.constraint_names = self._monitor.constraint_names
 
     def export(
@@ -105,13 +109,13 @@ class PlannedLoop(ClosedLoop):
             "true_state": ports["state"],
             "desired_output": self._planner.GetOutputPort("desired_output"),
             "desired_preview": self._planner.GetOutputPort("desired_preview"),
-            "features": self._features,
+            "features": self._seen["features"],
             "margins": self._monitor.GetOutputPort("margins"),
             "safe": self._monitor.GetOutputPort("safe"),
             "plant_state": self._plant_state,
             **ports,
         }
-        return super().export(builder, ports, margins=self._seen_margins, **options)
+        return super().export(builder, ports, margins=self._seen["margins"], **options)
 
     @cached_property
     def _default(self) -> Context:

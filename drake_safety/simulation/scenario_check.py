@@ -238,11 +238,7 @@ def _motors(kinematics: RobotKinematics) -> _Check:
             _EFFORT_REMEDY,
         )
     if robot.joint_gains:
-        loose = [
-            name
-            for name in kinematics.joint_names
-            if by_pattern(robot.joint_gains, name, "gains", robot.name) is None
-        ]
+        loose = [name for name in kinematics.joint_names if robot.gains_of(name) is None]
         if loose:
             yield failed(
                 "servo gains", f"joints {loose} have none", "add them under 'joint_gains' [N·m/rad]"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_safety.control.inverse_kinematics import solve_from
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
@@ -35,24 +35,30 @@ class InverseKinematicsController(LeafSystem):
     over the feet on the ground; it removes the sag of a servo of finite stiffness. Commands
     respect the joint limits, and set points move at most at 0.7 of the joints' speed limits.
 
+    Without ``desired_foot_positions`` the feet are those of the first state that the controller
+    sees when a simulation is initialised, put on level ground.
+
     Args:
-        stiffness: Servo stiffness of every joint, (n_j,) [N·m/rad].
+        stiffness: Servo stiffness of every joint, (n_j,) [N·m/rad]; robot.yaml's by default.
         period_s: Control period [s].
         offset_s: Time of the first update, after those of its inputs [s].
 
     Raises:
-        ValueError: A stiffness is not positive.
+        ValueError: A joint has no stiffness, or one that is not positive.
     """
 
     def __init__(
         self,
         kinematics: RobotKinematics,
-        stiffness: np.ndarray,
+        stiffness: np.ndarray | None = None,
         *,
         period_s: float,
         offset_s: float = 0.0,
     ):
         super().__init__()
+        if stiffness is None:
+            gains = map(kinematics.robot.gains_of, kinematics.joint_names)
+            stiffness = np.array([0.0 if one is None else one.stiffness for one in gains])
         stiffness = np.asarray(stiffness, dtype=float)
         if stiffness.shape != (kinematics.num_joints,) or not np.all(stiffness > 0):
             raise ValueError(
@@ -75,8 +81,7 @@ class InverseKinematicsController(LeafSystem):
             "desired_foot_positions", 3 * kinematics.num_contacts
         )
         self._yaw_port = self.DeclareVectorInputPort("desired_yaw", 1)
-        standing = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
-        self._feet_index = self.DeclareNumericParameter(BasicVector(standing.ravel()))
+        self._feet = self.DeclareDiscreteState(np.full(3 * kinematics.num_contacts, np.nan))
         self._set_point = self.DeclareDiscreteState(n_j)  # Of the joints, without the offset.
         self._command = self.DeclareDiscreteState(2 * n_j)  # Positions with it, and rates.
         self.DeclareInitializationDiscreteUpdateEvent(self._initialize)
@@ -84,20 +89,21 @@ class InverseKinematicsController(LeafSystem):
         self.DeclareStateOutputPort("desired_joint_state", self._command)
 
     def set_foot_positions(self, context: Context, p_WC: np.ndarray) -> None:
-        """Sets the feet, (n_c, 3) [m], used while ``desired_foot_positions`` is not connected."""
-        context.get_mutable_numeric_parameter(self._feet_index).SetFromVector(np.ravel(p_WC))
+        """Sets the feet, (n_c, 3) [m], in place of those of the first state."""
+        context.SetDiscreteState(self._feet, np.ravel(p_WC))
 
     def foot_positions(self, context: Context) -> np.ndarray:
         """The present set points of the feet: centres of the contact spheres, (n_c, 3) [m]."""
         if self._feet_port.HasValue(context):
             feet = self._feet_port.Eval(context)
         else:
-            feet = context.get_numeric_parameter(self._feet_index).get_value()
+            feet = context.get_discrete_state(self._feet).value()
         return feet.reshape(-1, 3)
 
-    def _solve(self, context: Context, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _solve(
+        self, context: Context, p_WC: np.ndarray, guess: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         kinematics = self._kinematics
-        p_WC = self.foot_positions(context)
         if self._yaw_port.HasValue(context):
             half_yaw = 0.5 * self._yaw_port.Eval(context)[0]
         else:
@@ -126,9 +132,12 @@ class InverseKinematicsController(LeafSystem):
         self._update(context, context.get_mutable_discrete_state())
 
     def _initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
-        plant_state = self._state_port.Eval(context)
-        guess = plant_state[NUM_BASE_POSITIONS : self._kinematics.num_positions]
-        joints, torques = self._solve(context, guess)
+        q = self._state_port.Eval(context)[: self._kinematics.num_positions]
+        p_WC = self.foot_positions(context)
+        if math.isnan(p_WC[0, 0]):
+            p_WC = self._kinematics.planted_contacts(q)
+            discrete_state.set_value(self._feet, p_WC.ravel())
+        joints, torques = self._solve(context, p_WC, q[NUM_BASE_POSITIONS:])
         command = np.concatenate([self._add_offset(joints, torques), np.zeros_like(joints)])
         discrete_state.set_value(self._set_point, joints)
         discrete_state.set_value(self._command, command)
@@ -137,7 +146,8 @@ class InverseKinematicsController(LeafSystem):
         previous = context.get_discrete_state(self._set_point).get_value()
         last_rate = context.get_discrete_state(self._command).get_value()[len(previous) :]
         # Extrapolation of smooth set points: most updates then need no Newton step.
-        desired, torques = self._solve(context, previous + self._period_s * last_rate)
+        guess = previous + self._period_s * last_rate
+        desired, torques = self._solve(context, self.foot_positions(context), guess)
         rate = (desired - previous) / self._period_s
         rate = np.minimum(np.maximum(rate, self._lowest_rate), self._rate_limit)
         joints = previous + self._period_s * rate

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance, yaw_of
 from drake_safety.control.observation import quaternion_of
@@ -44,18 +44,19 @@ class RecoveryStepPlanner(LeafSystem):
         - stance_pose
         - recovery_done
 
-    While idle, the feet keep the positions of :meth:`set_stance`. When ``recovery_active`` rises,
-    the group of feet whose partners' line is nearest to the capture point swings to Raibert
-    footholds, which follow the base at every update; the base set point follows the measured base
-    at the standing height, so that the stance legs carry the weight without pulling the base back.
-    The heading of the initial stance is held: the stance legs twist the base towards it and damp
-    its yaw rate, and the footholds follow the base. With a ``max_twist_rad`` of 0 the base follows
-    the yaw of its feet instead. Groups alternate until the capture point is
-    well inside the support polygon and the heading error is small. The base then comes to rest
-    like an inverted pendulum over its capture point, and moves to the nominal planner's set point
-    in the stance frame of the new footholds; if the capture point comes near the polygon's edge
-    meanwhile, the robot steps again. After that ``recovery_done`` is 1 until ``recovery_active``
-    has fallen.
+    While idle, the feet keep the positions of the first state that the planner sees when a
+    simulation is initialised, put on level ground, or those of :meth:`set_stance`. When
+    ``recovery_active`` rises, the group of feet whose partners' line is nearest to the capture
+    point swings to Raibert footholds, which follow the base at every update; the base set point
+    follows the measured base at the standing height, so that the stance legs carry the weight
+    without pulling the base back. The heading of the initial stance is held: the stance legs twist
+    the base towards it and damp its yaw rate, and the footholds follow the base. With a
+    ``max_twist_rad`` of 0 the base follows the yaw of its feet instead. Groups alternate until the
+    capture point is well inside the support polygon and the heading error is small. The base then
+    comes to rest like an inverted pendulum over its capture point, and moves to the nominal
+    planner's set point in the stance frame of the new footholds; if the capture point comes near
+    the polygon's edge meanwhile, the robot steps again. After that ``recovery_done`` is 1 until
+    ``recovery_active`` has fallen.
 
     Preview and outlook are the base set point, held constant, in the stance frame of the present
     set points. No output has direct feedthrough.
@@ -96,11 +97,14 @@ class RecoveryStepPlanner(LeafSystem):
         self._start_s = self.DeclareDiscreteState(1)  # Of the swing, or of the return.
         self._heading = self.DeclareDiscreteState(1)  # Desired.
         self._return_start = self.DeclareDiscreteState(6)  # Position and velocity of the base.
-        self._planted = self.DeclareDiscreteState(n_p)  # Last contact positions.
+        unset = np.full(n_p, np.nan)
+        self._planted = self.DeclareDiscreteState(unset)  # Last contact positions.
         self._set_point = self.DeclareDiscreteState(3)
-        self._feet = self.DeclareDiscreteState(n_p)  # Set points for the controller.
+        self._feet = self.DeclareDiscreteState(unset)  # Set points for the controller.
         self._yaw = self.DeclareDiscreteState(1)
         self._stance = self.DeclareDiscreteState(3)  # x, y, yaw
+        # Before the discrete updates, such as that of a controller of these feet.
+        self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
         self.DeclareStateOutputPort("desired_output", self._set_point)
         self.DeclareStateOutputPort("desired_foot_positions", self._feet)
@@ -125,11 +129,25 @@ class RecoveryStepPlanner(LeafSystem):
             p_WC: Centres of the contact spheres, (n_c, 3) [m].
             stance_pose: [x, y, yaw] of the stance frame (3,) [m, rad].
         """
-        context.SetDiscreteState(self._mode, [_IDLE])
-        context.SetDiscreteState(self._stance, stance_pose)
-        context.SetDiscreteState(self._yaw, stance_pose[2:])
-        context.SetDiscreteState(self._feet, np.ravel(p_WC))
-        context.SetDiscreteState(self._planted, np.ravel(p_WC))
+        self._set_stance(context.get_mutable_discrete_state(), p_WC, stance_pose)
+
+    def _set_stance(
+        self, discrete_state: DiscreteValues, p_WC: np.ndarray, stance_pose: np.ndarray
+    ) -> None:
+        discrete_state.set_value(self._mode, [_IDLE])
+        discrete_state.set_value(self._stance, stance_pose)
+        discrete_state.set_value(self._yaw, stance_pose[2:])
+        discrete_state.set_value(self._feet, np.ravel(p_WC))
+        discrete_state.set_value(self._planted, np.ravel(p_WC))
+
+    def _initialize(self, context: Context, state: State) -> None:
+        discrete_state = state.get_mutable_discrete_state()
+        if not np.isnan(discrete_state.get_value(self._planted)).any():
+            return
+        q = self._state_port.Eval(context)[: self._kinematics.num_positions]
+        p_WC = self._kinematics.planted_contacts(q)
+        stance = fit_stance(p_WC, self._kinematics.nominal_contacts)
+        self._set_stance(discrete_state, p_WC, stance)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         mode = discrete_state.get_value(self._mode)[0]

@@ -35,7 +35,8 @@ class RecoverySwitch(Diagram):
 
     Connect ``stance_pose`` to the TrajectoryPlanner, so that the plan continues over the new
     footholds, and ``desired_foot_positions`` and ``desired_yaw`` to the controller. Connect
-    ``desired_preview`` to the assessor, and ``desired_outlook`` to the features.
+    ``desired_preview`` to the assessor, and ``desired_outlook`` to the features. It stands on the
+    feet of the first state that it sees when a simulation is initialised.
 
     Args:
         threshold: Γ_thre; see :class:`~drake_safety.systems.recovery_trigger.RecoveryTrigger`.

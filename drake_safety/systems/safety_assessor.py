@@ -124,7 +124,9 @@ def AddSafetyAssessor(
         state: Port of the state, as in the training episodes.
         desired_preview: Port of the desired preview, as in the training episodes.
         margins: Port of the measured state's margins; None if nothing checks them.
-        features: Port of the features; not needed if the assessment reads none.
+        features: Port of the features, in the order of the assessment's ``feature_names``, such as
+            that of :class:`~drake_safety.systems.assessor_inputs.AssessorInputs`; not needed if the
+            assessment reads none.
         hold: Port that is 1 while the monitor waits, as during recovery.
 
     Raises:
@@ -154,9 +156,19 @@ def AddSafetyAssessor(
         if port.size() != (size := assessor.GetInputPort(name).size()):
             raise ValueError(
                 f"AddSafetyAssessor: port '{port.get_name()}' for {name} has size {port.size()}; "
-                f"the assessment was fitted with {size}"
+                f"the assessment was fitted with {size}{_lacking(name, port, assessment)}"
             )
     builder.AddNamedSystem("safety_assessor", assessor)
     for name, port in ports.items():
         builder.Connect(port, assessor.GetInputPort(name))
     return assessor
+
+
+def _lacking(name: str, port: OutputPort, assessment: SafetyAssessment) -> str:
+    """Says which features a system that lists the names of its own lacks."""
+    own = getattr(port.get_system(), "feature_names", None)
+    if name != "features" or own is None:
+        return ""
+    return (
+        f", of which it lacks {[one for one in assessment.info_.feature_names if one not in own]}"
+    )
