@@ -10,7 +10,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, LinearSystem
 
-import quadrotor_file
+import quadrotor
 from cart_episodes import assert_identical
 from drake_safety import record_episodes
 from drake_safety.learning.segments import DIVERGED, DivergenceError, EpisodeError
@@ -18,6 +18,8 @@ from drake_safety.simulation.dataset import completed, load_episodes
 from gliding_task import declare_outputs
 
 STEP_S = 0.1
+# The example without what is said and drawn of the result.
+QUADROTOR = Path(quadrotor.__file__).read_text().partition("\n\n\ndef main(")[0]
 
 
 class Glider(LeafSystem):
@@ -280,18 +282,18 @@ def test_a_drake_plant_that_diverges_is_no_mistake():
 
 @pytest.mark.train
 def test_from_an_empty_file_to_gamma_in_a_diagram_of_pydrakes_own():
-    assert len(Path(quadrotor_file.__file__).read_text().splitlines()) <= 60
-    assessment = quadrotor_file.learn(
+    assert len(QUADROTOR.splitlines()) <= 60
+    assessment = quadrotor.learn(
         200, num_workers=1, epochs=10, ensemble_size=1, hidden_sizes=[16], perplexity=10
     )
-    diagram = quadrotor_file.make_diagram(assessment)
+    diagram = quadrotor.make_diagram(assessment)
     gamma = []
     for share in (0.0, 1.0):
         simulator = Simulator(diagram)
         context = simulator.get_mutable_context()
-        quadrotor = diagram.GetSubsystemByName("quadrotor")
-        start = np.append(quadrotor_file.GOAL, np.zeros(9)) + share * quadrotor_file.START
-        quadrotor.GetMyMutableContextFromRoot(context).SetContinuousState(start)
+        plant = diagram.GetSubsystemByName("quadrotor")
+        start = np.append(quadrotor.GOAL, np.zeros(9)) + share * quadrotor.START
+        plant.GetMyMutableContextFromRoot(context).SetContinuousState(start)
         simulator.Initialize()
         gamma.append(diagram.GetOutputPort("gamma").Eval(context)[0])
     assert gamma[0] > 0.6 > gamma[1]
@@ -301,8 +303,7 @@ def test_from_an_empty_file_to_gamma_in_a_diagram_of_pydrakes_own():
 def test_what_a_script_or_notebook_defines_reaches_the_workers(tmp_path):
     script = tmp_path / "mine.py"
     script.write_text(
-        Path(quadrotor_file.__file__).read_text()
-        + "\n\ntimes = {'duration_s': 2.0, 'step_s': STEP_S}\n"
+        QUADROTOR + "\n\ntimes = {'duration_s': 2.0, 'step_s': STEP_S}\n"
         "sets = [record_episodes(make_diagram, 8, reset=reset, num_workers=n, **times)\n"
         "        for n in (1, 2)]\n"
         "for one, other in zip(*sets, strict=True):\n"

@@ -92,7 +92,7 @@ class TrajectoryPlanner(LeafSystem):
         - desired_outlook
 
     The plan is a trajectory of 3-D positions in the stance frame S, and a parameter of the
-    Context (:meth:`set_plan`). ``desired_output`` and its rate are in the world;
+    Context (:meth:`set_plan`); without one, evaluation is an error. ``desired_output`` and its rate are in the world;
     ``desired_preview`` is z*_{k:k+H}, row-major in time, in S, so that it does not depend on the
     robot's position. ``desired_outlook`` has M samples at equal intervals from now to ``outlook_s``
     ahead, in S. Before its start and after its end the plan is constant. The stance pose
@@ -104,10 +104,11 @@ class TrajectoryPlanner(LeafSystem):
         num_outputs: n_z, a multiple of three.
         outlook_s: Duration of the outlook [s]; that of the preview by default.
         num_outlook: M, samples of the outlook.
+        plan: The plan of a default Context, (n_z, 1) [m].
 
     Raises:
         ValueError: ``num_outputs`` is not a multiple of three, or horizon, step or number of
-            samples of the outlook is too small.
+            samples of the outlook is too small, or the plan's size is not n_z.
     """
 
     def __init__(
@@ -118,6 +119,7 @@ class TrajectoryPlanner(LeafSystem):
         num_outputs: int = 3,
         outlook_s: float | None = None,
         num_outlook: int = 5,
+        plan: PiecewisePolynomial | None = None,
     ):
         super().__init__()
         if num_outputs % 3 or num_outputs <= 0:
@@ -130,8 +132,10 @@ class TrajectoryPlanner(LeafSystem):
             raise ValueError(f"planner: num_outlook must be at least 2; got {num_outlook}")
         self._num_outputs = num_outputs
         outlook_s = step_s * (horizon - 1) if outlook_s is None else outlook_s
-        hold = PiecewisePolynomial(np.zeros((num_outputs, 1)))
-        self._plan_index = self.DeclareAbstractParameter(Value((hold, hold)))
+        no_plan = None, None
+        self._plan_index = self.DeclareAbstractParameter(
+            Value(no_plan if plan is None else self._with_rate(plan))
+        )
         self._stance_index = self.DeclareNumericParameter(BasicVector(np.zeros(3)))
         self._stance_port = self.DeclareVectorInputPort("stance_pose", 3)
         self.DeclareVectorOutputPort("desired_output", BasicVector(num_outputs), self._calc_output)
@@ -163,25 +167,38 @@ class TrajectoryPlanner(LeafSystem):
         Raises:
             ValueError: The plan's size is not n_z.
         """
-        if (plan.rows(), plan.cols()) != (self._num_outputs, 1):
-            raise ValueError(
-                f"planner: the plan must have {self._num_outputs} rows and one column; got "
-                f"{plan.rows()} x {plan.cols()}"
-            )
         value = context.get_mutable_abstract_parameter(self._plan_index)
-        value.set_value((plan, plan.MakeDerivative()))
+        value.set_value(self._with_rate(plan))
         if stance_pose is not None:
             context.get_mutable_numeric_parameter(self._stance_index).SetFromVector(stance_pose)
 
     def get_plan(self, context: Context) -> PiecewisePolynomial:
         """Returns the plan in a Context, in the stance frame."""
-        return context.get_abstract_parameter(self._plan_index).get_value()[0]
+        return self._plan_and_rate(context)[0]
 
     def plan_from_now(self, context: Context) -> PiecewisePolynomial:
         """Returns the plan in a Context over the time since now, in the stance frame."""
         plan = copy.copy(self.get_plan(context))
         plan.shiftRight(-context.get_time())
         return plan
+
+    def _with_rate(
+        self, plan: PiecewisePolynomial
+    ) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
+        if (plan.rows(), plan.cols()) != (self._num_outputs, 1):
+            raise ValueError(
+                f"planner: the plan must have {self._num_outputs} rows and one column; got "
+                f"{plan.rows()} x {plan.cols()}"
+            )
+        return plan, plan.MakeDerivative()
+
+    def _plan_and_rate(self, context: Context) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
+        plan, rate = context.get_abstract_parameter(self._plan_index).get_value()
+        if plan is None:
+            raise ValueError(
+                "planner: it has no plan; give one by plan= or set_plan(context, plan)"
+            )
+        return plan, rate
 
     def _stance_pose(self, context: Context) -> np.ndarray:
         if self._stance_port.HasValue(context):
@@ -193,7 +210,7 @@ class TrajectoryPlanner(LeafSystem):
         output.SetFromVector(to_world(self._stance_pose(context), z.reshape(-1, 3)).ravel())
 
     def _calc_rate(self, context: Context, output: BasicVector) -> None:
-        plan, derivative = context.get_abstract_parameter(self._plan_index).get_value()
+        plan, derivative = self._plan_and_rate(context)
         time = context.get_time()
         if plan.start_time() <= time <= plan.end_time():
             rate = derivative.value(time).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""What a user writes: from an empty file to Γ in a diagram of pydrake's own parts."""
+"""From an empty file to Γ in a diagram of pydrake's own parts: a quadrotor and its LQR."""
 
 import numpy as np
 from pydrake.examples import QuadrotorPlant, StabilizingLQRController
@@ -48,8 +48,32 @@ def reset(diagram, context, rng):
     quadrotor.GetMyMutableContextFromRoot(context).SetContinuousState(start)
 
 
+def fly(num_episodes, **options):
+    options |= {"duration_s": 2.0, "step_s": STEP_S, "constraint_names": ["height", "tilt"]}
+    return record_episodes(make_diagram, num_episodes, reset=reset, **options)
+
+
 def learn(num_episodes=1000, *, num_workers=None, **parameters):
-    options = {"constraint_names": ["height", "tilt"], "num_workers": num_workers}
-    times = {"duration_s": 2.0, "step_s": STEP_S}
-    episodes = record_episodes(make_diagram, num_episodes, reset=reset, **times, **options)
+    episodes = fly(num_episodes, num_workers=num_workers)
     return SafetyAssessment(AssessmentParameters(horizon=HORIZON, **parameters)).fit(episodes)
+
+
+def main(num_episodes=1000, **options):
+    from drake_safety.evaluation.figure_style import save
+    from drake_safety.evaluation.truth_figure import truth_figure
+
+    assessment = learn(num_episodes, **options)
+    fresh = fly(num_episodes // 4, seed=1, num_workers=options.get("num_workers"))
+    starts = [(one.state[0], one.desired_preview[0]) for one in fresh]
+    gamma = np.array([assessment.predict_one(*start).probability for start in starts])
+    is_safe = np.array([one.is_safe for one in fresh])
+    print(f"{assessment}; of {len(fresh)} fresh flights {is_safe.sum()} stay safe.")
+    for what, rows in ("stay safe", is_safe), ("do not", ~is_safe):
+        print(f"Γ before those that {what}: {gamma[rows].mean():.2f} in the mean")
+    labels = "vertical speed [m/s]", "height [m]"
+    save(truth_figure(assessment, fresh, "state_8", "state_2", labels=labels), "quadrotor")
+    print("quadrotor.png: Γ of each start over height and vertical speed, beside what came of it")
+
+
+if __name__ == "__main__":
+    main()
