@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 from pydrake.systems.framework import PortDataType
+from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety import load_assessment
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.diagrams.pendulum import PendulumController, PendulumObserver, PendulumParameters
 from drake_safety.robots.shift import Fault
+from drake_safety.systems.assessor_inputs import AssessorInputs
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
 from drake_safety.systems.change_monitor import ChangeMonitor
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
@@ -51,7 +53,9 @@ CASES = {
         "safety_probability 1, belief? 3, recovery_done? 1 -> recovery_active 1, port_selector -",
     ),
     "TrajectoryPlanner": (
-        lambda: TrajectoryPlanner(horizon=7, step_s=0.1, num_outputs=6),
+        lambda: TrajectoryPlanner(
+            horizon=7, step_s=0.1, num_outputs=6, plan=PiecewisePolynomial(np.zeros((6, 1)))
+        ),
         "stance_pose? 3 -> desired_output 6 < *, desired_output_rate 6 < *, "
         "desired_preview 42, desired_outlook 30",
     ),
@@ -131,6 +135,14 @@ def add_robot(name):
             f"{x} -> safe 1 < *, margins {len(safe_set.names)} < *",
         ),
         (lambda: GravityFeatures(k), f"{x}, gravity 3 -> features 2 < *"),
+        (
+            lambda: AssessorInputs(
+                k, safe_set, gravity=[0, 0, -9.81], servo_loads=True, memory=["m"], num_outlook=2
+            ),
+            f"{x}, desired_outlook 6, desired_joint_state {2 * n_j}, controller_memory 1 -> "
+            f"state {12 + 2 * n_j} < plant_state, features {len(safe_set.feature_names) + n_j + 3} "
+            f"< *, margins {len(safe_set.names)} < plant_state",
+        ),
     ):
         CASES[f"{type(make()).__name__} {name}"] = make, text
 
@@ -195,14 +207,24 @@ def test_ports_have_the_promised_names_and_sizes_and_feed_through_what_they_say(
     }
 
 
+INNER = {
+    ("RecoverySwitch", "nominal_desired_output"): "nominal",
+    ("RecoverySwitch", "nominal_desired_preview"): "nominal",
+    ("RecoverySwitch", "nominal_desired_outlook"): "nominal",
+    ("AssessorInputs", "desired_outlook"): "desired_preview",
+    ("AssessorInputs", "desired_joint_state"): "u0",
+    ("AssessorInputs", "controller_memory"): "u3",
+}
+
+
 @pytest.mark.parametrize("key", ONE_OF_EACH)
 def test_optional_ports_may_be_left_open_and_any_other_is_named(key):
     given = Given(key, Given(key).optional)
     given.at(0.0)
     given.at(0.3)
     for port in given.inputs.keys() - given.optional:
-        # Within the switch it is that of one of Drake's.
-        name = "nominal" if key.startswith("RecoverySwitch") and "nominal" in port else port
+        # Within a diagram it may be that of one of Drake's.
+        name = INNER.get((key.split()[0], port), port)
         without = Given(key, {port})
         with pytest.raises(RuntimeError, match=rf"required InputPort.*\({name}.*is not connected"):
             without.at(0.0)

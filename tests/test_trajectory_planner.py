@@ -52,6 +52,17 @@ def test_an_interpolation_takes_time(duration_s):
         interpolate(START, GOAL, duration_s)
 
 
+def test_without_a_plan_it_says_so_and_one_may_be_given_to_the_constructor():
+    options = {"horizon": 2, "step_s": 0.1}
+    planner = TrajectoryPlanner(**options)
+    for name in ("desired_output", "desired_output_rate", "desired_preview", "desired_outlook"):
+        with pytest.raises(ValueError, match="no plan; give one by plan="):
+            evaluated(planner, planner.CreateDefaultContext(), name)
+    planner = TrajectoryPlanner(**options, plan=interpolate(START, GOAL, 1.0))
+    found = evaluated(planner, planner.CreateDefaultContext(), "desired_output")
+    np.testing.assert_array_equal(found, START)
+
+
 def test_the_desired_output_is_the_plan_at_the_stance():
     plan = interpolate(START, GOAL, 1.0)
     planner, context = planner_at(0.4, plan, np.array([2.0, 1.0, math.pi / 2]))
@@ -107,8 +118,8 @@ def test_a_new_plan_keeps_the_stance_and_renews_every_output():
 
 def test_a_plan_lives_in_the_context_not_in_the_planner():
     planner, context = planner_at(0.5, ramp())
-    other = planner.CreateDefaultContext()
-    np.testing.assert_array_equal(evaluated(planner, other, "desired_output"), np.zeros(3))
+    with pytest.raises(ValueError, match="no plan"):
+        evaluated(planner, planner.CreateDefaultContext(), "desired_output")
     assert planner.get_plan(context).end_time() == 1.0
 
 

@@ -91,12 +91,12 @@ class TrajectoryPlanner(LeafSystem):
         - desired_preview
         - desired_outlook
 
-    The plan is a trajectory of 3-D positions in the stance frame S, and a parameter of the
-    Context (:meth:`set_plan`); without one, evaluation is an error. ``desired_output`` and its rate are in the world;
-    ``desired_preview`` is z*_{k:k+H}, row-major in time, in S, so that it does not depend on the
-    robot's position. ``desired_outlook`` has M samples at equal intervals from now to ``outlook_s``
-    ahead, in S. Before its start and after its end the plan is constant. The stance pose
-    [x, y, yaw] is the input if it is connected, else a parameter.
+    The plan is a trajectory of 3-D positions in the stance frame S, and a parameter of the Context
+    (:meth:`set_plan`); without one, evaluation is an error. ``desired_output`` and its rate are in
+    the world; ``desired_preview`` is z*_{k:k+H}, row-major in time, in S, so that it does not
+    depend on the robot's position. ``desired_outlook`` has M samples at equal intervals from now to
+    ``outlook_s`` ahead, in S. Before its start and after its end the plan is constant. The stance
+    pose [x, y, yaw] is the input if it is connected, else a parameter.
 
     Args:
         horizon: H, samples of the preview.
@@ -195,9 +195,7 @@ class TrajectoryPlanner(LeafSystem):
     def _plan_and_rate(self, context: Context) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
         plan, rate = context.get_abstract_parameter(self._plan_index).get_value()
         if plan is None:
-            raise ValueError(
-                "planner: it has no plan; give one by plan= or set_plan(context, plan)"
-            )
+            raise ValueError("planner: no plan; give one by plan= or set_plan(context, plan)")
         return plan, rate
 
     def _stance_pose(self, context: Context) -> np.ndarray:
