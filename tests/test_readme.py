@@ -1,3 +1,5 @@
+import ast
+import builtins
 import os
 import re
 import shlex
@@ -12,6 +14,7 @@ import pytest
 import typer
 import yaml
 
+import quadrotor
 from drake_safety.cli import make_app
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.robots.robot_model import load_robot_file
@@ -22,7 +25,6 @@ from studies.__main__ import app as studies
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = (ROOT / "docs/command_line.md").read_text(encoding="utf-8")
-OWN_DIAGRAM = (ROOT / "docs/own_diagram.md").read_text(encoding="utf-8")
 MAKEFILE = (ROOT / "Makefile").read_text()
 CARDS = "".join(
     path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("assessments/*/README.md"))
@@ -47,13 +49,11 @@ def shell_commands(program, text=README):
 @pytest.mark.slow
 def test_the_python_of_the_readme_runs_as_one_script_and_prints_a_belief(tmp_path):
     (first,) = blocks("python")
-    # The documentation goes on with the README's assessment.
-    others = blocks("python", OWN_DIAGRAM)
     # The README's number of episodes takes minutes; it is the only thing that is changed.
     assert first.count("num_episodes=2048") == 1
     first = first.replace("num_episodes=2048", "num_episodes=56")
     script = tmp_path / "readme.py"
-    script.write_text("\n".join([first, *others]), encoding="utf-8")
+    script.write_text(first, encoding="utf-8")
     paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
     done = subprocess.run(
         [sys.executable, script],
@@ -67,6 +67,19 @@ def test_the_python_of_the_readme_runs_as_one_script_and_prints_a_belief(tmp_pat
     assert belief.shape == (3,)
     assert np.all(belief >= 0)
     assert belief.sum() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_every_name_in_the_python_of_the_readme_is_defined_in_it():
+    for block in [*blocks("python"), *blocks("py")]:
+        tree = ast.parse(block)
+        names = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
+        imported = [one.name for node in ast.walk(tree) for one in getattr(node, "names", [])]
+        known = {one.id for one in names if isinstance(one.ctx, ast.Store)}
+        known |= {"np", *imported, *dir(builtins)}
+        assert {one.id for one in names} - known == set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module == "quadrotor":
+                assert {one.name for one in node.names} <= set(dir(quadrotor))
 
 
 def test_every_command_of_the_readme_of_the_command_line_page_and_of_the_cards_parses():

@@ -1,0 +1,95 @@
+"""The composition guide: the example that it explains, its table and picture, and its parts."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+import compose
+from drake_safety import AddSafetyAssessor
+from drake_safety.control.safe_sets import BalanceSafeSet
+from drake_safety.systems.assessor_inputs import AssessorInputs
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = (ROOT / "docs/own_diagram.md").read_text(encoding="utf-8")
+GUIDE = PAGE.partition("## From single parts")[2].partition("\n## ")[0]
+PARTS = re.findall(r"### Your (\w+)\n.*?```python\n(.*?)```", GUIDE, flags=re.DOTALL)
+
+
+def connections(diagram):
+    """Pairs of `system.port`, with their size; the SceneGraph's are Drake's own matter."""
+    for (other, u), (one, y) in diagram.connection_map().items():
+        port = one.get_output_port(y)
+        ends = [f"{one.get_name()}.{port.get_name()}"]
+        ends.append(f"{other.get_name()}.{other.get_input_port(u).get_name()}")
+        if "scene_graph" not in {one.get_name(), other.get_name()}:
+            yield *ends, port.size()
+
+
+def test_the_example_is_short_and_its_robot_that_is_pushed_steps_and_stands_again():
+    file = Path(compose.__file__)
+    assert len(file.read_text(encoding="utf-8").splitlines()) <= 80
+    command = [sys.executable, str(file)]
+    env = {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8"}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, encoding="utf-8")
+    assert done.returncode == 0, done.stderr
+    found = re.findall(r"(\S+) s  Γ (\S+)  nearest limit (\S+) cm", done.stdout)
+    gamma, limit = np.array(found, dtype=float).T[1:]
+    assert gamma[0] < compose.RECOVERY.threshold
+    assert limit.min() < 0.0  # On two legs.
+    assert gamma[-1] > 0.9
+    assert limit[-1] > 5.0
+
+
+def test_the_table_of_the_guide_lists_every_connection_with_its_size():
+    rows = re.findall(r"^\| (`[\w.]+`) \| ([^|]+) \| (\d+) \|", GUIDE, flags=re.MULTILINE)
+    listed = {
+        (one.strip("`"), other, int(size))
+        for one, others, size in rows
+        for other in re.findall(r"`([\w.]+)`", others)
+    }
+    assert listed == set(connections(compose.compose()))
+
+
+def test_the_picture_of_the_guide_shows_every_connection():
+    picture = (ROOT / "docs/pictures/compose.svg").read_text(encoding="utf-8")
+    diagram = compose.compose()
+    ends = list(connections(diagram))
+    assert picture.count('class="edge"') == len(ends) + diagram.num_output_ports()
+    words = set(re.findall(r">([^<\n]+)</text>", picture))
+    assert {word for *pair, _ in ends for end in pair for word in end.split(".")} <= words
+
+
+@pytest.mark.parametrize("number", range(3), ids=[name for name, _ in PARTS])
+def test_a_part_of_ones_own_takes_the_place_of_ours(number):
+    names = {}
+    for _, lines in PARTS[: number + 1]:
+        exec(lines, names)
+    diagram = names["diagram"]
+    simulator = Simulator(diagram)
+    for time_s in (0.0, 0.5):
+        simulator.AdvanceTo(time_s)
+        values = [diagram.GetOutputPort(one) for one in ("safety_probability", "margins")]
+        gamma, margins = (port.Eval(simulator.get_context()) for port in values)
+        assert gamma[0] > 0.8
+        assert margins.min() > 0.05
+
+
+def test_the_assessors_inputs_are_what_the_assessment_reads_and_what_they_lack_is_named():
+    safe_set = BalanceSafeSet(compose.ROBOT, compose.LIMITS)
+    whole = AssessorInputs(compose.ROBOT, safe_set, gravity=[0.0, 0.0, -9.81], servo_loads=True)
+    info = compose.GAMMA.info_
+    assert whole.feature_names == compose.GAMMA.feature_names
+    assert [whole.state_names, whole.constraint_names] == [info.state_names, info.constraint_names]
+    builder = DiagramBuilder()
+    inputs = builder.AddSystem(AssessorInputs(compose.ROBOT, safe_set, servo_loads=True))
+    ports = {name: inputs.GetOutputPort(name) for name in ("state", "features", "margins")}
+    plan = builder.AddSystem(ConstantVectorSource(np.zeros(3 * info.horizon))).get_output_port()
+    with pytest.raises(ValueError, match=r"size 52; .* lacks \['gravity_x', 'gravity_y'\]"):
+        AddSafetyAssessor(builder, compose.GAMMA, desired_preview=plan, **ports)
