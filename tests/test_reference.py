@@ -1,7 +1,7 @@
 """The reference documentation: ports as the docstrings say them, and as the systems have them."""
 
 import ast
-import importlib.util
+import re
 import shlex
 import subprocess
 import sys
@@ -12,50 +12,46 @@ import pytest
 import yaml
 from packaging.specifiers import SpecifierSet
 
+import system_block
+
 ROOT = Path(__file__).resolve().parents[1]
 SYSTEMS = sorted((ROOT / "drake_safety" / "systems").glob("*.py"))
 
-
-def load(name):
-    path = ROOT / "docs" / "generator" / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-system_block = load("system_block")
 DOCSTRING = """Adds two numbers.
 
 .. pydrake_system::
 
     name: Adder
     input_ports:
-    - first
-    - second (optional)
+    - state: n_s + 1
+    - noise: 2 n_v (optional)
     output_ports:
-    - total
+    - margins: 3
 
-Not :meth:`subtract`, see ``total``.
+Not :meth:`subtract`, see ``margins``.
 """
 
 
 def test_a_block_says_its_ports_and_their_remarks():
     block = system_block.parse_block(DOCSTRING)
     assert block.name == "Adder"
-    assert block.inputs == (("first", ""), ("second", "optional"))
-    assert "| input | `second` | optional |" in block.table
-    assert block.table.count("\n") == 4
+    assert [(one.name, one.size, one.remark) for one in block.inputs] == [
+        ("state", "n_s + 1", ""),
+        ("noise", "2 n_v", "optional"),
+    ]
+    assert "| input | `noise` | 2 n_v | optional: standard normal numbers, for" in block.table
+    assert block.table.count("\n") == 6
+    # Behind it the symbols of the sizes.
+    assert re.findall(r"(n_\w+)[:,]", block.table.splitlines()[-1]) == ["n_q", "n_v", "n_s"]
     # The picture names the system and has a dot for every port.
     assert block.svg.count("<circle") == 3
-    assert all(f">{name}</text>" in block.svg for name in ("Adder", "first", "second", "total"))
+    assert all(f">{name}</text>" in block.svg for name in ("Adder", "state", "noise", "margins"))
     assert block.svg.count("<text") == 4
 
 
 def test_a_docstring_becomes_markdown_without_its_block():
     text = system_block.to_markdown(DOCSTRING)
-    assert text == "Adds two numbers.\n\nNot `subtract`, see `total`."
+    assert text == "Adds two numbers.\n\nNot `subtract`, see `margins`."
     # A unit behind an index is no link.
     assert system_block.to_markdown("The entry q[3] [rad].") == "The entry q[3] \\[rad]."
 
@@ -63,6 +59,8 @@ def test_a_docstring_becomes_markdown_without_its_block():
 def test_a_block_of_something_else_is_refused():
     with pytest.raises(ValueError, match="got \\['name', 'ports'\\]"):
         system_block.parse_block(".. pydrake_system::\n\n    name: A\n    ports: [x]\n")
+    with pytest.raises(ValueError, match="a port is 'name: size"):
+        system_block.parse_block(".. pydrake_system::\n\n    name: A\n    input_ports: [x]\n")
     assert system_block.parse_block("Says nothing of ports.") is None
 
 
@@ -77,8 +75,20 @@ def test_every_port_that_a_docstring_lists_is_declared_in_its_module(path):
     for node in trees[0].body:
         if isinstance(node, ast.ClassDef):
             block = system_block.parse_block(ast.get_docstring(node) or "")
-            ports = {name for name, _ in (*block.inputs, *block.outputs)} if block else set()
+            ports = {one.name for one in (*block.inputs, *block.outputs)} if block else set()
             assert ports - words == set()
+
+
+def test_every_port_has_a_meaning_and_every_meaning_a_port():
+    nodes = [node for path in SYSTEMS for node in ast.parse(path.read_text("utf-8")).body]
+    docs = [ast.get_docstring(node) or "" for node in nodes if isinstance(node, ast.ClassDef)]
+    blocks = [block for block in map(system_block.parse_block, docs) if block]
+    used = set()
+    for block in blocks:
+        for port in (*block.inputs, *block.outputs):
+            own = f"{block.name}.{port.name}"
+            used.add(own if own in system_block.PORTS else port.name)
+    assert used == set(system_block.PORTS)
 
 
 def test_hosted_pages_are_built_with_what_the_extra_docs_installs_alone():

@@ -1,10 +1,14 @@
 """What every system promises: its ports, which may be left open, what feeds through, and NaN."""
 
+import inspect
+import re
+
 import numpy as np
 import pytest
 from pydrake.systems.framework import PortDataType
 from pydrake.trajectories import PiecewisePolynomial
 
+import system_block
 from drake_safety import load_assessment
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
@@ -215,6 +219,49 @@ INNER = {
     ("AssessorInputs", "desired_joint_state"): "u0",
     ("AssessorInputs", "controller_memory"): "u3",
 }
+
+
+SYMBOLS = {
+    "SensorFaults": {"n": 2},
+    "TrajectoryPlanner": {"n_z": 6, "H": 7, "M": 5},
+    "BeliefEvaluator": {"n_s": 2, "n_z": 3, "H": 2, "n_f": 3, "n_c": 2},
+    "CommandGuard": {"n_s": 1, "n_z": 3, "H": 4, "M": 3, "n_f": 3},
+    "FeedbackRecorder": {"n_s": 1, "n_z": 3, "H": 3, "n_f": 1, "n_c": 2, "n_q": 1, "n_v": 1},
+    "PolicyController": {"n_q": 9, "n_v": 8, "n_j": 2, "n_m": 10},
+    "PlanFeatures": {"M": 2},
+    "AssessorInputs": {"M": 2, "n_m": 1},
+}
+LEARNED_SIZES = {"n_s": N_S, "n_w": N_S, "n_z": 3, "H": N_P // 3, "n_f": N_F, "n_c": N_C}
+SYMBOLS |= {"ChangeMonitor": LEARNED_SIZES, "SafetyAssessor": LEARNED_SIZES}
+
+
+def symbols(key):
+    """What the sizes in a docstring stand for, in a case."""
+    name, *robot = key.split()
+    found = {}
+    if robot:
+        k = robot_kinematics(*robot)
+        found = {"n_q": k.num_positions, "n_v": k.num_velocities, "n_j": k.num_joints}
+        found |= {"n_p": k.num_contacts, "n_s": 12 + 2 * k.num_joints, "n_z": 3, "H": 4, "M": 3}
+        safe_set = BalanceSafeSet(k, BalanceLimits())
+        more = 3 + k.num_joints if name == "AssessorInputs" else 0
+        found |= {"n_c": len(safe_set.names), "n_f": len(safe_set.feature_names) + more}
+    return found | SYMBOLS.get(name, {})
+
+
+@pytest.mark.parametrize("key", [key for key in CASES if not key.startswith("Pendulum")])
+def test_the_docstring_says_the_size_of_every_port_and_which_may_be_left_open(key):
+    given = Given(key)
+    block = system_block.parse_block(inspect.getdoc(type(given.system)))
+
+    def size(port):
+        product = re.sub(r"(?<=\w) (?=\w)", " * ", port.size)
+        return None if product == "abstract" else eval(product, symbols(key))
+
+    assert {one.name: size(one) for one in block.inputs} == given.inputs
+    promised = {name: None if n == "-" else int(n) for name, n in given.promised.items()}
+    assert {one.name: size(one) for one in block.outputs} == promised
+    assert {one.name for one in block.inputs if one.remark == "optional"} == given.optional
 
 
 @pytest.mark.parametrize("key", ONE_OF_EACH)

@@ -5,12 +5,29 @@ from __future__ import annotations
 import html
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 import yaml
 
 DIRECTIVE = re.compile(r"^\.\. pydrake_system::\n((?:[ \t]+.*\n|\n)*)", re.MULTILINE)
 _ROW, _MARGIN, _HEAD, _LETTER = 24, 14, 34, 7.4  # Of the picture [pixels].
-_REMARK = re.compile(r"^(\w+)\s*(?:\((.*)\))?$")
+_SIZE = re.compile(r"^([^(]+?)\s*(?:\((.*)\))?$")
+_KNOWN = yaml.safe_load((Path(__file__).parent / "ports.yaml").read_text("utf-8"))
+SIZES, PORTS = _KNOWN["sizes"], _KNOWN["ports"]
+
+
+@dataclass(frozen=True)
+class Port:
+    """A port of a system.
+
+    Attributes:
+        size: Number of entries, in the symbols of ``SIZES``; "abstract" for no vector.
+        remark: Behind the size, such as "optional".
+    """
+
+    name: str
+    size: str
+    remark: str = ""
 
 
 @dataclass(frozen=True)
@@ -19,26 +36,37 @@ class SystemBlock:
 
     Attributes:
         name: Of the system.
-        inputs: Each port and the remark behind it, if there is one.
-        outputs: Likewise.
     """
 
     name: str
-    inputs: tuple[tuple[str, str], ...]
-    outputs: tuple[tuple[str, str], ...]
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
 
     @property
     def table(self) -> str:
-        """The ports as a Markdown table."""
-        rows = [("input", *port) for port in self.inputs]
-        rows += [("output", *port) for port in self.outputs]
-        lines = [f"| {kind} | `{port}` | {remark} |" for kind, port, remark in rows]
-        return "\n".join(["| | port | |", "|---|---|---|", *lines])
+        """The ports as a Markdown table, and what the symbols of their sizes mean."""
+        rows = [("input", port) for port in self.inputs]
+        rows += [("output", port) for port in self.outputs]
+        lines = [
+            f"| {kind} | `{port.name}` | {port.size} | {self.content(port)} |"
+            for kind, port in rows
+        ]
+        used = set(re.findall(r"[A-Za-z]\w*", " ".join(port.size for _, port in rows)))
+        symbols = [f"{key}: {text}" for key, text in SIZES.items() if used & set(key.split(", "))]
+        return "\n".join(
+            ["| | port | size | content |", "|---|---|---|---|", *lines, "", "; ".join(symbols)]
+        )
+
+    def content(self, port: Port) -> str:
+        """What a port carries, with its remark in front."""
+        text = PORTS.get(f"{self.name}.{port.name}") or PORTS[port.name]
+        remark = port.remark.replace("``", "`")
+        return f"{remark}: {text}" if remark else text
 
     @property
     def svg(self) -> str:
         """The block with its ports, as an SVG that takes its colours from the page."""
-        names = [port for port, _ in (*self.inputs, *self.outputs)]
+        names = [port.name for port in (*self.inputs, *self.outputs)]
         half = max(map(len, names), default=4) * _LETTER + 2 * _MARGIN
         width = max(2 * half, len(self.name) * 9 + 2 * _MARGIN)
         num_rows = max(len(self.inputs), len(self.outputs), 1)
@@ -54,12 +82,12 @@ class SystemBlock:
             (self.outputs, _MARGIN + width, "end", -_MARGIN),
         )
         for ports, x, anchor, inwards in sides:
-            for row, (port, _) in enumerate(ports):
+            for row, port in enumerate(ports):
                 y = _HEAD + (row + 0.5) * _ROW
                 parts.append(f'<circle cx="{x:.0f}" cy="{y:.0f}" r="4" fill="currentColor"/>')
                 parts.append(
                     f'<text x="{x + inwards:.0f}" y="{y + 4:.0f}" text-anchor="{anchor}">'
-                    f"{html.escape(port)}</text>"
+                    f"{html.escape(port.name)}</text>"
                 )
         full = width + 2 * _MARGIN
         return (
@@ -110,11 +138,11 @@ def to_markdown(docstring: str) -> str:
     return re.sub(r"``([^`\n]+)``", r"`\1`", text)
 
 
-def _ports(lines: list[str] | None) -> tuple[tuple[str, str], ...]:
+def _ports(lines: list[dict[str, str | int]] | None) -> tuple[Port, ...]:
     ports = []
     for line in lines or []:
-        found = _REMARK.match(str(line))
-        if found is None:
-            raise ValueError(f"pydrake_system: a port is 'name' or 'name (remark)'; got '{line}'")
-        ports.append((found.group(1), found.group(2) or ""))
+        if not isinstance(line, dict) or len(line) != 1:
+            raise ValueError(f"pydrake_system: a port is 'name: size (remark)'; got '{line}'")
+        ((name, size),) = line.items()
+        ports.append(Port(name, *_SIZE.match(str(size)).groups(default="")))
     return tuple(ports)

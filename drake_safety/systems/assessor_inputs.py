@@ -23,14 +23,14 @@ class AssessorInputs(Diagram):
 
         name: AssessorInputs
         input_ports:
-        - plant_state
-        - desired_outlook
-        - desired_joint_state (only with servo loads)
-        - controller_memory (only with its names)
+        - plant_state: n_q + n_v
+        - desired_outlook: M n_z
+        - desired_joint_state: 2 n_j (only with servo loads)
+        - controller_memory: n_m (only with its names)
         output_ports:
-        - state
-        - features
-        - margins
+        - state: n_s
+        - features: n_f
+        - margins: n_c
 
     The features are those of the safe set, and behind them, where they are asked for, two of
     gravity (:class:`~drake_safety.systems.gravity_features.GravityFeatures`), the loads of the

@@ -21,18 +21,18 @@ class BeliefEvaluator(LeafSystem):
 
         name: BeliefEvaluator
         input_ports:
-        - state
-        - desired_preview
-        - features (read in the sharpened mode only)
-        - margins (with ``checks_margins``)
-        - alarm (with ``heeds_alarm``)
+        - state: n_s
+        - desired_preview: H n_z
+        - features: n_f (read in the sharpened mode only)
+        - margins: n_c (with ``checks_margins``)
+        - alarm: 1 (with ``heeds_alarm``)
         output_ports:
-        - safety_probability
-        - belief
-        - cause_probability
-        - embedding
-        - predicted_margins
-        - novelty
+        - safety_probability: 1
+        - belief: 3
+        - cause_probability: n_c
+        - embedding: 2
+        - predicted_margins: n_c
+        - novelty: 1
 
     Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
     ``belief`` is (safe, unsafe, don't know), and its first entry the paper's Γ.

@@ -20,14 +20,14 @@ class ChangeMonitor(LeafSystem):
 
         name: ChangeMonitor
         input_ports:
-        - state
-        - desired_preview
-        - features (only if the prediction reads some)
-        - hold (optional)
+        - state: n_s
+        - desired_preview: H n_z
+        - features: n_f (only if the prediction reads some)
+        - hold: 1 (optional)
         output_ports:
-        - alarm
-        - levels
-        - alarm_cause
+        - alarm: 1
+        - levels: n_w
+        - alarm_cause: abstract
 
     Every step of its training it predicts the state and updates the charts of a
     :class:`~drake_safety.learning.change_detector.ChangeDetector`. ``levels`` has the level of each

@@ -20,15 +20,15 @@ class CommandGuard(LeafSystem):
 
         name: CommandGuard
         input_ports:
-        - command
-        - state
-        - features
+        - command: 3
+        - state: n_s
+        - features: n_f
         output_ports:
-        - desired_output
-        - desired_preview
-        - desired_outlook
-        - is_changed
-        - safety_probability
+        - desired_output: n_z
+        - desired_preview: H n_z
+        - desired_outlook: M n_z
+        - is_changed: 1
+        - safety_probability: 1
 
     Every ``period_s`` the asked command, held from now on, is assessed. If it is accepted,
     ``desired_output`` is the asked command. Otherwise it is the accepted one nearest to it,

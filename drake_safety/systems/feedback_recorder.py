@@ -47,18 +47,18 @@ class FeedbackRecorder(LeafSystem):
 
         name: FeedbackRecorder
         input_ports:
-        - state
-        - true_state (optional)
-        - output
-        - desired_output
-        - desired_preview
-        - features
-        - margins
-        - safe
-        - plant_state
-        - recovery_active (optional)
+        - state: n_s
+        - true_state: n_s (optional)
+        - output: n_z
+        - desired_output: n_z
+        - desired_preview: H n_z
+        - features: n_f
+        - margins: n_c
+        - safe: 1
+        - plant_state: n_q + n_v
+        - recovery_active: 1 (optional)
         output_ports:
-        - num_finished
+        - num_finished: 1
 
     A row is recorded every ``info.step_s``. A window ends safe after ``num_steps`` steps, and the
     next one begins with its last row. It ends unsafe as soon as ``safe``, sampled every

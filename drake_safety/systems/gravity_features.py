@@ -16,10 +16,10 @@ class GravityFeatures(LeafSystem):
 
         name: GravityFeatures
         input_ports:
-        - plant_state
-        - gravity
+        - plant_state: n_q + n_v
+        - gravity: 3
         output_ports:
-        - features
+        - features: 2
 
     The features are the components of gravity's direction in the plane of the feet, (2,), see
     :func:`~drake_safety.control.observation.gravity_in_foot_plane`. ``gravity`` (3,) is in the

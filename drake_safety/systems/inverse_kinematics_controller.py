@@ -21,12 +21,12 @@ class InverseKinematicsController(LeafSystem):
 
         name: InverseKinematicsController
         input_ports:
-        - plant_state
-        - desired_output
-        - desired_foot_positions (optional)
-        - desired_yaw (optional)
+        - plant_state: n_q + n_v
+        - desired_output: n_z
+        - desired_foot_positions: 3 n_p (optional)
+        - desired_yaw: 1 (optional)
         output_ports:
-        - desired_joint_state
+        - desired_joint_state: 2 n_j
 
     The command is a discrete state, so the output has no direct feedthrough. Base yaw is
     ``desired_yaw``, or that of the planar fit of the feet if this is not connected. The joint

@@ -14,10 +14,10 @@ class PlanFeatures(LeafSystem):
 
         name: PlanFeatures
         input_ports:
-        - plant_state
-        - desired_preview
+        - plant_state: n_q + n_v
+        - desired_preview: M n_z
         output_ports:
-        - features
+        - features: n_f
     """
 
     def __init__(

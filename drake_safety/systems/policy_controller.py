@@ -19,12 +19,12 @@ class PolicyController(LeafSystem):
 
         name: PolicyController
         input_ports:
-        - plant_state
-        - command
+        - plant_state: n_q + n_v
+        - command: 3
         output_ports:
-        - desired_joint_state
-        - action_state
-        - status
+        - desired_joint_state: 2 n_j
+        - action_state: n_m
+        - status: 1
 
     ``command`` is (v_x, v_y, ω_z) in the base's heading frame [m/s, rad/s]. All outputs and the
     memory of a recurrent network are discrete states: a cloned Context continues from its phase of

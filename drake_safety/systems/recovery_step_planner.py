@@ -32,17 +32,17 @@ class RecoveryStepPlanner(LeafSystem):
 
         name: RecoveryStepPlanner
         input_ports:
-        - plant_state
-        - recovery_active
-        - nominal_desired_output
+        - plant_state: n_q + n_v
+        - recovery_active: 1
+        - nominal_desired_output: n_z
         output_ports:
-        - desired_output
-        - desired_foot_positions
-        - desired_yaw
-        - desired_preview
-        - desired_outlook
-        - stance_pose
-        - recovery_done
+        - desired_output: n_z
+        - desired_foot_positions: 3 n_p
+        - desired_yaw: 1
+        - desired_preview: H n_z
+        - desired_outlook: M n_z
+        - stance_pose: 3
+        - recovery_done: 1
 
     While idle, the feet keep the positions of the first state that the planner sees when a
     simulation is initialised, put on level ground, or those of :meth:`set_stance`. When

@@ -17,12 +17,12 @@ class RecoveryTrigger(LeafSystem):
 
         name: RecoveryTrigger
         input_ports:
-        - safety_probability
-        - belief (optional)
-        - recovery_done (optional)
+        - safety_probability: 1
+        - belief: 3 (optional)
+        - recovery_done: 1 (optional)
         output_ports:
-        - port_selector
-        - recovery_active
+        - port_selector: abstract
+        - recovery_active: 1
 
     The trigger latches: once active it stays active until ``recovery_done`` is 1. A probability
     that is NaN activates it. ``belief`` (3,) tells a low probability from one that is 0 because the

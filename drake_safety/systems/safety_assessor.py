@@ -22,21 +22,21 @@ class SafetyAssessor(Diagram):
 
         name: SafetyAssessor
         input_ports:
-        - state
-        - desired_preview
-        - features (read in the sharpened mode only)
-        - margins
-        - hold (optional)
+        - state: n_s
+        - desired_preview: H n_z
+        - features: n_f (read in the sharpened mode only)
+        - margins: n_c
+        - hold: 1 (optional)
         output_ports:
-        - safety_probability
-        - belief
-        - cause_probability
-        - embedding
-        - predicted_margins
-        - novelty
-        - alarm
-        - levels
-        - alarm_cause
+        - safety_probability: 1
+        - belief: 3
+        - cause_probability: n_c
+        - embedding: 2
+        - predicted_margins: n_c
+        - novelty: 1
+        - alarm: 1
+        - levels: n_w
+        - alarm_cause: abstract
 
     The ports are those of its two systems.
 

@@ -36,10 +36,10 @@ class SafetyMonitor(LeafSystem):
 
         name: SafetyMonitor
         input_ports:
-        - plant_state
+        - plant_state: n_q + n_v
         output_ports:
-        - margins
-        - safe
+        - margins: n_c
+        - safe: 1
 
     Both outputs are direct functions of the state: margins that were sampled and held would lag a
     recorded row by one period. ``safe`` is 1 while no margin is negative. The margins of a state

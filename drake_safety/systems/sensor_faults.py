@@ -21,9 +21,9 @@ class SensorFaults(LeafSystem):
 
         name: SensorFaults
         input_ports:
-        - input
+        - input: n
         output_ports:
-        - output
+        - output: n
 
     :class:`~drake_safety.robots.shift.Fault` lists the kinds. Without faults, and before they
     start, the output has the input's bits. Delays, ``half_rate`` and ``freeze`` hold samples, which

@@ -25,12 +25,12 @@ class StateObserver(LeafSystem):
 
         name: StateObserver
         input_ports:
-        - plant_state
-        - noise (optional)
+        - plant_state: n_q + n_v
+        - noise: 2 n_v (optional)
         output_ports:
-        - measured_plant_state
-        - state
-        - output
+        - measured_plant_state: n_q + n_v
+        - state: n_s
+        - output: n_z
 
     Every output is a direct function of the inputs. Without the ``noise`` input, or with zero
     standard deviations, the measurement is exact.
