@@ -8,8 +8,9 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from drake_safety import load_scenario
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import gravity_in_foot_plane
+from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.robots.shift import Shift
-from drake_safety.systems.gravity_features import GravityFeatures
+from drake_safety.systems.assessor_inputs import AssessorInputs
 from legged_robots import ROBOT_NAMES, robot_kinematics
 from system_doubles import Bench
 
@@ -64,11 +65,13 @@ def test_the_mirrored_robot_sees_the_mirrored_slope():
     kinematics = robot_kinematics("atlas")
     seen = []
     for mirror in (None, Mirror(kinematics)):
-        system = GravityFeatures(kinematics, mirror=mirror)
+        safe_set = BalanceSafeSet(kinematics, BalanceLimits())
+        gravity = downhill(0.1, 0.7)
+        system = AssessorInputs(kinematics, safe_set, gravity=gravity, mirror=mirror)
         q, v = kinematics.standing_positions(), np.zeros(kinematics.num_velocities)
-        bench = Bench(system, plant_state=np.append(q, v), gravity=downhill(0.1, 0.7))
-        seen.append(bench.get("features"))
-    assert system.feature_names == ["gravity_x", "gravity_y"]
+        bench = Bench(system, plant_state=np.append(q, v), desired_outlook=np.zeros(15))
+        seen.append(bench.get("features")[-2:])
+    assert system.feature_names[-2:] == ["gravity_x", "gravity_y"]
     np.testing.assert_allclose(seen[0], 0.1 * np.array([math.cos(0.7), math.sin(0.7)]), atol=1e-3)
     np.testing.assert_allclose(seen[1], seen[0] * (1.0, -1.0))
 

@@ -18,7 +18,6 @@ from drake_safety.systems.assessor_inputs import AssessorInputs
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
 from drake_safety.systems.change_monitor import ChangeMonitor
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
-from drake_safety.systems.gravity_features import GravityFeatures
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
@@ -138,7 +137,6 @@ def add_robot(name):
             lambda: SafetyMonitor(safe_set, n_q, n_v),
             f"{x} -> safe 1 < *, margins {len(safe_set.names)} < *",
         ),
-        (lambda: GravityFeatures(k), f"{x}, gravity 3 -> features 2 < *"),
         (
             lambda: AssessorInputs(
                 k, safe_set, gravity=[0, 0, -9.81], servo_loads=True, memory=["m"], num_outlook=2
@@ -183,7 +181,6 @@ class Given(Bench):
             "safe": [1.0],
             "recovery_active": [float("Planner" in key)],
             "desired_output": [0.0, 0.0, 0.4],
-            "gravity": [0.0, 0.0, -9.81],
             "plant_state": np.eye(1, self.inputs[port]).ravel(),
         }.get(port, np.zeros(self.inputs[port]))
 
@@ -215,9 +212,6 @@ INNER = {
     ("RecoverySwitch", "nominal_desired_output"): "nominal",
     ("RecoverySwitch", "nominal_desired_preview"): "nominal",
     ("RecoverySwitch", "nominal_desired_outlook"): "nominal",
-    ("AssessorInputs", "desired_outlook"): "desired_preview",
-    ("AssessorInputs", "desired_joint_state"): "u0",
-    ("AssessorInputs", "controller_memory"): "u3",
 }
 
 
@@ -299,6 +293,7 @@ def test_all_memory_is_in_the_context_so_a_clone_goes_on_as_if_alone(key):
 NOT_FINITE = {
     ("SafetyMonitor laikago", "plant_state"): {"safe": 0.0, "margins": -np.inf},
     ("StateObserver laikago", "plant_state"): {"state": np.nan},
+    ("AssessorInputs laikago", "plant_state"): {"state": np.nan, "margins": -np.inf},
     ("PlanFeatures laikago", "plant_state"): {"features": np.nan},
     ("PlanFeatures laikago", "desired_preview"): {"features": np.nan},
     ("BeliefEvaluator", "state"): {"belief": [0.0, 0.0, 1.0], "safety_probability": 0.0},

@@ -1,22 +1,25 @@
-"""AssessorInputs: what an assessor reads of a legged robot besides its plan, as a diagram."""
+"""AssessorInputs: what an assessor reads of a legged robot besides its plan."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import ConstantVectorSource, MatrixGain, Multiplexer
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.control.mirror import Mirror
-from drake_safety.systems.gravity_features import GravityFeatures
-from drake_safety.systems.plan_features import PlanFeatures
-from drake_safety.systems.safety_monitor import FeaturedSafeSet, SafetyMonitor
-from drake_safety.systems.state_observer import StateObserver
+from drake_safety.control.observation import (
+    gravity_in_foot_plane,
+    stance_state,
+    state_names,
+    walking_state,
+    walking_state_names,
+)
+from drake_safety.systems.safety_monitor import FeaturedSafeSet, finite_margins
 
 
-class AssessorInputs(Diagram):
+class AssessorInputs(LeafSystem):
     """State, features and margins of a measured plant state, in the order of their names.
 
     .. pydrake_system::
@@ -25,22 +28,25 @@ class AssessorInputs(Diagram):
         input_ports:
         - plant_state: n_q + n_v
         - desired_outlook: M n_z
-        - desired_joint_state: 2 n_j (only with servo loads)
-        - controller_memory: n_m (only with its names)
+        - desired_joint_state: 2 n_j (with ``servo_loads``)
+        - controller_memory: n_m (with ``memory``)
         output_ports:
         - state: n_s
         - features: n_f
         - margins: n_c
 
-    The features are those of the safe set, and behind them, where they are asked for, two of
-    gravity (:class:`~drake_safety.systems.gravity_features.GravityFeatures`), the loads of the
-    servos and the controller's memory. The shipped assessments read: of balancing, gravity and
-    loads; of reaching, gravity; of walking, the memory of the policy.
+    The features are those of the safe set, and behind them, where they are asked for, gravity in
+    the plane of the feet, the loads of the servos and the controller's memory. The shipped
+    assessments read: of balancing, gravity and loads; of reaching, gravity; of walking, the memory
+    of the policy. All outputs are direct functions of the inputs.
 
     Args:
         num_outlook: M, samples of the outlook.
-        gravity: In the world of ``plant_state``, (3,) [m/s²]; None for no features of gravity.
-        servo_loads: Whether features are commanded minus measured joint positions, (n_j,) [rad].
+        gravity: In the world of ``plant_state``, (3,) [m/s²]; on an actual robot, whose attitude is
+            estimated from gravity, a constant. It shows the slope of the ground, which a state
+            relative to the feet does not. None for no features of gravity.
+        servo_loads: Whether features are commanded minus measured joint positions, (n_j,) [rad], to
+            which the servos' loads are proportional.
         memory: Names of the entries of ``controller_memory``.
         mirror: If given, state and gravity are those of the robot's mirror image.
         is_walking: See :class:`~drake_safety.systems.state_observer.StateObserver`.
@@ -62,59 +68,52 @@ class AssessorInputs(Diagram):
         is_walking: bool = False,
     ):
         super().__init__()
-        sizes = kinematics.num_positions, kinematics.num_velocities
-        builder = DiagramBuilder()
-        observer = builder.AddNamedSystem(
-            "observer", StateObserver(kinematics, mirror=mirror, is_walking=is_walking)
-        )
-        monitor = builder.AddNamedSystem("safety_monitor", SafetyMonitor(safe_set, *sizes))
-        plan = builder.AddNamedSystem(
-            "plan_features", PlanFeatures(safe_set, *sizes, horizon=num_outlook)
-        )
-        builder.ExportInput(observer.GetInputPort("plant_state"), "plant_state")
-        for system in (monitor, plan):
-            builder.ConnectInput("plant_state", system.GetInputPort("plant_state"))
-        builder.ExportInput(plan.GetInputPort("desired_preview"), "desired_outlook")
-        parts: list[tuple[OutputPort | None, list[str]]] = [
-            (plan.GetOutputPort("features"), plan.feature_names)
-        ]
+        self._kinematics, self._safe_set, self._mirror = kinematics, safe_set, mirror
+        self._state_of = walking_state if is_walking else stance_state
+        self._gravity = None if gravity is None else np.array(gravity)
+        self.state_names = (walking_state_names if is_walking else state_names)(kinematics)
+        self.constraint_names = list(safe_set.names)
+        self.feature_names = list(safe_set.feature_names)
         if gravity is not None:
-            against = builder.AddNamedSystem(
-                "gravity_features", GravityFeatures(kinematics, mirror=mirror)
-            )
-            constant = builder.AddNamedSystem("gravity", ConstantVectorSource(np.array(gravity)))
-            builder.Connect(constant.get_output_port(), against.GetInputPort("gravity"))
-            builder.ConnectInput("plant_state", against.GetInputPort("plant_state"))
-            parts.append((against.GetOutputPort("features"), against.feature_names))
+            self.feature_names += ["gravity_x", "gravity_y"]
+        state = kinematics.num_positions + kinematics.num_velocities
+        self._state_port = self.DeclareVectorInputPort("plant_state", state)
+        self._outlook_port = self.DeclareVectorInputPort("desired_outlook", 3 * num_outlook)
+        self._command_port = self._memory_port = None
         if servo_loads:
-            names = kinematics.joint_names
-            parts.append((_add_loads(builder, kinematics), [f"servo_load_{n}" for n in names]))
+            self.feature_names += [f"servo_load_{name}" for name in kinematics.joint_names]
+            size = 2 * kinematics.num_joints
+            self._command_port = self.DeclareVectorInputPort("desired_joint_state", size)
         if memory:
-            parts.append((None, list(memory)))
-        joined = builder.AddNamedSystem("features", Multiplexer([len(names) for _, names in parts]))
-        for i, (port, _) in enumerate(parts):
-            if port is None:
-                builder.ExportInput(joined.get_input_port(i), "controller_memory")
-            else:
-                builder.Connect(port, joined.get_input_port(i))
-        builder.ExportOutput(observer.GetOutputPort("state"), "state")
-        builder.ExportOutput(joined.get_output_port(0), "features")
-        builder.ExportOutput(monitor.GetOutputPort("margins"), "margins")
-        self.state_names = observer.state_names
-        self.feature_names = [name for _, names in parts for name in names]
-        self.constraint_names = monitor.constraint_names
-        builder.BuildInto(self)
+            self.feature_names += memory
+            self._memory_port = self.DeclareVectorInputPort("controller_memory", len(memory))
+        ticket = {self.input_port_ticket(self._state_port.get_index())}
+        n_s, n_f, n_c = map(len, (self.state_names, self.feature_names, self.constraint_names))
+        self.DeclareVectorOutputPort("state", BasicVector(n_s), self._calc_state, ticket)
+        self.DeclareVectorOutputPort("features", BasicVector(n_f), self._calc_features)
+        self.DeclareVectorOutputPort("margins", BasicVector(n_c), self._calc_margins, ticket)
 
+    def _measured(self, context: Context) -> tuple[np.ndarray, np.ndarray]:
+        q, v = np.split(self._state_port.Eval(context), [self._kinematics.num_positions])
+        return q, v
 
-def _add_loads(builder: DiagramBuilder, kinematics: RobotKinematics) -> OutputPort:
-    """Adds commanded minus measured joint positions, to which loads are proportional."""
-    n_j, n_x = kinematics.num_joints, kinematics.num_positions + kinematics.num_velocities
-    gain = np.zeros((n_j, 2 * n_j + n_x))
-    gain[:, :n_j] = np.eye(n_j)
-    gain[:, 2 * n_j + NUM_BASE_POSITIONS :][:, :n_j] = -np.eye(n_j)
-    both = builder.AddNamedSystem("command_and_state", Multiplexer([2 * n_j, n_x]))
-    loads = builder.AddNamedSystem("servo_loads", MatrixGain(gain))
-    builder.ExportInput(both.get_input_port(0), "desired_joint_state")
-    builder.ConnectInput("plant_state", both.get_input_port(1))
-    builder.Connect(both.get_output_port(0), loads.get_input_port())
-    return loads.get_output_port()
+    def _calc_state(self, context: Context, output: BasicVector) -> None:
+        state = self._state_of(self._kinematics, *self._measured(context))
+        output.SetFromVector(state if self._mirror is None else self._mirror.stance_state(state))
+
+    def _calc_features(self, context: Context, output: BasicVector) -> None:
+        q, v = self._measured(context)
+        outlook = self._outlook_port.Eval(context).reshape(-1, 3)
+        parts = [self._safe_set.features(q, v, outlook)]
+        if self._gravity is not None:
+            gravity = gravity_in_foot_plane(self._kinematics, q, self._gravity)
+            parts.append(gravity if self._mirror is None else gravity * (1.0, -1.0))
+        if self._command_port is not None:
+            joints = q[NUM_BASE_POSITIONS:]
+            parts.append(self._command_port.Eval(context)[: len(joints)] - joints)
+        if self._memory_port is not None:
+            parts.append(self._memory_port.Eval(context))
+        output.SetFromVector(np.concatenate(parts))
+
+    def _calc_margins(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(finite_margins(self._safe_set, *self._measured(context)))

@@ -29,6 +29,13 @@ class FeaturedSafeSet(SafeSet, Protocol):
         ...
 
 
+def finite_margins(safe_set: SafeSet, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Margins (n_c,) of a state; minus infinity for one that is not finite."""
+    if q.dot(q) + v.dot(v) < math.inf:
+        return safe_set.margins(q, v)
+    return np.full(len(safe_set.names), -np.inf)
+
+
 class SafetyMonitor(LeafSystem):
     """Evaluates the safe set on the plant's true state.
 
@@ -61,12 +68,8 @@ class SafetyMonitor(LeafSystem):
         self.DeclareVectorOutputPort("safe", BasicVector(1), self._calc_safe, ticket)
 
     def _calc_margins(self, context: Context, output: BasicVector) -> None:
-        state = self._state_port.Eval(context)
-        if state.dot(state) < math.inf:
-            margins = self._safe_set.margins(state[: self._n_q], state[self._n_q :])
-        else:
-            margins = np.full(len(self.constraint_names), -np.inf)
-        output.SetFromVector(margins)
+        q, v = np.split(self._state_port.Eval(context), [self._n_q])
+        output.SetFromVector(finite_margins(self._safe_set, q, v))
 
     def _calc_safe(self, context: Context, output: BasicVector) -> None:
         margins = self._margins_port.Eval(context)
