@@ -58,7 +58,8 @@ def pins(name):
 def call_backend(hook, source, out):
     """Builds with the setuptools of this environment, as `python -m build` would, offline."""
     out.mkdir()
-    code = f"import sys; from setuptools import build_meta as b; b.{hook}(sys.argv[1])"
+    code = "import sys; sys.path.insert(0, '.ci'); import build_backend as b; "
+    code += f"b.{hook}(sys.argv[1])"
     run(sys.executable, "-c", code, out, cwd=source)
     (built,) = out.iterdir()
     return built
@@ -69,7 +70,9 @@ def sdist(tmp_path_factory):
     work = tmp_path_factory.mktemp("packaging")
     checkout = work / "checkout"
     # A copy: building in place would leave egg-info and build folders in the checkout.
-    kept_out = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "runs")
+    kept_out = shutil.ignore_patterns(
+        ".[!c]*", "__pycache__", "*.egg-info", "build", "dist", "runs"
+    )
     shutil.copytree(ROOT, checkout, ignore=kept_out)
     for name in SHIPPED:
         (checkout / name).parent.mkdir(exist_ok=True)
@@ -210,9 +213,27 @@ def test_the_sdist_holds_what_is_needed_to_build_and_test(sdist):
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     top = "pyproject.toml LICENSE README.md constraints.txt lowest.txt Makefile"
+    top += " .ci/build_backend.py .ci/shadow.py"
     assert {*top.split(), *SHIPPED} <= names
-    for folder in ("tests", "studies", "assessments"):
+    for folder in ("tests", "studies", "assessments", "examples"):
         assert {f"{folder}/{name}" for name in files_under(ROOT / folder)} <= names
+
+
+def test_a_folder_that_hides_an_editable_install_is_named(sdist, tmp_path):
+    with tarfile.open(sdist) as archive:
+        archive.extractall(tmp_path / "unpacked", filter="data")
+    (source,) = (tmp_path / "unpacked").iterdir()
+    environment_of(call_backend("build_editable", source, tmp_path / "wheel"), tmp_path / "own")
+    python, scripts = tmp_path / "own/bin/python", tmp_path / "scripts"
+    (scripts / "drake_safety").mkdir(parents=True)
+    script = scripts / "mine.py"
+    script.write_text(
+        "try:\n    import drake_safety\nexcept ImportError as error:\n    print(error)"
+    )
+    assert f"the folder {scripts / 'drake_safety'} hides the" in run(python, script, cwd="/")
+    (scripts / "drake_safety").rename(scripts / "other")
+    script.write_text("import drake_safety\nprint(drake_safety.__file__)")
+    assert run(python, script, cwd="/").strip() == str(source / "drake_safety/__init__.py")
 
 
 def test_every_file_of_the_library_and_of_the_folders_beside_it_is_in_the_wheel_and_no_other(wheel):
