@@ -1,5 +1,6 @@
 """The composition guide: the example that it explains, its table and picture, and its parts."""
 
+import os
 import re
 import subprocess
 import sys
@@ -36,7 +37,7 @@ def test_the_example_is_short_and_its_robot_that_is_pushed_steps_and_stands_agai
     file = Path(compose.__file__)
     assert len(file.read_text(encoding="utf-8").splitlines()) <= 80
     command = [sys.executable, str(file)]
-    env = {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8"}
+    env = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8"}
     done = subprocess.run(command, env=env, capture_output=True, text=True, encoding="utf-8")
     assert done.returncode == 0, done.stderr
     found = re.findall(r"(\S+) s  Γ (\S+)  nearest limit (\S+) cm", done.stdout)
