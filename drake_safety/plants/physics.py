@@ -217,7 +217,8 @@ def add_physics(
 ) -> Physics:
     """Adds a robot on level ground to a diagram, simulated by the variation's engine.
 
-    The joints have robot.yaml's position servos, or else torque inputs.
+    The joints have robot.yaml's position servos, or else torque inputs. The variation's masses are
+    set in a Context by ``edited``.
     """
     engine = MujocoPhysics if variation.engine == "mujoco" else DrakePhysics
     return engine(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)
