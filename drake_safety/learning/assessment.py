@@ -44,6 +44,7 @@ from drake_safety.learning.segments import (
 )
 from drake_safety.learning.trained_maps import Embedding
 from drake_safety.learning.training_scores import TrainingScores, prior_beliefs
+from drake_safety.learning.trees import Trees
 
 __all__ = [
     "AdaptationParameters",
@@ -68,7 +69,9 @@ class SafetyAssessment:
     - `training_`: the `TrainingScores`, the embedded training segments, from which adaptation
       starts; crowded cells keep some of their segments.
     - `novelty_`: the `Novelty`, which says which inputs are unlike those of training.
-    - `base_logit_`: the `BaseLogit`, which scales the maps' heads to one logit; None without heads.
+    - `base_logit_`: the `BaseLogit`, which scales the maps' heads and the trees to one logit; None
+      without heads.
+    - `trees_`: the `Trees` beside the maps; None where none are learned.
     - `correction_`: the `Correction` that feedback adds to the base logit; initially zero.
     - `adaptation_`: the `Adaptation` to feedback; initially None.
     - `used_`: every set of episodes used for training, calibration or adaptation, as
@@ -91,6 +94,7 @@ class SafetyAssessment:
     training_: TrainingScores
     novelty_: Novelty
     base_logit_: BaseLogit | None
+    trees_: Trees | None
     correction_: Correction
     adaptation_: Adaptation | None
     used_: list[UsedEpisodes]
@@ -166,11 +170,13 @@ class SafetyAssessment:
         segments = training_segments(episodes, parameters)
         grid, columns = Grid.of(parameters), InputColumns(info, parameters)
         points = embedded_points(segments, grid, parameters, progress)
-        embedding, base_logit = learned_maps(
+        embedding, base_logit, trees = learned_maps(
             segments, points, columns, parameters, stage_of(progress, "training")
         )
-        output = embedding.evaluate(columns.of_rows(segments))
-        training = TrainingScores.of(segments, output, base_logit).thinned(grid, parameters.seed)
+        x = columns.of_rows(segments)
+        trees_logit = None if trees is None else trees.evaluate(x)
+        training = TrainingScores.of(segments, embedding.evaluate(x), base_logit, trees_logit)
+        training = training.thinned(grid, parameters.seed)
         beliefs = prior_beliefs(training, grid, parameters, len(info.constraint_names))
         stage_of(progress, "beliefs")(1.0)
         every = split(episodes, stride=1, discount=1.0, shortest=1)
@@ -189,11 +195,12 @@ class SafetyAssessment:
             "columns_": columns,
             "embedding_": embedding,
             "base_logit_": base_logit,
+            "trees_": trees,
             "training_": training,
             "beliefs_": beliefs,
             "novelty_": novelty,
             "detector_": detector,
-            "correction_": Correction.none(embedding, grid),
+            "correction_": Correction.none(embedding, grid, trees),
             "adaptation_": None,
             "calibrations_": {},
             "used_": [UsedEpisodes.of("training", info, len(episodes))],
@@ -256,7 +263,7 @@ class SafetyAssessment:
         num_causes = len(self.info_.constraint_names)
         if method == "paper" or self.base_logit_ is None:
             x = columns.of(segments.state, segments.desired_preview, segments.features)
-            adapted.correction_ = Correction.none(self.embedding_, self.grid_)
+            adapted.correction_ = Correction.none(self.embedding_, self.grid_, self.trees_)
             adapted.beliefs_ = adaptation.paper_beliefs(
                 self.training_,
                 segments,
@@ -272,6 +279,7 @@ class SafetyAssessment:
                 columns=columns,
                 embedding=self.embedding_,
                 base_logit=self.base_logit_,
+                trees=self.trees_,
                 training=self.training_,
                 grid=self.grid_,
                 parameters=parameters,
@@ -401,6 +409,7 @@ class SafetyAssessment:
             beliefs=self.beliefs_ if beliefs is None else beliefs,
             correction=self.correction_ if correction is None else correction,
             base_logit=self.base_logit_,
+            trees=self.trees_,
             novelty=self.novelty_ if novelty is None else novelty,
             initial_uncertainty=self.parameters.initial_uncertainty,
         )
@@ -447,10 +456,11 @@ class SafetyAssessment:
     def unsafe_logits(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns the mean logit of an unsafe end and its gradient with respect to x.
+        """Returns the maps' mean logit of an unsafe end and its gradient with respect to x.
 
         The belief is constant where all corners of a cell agree; the safety heads' logit has a
-        slope everywhere, for planners that need a gradient. The arguments are those of `predict`.
+        slope everywhere, for planners that need a gradient. Trees have none: they are left out. The
+        arguments are those of `predict`.
 
         Returns:
             x (N, n_x), the logit (N,) and its gradient (N, n_x).

@@ -28,9 +28,12 @@ from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
 from drake_safety.learning.training_scores import TrainingScores
+from drake_safety.learning.trees import Trees
 
 SCHEMA = "drake_safety.assessment"
-SCHEMA_VERSION = 11
+SCHEMA_VERSION = 12
+_WITHOUT_TREES = 11
+"""The version before, whose files are read as well."""
 
 _TRAINING: dict[str, tuple[type, type]] = {
     "points": (np.float32, np.float32),
@@ -67,6 +70,8 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
             if (values := getattr(training, name)) is not None
         },
     }
+    if learned["trees_"] is not None:
+        groups["trees."] = learned["trees_"].arrays
     if np.isfinite(embedding.input_range).all():
         groups[""]["input_range"] = embedding.input_range
     for prefix, one in moments.items():
@@ -114,7 +119,7 @@ def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
         if SCHEMA in metadata:
             entries = json.loads(metadata[SCHEMA])
             version = str(entries["schema_version"])
-        if version == str(SCHEMA_VERSION):
+        if version in (str(SCHEMA_VERSION), str(_WITHOUT_TREES)):
             return _learned(entries, tensors)
     except KeyError as error:
         raise ValueError(f"'{path}' is a damaged safety assessment: it has no {error}") from error
@@ -152,8 +157,8 @@ def _learned(
     stored = entries.pop("sha256")
     if stored != _digest(entries, tensors):
         raise ValueError("its contents do not have the SHA-256 that it was written with")
-    # Files from before this parameter are of exact neighbours.
-    own: dict[str, Any] = {"candidates_per_neighbour": 0} | entries["parameters"]
+    # Files from before these parameters are of exact neighbours, and without trees.
+    own: dict[str, Any] = {"candidates_per_neighbour": 0, "trees": False} | entries["parameters"]
     own["paper"] = _made(PaperReading, own["paper"])
     own["adaptation"] = _made(AdaptationParameters, own["adaptation"])
     parameters, info = _made(AssessmentParameters, own), _made(EpisodesInfo, entries["info"])
@@ -167,7 +172,7 @@ def _learned(
         base_logit["margin_range"] = tuple(base_logit["margin_range"])
     correction = Correction(**group("correction."))
     correction.guard = correction.guard.astype(float)
-    training = group("training_")
+    training, trees = group("training_"), group("trees.")
     counts = numbers["novelty_counts"]
     feedback = Moments(count=counts[1], **group("feedback_novelty.")) if counts[1] else None
     return parameters, {
@@ -181,6 +186,7 @@ def _learned(
             input_range=tensors.get("input_range"),
         ),
         "base_logit_": None if base_logit is None else _made(BaseLogit, base_logit),
+        "trees_": Trees(**trees) if trees else None,
         "beliefs_": tensors["beliefs"],
         "correction_": correction,
         "training_": TrainingScores(**{k: v.astype(_TRAINING[k][1]) for k, v in training.items()}),

@@ -155,6 +155,7 @@ class AssessmentParameters:
             horizon (sharpened). For episodes that end at rest.
         first_row_weight: Weight of an episode's first segment relative to the others (sharpened).
             First segments are few, but verdicts at planning time depend on them.
+        trees: Whether the base logit has boosted trees as a third input (sharpened).
         paper: Reading of the paper (paper).
         adaptation: Parameters of the adaptation.
     """
@@ -192,6 +193,7 @@ class AssessmentParameters:
     shortest_segment: Annotated[int, Field(ge=0)] = 0
     raw_input_scale: Positive = 1.0
     feature_unit: NotNegative = 0.0
+    trees: bool = True
     paper: PaperReading = field(default_factory=PaperReading)
     adaptation: AdaptationParameters = field(default_factory=AdaptationParameters)
 

@@ -1,4 +1,4 @@
-"""Training of the maps Psi, and of the logit of their heads."""
+"""Training of the maps Psi, of the trees beside them, and of the logit of both."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from drake_safety.learning.points import Points
 from drake_safety.learning.prediction import LOGIT_LIMIT, BaseLogit
 from drake_safety.learning.segments import Segments
 from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
+from drake_safety.learning.trees import Trees
 
 _INSIDE_SHARE = 0.995
 """Quantile of the inputs whose outputs are scaled to the extent of t-SNE's points."""
@@ -24,6 +25,8 @@ _CLIPPED_SHARE = 1e-3
 """Share of the training inputs that is clipped at either end of a column of x."""
 _SMALLEST_SPREAD = 1e-3
 _SAFETY_HIDDEN = 32
+_STOPPING_DIVISOR = 10
+"""One of so many episodes of the first trees is one that their number is chosen on."""
 _Report = Callable[[float], object]
 
 
@@ -64,7 +67,7 @@ def learned_maps(
     columns: InputColumns,
     parameters: AssessmentParameters,
     progress: _Report = ignore,
-) -> tuple[Embedding, BaseLogit | None]:
+) -> tuple[Embedding, BaseLogit | None, Trees | None]:
     """Trains the maps Psi to reproduce t-SNE's points and, when sharpened, to predict safety.
 
     Departure ("sharpened" only): maps of rectifiers extrapolate linearly, off the grid or into
@@ -76,7 +79,9 @@ def learned_maps(
         columns: The columns of x.
 
     Returns:
-        The maps, and the base logit of their heads; None without heads.
+        The maps, the base logit of their heads and of the trees, and the trees. Without heads there
+        is neither, and without held-out episodes of both labels there are no trees: what they say
+        of inputs that they learned from is worth nothing.
     """
     settings, x = mode_settings(parameters), columns.of_rows(segments)
     is_raw = np.arange(x.shape[1]) < columns.plan.stop
@@ -91,9 +96,9 @@ def learned_maps(
     is_held_out = held_out_segments(segments, parameters)
     if settings.is_regression:
         held_out = data.take(is_held_out) if is_held_out.any() else None
-        return _train(data.take(~is_held_out), parameters, progress, held_out), None
-    label = segments.is_unsafe[is_held_out]
-    if not 0 < label.sum() < len(label):
+        return _train(data.take(~is_held_out), parameters, progress, held_out), None, None
+    trees = trees_logit = None
+    if not _has_both(segments.is_unsafe[is_held_out]):
         # No held-out episodes of both labels.
         tried = embedding = _train(data, parameters, progress)
         is_held_out = np.ones(len(segments), dtype=bool)
@@ -102,12 +107,36 @@ def learned_maps(
         # on the held-out episodes, and the final one is trained on all episodes.
         tried = _train(data.take(~is_held_out), parameters, lambda done: progress(0.5 * done))
         embedding = _train(data, parameters, lambda done: progress(0.5 * (1 + done)))
+        if settings.trees and embedding.has_heads:
+            tried_trees, trees = _trees(data, segments.episode, is_held_out, parameters.seed)
+            trees_logit = tried_trees.evaluate(x[is_held_out])
     base_logit = None
     if embedding.has_heads:
         judged = segments.take(is_held_out)
-        base_logit = fitted_base_logit(tried.evaluate(x[is_held_out]), judged, parameters)
+        output = tried.evaluate(x[is_held_out])
+        base_logit = fitted_base_logit(output, judged, parameters, trees_logit)
     known = np.quantile(x, [_CLIPPED_SHARE, 1.0 - _CLIPPED_SHARE], axis=0)
-    return embedding.clipping(known), base_logit
+    return embedding.clipping(known), base_logit, trees
+
+
+def _has_both(label: np.ndarray) -> bool:
+    return 0 < label.sum() < len(label)
+
+
+def _trees(
+    data: MapData, episode: np.ndarray, is_held_out: np.ndarray, seed: int
+) -> tuple[Trees, Trees]:
+    """Trees without the held-out inputs, and as many of all inputs."""
+    others = np.unique(episode[~is_held_out])
+    drawn = np.random.default_rng(seed).permutation(others)
+    is_stopping = np.isin(episode, drawn[: -(-len(drawn) // _STOPPING_DIVISOR)])
+
+    def fit(rows: np.ndarray, **options: Any) -> Trees:
+        of = data.x[rows], data.is_unsafe[rows], data.sample_weight[rows]
+        return Trees.fit(*of, seed=seed, **options)
+
+    tried = fit(~is_held_out, is_held_out=is_stopping[~is_held_out])
+    return tried, fit(np.ones(len(episode), dtype=bool), num_trees=len(tried))
 
 
 def held_out_segments(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
@@ -349,19 +378,24 @@ def _folded_weights(
 
 
 def fitted_base_logit(
-    output: EmbeddingOutput, segments: Segments, parameters: AssessmentParameters
+    output: EmbeddingOutput,
+    segments: Segments,
+    parameters: AssessmentParameters,
+    trees_logit: np.ndarray | None = None,
 ) -> BaseLogit:
-    """Fits the base logit to the ensemble's heads by logistic regression.
+    """Fits the base logit to the ensemble's heads and the trees by logistic regression.
 
     Args:
         output: The maps' outputs for held-out segments; on training segments they are
             overconfident.
+        trees_logit: The logit of the trees for these segments, (N,); None without trees.
     """
     low, high = parameters.margin_range
     logit = BaseLogit(margin_unit=parameters.margin_unit, margin_range=(low, high))
     weight = _sample_weight(segments, mode_settings(parameters))
-    offset, safety_slope, margin_slope = _logistic(logit.heads(output), segments.is_unsafe, weight)
-    return replace(logit, offset=offset, safety_slope=safety_slope, margin_slope=margin_slope)
+    offset, *slopes = _logistic(logit.heads(output, trees_logit), segments.is_unsafe, weight)
+    names = ("safety_slope", "margin_slope", "trees_slope")
+    return replace(logit, offset=offset, **dict(zip(names, slopes, strict=False)))
 
 
 def _logistic(z: np.ndarray, label: np.ndarray, weight: np.ndarray) -> list[float]:

@@ -24,6 +24,7 @@ class ModeSettings:
         num_maps: K.
         is_regression: Whether a map reproduces t-SNE's points and no more. Held-out episodes then
             stop its training, and its inputs and outputs keep their range.
+        trees: Whether trees are learned beside the maps.
         interpolates: Whether beliefs are interpolated between cell centres.
     """
 
@@ -48,6 +49,7 @@ class ModeSettings:
     margin_weight: float = 0.0
     first_row_weight: float = 1.0
     raw_input_scale: float = 1.0
+    trees: bool = False
     interpolates: bool
 
 
@@ -62,7 +64,7 @@ def mode_settings(parameters: AssessmentParameters) -> ModeSettings:
         stride *= parameters.preview_stride
     else:
         names += ["target_weight", "safety_weight", "margin_weight"]
-        names += ["first_row_weight", "raw_input_scale"]
+        names += ["first_row_weight", "raw_input_scale", "trees"]
         stride, shortest = 1, parameters.shortest_segment or horizon
         target_stride = max(horizon // 2, 1) * parameters.preview_stride
     return ModeSettings(

@@ -25,6 +25,7 @@ from drake_safety.learning.prediction import (
 )
 from drake_safety.learning.segments import installed_versions
 from drake_safety.learning.trained_maps import INPUT_LIMIT, Embedding
+from drake_safety.learning.trees import Trees
 
 if TYPE_CHECKING:
     import onnx
@@ -68,7 +69,8 @@ def write(path: Path, assessment: Any) -> None:
     if assessment.columns_.has_features:
         inputs["features"] = info.widths["features"]
     x, is_usable = _inputs(nodes, inputs, assessment.columns_.is_used, parameters.feature_unit)
-    y, logit, margins, activations = _maps(nodes, nodes("Where", is_usable, x, 0.0), embedding)
+    usable = nodes("Where", is_usable, x, 0.0)
+    y, logit, margins, activations = _maps(nodes, usable, embedding)
     share = _novelty(nodes, x, assessment.novelty_)
     is_known = nodes("And", is_usable, nodes("LessOrEqual", share, 1.0))
     weights, inside = _cell_weights(nodes, y, grid)
@@ -93,9 +95,12 @@ def write(path: Path, assessment: Any) -> None:
     if base_logit is None:
         probability = safe
     else:
+        trees = assessment.trees_
         heads = _heads(nodes, logit, margins, base_logit)
-        slopes = np.array([[base_logit.safety_slope], [base_logit.margin_slope]], dtype=float)
-        scaled = nodes("MatMul", heads, slopes)
+        if trees is not None:
+            heads = nodes("Concat", heads, _trees(nodes, usable, trees), axis=1)
+        slopes = np.array(base_logit.slopes[: 2 if trees is None else 3], dtype=float)
+        scaled = nodes("MatMul", heads, slopes[:, None])
         unsafe_logit = nodes.clip(nodes("Add", scaled, base_logit.offset), LOGIT_LIMIT)
         if correction.is_any:
             guard = _read_grid(nodes, weights, correction.guard[..., None])
@@ -325,6 +330,29 @@ def _heads(nodes: _Nodes, logit: str | None, margins: str | None, base_logit: Ba
         zero = nodes("Mul", columns[0], 0.0)
         columns.insert(0 if logit is None else 1, zero)
     return nodes("Concat", *columns, axis=1)
+
+
+def _trees(nodes: _Nodes, x: str, trees: Trees) -> str:
+    """The clipped logit of the trees, (N, 1).
+
+    As `Trees.evaluate`, with counts of the nodes that exclude a leaf: the first leaf without any is
+    the first of the smallest count.
+    """
+    from onnx import TensorProto
+
+    arrays = trees.arrays
+    num_trees, num_leaves = arrays["value"].shape
+    # Trees first: (T, M) and (T, M, M + 1).
+    feature, threshold = arrays["feature"].T.astype(np.int64), arrays["threshold"].T
+    excludes = arrays["left"].T[..., None] >> np.arange(num_leaves, dtype=np.uint32) & 1
+    single = nodes("Cast", x, to=TensorProto.FLOAT)
+    is_right = nodes("Greater", nodes("Gather", single, feature, axis=1), threshold)
+    is_right = nodes("Unsqueeze", nodes("Cast", is_right, to=TensorProto.FLOAT), [2])
+    excludes = nodes("Cast", excludes.astype(np.uint8), to=TensorProto.FLOAT)
+    leaf = nodes("ArgMin", nodes("MatMul", is_right, excludes), axis=3, keepdims=0)
+    leaf = nodes("Add", nodes("Squeeze", leaf, [2]), num_leaves * np.arange(num_trees))
+    found = nodes.double(nodes("Gather", arrays["value"].ravel(), leaf))
+    return nodes.clip(nodes("ReduceSum", found, [1], keepdims=1), LOGIT_LIMIT)
 
 
 def _shift(nodes: _Nodes, heads: str, activations: str, guard: str, correction: Correction) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from drake_safety.learning import beliefs as belief_masses
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
+from drake_safety.learning.trees import Trees
 
 LOGIT_LIMIT = 8.0
 """Heads' logits are clipped to this magnitude."""
@@ -25,9 +27,9 @@ class Prediction:
     Attributes:
         belief: (b_safe, b_unsafe, mu), (N, 3); empty for novel inputs. Its first entry is the
             paper's Γ.
-        probability: Probability of staying safe, (N,), from the base logit with the correction by
-            feedback; b_safe without heads, as in the paper's mode. 0 where the belief is "don't
-            know", see `is_unknown`.
+        probability: Probability of staying safe, (N,), from the base logit, of maps and trees, with
+            the correction by feedback; b_safe without heads, as in the paper's mode. 0 where the
+            belief is "don't know", see `is_unknown`.
         cause_probability: b_unsafe split by the violated constraint, (N, n_c).
         embedding: y of the first map, (N, 2); NaN for inputs that are not finite.
         predicted_margins: Smallest margin of each constraint until the episode's end [unit of the
@@ -71,10 +73,15 @@ class Prediction:
 
 @dataclass(frozen=True, kw_only=True)
 class BaseLogit:
-    """The base logit: a logit of an unsafe end from the outputs of the maps' heads.
+    """The base logit: a logit of an unsafe end from the maps' heads and the trees.
 
-    ``offset + safety_slope z - margin_slope m / margin_unit``, where z is the mean logit of the
-    safety heads and m the smallest predicted margin; the term of a missing head is zero.
+    ``offset + safety_slope z - margin_slope m / margin_unit + trees_slope t``, where z is the mean
+    logit of the safety heads, m the smallest predicted margin and t the logit of the trees; the
+    term of a missing head is zero.
+
+    Departure: the paper judges by the map alone. Boosted trees, taught by the ends of the motions,
+    and maps, taught by margins too, err on different inputs; the base logit of both ranks better
+    than either. Belief, cause and gradient are the maps'.
 
     Attributes:
         margin_unit: Unit of margins [unit of the margins].
@@ -86,13 +93,29 @@ class BaseLogit:
     offset: float = 0.0
     safety_slope: float = 1.0
     margin_slope: float = 1.0
+    trees_slope: float = 0.0
 
-    def heads(self, output: EmbeddingOutput, margins: np.ndarray | None = None) -> np.ndarray:
-        """Returns z and -m / margin_unit of all inputs, (N, 2); zero for a missing head.
+    @property
+    def slopes(self) -> tuple[float, float, float]:
+        """The slopes of the values of `heads`."""
+        return self.safety_slope, self.margin_slope, self.trees_slope
 
-        The mean of the maps' margins, (N, n_c), is computed if it is not given.
+    def heads(
+        self,
+        output: EmbeddingOutput,
+        trees_logit: np.ndarray | None = None,
+        margins: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Returns z, -m / margin_unit and, with trees, t of all inputs, (N, 2) or (N, 3).
+
+        It is zero for a missing head of the maps.
+
+        Args:
+            output: Outputs of the maps.
+            trees_logit: Logit of the trees, (N,); None without trees.
+            margins: Mean of the maps' margins, (N, n_c); computed if it is not given.
         """
-        found = np.zeros((output.embedding.shape[1], 2))
+        found = np.zeros((output.embedding.shape[1], 2 if trees_logit is None else 3))
         logit = mean_of_maps(_clip(output.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT))
         if np.count_nonzero(np.isnan(logit)) < logit.size:
             found[:, 0] = logit
@@ -101,13 +124,14 @@ class BaseLogit:
             smallest = np.minimum.reduce(margins, axis=1)
             found[:, 1] = _clip(smallest, *self.margin_range)
             found[:, 1] /= -self.margin_unit
+        if trees_logit is not None:
+            found[:, 2] = _clip(trees_logit, -LOGIT_LIMIT, LOGIT_LIMIT)
         return found
 
     def of_heads(self, heads: np.ndarray) -> np.ndarray:
-        """Returns the base logit (N,) from the values of `heads`, (N, 2)."""
-        # Not a product of matrices, which would round a row differently beside other rows.
-        logit = heads[:, 0] * self.safety_slope + heads[:, 1] * self.margin_slope
-        return _clip(self.offset + logit, -LOGIT_LIMIT, LOGIT_LIMIT)
+        """Returns the base logit (N,) from the values of `heads`, (N, 2) or (N, 3)."""
+        logit = self.offset + _weighted(heads, self.slopes[: heads.shape[1]])
+        return _clip(logit, -LOGIT_LIMIT, LOGIT_LIMIT)
 
 
 @dataclass(eq=False, slots=True)
@@ -115,7 +139,8 @@ class Correction:
     """Correction of the base logit by feedback.
 
     Attributes:
-        change: Changes of the offset, safety slope and margin slope, (3,).
+        change: Changes of the offset, safety slope, margin slope and, with trees, trees slope, (3,)
+            or (4,).
         hidden: Weights of the activations of the maps' last hidden layer, and a constant, (K,
             num_activations + 1).
         hidden_range: Least and largest sum of the hidden layer's terms in feedback, to which it is
@@ -129,10 +154,10 @@ class Correction:
     guard: np.ndarray
 
     @classmethod
-    def none(cls, embedding: Embedding, grid: Grid) -> Correction:
+    def none(cls, embedding: Embedding, grid: Grid, trees: Trees | None = None) -> Correction:
         """Returns the zero correction."""
         return cls(
-            change=np.zeros(3),
+            change=np.zeros(3 if trees is None else 4),
             hidden=np.zeros((embedding.num_members, embedding.num_activations + 1)),
             hidden_range=np.zeros(2),
             guard=np.zeros((embedding.num_members, grid.num_cells)),
@@ -151,10 +176,21 @@ class Correction:
 
     def shift(self, heads: np.ndarray, residual: np.ndarray, guard: np.ndarray) -> np.ndarray:
         """The shift of the base logit, (N,), from heads, hidden layer and interpolated guard."""
-        offset, safety, margin = self.change
-        shift = offset + heads[:, 0] * safety + heads[:, 1] * margin + residual
+        offset, *slopes = self.change
+        shift = _weighted(heads, slopes, offset) + residual
         shift = _clip(shift, -SHIFT_LIMIT, SHIFT_LIMIT)
         return np.where(shift < 0.0, (1.0 - guard) * shift, shift)
+
+
+def _weighted(heads: np.ndarray, slopes: Sequence[float], offset: float = 0.0) -> np.ndarray:
+    """The weighted sum of heads, (N,).
+
+    Not a product of matrices, which would round a row differently beside other rows.
+    """
+    found = np.full(len(heads), offset)
+    for head, slope in zip(heads.T, slopes, strict=True):
+        found += head * slope
+    return found
 
 
 _CORRECTION = tuple(field.name for field in fields(Correction))
@@ -213,6 +249,7 @@ def predict(
     base_logit: BaseLogit | None,
     novelty: Novelty,
     initial_uncertainty: float,
+    trees: Trees | None = None,
 ) -> Prediction:
     """Assesses inputs; novel ones and those that are not finite get the empty belief.
 
@@ -246,7 +283,8 @@ def predict(
     else:
         margins = np.full((len(x), num_columns - 3), np.nan)
     if base_logit is not None:
-        heads = base_logit.heads(output, margins)
+        trees_logit = None if trees is None else trees.evaluate(x)
+        heads = base_logit.heads(output, trees_logit, margins)
         logit = base_logit.of_heads(heads)
         if has_correction:
             is_known = safe + masses[:, belief_masses.UNSAFE] > 0.0

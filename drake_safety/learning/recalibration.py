@@ -16,6 +16,7 @@ from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.prediction import BaseLogit, Correction, hidden_sum, sigmoid
 from drake_safety.learning.trained_maps import Embedding
 from drake_safety.learning.training_scores import TrainingScores
+from drake_safety.learning.trees import Trees
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -23,7 +24,7 @@ class Outcomes:
     """Outputs of the maps for rows of episodes, with the episodes' labels.
 
     Attributes:
-        heads: Inputs of the base logit, see `BaseLogit.heads`, (M, 2).
+        heads: Inputs of the base logit, see `BaseLogit.heads`, (M, 2) or (M, 3).
         activations: Activations of the maps' last hidden layer, (K, M, n).
         is_unsafe: Whether the row's episode ended unsafely, (M,).
         weight: Sample weight, (M,).
@@ -51,6 +52,7 @@ def outcomes(
     columns: InputColumns,
     embedding: Embedding,
     base_logit: BaseLogit,
+    trees: Trees | None,
 ) -> tuple[Outcomes, Outcomes]:
     """Outcomes of all rows of the actual episodes, and of the twins' first rows."""
     num_rows = np.array([len(pair.rows) for pair in feedback])
@@ -67,9 +69,14 @@ def outcomes(
         (twins, np.array([not one.twin.is_safe for one in feedback]), np.ones(len(feedback))),
     ):
         x = columns.of(*map(np.concatenate, zip(*rows, strict=True)))
-        heads, activations = base_logit.heads(embedding.evaluate(x)), embedding.activations(x)
+        trees_logit = None if trees is None else trees.evaluate(x)
         found.append(
-            Outcomes(heads=heads, activations=activations, is_unsafe=is_unsafe, weight=weight)
+            Outcomes(
+                heads=base_logit.heads(embedding.evaluate(x), trees_logit),
+                activations=embedding.activations(x),
+                is_unsafe=is_unsafe,
+                weight=weight,
+            )
         )
     return found[0], found[1]
 
@@ -79,7 +86,7 @@ def fitted_change(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fits the correction of the base logit.
 
-    With phi = (1, z, -m / margin_unit, activations) and the base logit ell, w minimises the log
+    With phi = (1, heads, activations) and the base logit ell, w minimises the log
     loss of sigma(ell + w . phi) on the actual episodes with a normal prior, minus the error of ell
     at the start of the twins, w . sum phi (sigma(ell) - label). Errors of ell that a pair shares,
     from an ambiguous start or on the nominal plant, cancel. Later rows of the actual episodes have
@@ -88,7 +95,7 @@ def fitted_change(
     `hidden_std`. The corrected slopes stay >= 0.
 
     Returns:
-        `change` (3,), `hidden` (K, n + 1) and `hidden_range` (2,) of a `Correction`.
+        `change` (3,) or (4,), `hidden` (K, n + 1) and `hidden_range` (2,) of a `Correction`.
     """
     from scipy.optimize import minimize
 
@@ -105,8 +112,9 @@ def fitted_change(
     label = actual.is_unsafe.astype(float)
     error = sigmoid(base_logit.of_heads(twins.heads)) - twins.is_unsafe
     expected = columns(twins).T @ (twins.weight * error)
+    num_heads = actual.heads.shape[1]
     deviation = np.full(phi.shape[1], settings.hidden_std)
-    deviation[:3] = settings.offset_std, settings.slope_std, settings.slope_std
+    deviation[: 1 + num_heads] = settings.offset_std, *[settings.slope_std] * num_heads
     precision = deviation**-2.0
 
     def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
@@ -118,15 +126,15 @@ def fitted_change(
         return float(value - expected @ w + 0.5 * pull @ w), slope
 
     bounds: list[tuple[float | None, None]] = [(None, None)] * phi.shape[1]
-    bounds[1:3] = [(-base_logit.safety_slope, None), (-base_logit.margin_slope, None)]
+    bounds[1 : 1 + num_heads] = [(-slope, None) for slope in base_logit.slopes[:num_heads]]
     options = {"ftol": 1e-13, "gtol": 1e-7, "maxiter": 2000, "maxfun": 4000, "maxcor": 30}
     start = np.zeros(phi.shape[1])
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
-    weights = found[3:].reshape(num_members, num_activations) / unit
+    weights = found[1 + num_heads :].reshape(num_members, num_activations) / unit
     constant = -np.sum(weights * mean[:, 0], axis=1)
     hidden = np.column_stack([weights, constant])
     added = hidden_sum(actual.activations, hidden)
-    return found[:3], hidden, np.array([added.min(), added.max()])
+    return found[: 1 + num_heads], hidden, np.array([added.min(), added.max()])
 
 
 def recalibrated(
@@ -136,6 +144,7 @@ def recalibrated(
     columns: InputColumns,
     embedding: Embedding,
     base_logit: BaseLogit,
+    trees: Trees | None,
     training: TrainingScores,
     grid: Grid,
     parameters: AssessmentParameters,
@@ -148,10 +157,12 @@ def recalibrated(
     """
     x = columns.of(segments.state, segments.desired_preview, segments.features)
     points = embedding.embed(x)
-    correction = Correction.none(embedding, grid)
+    correction = Correction.none(embedding, grid, trees)
     if any(pair.differs for pair in feedback):
         change, hidden, hidden_range = fitted_change(
-            *outcomes(feedback, columns, embedding, base_logit), base_logit, parameters.adaptation
+            *outcomes(feedback, columns, embedding, base_logit, trees),
+            base_logit,
+            parameters.adaptation,
         )
         # Where most feedback was unsafe, the base logit must not fall.
         vote = np.where(segments.is_unsafe, 1.0, -1.0)

@@ -24,7 +24,8 @@ class TrainingScores:
         points: Psi(x), (K, N, 2).
         score: lambda, (N,).
         cause: Column of the constraint that ended the episode, -1 when safe, (N,).
-        heads: Inputs of the base logit, see `BaseLogit.heads`, (N, 2); None for maps without heads.
+        heads: Inputs of the base logit, see `BaseLogit.heads`, (N, 2) or (N, 3); None for maps
+            without heads.
         nearest: Column of the constraint with the smallest predicted margin, (N,).
         multiplicity: Number of segments that each stands for, (N,); None for one each.
         count: Number of all training segments in every map's cells, (K, R*R); None if none of them
@@ -41,13 +42,17 @@ class TrainingScores:
 
     @classmethod
     def of(
-        cls, segments: Segments, output: EmbeddingOutput, base_logit: BaseLogit | None
+        cls,
+        segments: Segments,
+        output: EmbeddingOutput,
+        base_logit: BaseLogit | None,
+        trees_logit: np.ndarray | None = None,
     ) -> TrainingScores:
         """Those of training segments, in the precision in which files store them."""
         heads = nearest = None
         if base_logit is not None:
             margins = output.margins.mean(axis=0)
-            heads = _single(base_logit.heads(output))
+            heads = _single(base_logit.heads(output, trees_logit))
             nearest = (
                 margins.argmin(axis=1)
                 if margins.shape[1]

@@ -1,0 +1,143 @@
+"""Gradient-boosted trees: learned by scikit-learn, evaluated in numpy without it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from drake_safety.learning.trained_maps import INPUT_LIMIT
+
+MOST_TREES = 400
+MOST_LEAVES = 31
+_WITHOUT_GAIN = 20
+"""Trees that may follow without a gain on the held-out inputs."""
+_CHUNK = 16  # Rows, whose comparisons fit into the cache.
+
+
+class Trees:
+    """An immutable sum of T decision trees: a logit of an unsafe end.
+
+    At a node with ``x[feature] > threshold`` an input goes to the right, in single precision. There
+    is no walk from root to leaf: every node with that outcome excludes the leaves on its left, and
+    the first leaf that no node excludes is the one that is reached ("QuickScorer", Lucchese et
+    al., 2015). That costs the same for any depth.
+
+    Args:
+        feature: Columns of x that the nodes compare, (M, T), M < 32.
+        threshold: What they are compared with, (M, T); infinite for nodes that a tree has not.
+        left: Leaves to the left of the nodes, as bits, the lowest of which is the first leaf,
+            (M, T).
+        value: What the leaves add to the logit, (T, M + 1).
+    """
+
+    def __init__(
+        self, *, feature: np.ndarray, threshold: np.ndarray, left: np.ndarray, value: np.ndarray
+    ):
+        self._arrays = {
+            "feature": feature.astype(np.uint16),
+            "threshold": threshold.astype(np.float32),
+            "left": left.astype(np.uint32),
+            "value": value.astype(np.float32),
+        }
+        for array in self._arrays.values():
+            array.setflags(write=False)
+        self._feature, self._value = feature.astype(np.intp), value.astype(np.float32).astype(float)
+        self._first = np.arange(len(value)) * value.shape[1]
+
+    def __len__(self) -> int:
+        """T."""
+        return len(self._value)
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arguments of the constructor."""
+        return dict(self._arrays)
+
+    @classmethod
+    def fit(
+        cls,
+        x: np.ndarray,
+        is_unsafe: np.ndarray,
+        weight: np.ndarray,
+        *,
+        seed: int,
+        is_held_out: np.ndarray | None = None,
+        num_trees: int = MOST_TREES,
+    ) -> Trees:
+        """Learns from inputs with both labels, deterministically for a seed.
+
+        Args:
+            x: Finite inputs, (N, n_x).
+            is_unsafe: Labels, (N,).
+            weight: Weights of the inputs in the log loss, (N,).
+            is_held_out: Inputs, (N,), on which the number of trees is chosen. They are not learned
+                from.
+            num_trees: Number of trees, or the largest with held-out inputs.
+        """
+        from sklearn.ensemble import HistGradientBoostingClassifier
+        from threadpoolctl import threadpool_limits
+
+        data = x.astype(np.float32), is_unsafe, weight
+        learned, judged = data, (None, None, None)
+        if is_held_out is not None:
+            learned = tuple(part[~is_held_out] for part in data)
+            judged = tuple(part[is_held_out] for part in data)
+        model = HistGradientBoostingClassifier(
+            learning_rate=0.1,
+            max_iter=num_trees,
+            max_leaf_nodes=MOST_LEAVES,
+            min_samples_leaf=40,
+            l2_regularization=1.0,
+            max_features=0.5,
+            early_stopping=is_held_out is not None,
+            n_iter_no_change=_WITHOUT_GAIN,
+            random_state=seed,
+        )
+        with threadpool_limits(1):
+            model.fit(*learned, X_val=judged[0], y_val=judged[1], sample_weight_val=judged[2])
+        if is_held_out is not None:
+            num_trees = max(1, int(np.argmax(model.validation_score_)))
+        return cls._of(model, num_trees)
+
+    @classmethod
+    def _of(cls, model: Any, num_trees: int) -> Trees:
+        """The first trees of scikit-learn's `HistGradientBoostingClassifier`."""
+        shape = MOST_LEAVES - 1, num_trees
+        feature, left = np.zeros(shape, dtype=np.intp), np.zeros(shape, dtype=np.int64)
+        threshold, value = np.full(shape, np.inf), np.zeros((num_trees, MOST_LEAVES))
+        # The public interface gives neither trees nor the first guess.
+        for tree, (predictor,) in enumerate(model._predictors[:num_trees]):
+            nodes = predictor.nodes
+            is_leaf = nodes["is_leaf"] > 0
+            # A node comes before its left subtree, and that before its right one.
+            first_leaf = np.cumsum(is_leaf) - is_leaf
+            split = nodes[~is_leaf]
+            rows = slice(len(split)), tree
+            feature[rows], threshold[rows] = split["feature_idx"], split["num_threshold"]
+            left[rows] = (1 << first_leaf[split["right"]]) - (1 << first_leaf[~is_leaf])
+            value[tree, : len(split) + 1] = nodes["value"][is_leaf]
+        value[0] += model._baseline_prediction.item()
+        # The largest number of single precision that is not above: the same decisions.
+        single = threshold.astype(np.float32)
+        below = np.nextafter(single, np.float32(-np.inf))
+        single = np.where(single > threshold, below, single)
+        return cls(feature=feature, threshold=single, left=left, value=value)
+
+    def evaluate(self, x: np.ndarray) -> np.ndarray:
+        """Returns the logit at inputs (N, n_x), (N,); NaN for rows that are not finite.
+
+        A row has the same bits whatever the others are.
+        """
+        is_usable = (np.abs(x) < INPUT_LIMIT).all(axis=1)  # False for NaN.
+        single = np.where(is_usable[:, None], x, 0.0).astype(np.float32)
+        logit = np.empty(len(x))
+        for start in range(0, len(x), _CHUNK):
+            rows = slice(start, start + _CHUNK)
+            is_right = single[rows].take(self._feature, axis=1) > self._arrays["threshold"]
+            excluded = np.bitwise_or.reduce(is_right * self._arrays["left"], axis=1)
+            # The lowest bit that is not set.
+            leaf = np.frexp(~excluded & (excluded + 1))[1] - 1
+            logit[rows] = self._value.take(self._first + leaf).sum(axis=1)
+        logit[~is_usable] = np.nan
+        return logit
