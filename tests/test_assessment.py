@@ -1,17 +1,21 @@
+import copy
+import json
 import operator
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 from threadpoolctl import threadpool_limits
 
 from drake_safety.evaluation.metrics import area_under_curve
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
-from drake_safety.learning.assessment_file import SCHEMA, SCHEMA_VERSION
+from drake_safety.learning.assessment_file import SCHEMA, SCHEMA_VERSION, _digest
 from drake_safety.learning.beliefs import EMPTY
-from drake_safety.learning.prediction import is_unknown
+from drake_safety.learning.prediction import Correction, is_unknown
 from drake_safety.learning.segments import split, training_segments
 from lip_assessments import (
     QUICK,
@@ -302,6 +306,55 @@ def test_what_is_saved_is_loaded_to_the_bit(assessment, held_out, tmp_path, path
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_trees_speak_beside_the_maps_unless_they_are_switched_off(assessment, held_out):
+    if not assessment.uses_features:
+        assert assessment.trees_ is None
+        return
+    without = SafetyAssessment(AssessmentParameters(**QUICK, trees=False)).fit(quick_episodes())
+    assert (without.trees_, without.base_logit_.trees_slope) == (None, 0.0)
+    assert without.training_.heads.shape[1] + 1 == assessment.training_.heads.shape[1] == 3
+    assert assessment.base_logit_.trees_slope > 0.1
+    found, expected = (a.predict(*inputs(held_out)) for a in (assessment, without))
+    assert np.abs(found.probability - expected.probability).max() > 0.05
+    # The rest of it is the maps'.
+    for name in ("belief", "cause_probability", "embedding", "predicted_margins", "novelty"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    gradients = (a.unsafe_logits(*inputs(held_out)) for a in (assessment, without))
+    np.testing.assert_array_equal(*(gradient for *_, gradient in gradients))
+    area = [area_under_curve(-one.probability, held_out.is_unsafe) for one in (found, expected)]
+    assert area[0] > area[1] - 0.005
+
+
+def test_a_file_of_the_version_before_trees_is_read_to_the_bit(assessment, held_out, path):
+    before = copy.copy(assessment)
+    if before.trees_ is not None:
+        before.trees_ = None
+        before.base_logit_ = replace(before.base_logit_, trees_slope=0.0)
+        before.training_ = replace(before.training_, heads=before.training_.heads[:, :2])
+        before.correction_ = Correction.none(before.embedding_, before.grid_)
+    before.save(path)
+    with safe_open(path, framework="numpy") as file:
+        entries, tensors = json.loads(file.metadata()[SCHEMA]), load_file(path)
+    entries |= {"schema_version": 11}
+    del entries["sha256"], entries["parameters"]["trees"]
+    if entries["numbers"]["base_logit"] is not None:
+        del entries["numbers"]["base_logit"]["trees_slope"]
+    entries["sha256"] = _digest(entries, tensors)
+    save_file(tensors, path, {SCHEMA: json.dumps(entries)})
+    loaded = SafetyAssessment.load(path)
+    assert not loaded.parameters.trees
+    one, other = (a.predict(*inputs(held_out)) for a in (before, loaded))
+    for field in fields(one):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
+    if before.base_logit_ is not None:
+        logit = before.base_logit_
+        heads = logit.heads(before.embedding_.evaluate(before.inputs_of(*inputs(held_out))))
+        said = heads[:, 0] * logit.safety_slope + heads[:, 1] * logit.margin_slope
+        said = 1.0 / (1.0 + np.exp(np.clip(logit.offset + said, -8.0, 8.0)))
+        is_known = other.probability > 0.0
+        np.testing.assert_array_equal(other.probability[is_known], said[is_known])
+
+
 def test_a_calibration_is_kept_with_the_assessment(assessment, tmp_path):
     found = calibration(confidence=0.9)
     path = tmp_path / "gamma.safetensors"
@@ -330,8 +383,6 @@ def test_a_failed_save_leaves_the_earlier_file_and_nothing_else(
 
 
 def test_a_truncated_a_foreign_and_an_outdated_file_are_refused(tmp_path, path):
-    from safetensors.numpy import load_file, save_file
-
     content = path.read_bytes()
     for size in (0, 5, 200, len(content) // 2, len(content) - 1):
         (tmp_path / "short").write_bytes(content[:size])

@@ -55,10 +55,16 @@ def test_the_logit_is_fitted_on_an_ensemble_that_knows_none_of_the_episodes(monk
     held_out = held_out_segments(segments, settings)
     # Three maps are tried on what they have not learned; three others learn from all.
     assert sizes == [np.sum(~held_out)] * 3 + [len(segments)] * 3
-    ((output, others, _),) = tried
+    ((output, others, _, trees_logit),) = tried
     assert output.unsafe_logit.shape == (3, held_out.sum())
     np.testing.assert_array_equal(others.state, segments.state[held_out])
-    assert learned.base_logit_ == fit(output, others, settings)
+    assert learned.base_logit_ == fit(output, others, settings, trees_logit)
+    # Nor have the trees that are tried.
+    x = learned.columns_.of_rows(others)
+    assert np.abs(trees_logit - learned.trees_.evaluate(x)).max() > 0.1
+    assert np.mean((trees_logit > 0.0) == others.is_unsafe) < np.mean(
+        (learned.trees_.evaluate(x) > 0.0) == others.is_unsafe
+    )
 
 
 def test_it_is_the_mean_of_the_maps_that_is_scaled_and_not_each_of_them(segments):
@@ -93,6 +99,22 @@ def test_each_head_counts_for_what_it_is_worth(segments, safety_slope):
     logit = fitted_base_logit(alone, relabelled, parameters())
     logit = logit.of_heads(logit.heads(alone))
     assert np.isfinite(logit).all()
+
+
+def test_the_trees_count_for_what_they_are_worth_beside_the_heads(segments):
+    rng = np.random.default_rng(2)
+    said, trees = rng.normal(scale=2.0, size=(4, len(segments))).reshape(2, 2, -1)
+    output = EmbeddingOutput(np.zeros((*said.shape, 2)), said, np.zeros((*said.shape, 0)))
+    is_unsafe = rng.random(len(segments)) < sigmoid(0.5 * said.mean(axis=0) + 0.7 * trees[0])
+    relabelled = dataclasses.replace(segments, is_unsafe=is_unsafe)
+    found = fitted_base_logit(output, relabelled, parameters(), trees[0])
+    assert found.slopes == pytest.approx((0.5, 0.0, 0.7), abs=0.15)
+    # What says the opposite counts for nothing.
+    assert fitted_base_logit(output, relabelled, parameters(), -trees[0]).trees_slope == 0.0
+    heads = found.heads(output, 9.0 * trees[0])
+    assert np.abs(heads[:, 2]).max() == 8.0
+    expected = found.offset + heads @ np.array(found.slopes)
+    np.testing.assert_allclose(found.of_heads(heads), np.clip(expected, -8.0, 8.0))
 
 
 def test_the_logit_is_that_of_the_mean_head_and_the_smallest_mean_margin_and_is_limited():

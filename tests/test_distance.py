@@ -123,7 +123,7 @@ def test_a_user_chooses_what_computes_dtw_and_learns_the_same(monkeypatch):
         segments = training_segments(episodes, parameters)
         points = embedded_points(segments, Grid(resolution=14, cell_length=10.0), parameters)
         columns = InputColumns(episodes.info, parameters)
-        learned[backend], _ = learned_maps(segments, points, columns, parameters)
+        learned[backend], *_ = learned_maps(segments, points, columns, parameters)
         assert bool(asked) == (backend == "tslearn")
     assert learned["tslearn"].is_same(learned["dtaidistance"])
 

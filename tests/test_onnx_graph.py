@@ -16,6 +16,7 @@ from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Correction, is_unknown
 from drake_safety.learning.trained_maps import Embedding
+from drake_safety.learning.trees import Trees
 
 onnx = pytest.importorskip("onnx", reason="the extra 'onnx' is not installed")
 onnxruntime = pytest.importorskip("onnxruntime", reason="the extra 'walking' is not installed")
@@ -168,6 +169,21 @@ def with_whole_numbers(assessment):
     return changed
 
 
+def with_trees(assessment):
+    """Beside fifty trees of three nodes."""
+    rng, known = np.random.default_rng(5), assessment.novelty_.training
+    feature = rng.integers(len(known.mean), size=(3, 50))
+    threshold = known.mean[feature] + known.scale[feature] * rng.normal(size=feature.shape)
+    left = np.repeat([[0b0011], [0b0001], [0b0100]], 50, axis=1)
+    changed = copy.copy(assessment)
+    changed.trees_ = Trees(
+        feature=feature, threshold=threshold, left=left, value=rng.normal(size=(50, 4))
+    )
+    changed.base_logit_ = dataclasses.replace(assessment.base_logit_, trees_slope=0.8)
+    changed.correction_ = Correction.none(changed.embedding_, changed.grid_, changed.trees_)
+    return changed
+
+
 def without_velocities(assessment):
     """That of the paper's mode whose x has no velocities."""
     changed, parameters, known = copy.copy(assessment), assessment.parameters, assessment.novelty_
@@ -195,7 +211,7 @@ def adapted_by_hand(assessment, *, has_hidden=True, seed=1):
     adapted, embedding, grid = copy.copy(assessment), assessment.embedding_, assessment.grid_
     hidden = rng.normal(scale=0.02, size=(embedding.num_members, embedding.num_activations + 1))
     adapted.correction_ = Correction(
-        change=np.array([-0.5, 0.2, -0.1]),
+        change=np.array([-0.5, 0.2, -0.1, 0.3])[: len(assessment.correction_.change)],
         hidden=hidden if has_hidden else np.zeros_like(hidden),
         hidden_range=np.array([-1.0, 1.5]),
         guard=(rng.random((embedding.num_members, grid.num_cells)) < 0.5).astype(float),
@@ -211,6 +227,7 @@ def adapted_by_hand(assessment, *, has_hidden=True, seed=1):
 @pytest.mark.parametrize("has_hidden", [True, False])
 def test_the_graph_of_an_adapted_assessment_is_that_of_its_present_adaptation(has_hidden, tmp_path):
     before = load_assessment("laikago_balancing")
+    before = with_trees(before) if has_hidden else before
     adapted = adapted_by_hand(before, has_hidden=has_hidden)
     ports = every_kind_of_input(before)
     said = check_equal(adapted, exported(adapted, tmp_path), ports)
@@ -228,6 +245,7 @@ def test_the_graph_of_an_adapted_assessment_is_that_of_its_present_adaptation(ha
     [
         ("laikago_balancing", "sharpened", without_margins, 0.5),
         ("laikago_balancing", "sharpened", without_safety_heads, 0.5),
+        ("laikago_balancing", "sharpened", with_trees, 0.5),
         ("laikago_balancing", "paper", without_velocities, 0.5),
         ("atlas_reaching", "sharpened", with_whole_numbers, 0.0),  # All of it is novel.
     ],
@@ -259,7 +277,7 @@ def test_any_number_of_rows_is_taken_none_too(tmp_path):
 def test_a_second_runtime_agrees(tmp_path):
     from onnx.reference import ReferenceEvaluator
 
-    assessment = adapted_by_hand(load_assessment("atlas_reaching"))
+    assessment = adapted_by_hand(with_trees(load_assessment("atlas_reaching")))
     assessment.to_onnx(tmp_path / "gamma.onnx")
     evaluator = ReferenceEvaluator(str(tmp_path / "gamma.onnx"))
 

@@ -5,7 +5,7 @@ from drake_safety.learning.assessment import AdaptationParameters
 from drake_safety.learning.prediction import BaseLogit, sigmoid
 from drake_safety.learning.recalibration import Outcomes, fitted_change, row_weights
 
-LOGIT = BaseLogit(margin_unit=0.02, margin_range=(-0.03, 0.1), margin_slope=0.5)
+LOGIT = BaseLogit(margin_unit=0.02, margin_range=(-0.03, 0.1), margin_slope=0.5, trees_slope=0.4)
 SETTINGS = AdaptationParameters()
 
 
@@ -20,7 +20,7 @@ def outcomes(heads, is_unsafe, activations=None):
 
 def drawn(rng, num, change=(0.0, 0.0, 0.0), hidden=None):
     """Heads and two maps of three activations, and ends that are as likely as L with a change."""
-    heads = rng.normal(scale=1.5, size=(num, 2))
+    heads = rng.normal(scale=1.5, size=(num, len(change) - 1))
     activations = np.maximum(rng.normal(size=(2, num, 3)), 0.0)
     shifted = LOGIT.of_heads(heads) + change[0] + heads @ change[1:]
     if hidden is not None:
@@ -28,9 +28,10 @@ def drawn(rng, num, change=(0.0, 0.0, 0.0), hidden=None):
     return outcomes(heads, rng.random(num) < sigmoid(shifted), activations)
 
 
-def test_the_change_solves_its_own_equation():
+@pytest.mark.parametrize("made", [(0.8, 0.2, 0.1), (1.2, 0.2, 0.1, 0.2)])
+def test_the_change_solves_its_own_equation(made):
     rng = np.random.default_rng(0)
-    actual, twins = drawn(rng, 50, (0.8, 0.2, 0.1)), drawn(rng, 50)
+    actual, twins = drawn(rng, 50, made), drawn(rng, 50, np.zeros(len(made)))
     mean = actual.activations.mean(axis=1, keepdims=True)
     unit = np.sqrt(np.mean(np.sum((actual.activations - mean) ** 2, axis=(0, 2))))
     change, hidden, hidden_range = fitted_change(actual, twins, LOGIT, SETTINGS)
@@ -44,8 +45,9 @@ def test_the_change_solves_its_own_equation():
         phi = np.column_stack([np.ones(len(of.heads)), of.heads, centred])
         return phi.T @ (sigmoid(LOGIT.of_heads(of.heads) + phi @ w) - of.is_unsafe)
 
-    deviation = [SETTINGS.offset_std, *[SETTINGS.slope_std] * 2, *[SETTINGS.hidden_std] * 6]
-    residual = slope(actual, w) - slope(twins, np.zeros(9)) + w / np.array(deviation) ** 2
+    of_slopes = [SETTINGS.slope_std] * (len(made) - 1)
+    deviation = [SETTINGS.offset_std, *of_slopes, *[SETTINGS.hidden_std] * 6]
+    residual = slope(actual, w) - slope(twins, np.zeros(len(w))) + w / np.array(deviation) ** 2
     np.testing.assert_allclose(residual, 0.0, atol=1e-3)
     assert change[0] > 0.3
 
@@ -62,11 +64,11 @@ def test_what_is_wrong_of_the_twins_too_is_not_adapted_to():
 
 def test_more_danger_never_counts_as_less():
     rng = np.random.default_rng(3)
-    heads = rng.normal(scale=2.0, size=(5000, 2))
+    heads = rng.normal(scale=2.0, size=(5000, 3))
     upside_down = outcomes(heads, rng.random(5000) < sigmoid(-3.0 * heads.sum(axis=1)))
     right = outcomes(heads, rng.random(5000) < sigmoid(LOGIT.of_heads(heads)))
     change, *_ = fitted_change(upside_down, right, LOGIT, SETTINGS)
-    np.testing.assert_allclose(change[1:], [-LOGIT.safety_slope, -LOGIT.margin_slope])
+    np.testing.assert_allclose(change[1:], -np.array(LOGIT.slopes))
 
 
 def test_the_change_stays_finite_however_large_the_gap():
@@ -83,12 +85,17 @@ def test_an_episode_counts_by_its_first_row_and_by_all_of_them_together():
 
 @pytest.mark.parametrize(
     ("change", "hidden"),
-    [((-0.6, 0.3, -0.2), np.zeros((2, 3))), (np.zeros(3), [[1.0, -1.0, 0.5], [0.0, 0.8, -0.6]])],
+    [
+        ((-0.6, 0.3, -0.2), np.zeros((2, 3))),
+        ((-0.6, 0.3, -0.2, 0.4), np.zeros((2, 3))),
+        (np.zeros(3), [[1.0, -1.0, 0.5], [0.0, 0.8, -0.6]]),
+    ],
 )
 def test_what_the_heads_and_the_hidden_layer_know_of_the_actual_robot_is_found(change, hidden):
     rng = np.random.default_rng(4)
     actual = drawn(rng, 20_000, change, hidden)
-    found, weights, _ = fitted_change(actual, drawn(rng, 20_000), LOGIT, SETTINGS)
+    twins = drawn(rng, 20_000, np.zeros(len(change)))
+    found, weights, _ = fitted_change(actual, twins, LOGIT, SETTINGS)
     np.testing.assert_allclose(weights[:, :-1], hidden, atol=0.15)
     # The last column takes off what the hidden layer adds on average.
     found[0] += weights[:, -1].sum()
