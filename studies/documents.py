@@ -23,7 +23,6 @@ from drake_safety.evaluation.shift_study import CONFIDENT
 from drake_safety.evaluation.tables import Column, Row, Table
 from drake_safety.evaluation.verdict_tables import INPUTS, verdict_table
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.assessment_file import SCHEMA_VERSION
 from drake_safety.learning.seeds import use_of
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.scenario import Scenario
@@ -209,7 +208,6 @@ def card_text(folder: Path, scenario: Scenario) -> str:
         info=info,
         differences=yaml.safe_dump(changed, default_flow_style=True, width=1000).strip(),
         commands=_commands(results, assessments),
-        SCHEMA_VERSION=SCHEMA_VERSION,
         CONFIDENT=CONFIDENT,
     )
     return f"{text}\n"

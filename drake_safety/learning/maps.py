@@ -25,8 +25,6 @@ _CLIPPED_SHARE = 1e-3
 """Share of the training inputs that is clipped at either end of a column of x."""
 _SMALLEST_SPREAD = 1e-3
 _SAFETY_HIDDEN = 32
-_STOPPING_DIVISOR = 10
-"""One of so many episodes of the first trees is one that their number is chosen on."""
 _Report = Callable[[float], object]
 
 
@@ -79,9 +77,8 @@ def learned_maps(
         columns: The columns of x.
 
     Returns:
-        The maps, the base logit of their heads and of the trees, and the trees. Without heads there
-        is neither, and without held-out episodes of both labels there are no trees: what they say
-        of inputs that they learned from is worth nothing.
+        The maps, the base logit of their heads and of the trees, and the trees. Without heads, both
+        are None; without held-out episodes of both labels, to weigh them on, trees are.
     """
     settings, x = mode_settings(parameters), columns.of_rows(segments)
     is_raw = np.arange(x.shape[1]) < columns.plan.stop
@@ -98,7 +95,8 @@ def learned_maps(
         held_out = data.take(is_held_out) if is_held_out.any() else None
         return _train(data.take(~is_held_out), parameters, progress, held_out), None, None
     trees = trees_logit = None
-    if not _has_both(segments.is_unsafe[is_held_out]):
+    label = segments.is_unsafe[is_held_out]
+    if not 0 < label.sum() < len(label):
         # No held-out episodes of both labels.
         tried = embedding = _train(data, parameters, progress)
         is_held_out = np.ones(len(segments), dtype=bool)
@@ -119,17 +117,12 @@ def learned_maps(
     return embedding.clipping(known), base_logit, trees
 
 
-def _has_both(label: np.ndarray) -> bool:
-    return 0 < label.sum() < len(label)
-
-
 def _trees(
     data: MapData, episode: np.ndarray, is_held_out: np.ndarray, seed: int
 ) -> tuple[Trees, Trees]:
     """Trees without the held-out inputs, and as many of all inputs."""
-    others = np.unique(episode[~is_held_out])
-    drawn = np.random.default_rng(seed).permutation(others)
-    is_stopping = np.isin(episode, drawn[: -(-len(drawn) // _STOPPING_DIVISOR)])
+    # A tenth of the other episodes, on which their number is chosen.
+    is_stopping = np.isin(episode, np.unique(episode[~is_held_out])[::10])
 
     def fit(rows: np.ndarray, **options: Any) -> Trees:
         of = data.x[rows], data.is_unsafe[rows], data.sample_weight[rows]

@@ -106,14 +106,10 @@ class BaseLogit:
         trees_logit: np.ndarray | None = None,
         margins: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Returns z, -m / margin_unit and, with trees, t of all inputs, (N, 2) or (N, 3).
+        """Returns z, -m / margin_unit and, if given, t of all inputs, (N, 2) or (N, 3).
 
-        It is zero for a missing head of the maps.
-
-        Args:
-            output: Outputs of the maps.
-            trees_logit: Logit of the trees, (N,); None without trees.
-            margins: Mean of the maps' margins, (N, n_c); computed if it is not given.
+        It is zero for a missing head of the maps. The mean of their margins, (N, n_c), is computed
+        if it is not given.
         """
         found = np.zeros((output.embedding.shape[1], 2 if trees_logit is None else 3))
         logit = mean_of_maps(_clip(output.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT))
