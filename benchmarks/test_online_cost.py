@@ -224,6 +224,9 @@ def test_one_prediction_beside_gradient_boosting(
     benchmark: Any, report: Callable[..., None], scenario: Scenario, episodes: Episodes
 ) -> None:
     gamma = SafetyAssessment(copy.deepcopy(scenario.assessment)).fit(episodes[:NUM_EPISODES])
+    trees = gamma.trees_
+    assert trees is not None
+    row = gamma.novelty_.training.mean[None]
     boosting = DirectClassifier("gradient_boosting", shortest=gamma.settings.shortest)
     boosting.fit(episodes)  # All: the cost grows with the number of trees.
     inputs = [getattr(episodes[0], name)[0] for name in INPUT_NAMES]
@@ -231,7 +234,10 @@ def test_one_prediction_beside_gradient_boosting(
     cost_s, peers_s = alternate(
         benchmark,
         repeat(lambda: gamma.predict_one(*inputs)),
-        {"gradient boosting": repeat(lambda: boosting.model_.predict_proba(x))},
+        {
+            "its trees": repeat(lambda: trees.evaluate(row)),
+            "gradient boosting": repeat(lambda: boosting.model_.predict_proba(x)),
+        },
         rounds=3,
     )
     report(
@@ -240,5 +246,5 @@ def test_one_prediction_beside_gradient_boosting(
         "us CPU",
         at_most=MAX_US,
         peers={name: per_update_us(seconds) for name, seconds in peers_s.items()},
-        note=f"{x.size} inputs, boosting of {len(episodes)} episodes",
+        note=f"{x.size} inputs, {len(trees)} trees, boosting of {len(episodes)} episodes",
     )

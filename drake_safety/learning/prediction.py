@@ -183,10 +183,7 @@ def _weighted(heads: np.ndarray, slopes: Sequence[float], offset: float = 0.0) -
 
     Not a product of matrices, which would round a row differently beside other rows.
     """
-    found = np.full(len(heads), offset)
-    for head, slope in zip(heads.T, slopes, strict=True):
-        found += head * slope
-    return found
+    return sum((head * slope for head, slope in zip(heads.T, slopes, strict=True)), offset)
 
 
 _CORRECTION = tuple(field.name for field in fields(Correction))

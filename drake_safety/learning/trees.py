@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_safety.learning.trained_maps import INPUT_LIMIT
 
-MOST_TREES = 400
+MOST_TREES = 300
 MOST_LEAVES = 31
 _WITHOUT_GAIN = 20
 """Trees that may follow without a gain on the held-out inputs."""
@@ -129,15 +129,16 @@ class Trees:
 
         A row has the same bits whatever the others are.
         """
-        is_usable = (np.abs(x) < INPUT_LIMIT).all(axis=1)  # False for NaN.
-        single = np.where(is_usable[:, None], x, 0.0).astype(np.float32)
-        logit = np.empty(len(x))
-        for start in range(0, len(x), _CHUNK):
-            rows = slice(start, start + _CHUNK)
-            is_right = single[rows].take(self._feature, axis=1) > self._arrays["threshold"]
-            excluded = np.bitwise_or.reduce(is_right * self._arrays["left"], axis=1)
-            # The lowest bit that is not set.
-            leaf = np.frexp(~excluded & (excluded + 1))[1] - 1
-            logit[rows] = self._value.take(self._first + leaf).sum(axis=1)
-        logit[~is_usable] = np.nan
-        return logit
+        is_usable = np.abs(x) < INPUT_LIMIT  # False for NaN.
+        if np.count_nonzero(is_usable) < is_usable.size:
+            is_usable, logit = is_usable.all(axis=1), np.full(len(x), np.nan)
+            logit[is_usable] = self.evaluate(x[is_usable])
+            return logit
+        if len(x) > _CHUNK:
+            parts = [self.evaluate(x[i : i + _CHUNK]) for i in range(0, len(x), _CHUNK)]
+            return np.concatenate(parts)
+        is_right = x.astype(np.float32).take(self._feature, axis=1) > self._arrays["threshold"]
+        excluded = np.bitwise_or.reduce(is_right * self._arrays["left"], axis=1)
+        # The lowest bit that is not set.
+        leaf = np.frexp(~excluded & (excluded + 1))[1] - 1
+        return np.add.reduce(self._value.take(self._first + leaf), axis=1)
