@@ -159,7 +159,7 @@ def test_far_from_all_feedback_the_hidden_layer_adds_no_more_than_it_did_there(s
 @pytest.mark.parametrize(("offset", "expected"), [(1e5, 0.0), (-1e5, 1.0)])
 def test_a_gap_of_any_size_gives_a_probability_online_and_offline(sharpened, offset, expected):
     own = sharpened.correction_
-    extreme = replace(own, change=np.array([offset, 0.0, 0.0]))
+    extreme = replace(own, change=np.array([offset, 0.0, 0.0, 0.0]))
     x = inputs(worse()[0].rows)
     many = sharpened.predict(*x, correction=extreme).probability
     single = sharpened.predict_one(*(part[0] for part in x), correction=extreme).probability

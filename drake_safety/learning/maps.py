@@ -386,9 +386,16 @@ def fitted_base_logit(
     low, high = parameters.margin_range
     logit = BaseLogit(margin_unit=parameters.margin_unit, margin_range=(low, high))
     weight = _sample_weight(segments, mode_settings(parameters))
-    offset, *slopes = _logistic(logit.heads(output, trees_logit), segments.is_unsafe, weight)
-    names = ("safety_slope", "margin_slope", "trees_slope")
-    return replace(logit, offset=offset, **dict(zip(names, slopes, strict=False)))
+    offset, safety_slope, margin_slope, *of_trees = _logistic(
+        logit.heads(output, trees_logit), segments.is_unsafe, weight
+    )
+    return replace(
+        logit,
+        offset=offset,
+        safety_slope=safety_slope,
+        margin_slope=margin_slope,
+        trees_slope=of_trees[0] if of_trees else 0.0,
+    )
 
 
 def _logistic(z: np.ndarray, label: np.ndarray, weight: np.ndarray) -> list[float]:

@@ -344,11 +344,11 @@ def _trees(nodes: _Nodes, x: str, trees: Trees) -> str:
     num_trees, num_leaves = arrays["value"].shape
     # Trees first: (T, M) and (T, M, M + 1).
     feature, threshold = arrays["feature"].T.astype(np.int64), arrays["threshold"].T
-    excludes = arrays["left"].T[..., None] >> np.arange(num_leaves, dtype=np.uint32) & 1
+    bits = arrays["left"].T[..., None] >> np.arange(num_leaves, dtype=np.uint32) & 1
     single = nodes("Cast", x, to=TensorProto.FLOAT)
     is_right = nodes("Greater", nodes("Gather", single, feature, axis=1), threshold)
     is_right = nodes("Unsqueeze", nodes("Cast", is_right, to=TensorProto.FLOAT), [2])
-    excludes = nodes("Cast", excludes.astype(np.uint8), to=TensorProto.FLOAT)
+    excludes = nodes("Cast", bits.astype(np.uint8), to=TensorProto.FLOAT)
     leaf = nodes("ArgMin", nodes("MatMul", is_right, excludes), axis=3, keepdims=0)
     leaf = nodes("Add", nodes("Squeeze", leaf, [2]), num_leaves * np.arange(num_trees))
     found = nodes.double(nodes("Gather", arrays["value"].ravel(), leaf))

@@ -183,7 +183,8 @@ def _weighted(heads: np.ndarray, slopes: Sequence[float], offset: float = 0.0) -
 
     Not a product of matrices, which would round a row differently beside other rows.
     """
-    return sum((head * slope for head, slope in zip(heads.T, slopes, strict=True)), offset)
+    terms = (head * slope for head, slope in zip(heads.T, slopes, strict=True))
+    return sum(terms, np.array(offset))
 
 
 _CORRECTION = tuple(field.name for field in fields(Correction))

@@ -34,7 +34,7 @@ class Trees:
     def __init__(
         self, *, feature: np.ndarray, threshold: np.ndarray, left: np.ndarray, value: np.ndarray
     ):
-        self._arrays = {
+        self._arrays: dict[str, np.ndarray] = {
             "feature": feature.astype(np.uint16),
             "threshold": threshold.astype(np.float32),
             "left": left.astype(np.uint32),
