@@ -28,14 +28,15 @@ from lip_assessments import NUM_PAIRS, QUICK, better, inputs, pairs_with, worse
 from lip_episodes import make_episodes
 
 
+def learned(mode, **changed):
+    quick = QUICK | {"epochs": 6, "perplexity": 8.0} | changed
+    episodes = make_episodes(130, noise=0.002)
+    return SafetyAssessment(AssessmentParameters(mode=mode, **quick)).fit(episodes)
+
+
 @pytest.fixture(scope="module")
 def fitted():
-    episodes = make_episodes(130, noise=0.002)
-    quick = QUICK | {"epochs": 6, "perplexity": 8.0}
-    return {
-        mode: SafetyAssessment(AssessmentParameters(mode=mode, **quick)).fit(episodes)
-        for mode in ("sharpened", "paper")
-    }
+    return {mode: learned(mode) for mode in ("sharpened", "paper")}
 
 
 @pytest.fixture
@@ -233,7 +234,9 @@ def test_every_way_to_ask_an_adapted_assessment_gives_the_same(fitted, tmp_path)
 
 
 @pytest.mark.train
-def test_grid_and_published_probability_move_the_same_way(sharpened):
+@pytest.mark.parametrize("trees", [False, True])
+def test_grid_and_published_probability_move_the_same_way(sharpened, trees):
+    sharpened = sharpened if trees else learned("sharpened", trees=False)
     given = inputs(feedback_segments(worse(), sharpened.parameters), slice(None, None, 3))
     before = sharpened.predict(*given)
     adapted = sharpened.adapt(worse())
@@ -244,7 +247,8 @@ def test_grid_and_published_probability_move_the_same_way(sharpened):
     grid = (safe_share(after.belief) - safe_share(before.belief))[was_known]
     assert published.mean() < -0.05
     assert grid.mean() < -0.05
-    assert np.corrcoef(published, grid)[0, 1] > 0.7
+    # Trees tell more inputs of a cell apart than maps do.
+    assert np.corrcoef(published, grid)[0, 1] > (0.6 if trees else 0.7)
     beliefs = adapted.beliefs_
     np.testing.assert_allclose(beliefs[..., :3].sum(axis=2), 1.0)
     np.testing.assert_allclose(beliefs[..., 3:].sum(axis=2), beliefs[..., 1], atol=1e-12)
