@@ -12,7 +12,13 @@ from pydrake.systems.primitives import MatrixGain, PortSwitch
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
-from drake_safety.control.policy import load_policy, network_file, read_policy_file, with_policy
+from drake_safety.control.policy import (
+    Policy,
+    load_policy,
+    network_file,
+    read_policy_file,
+    with_policy,
+)
 from drake_safety.control.policy_network import network_files
 from drake_safety.control.walking_safe_set import WalkingSafeSet
 from drake_safety.diagrams.walking_parameters import WalkingParameters, profile
@@ -51,6 +57,8 @@ class Walking(LeggedLoop):
         guard: Whether a :class:`CommandGuard` passes on commands; requires an assessment.
         recovery: Whether to recover when Γ falls below a threshold. Without an assessment the
             diagram then has an input port ``safety_probability``.
+        starts_of: The scenario whose policy walks before the start, within whose commands plans are
+            drawn, and whose standing height the safe set refers to; by default this one.
 
     Raises:
         ValueError: The policy does not fit the robot, an assessment is that of another diagram, or
@@ -75,15 +83,19 @@ class Walking(LeggedLoop):
         command_s: float | None = None,
         guard: bool = False,
         recovery: bool = False,
+        starts_of: Scenario | None = None,
     ):
         super().__init__(scenario, variation, assessment)
+        self._starts_of = starts_of
+        self._rehearsal: Walking | None = None
         if guard and assessment is None:
             raise ValueError("walking: guard=True needs an assessment; got none")
         parameters = scenario.parameters
         self._is_disturbed, self._command_s = disturbed, command_s
         self.named_targets, self.pushes = parameters.named_commands, parameters.pushes
         self.view = parameters.view
-        self.policy = load_policy(policy_file(scenario), self.kinematics)
+        path, network = policy_files(scenario)
+        self.policy = load_policy(path, self.kinematics, network)
         # The servos' gains are part of the policy, and its default posture is how it stands.
         self.robot = with_policy(self.robot, self.policy, self.kinematics.joint_names)
         self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
@@ -95,7 +107,8 @@ class Walking(LeggedLoop):
         )
         names = ("desired_output", "desired_preview", "desired_outlook")
         desired = {name: planner.GetOutputPort(name) for name in names}
-        safe_set = WalkingSafeSet(self.kinematics, parameters.safe_set)
+        standing = self if starts_of is None else self._rehearsing()
+        safe_set = WalkingSafeSet(standing.kinematics, parameters.safe_set)
         guard_system = None
         if guard and assessment is not None:
             guard_system = builder.AddNamedSystem(
@@ -150,7 +163,6 @@ class Walking(LeggedLoop):
             "states": [name for name in self.state_names if name != _POSITION],
             "features": [name for name in self.memory_features if name != _UNCOMMANDED],
         }
-        self._rehearsal: Walking | None = None
         self._settled: EpisodeStart | None = None
         builder.BuildInto(self)
 
@@ -185,9 +197,9 @@ class Walking(LeggedLoop):
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's files and those of the policy."""
         of_robot = super().model_files(scenario)
-        path = policy_file(scenario)
-        network = network_file(read_policy_file(path), str(path.parent))
-        return [*of_robot, path, *network_files(network)]
+        path, network = policy_files(scenario)
+        named = network_file(read_policy_file(path, network), str(path.parent))
+        return [*of_robot, path, *network_files(named)]
 
     @classmethod
     def options_for(cls, purpose: Purpose, scenario: Scenario, variation: str) -> dict[str, Any]:
@@ -232,7 +244,8 @@ class Walking(LeggedLoop):
     ) -> int:
         """Samples a start, some with an offset, and a velocity profile; a goal is its command."""
         parameters = self.scenario.parameters
-        sampling, limits = parameters.start, self.policy.parameters.command
+        starter = self if self._starts_of is None else self._rehearsing()
+        sampling, limits = parameters.start, starter.policy.parameters.command
         plan = parameters.commands.sample(limits, rng, self.scenario.episode_duration_s)
         is_standing = rng.random() < sampling.standing_share
         before = parameters.commands.sample_command(limits, rng)
@@ -241,7 +254,7 @@ class Walking(LeggedLoop):
         offset_rng = rng.spawn(1)[0]
         if goal is not None:
             plan = self.command_plan(goal)
-        start = self.standing_start() if is_standing else self.rehearse(before, walked_s)
+        start = starter.standing_start() if is_standing else self.rehearse(before, walked_s)
         q, v = start.q, start.v
         if is_offset and self._is_disturbed:
             v = sampling.offset_velocities(v, offset_rng)
@@ -317,16 +330,23 @@ class Walking(LeggedLoop):
             command: (v_x, v_y, ω_z) (3,) [m/s, rad/s].
             duration_s: For how long [s]; rounded to the policy's period, so that the controller's
                 next update is due.
+
+        Raises:
+            ValueError: The policy that walks remembers other things than this one.
         """
-        if self._rehearsal is None:
-            self._rehearsal = type(self)(self.scenario)
-        other = self._rehearsal
+        other = self._rehearsing()
+        if _remembered(other.policy) != _remembered(self.policy):
+            raise ValueError(
+                "walking: a policy cannot take over in mid-stride from one with other observations "
+                "or joints, nor a recurrent one: begin all episodes at rest, "
+                "parameters.start.standing_share: 1"
+            )
         period_s = self.policy.parameters.period_s
         simulator = Simulator(other)
         context = simulator.get_mutable_context()
         other.remove_visuals(context)
         plan = PiecewisePolynomial(command[:, None])
-        other.reset_to(context, None, replace(self.standing_start(), plan=plan))
+        other.reset_to(context, None, replace(other.standing_start(), plan=plan))
         simulator.Initialize()
         simulator.AdvanceTo(max(round(duration_s / period_s), 0) * period_s)
         start = other.start_of(context)
@@ -334,6 +354,12 @@ class Walking(LeggedLoop):
         q[:4] /= np.linalg.norm(q[:4])
         q[4:6] = 0.0
         return replace(start, q=q)
+
+    def _rehearsing(self) -> "Walking":
+        """The nominal loop that walks before the start."""
+        if self._rehearsal is None:
+            self._rehearsal = type(self)(self._starts_of or self.scenario)
+        return self._rehearsal
 
     def settled_start(self) -> EpisodeStart:
         """A start where the policy has stood for a second, with a command of zero."""
@@ -352,6 +378,16 @@ class Walking(LeggedLoop):
         return np.zeros(3)  # Commands are in the heading frame, wherever the feet are.
 
 
-def policy_file(scenario: Scenario) -> Path:
-    """The policy file of a scenario of the walking task, beside its robot's YAML file."""
-    return Path(load_robot(scenario.robot).source_dir) / scenario.parameters.policy
+def _remembered(policy: Policy) -> tuple[Any, ...]:
+    """What tells the memories of two policies apart: that of a recurrent network is its own."""
+    parameters, is_recurrent = policy.parameters, len(policy.network.initial_memory) > 0
+    network = parameters.network if is_recurrent else ""
+    return parameters.observation, parameters.history, policy.joint_names, network
+
+
+def policy_files(scenario: Scenario) -> tuple[Path, str]:
+    """The policy file of a scenario, and a network in place of the one that it names, or ""."""
+    folder = Path(load_robot(scenario.robot).source_dir)
+    named = folder / scenario.parameters.policy
+    is_network = named.suffix not in (".yaml", ".yml")
+    return (folder / "policy.yaml", str(named)) if is_network else (named, "")

@@ -148,7 +148,8 @@ class WalkingParameters:
     )
 
     policy: str = "policy.yaml"
-    """Policy file, relative to the folder of the robot's YAML file."""
+    """Policy file, relative to the folder of the robot's YAML file; or a network in place of the
+    one that ``policy.yaml`` there names."""
     safe_set: WalkingLimits = field(default_factory=WalkingLimits)
     commands: CommandSampling = field(default_factory=CommandSampling)
     start: WalkingStart = field(default_factory=WalkingStart)

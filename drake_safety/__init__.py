@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from drake_safety.assessments import load_assessment
+    from drake_safety.evaluation.loop_comparison import compare_loops
     from drake_safety.learning.assessment import SafetyAssessment
     from drake_safety.learning.assessment_parameters import AssessmentParameters
     from drake_safety.learning.change_detector import ChangeDetector
@@ -47,6 +48,7 @@ __all__ = [
     "SensorFaults",
     "__version__",
     "check_contract",
+    "compare_loops",
     "inputs_at",
     "load_assessment",
     "load_scenario",
@@ -99,6 +101,7 @@ _HOMES = {
     "Scenario": "drake_safety.simulation.scenario",
     "SensorFaults": "drake_safety.systems.sensor_faults",
     "check_contract": "drake_safety.simulation.contract",
+    "compare_loops": "drake_safety.evaluation.loop_comparison",
     "inputs_at": "drake_safety.simulation.rollouts",
     "load_assessment": "drake_safety.assessments",
     "load_scenario": "drake_safety.simulation.scenario",

@@ -161,7 +161,10 @@ def upward_imports(source, name):
 DRAWING = {
     f"drake_safety/evaluation/{name}.py"
     for name in (
-        *(f"{what}_figure" for what in ("embedding", "interval", "path", "robot", "timeline")),
+        *(
+            f"{what}_figure"
+            for what in ("embedding", "gate", "interval", "path", "robot", "timeline")
+        ),
         *("truth_figure", "figure_style", "reliability", "shift_study"),
     )
 }

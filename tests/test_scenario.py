@@ -52,6 +52,18 @@ def test_a_file_holds_only_what_differs_from_the_defaults():
     assert scenario.variation("actual").mass_scale == 1.2
 
 
+def test_values_of_a_file_are_replaced_by_their_keys():
+    plain = load_scenario("pendulum")
+    changes = {"episode_duration_s": 3.0, "variations.heavy.mass_scale": 2.0}
+    changed = load_scenario("pendulum", changes | {"parameters.damping": 0.1})
+    assert changed.variation("heavy").mass_scale == 2.0
+    assert changed.variations.keys() - plain.variations.keys() == {"heavy"}
+    assert (changed.episode_duration_s, changed.parameters.damping) == (3.0, 0.1)
+    assert changed.assessment == plain.assessment
+    with pytest.raises(ValueError, match="unknown key 'dampng'"):
+        load_scenario("pendulum", {"parameters.dampng": 0.1})
+
+
 @pytest.mark.parametrize(
     ("control_period_s", "monitor_step_s"),
     [(0.01, 0.02), (0.02, 0.02), (0.004, 0.02), (0.006, 0.024), (0.05, 0.05)],

@@ -6,8 +6,9 @@ import pytest
 import typer
 
 from drake_safety import __version__
-from drake_safety.cli import adapt, calibrate, evaluate, play, prepare, run, train
+from drake_safety.cli import adapt, calibrate, evaluate, gate, play, prepare, run, train
 from drake_safety.evaluation.episode_study import evaluate_episodes
+from drake_safety.evaluation.loop_comparison import compare_loops
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.calibration import calibrate as choose
@@ -17,6 +18,7 @@ from drake_safety.learning.seeds import (
     BLOCKS,
     DEMONSTRATION,
     FRESH_MOTION,
+    GATE,
     NOT_DRAWN,
     RELEASE,
     SHIFTS,
@@ -101,6 +103,7 @@ def test_every_command_takes_its_default_seed_from_the_table():
     shown = [default_seed(command) for command in (run.run, play.play, prepare.check)]
     assert shown == [DEMONSTRATION.first] * 3
     assert default_seed(run_pairs) == ADAPTATION.first
+    assert default_seed(gate.gate) == default_seed(compare_loops) == GATE.first
 
 
 def test_a_used_seed_is_refused_with_what_it_was_used_for_and_one_that_is_free():

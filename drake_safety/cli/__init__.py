@@ -37,13 +37,14 @@ COMMANDS = {
     "run": ("run", ""),
     "play": ("play", "live"),
     "evaluate": ("evaluate", "train"),
+    "gate": ("gate", ""),
     "adapt": ("adapt", "train"),
     "monitor": ("monitor", ""),
     "export": ("export", ""),
     "report": ("report", "report"),
 }
 """In the order of the help: module, and the extra that it needs, said before it does anything."""
-_RESUMED = {"train": "--resume", "calibrate": "", "evaluate": "", "adapt": ""}
+_RESUMED = {"train": "--resume", "calibrate": "", "evaluate": "", "gate": "", "adapt": ""}
 """Commands that the same line continues after Ctrl-C, and the option that does so."""
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.

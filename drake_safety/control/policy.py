@@ -377,19 +377,20 @@ def _wrapped(phases: np.ndarray) -> np.ndarray:
     return np.fmod(phases + math.pi, 2 * math.pi) - math.pi
 
 
-def read_policy_file(path: Path) -> PolicyParameters:
-    """Reads a ``policy.yaml``."""
-    return load_typed_file(PolicyParameters, path, f"policy file '{path}'")
+def read_policy_file(path: Path, network: str = "") -> PolicyParameters:
+    """Reads a ``policy.yaml``; a network replaces the one that it names."""
+    read = load_typed_file(PolicyParameters, path, f"policy file '{path}'")
+    return replace(read, network=network, requires="") if network else read
 
 
-def load_policy(path: Path, kinematics: RobotKinematics) -> Policy:
-    """Loads a policy for a robot.
+def load_policy(path: Path, kinematics: RobotKinematics, network: str = "") -> Policy:
+    """Loads a policy for a robot; see :func:`read_policy_file`.
 
     Raises:
         ValueError: The file does not fit the schema, the robot or the network.
     """
     return Policy(
-        read_policy_file(path),
+        read_policy_file(path, network),
         kinematics.joint_names,
         robot=kinematics.robot.name,
         folder=str(path.parent),

@@ -67,9 +67,11 @@ WALKING = SeedBlock(6_000_000, ("calibration", "tour", "push", "command", "start
 show when a robot falls."""
 ANOMALIES = SeedBlock(10_000_000, ("unperturbed", "perturbed", "thresholds"))
 """Motion with and without an anomaly, and that for thresholds."""
+GATE = SeedBlock(11_000_000, ("pairs of two loops",))
+"""Both loops of a pair draw from the same generator."""
 BLOCKS = (
     *(TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION),
-    *(DEMONSTRATION, SHIFTS, MOTION, FRESH_MOTION, ANOMALIES, WALKING),
+    *(DEMONSTRATION, SHIFTS, MOTION, FRESH_MOTION, ANOMALIES, WALKING, GATE),
 )
 
 

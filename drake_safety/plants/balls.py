@@ -70,6 +70,10 @@ class Ball:
         self._plant.SetFreeBodyPose(context, self._body, RigidTransform(p))
         self._plant.SetFreeBodySpatialVelocity(context, self._body, SpatialVelocity.Zero())
 
+    def mass(self, context: Context) -> float:
+        """Mass of the ball in the plant's Context [kg]."""
+        return float(self._body.get_mass(context))
+
     def throw(self, context: Context, throw: Throw, lead_s: float) -> None:
         """Starts the ball's flight so that it touches the robot after ``lead_s``.
 

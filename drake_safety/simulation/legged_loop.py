@@ -225,6 +225,16 @@ class LeggedLoop(PlannedLoop):
             duration_s=push.duration_s,
         )
 
+    def disturbances(self, context: Context) -> dict[str, np.ndarray]:
+        """The ball's mass and state, and the push; see `IsDisturbed`."""
+        found = {}
+        if self._physics.ball is not None:
+            mass = self._physics.ball.mass(self.plant.GetMyContextFromRoot(context))
+            found["ball"] = np.append(mass, self.GetOutputPort("ball_state").Eval(context))
+        if self._push_source is not None:
+            found["push"] = self._push_source.push(self._push_source.GetMyContextFromRoot(context))
+        return found
+
     def export(
         self, builder: DiagramBuilder, ports: Mapping[str, OutputPort], **options: Any
     ) -> SafetyAssessor | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
@@ -102,6 +102,8 @@ def run_episode(
     start: EpisodeStart | None = None,
     plan: Any = None,
     monitor: Callable[[Context], None] | None = None,
+    after_leaving_s: float = 0.0,
+    at_start: Callable[[Context], object] = lambda context: None,
 ) -> Episode:
     """Simulates one episode, which ends when it leaves the safe set or its time is over.
 
@@ -114,6 +116,8 @@ def run_episode(
             the index.
         plan: Replaces the initial plan: one of the loop's ``candidate_plans``.
         monitor: Called with the Context after each step of the simulator.
+        after_leaving_s: Time for which it goes on outside the safe set, until a fall [s].
+        at_start: Called with the root Context at the start.
 
     Returns:
         The episode. If the simulation fails, its cause is ``diverged`` and it has the rows that
@@ -141,6 +145,7 @@ def run_episode(
             first_step = require(loop, HasGoals).reset(context, rng, goal)
         if plan is not None:
             require(loop, OffersPlans).set_plan(context, plan)
+        at_start(context)
         return first_step
 
     counted = filter(loop.HasOutputPort, ["num_controller_failures"])
@@ -151,7 +156,7 @@ def run_episode(
         duration_s=scenario.episode_duration_s,
         step_s=scenario.step_s,
         watch_period_s=scenario.watch_period_s,
-        after_leaving_s=0.0,
+        after_leaving_s=after_leaving_s,
         monitor=monitor,
         may_fail=True,
         index=index,
@@ -389,7 +394,7 @@ def collect_episodes(
         if writer is not None:
             episodes += (e for e in load_episodes(writer.path) if e.index < num_episodes)
             if episodes:
-                _check_kept(writer.path, episodes, partial(make.run, function))
+                check_kept(writer.path, episodes, partial(make.run, function))
                 _LOGGER.warning(
                     "%d of %d episodes are kept from %s", len(episodes), num_episodes, path
                 )
@@ -431,8 +436,12 @@ def collect_episodes(
     return collected
 
 
-def _check_kept(path: Path, kept: list[Episode], run: Callable[[int], Episode]) -> None:
-    """Simulates one episode again, a long unsafe one if there is one."""
+def check_kept(path: Path, kept: Sequence[Episode], run: Callable[[int], Episode]) -> None:
+    """Simulates one of a folder's episodes again, a long unsafe one if there is one.
+
+    Raises:
+        ValueError: It is not the same any more.
+    """
     one = min(kept, key=lambda episode: (episode.is_safe, -episode.num_steps, episode.index))
     with ONE_BLAS_THREAD:
         again = run(one.index)

@@ -5,6 +5,7 @@ import importlib
 import inspect
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import field
 from importlib.resources import files
 from pathlib import Path
@@ -306,12 +307,15 @@ def task_names() -> list[str]:
     return sorted({yaml.safe_load(text)["task"].partition(":")[0] for text in texts})
 
 
-def load_scenario(name: str | Path) -> Scenario:
+def load_scenario(name: str | Path, changes: Mapping[str, Any] | None = None) -> Scenario:
     """Loads a scenario by name, or by the path of a YAML file, and imports its task.
 
     Importing runs the task's code, wherever the file says that it is; :func:`read_scenario` does
     not. The task's module may stand in the scenario file's folder, where modules are searched last,
     while the task is imported. A relative ``robot`` path is relative to the scenario file's folder.
+
+    Args:
+        changes: Values that replace those of the file, by key, such as ``parameters.policy``.
 
     Raises:
         ValueError: No such scenario, unknown or ill-typed keys, or no such task.
@@ -320,7 +324,23 @@ def load_scenario(name: str | Path) -> Scenario:
     with reading(path, errors=ValueError):
         folder = path.resolve().parent
         text = path.read_text(encoding="utf-8")
+        if changes:
+            text = _changed(text, path.stem, changes)
         return parse_scenario(text, name=path.stem, folder=folder, task_folder=str(folder))
+
+
+def _changed(text: str, name: str, changes: Mapping[str, Any]) -> str:
+    """The text of a scenario with other values by dotted key."""
+    raw = parse_yaml(text, f"scenario '{name}'")
+    for key, value in changes.items():
+        *outer, last = key.split(".")
+        place = raw
+        for part in outer:
+            if not isinstance(place.get(part), dict):
+                place[part] = {}
+            place = place[part]
+        place[last] = value
+    return yaml.safe_dump(raw, sort_keys=False)
 
 
 def read_scenario(name: str | Path) -> Scenario:

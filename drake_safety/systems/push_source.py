@@ -62,6 +62,10 @@ class PushSource(LeafSystem):
             np.array([index, *force_n, start_s, duration_s], dtype=float)
         )
 
+    def push(self, context: Context) -> np.ndarray:
+        """Index of the body, force [N], start and duration [s] of the push, (6,)."""
+        return context.get_numeric_parameter(self._parameter).get_value().copy()
+
     def clear_push(self, context: Context) -> None:
         """Removes the push from the next update on."""
         context.get_mutable_numeric_parameter(self._parameter).SetFromVector(np.zeros(_SIZE))

@@ -1,0 +1,332 @@
+"""Two closed loops in the same episodes: verdicts, refusals, and the command."""
+
+import json
+import shutil
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from cart_episodes import assert_identical
+from command_line import call
+from drake_safety import compare_loops, load_scenario, run_episode, run_episodes
+from drake_safety.cli import gate
+from drake_safety.control.policy import network_file, read_policy_file
+from drake_safety.diagrams.walking import policy_files
+from drake_safety.evaluation import loop_comparison
+from drake_safety.evaluation.loop_comparison import Loop
+from drake_safety.evaluation.results import Results
+from drake_safety.learning.segments import DIVERGED
+from drake_safety.simulation.dataset import load_episodes
+from drake_safety.simulation.rollouts import episode_rng
+
+WEAK = {"parameters.effort_share": 0.2}
+COMPARED = partial(compare_loops, num_workers=1, worse_by=0.2)
+
+
+def pendulum(**changes):
+    return load_scenario("pendulum", {f"parameters.{name}": one for name, one in changes.items()})
+
+
+def numbers(verdict):
+    return [verdict.verdict, verdict.pairs, verdict.difference, verdict.survival_s, verdict.changes]
+
+
+@pytest.fixture(scope="module")
+def worse():
+    return COMPARED(pendulum(), pendulum(effort_share=0.2))
+
+
+def test_a_weaker_motor_is_found_to_be_worse_and_what_it_changes_is_named(worse):
+    assert (worse.verdict, worse.only_baseline) == ("worse", 0)
+    assert worse.pairs % 16 == 0
+    assert worse.difference.low[-1] > 0 >= worse.difference.low[-2]
+    assert worse.e_worse >= 20 > 1 > worse.e_better
+    assert worse.survival_s.mean[-1] < 0
+    assert worse.neither + worse.both + worse.only_candidate == worse.pairs
+    assert len(worse.changes) == worse.only_candidate
+    assert all(one.newly_fails and one.probability is None for one in worse.changes)
+    first = worse.changes[0]
+    assert first.time_s == min(one.time_s for one in worse.changes)
+    # Episodes are those that seed and index give.
+    loops = [scenario.make_loop() for scenario in (pendulum(), pendulum(effort_share=0.2))]
+    one, two = (run_episode(loop, first.episode, seed=11_000_000) for loop in loops)
+    assert one.is_safe
+    assert (two.cause, two.time_s[-1]) == (first.cause, first.time_s)
+    np.testing.assert_array_equal(one.true_state[0], two.true_state[0])
+
+
+def test_a_stronger_motor_is_better_by_the_same_numbers(worse):
+    # It is also not worse, which is known sooner by a difference of 0.2.
+    better = COMPARED(pendulum(effort_share=0.2), pendulum(), worse_by=0.01)
+    assert (better.verdict, better.pairs) == ("better", worse.pairs)
+    assert better.difference.high == pytest.approx([-low for low in worse.difference.low])
+    assert better.e_better == pytest.approx(worse.e_worse)
+    assert not any(one.newly_fails for one in better.changes)
+
+
+def test_a_loop_that_differs_in_nothing_that_matters_is_not_worse():
+    looks = []
+    same = COMPARED(pendulum(), pendulum(damping=0.0501), each_look=looks.append)
+    assert (same.verdict, same.pairs, same.changes) == ("not worse", 32, [])
+    assert [one.verdict for one in looks] == ["undecided", "not worse"]
+    assert [one.pairs for one in looks] == [16, 32]
+    assert same.difference.high[-1] < 0.2 <= same.difference.high[0]
+
+
+def test_at_the_limit_nothing_is_known():
+    found = COMPARED(pendulum(), pendulum(damping=0.0501), max_pairs=18, worse_by=0.01)
+    assert (found.verdict, found.difference.pairs) == ("undecided", [16, 18])
+
+
+def test_metrics_are_a_constraint_the_tracking_error_or_a_function():
+    weak, options = pendulum(effort_share=0.2), {"max_pairs": 16, "worse_by": 0.9}
+    unsafe = COMPARED(pendulum(), weak, **options)
+    sides = [COMPARED(pendulum(), weak, metric=name, **options) for name in ("front", "back")]
+    # Outside the safe set a motion goes on, so that it may violate the other constraint, too.
+    assert sum(one.both + one.only_candidate for one in sides) >= unsafe.both
+    loose = COMPARED(pendulum(), weak, metric="tracking=100", **options)
+    assert loose.neither == 16
+    tight = COMPARED(pendulum(), weak, metric="tracking=0.001", **options)
+    assert tight.both == 16
+    as_function = COMPARED(pendulum(), weak, metric=lambda one: 0.5 * (not one.is_safe), **options)
+    assert as_function.difference.mean[-1] == pytest.approx(0.5 * unsafe.difference.mean[-1])
+    assert numbers(as_function)[3:] == numbers(unsafe)[3:]
+
+
+def test_a_fall_and_a_diverged_simulation_are_failures():
+    loop = SimpleNamespace(
+        constraint_names=["tilt", "fall"],
+        scenario=pendulum(),
+        fall_name="fall",
+        watched_features={},
+    )
+    one = run_episode(pendulum(effort_share=0.2).make_loop(), 6)
+    num_rows = len(one.time_s)
+    margins = np.ones((num_rows, 2))
+    margins[5:, 0], margins[9:, 1] = -1.0, -0.1
+    fallen = replace(one, margins=margins)
+    for metric, first in (("tilt", 5), ("fall", 9)):
+        is_bad = loop_comparison._bad_rows(loop, metric)(fallen)
+        np.testing.assert_array_equal(is_bad, np.arange(num_rows) >= first)
+    pairing = loop_comparison._Pairing(
+        (Loop(pendulum()), Loop(pendulum(effort_share=0.2))), "front", 0, {}, None
+    )
+    diverged = replace(one, margins=np.ones((num_rows, 2)), cause=DIVERGED, is_safe=False)
+    assert pairing.read(0, diverged)[:2] == (1.0, one.time_s[-1])
+
+
+def test_gamma_says_of_each_change_whether_it_was_to_be_expected(worse):
+    seen = []
+
+    def predict_one(state, preview, features):
+        seen.append(state)
+        return SimpleNamespace(probability=np.float64(0.25))
+
+    gamma = SimpleNamespace(predict_one=predict_one)
+    found = COMPARED(pendulum(), pendulum(effort_share=0.2), assessment=gamma)
+    assert found.pairs == len(seen) == worse.pairs
+    assert {one.probability for one in found.changes} == {0.25}
+
+
+@pytest.mark.parametrize(
+    ("candidate", "options", "message"),
+    [
+        ({}, {}, "the candidate is the baseline: scenario 'pendulum', variation 'nominal'"),
+        (WEAK, {"metric": "frnt"}, r"metric 'frnt' \(did you mean 'front'\?\): expected one of"),
+        (WEAK, {"metric": "fall"}, "metric 'fall': task 'Pendulum' has no fall"),
+        (WEAK, {"metric": "tracking=-1"}, "metric 'tracking=-1'"),
+        (WEAK, {"metric": lambda episode: 2}, "episode 0 has 2.0, expected 0 to 1"),
+        (WEAK, {"worse_by": 0.0}, "worse_by must be between 0 and 1; got 0.0"),
+        (WEAK, {"max_pairs": 0}, "max_pairs must be at least 1; got 0"),
+        (
+            {"parameters.start_angle_rad": 0.1},
+            {},
+            r"pair 0 does not start alike in both loops: entry 0 \(angle\) of 'state' is \S+ in",
+        ),
+        ({"parameters.plan_angle_rad": 0.1}, {}, "entry 0 of 'plan' is"),
+        ({"assessment.horizon": 4}, {}, None),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_by_name(candidate, options, message):
+    other = load_scenario("pendulum", candidate)
+    if message is None:
+        COMPARED(pendulum(), other, max_pairs=1)
+        return
+    with pytest.raises(ValueError, match=message):
+        COMPARED(pendulum(), other, **options)
+
+
+def test_another_ball_is_another_disturbance():
+    changes = {"parameters.push.share": 0.99}
+    heavy = changes | {"parameters.push.mass_kg": [9.0, 10.0]}
+    starts = []
+    for values in (changes, heavy):
+        loop = load_scenario("laikago_balancing", values).make_loop()
+        context = loop.CreateDefaultContext()
+        loop.reset(context, episode_rng(0, 0))
+        starts.append(loop_comparison._start_of(loop, context))
+    with pytest.raises(ValueError, match=r"pair 0 .*: entry 0 of 'ball' is \S+ in the baseline"):
+        loop_comparison._check_alike(0, loop, *starts)
+
+
+@pytest.mark.train
+def test_what_was_simulated_is_kept_and_continued_with_the_same_result(tmp_path, worse):
+    weak, told = pendulum(effort_share=0.2), []
+    kept = {"path": tmp_path, "progress": lambda done, wanted: told.append((done, wanted))}
+    COMPARED(pendulum(), weak, max_pairs=10, worse_by=0.01, **kept)
+    again = COMPARED(pendulum(), weak, max_pairs=worse.pairs, **kept)
+    assert numbers(again) == numbers(worse)
+    assert told[0] == (0, 10)
+    assert (10, worse.pairs) in told
+    # Another candidate has the same baseline; its starts are compared with those of a kept one.
+    told.clear()
+    with pytest.raises(ValueError, match="'state' is"):
+        COMPARED(pendulum(), pendulum(start_angle_rad=0.1), max_pairs=4, **kept)
+    folders = {load_episodes(one).info.scenario_hash: one for one in tmp_path.iterdir()}
+    assert len(folders) == 3
+    baseline = load_episodes(folders[pendulum().simulation_hash()])
+    ordinary = run_episodes(pendulum(), worse.pairs, seed=11_000_000, num_workers=1)
+    assert_identical(baseline, ordinary)
+
+
+@pytest.mark.slow
+def test_the_verdict_does_not_depend_on_the_number_of_workers(worse):
+    two = COMPARED(pendulum(), pendulum(effort_share=0.2), num_workers=2)
+    assert numbers(two) == numbers(worse)
+
+
+GATE = ("gate", "pendulum", "--workers", 1, "--worse-by", 0.2)
+
+
+@pytest.mark.train
+def test_the_command_says_which_candidate_is_worse_and_replays_an_episode(
+    monkeypatch, capsys, tmp_path
+):
+    junit = tmp_path / "junit.xml"
+    weak = ("--candidate", "parameters.effort_share=0.2 variation=actual")
+    command = (*GATE, *weak, "--candidate", "parameters.damping=0.0501", "--out", tmp_path)
+    assert call(monkeypatch, *command, "--junit", junit) == 1
+    printed = capsys.readouterr().out
+    assert "at most 2.5 % a candidate" in printed
+    results = Results.read(tmp_path / "gate.json")
+    candidates = results.entries["candidates"]
+    assert [one["verdict"] for one in candidates.values()] == ["worse", "not worse"]
+    first = candidates["parameters.effort_share=0.2 variation=actual"]
+    ends = results["parameters_effort_share_0_2_variation_actual.difference"]
+    assert ends.n == first["pairs"] == first["difference"]["pairs"][-1]
+    assert ends.low == pytest.approx(first["difference"]["low"][-1], rel=1e-5)
+    assert (tmp_path / "gate.png").stat().st_size > 10_000
+    suite = ElementTree.parse(junit).getroot()
+    assert (suite.get("tests"), suite.get("failures"), suite.get("errors")) == ("2", "1", "0")
+    (failure,) = suite.iter("failure")
+    assert failure.get("message").startswith(f"worse after {first['pairs']} pairs: +")
+    index = first["changes"][0]["episode"]
+    assert f"--replay={index}" in printed
+    assert call(monkeypatch, *command, "--replay", index) == 0
+    printed = capsys.readouterr().out
+    recordings = sorted(tmp_path.glob(f"episode-{index}-*.html"))
+    assert len(recordings) == 3
+    assert f"episode-{index}-baseline.html: stays in the safe set" in printed
+    assert "_actual.html: leaves the safe set at" in printed
+
+
+@pytest.mark.train
+def test_scenario_files_are_candidates_and_what_is_undecided_has_a_code(monkeypatch, tmp_path):
+    file = tmp_path / "mine.yaml"
+    source = Path(__file__).resolve().parents[1] / "diagrams/pendulum.yaml"
+    file.write_text(source.read_text() + "parameters: {damping: 0.0501}\n")
+    few = (*GATE, file, "--out", tmp_path / "out", "--episodes")
+    assert call(monkeypatch, *few, 8) == 2
+    assert call(monkeypatch, *few, 64) == 0
+    (one,) = json.loads((tmp_path / "out/gate.json").read_text())["entries"]["candidates"].items()
+    assert (one[0], one[1]["verdict"]) == ("mine", "not worse")
+
+
+@pytest.mark.train
+def test_ctrl_c_tells_what_is_known_so_far(monkeypatch, capsys, tmp_path):
+    def stopped(*loops, each_look, **options):
+        def look(verdict):
+            each_look(verdict)
+            raise KeyboardInterrupt
+
+        compare_loops(*loops, each_look=look, **options)
+
+    monkeypatch.setattr(gate, "compare_loops", stopped)
+    command = (*GATE, "--candidate", "parameters.damping=0.0501", "--out", tmp_path)
+    assert call(monkeypatch, *command) == 130
+    printed = capsys.readouterr().out
+    assert "undecided" in printed
+    assert "continue with: drake-safety gate pendulum" in printed
+    assert (tmp_path / "gate.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "gate: name different candidates"),
+        (
+            ["--candidate", "actual"],
+            "a change is KEY=VALUE, such as variation=actual; got 'actual'",
+        ),
+        (["--candidate", "variation=actul"], "has no variation 'actul' (did you mean 'actual'?)"),
+        (["--candidate", "parameters.dampng=1"], "unknown key 'dampng' (did you mean 'damping'?)"),
+        (["--candidate", "a.b=1"], "unknown key 'a'"),
+    ],
+)
+def test_a_candidate_that_is_none_is_an_error(monkeypatch, capsys, tmp_path, arguments, message):
+    assert call(monkeypatch, *GATE, *arguments, "--out", tmp_path) == 2
+    assert message in " ".join(capsys.readouterr().out.split())
+
+
+GO2, _ = policy_files(load_scenario("go2_walking"))
+
+
+def go2(tmp_path, **changes):
+    """The walking scenario with other words in its policy's file."""
+    text = GO2.read_text()
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "policy.yaml").write_text(text)
+    return load_scenario("go2_walking", {"parameters.policy": str(tmp_path / "policy.yaml")})
+
+
+def start_of(loop):
+    context = loop.CreateDefaultContext()
+    loop.reset(context, episode_rng(0, 5))
+    return loop_comparison._start_of(loop, context)
+
+
+def test_another_policy_takes_over_where_the_baselines_has_walked(tmp_path):
+    baseline = load_scenario("go2_walking")
+    crouched = go2(tmp_path, **{"_thigh_joint: 0.8": "_thigh_joint: 0.9"})
+    there = start_of(baseline.make_loop())
+    assert np.abs(there["state"][-12:]).max() > 0.1  # In mid-stride.
+    alone = start_of(crouched.make_loop())
+    with pytest.raises(ValueError, match="pair 5 does not start alike"):
+        loop_comparison._check_alike(5, baseline.make_loop(), there, alone)
+    taking_over = loop_comparison.make_paired((Loop(baseline), Loop(crouched)), 1)
+    loop_comparison._check_alike(5, taking_over, there, start_of(taking_over))
+
+
+def test_a_policy_that_remembers_other_things_cannot_take_over_in_mid_stride(tmp_path):
+    clipped = go2(tmp_path, **{"{name: last_action}": "{name: last_action, clip: 5}"})
+    loop = loop_comparison.make_paired((Loop(load_scenario("go2_walking")), Loop(clipped)), 1)
+    with pytest.raises(ValueError, match=r"begin all episodes at rest, parameters\.start\.stand"):
+        start_of(loop)
+
+
+def test_a_network_alone_is_a_policy(tmp_path):
+    network = network_file(read_policy_file(GO2), str(GO2.parent))
+    copy = tmp_path / "new.onnx"
+    shutil.copyfile(network, copy)
+    changed = gate._changed("go2_walking", f"policy={copy}").scenario
+    assert policy_files(changed) == (GO2, str(copy))
+    assert copy in changed.task_class().model_files(changed)
+    starts = [start_of(load_scenario("go2_walking").make_loop()), start_of(changed.make_loop())]
+    loop_comparison._check_alike(5, changed.make_loop(), *starts)

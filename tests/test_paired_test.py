@@ -1,0 +1,166 @@
+"""Sequential tests: the law of every bet, and thousands of replays."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+import naive
+from drake_safety.evaluation.paired_test import (
+    _SHARES,
+    _WEIGHTS,
+    ConfidenceSequence,
+    betting_log_e,
+)
+
+ALPHA = 0.05
+OUTCOMES = np.array([-1.0, 0.0, 1.0])
+LOOKS = np.arange(16, 5001, 16)
+NUM_REPLAYS = 500
+
+
+def failures(rng, baseline, candidate, num_pairs, shared=0.0, num_replays=NUM_REPLAYS):
+    """Differences of two loops that share a part of the baseline's failures, (replays, pairs)."""
+    common = shared * baseline
+    draw = rng.random((3, num_replays, num_pairs), dtype=np.float32)
+    both = draw[0] < common
+    one, two = (draw[i + 1] < (p - common) for i, p in enumerate((baseline, candidate)))
+    return (both | two).astype(np.int8) - (both | one).astype(np.int8)
+
+
+def counted(differences, looks):
+    """How often -1, 0 and 1 was seen at each look, (replays, looks, 3)."""
+    seen = [np.cumsum(differences == value, axis=1)[:, looks - 1] for value in OUTCOMES]
+    return np.stack(seen, axis=-1)
+
+
+def first_looks(log_e, looks):
+    """Pairs until 1 / alpha is reached, infinite without."""
+    is_over = log_e >= -math.log(ALPHA)
+    return np.where(is_over.any(axis=1), looks[is_over.argmax(axis=1)], np.inf)
+
+
+@pytest.mark.parametrize("is_above", [True, False])
+@pytest.mark.parametrize("mean", [-0.6, 0.0, 0.02, 0.9])
+def test_the_capital_is_that_of_one_bet_after_the_other(mean, is_above):
+    outcomes = np.random.default_rng(1).choice([-1.0, -0.3, 0.0, 0.25, 1.0], 60)
+    values, counts = np.unique(outcomes, return_counts=True)
+    expected = naive.capital(outcomes, mean, _SHARES, _WEIGHTS, is_above)
+    found = betting_log_e(values, counts, mean, is_above=is_above)
+    assert math.exp(found) == pytest.approx(expected)
+
+
+def test_a_bet_is_fair_at_its_mean_and_loses_where_the_null_hypothesis_holds():
+    for mean, is_above in ((0.3, True), (-0.2, False)):
+        # One pair, whose outcome is 1 or -1.
+        for truth, compare in (
+            (mean, math.isclose),
+            (mean - 0.1 if is_above else mean + 0.1, None),
+        ):
+            chances = np.array([1 - truth, 1 + truth]) / 2
+            each = [
+                math.exp(betting_log_e(np.array([d]), np.array([1]), mean, is_above=is_above))
+                for d in (-1.0, 1.0)
+            ]
+            expected = float(chances @ each)
+            assert math.isclose(expected, 1.0) if compare else expected < 1.0
+
+
+def test_against_no_difference_only_the_pairs_count_in_which_one_fails_alone():
+    share = (1 + _SHARES) / 2
+    for more, less in ((0, 0), (7, 2), (3, 9)):
+        n = more + less
+        ratios = binom.pmf(more, n, share) / binom.pmf(more, n, 0.5)
+        for none in (0, 1000):
+            found = betting_log_e(OUTCOMES, np.array([less, none, more]), 0.0, is_above=True)
+            assert math.exp(found) == pytest.approx(float(_WEIGHTS @ ratios))
+
+
+def test_a_confidence_sequence_ends_where_the_capital_is_one_over_alpha():
+    outcomes = np.random.default_rng(2).choice([-0.5, 0.0, 1.0, 2.0], 300)
+    sequence = ConfidenceSequence(ALPHA, bound=2.0)
+    for n in (1, 60, 300):
+        sequence.look(outcomes[:n])
+    assert sequence.pairs == [1, 60, 300]
+    assert sequence.mean[-1] == pytest.approx(outcomes.mean())
+    assert sequence.low == sorted(sequence.low)
+    assert sequence.high == sorted(sequence.high, reverse=True)
+    assert -2 <= sequence.low[0] < sequence.low[-1] < outcomes.mean() < sequence.high[-1] < 2
+    values, counts = np.unique(outcomes / 2, return_counts=True)
+    for end, is_above in ((sequence.low[-1], True), (sequence.high[-1], False)):
+        log_e = betting_log_e(values, counts, end / 2, is_above=is_above)
+        assert log_e == pytest.approx(-math.log(ALPHA))
+    with pytest.raises(ValueError, match=r"outcomes must be in ±2; got 2\.5"):
+        sequence.look(np.array([0.0, 2.5]))
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, 1.0])
+def test_equal_outcomes_have_an_interval_too(value):
+    sequence = ConfidenceSequence(ALPHA)
+    sequence.look(np.full(200, value))
+    assert sequence.low[0] <= value <= sequence.high[0]
+    assert sequence.high[0] - sequence.low[0] < 0.06
+
+
+@pytest.mark.parametrize(("rate", "shared"), [(0.02, 0.0), (0.3, 0.0), (0.3, 0.8)])
+def test_two_equal_loops_are_rarely_called_different_however_often_one_looks(rate, shared):
+    every = np.arange(1, 2001)
+    differences = failures(np.random.default_rng(3), rate, rate, 2000, shared)
+    counts = counted(differences, every)
+    for is_above in (True, False):
+        log_e = betting_log_e(OUTCOMES, counts, 0.0, is_above=is_above)
+        assert np.isfinite(first_looks(log_e, every)).mean() <= ALPHA
+
+
+def survival(rng, size):
+    """Differences of survival times in four steps: mostly none, some of either sign."""
+    return rng.choice([-1.0, -0.25, 0.0, 0.5, 1.0], size, p=[0.02, 0.1, 0.8, 0.05, 0.03])
+
+
+@pytest.mark.parametrize("kind", ["failures", "survival"])
+def test_either_end_excludes_the_true_mean_in_at_most_a_share_alpha_of_replays(kind):
+    rng = np.random.default_rng(4)
+    if kind == "failures":
+        values, mean = OUTCOMES, 0.05
+        outcomes = failures(rng, 0.05, 0.1, 1600)
+    else:
+        outcomes = survival(rng, (NUM_REPLAYS, 1600))
+        values, mean = np.unique(outcomes), 0.01
+        assert outcomes.mean() == pytest.approx(mean, abs=0.002)
+    looks = np.arange(4, 1601, 4)
+    counts = np.stack([np.cumsum(outcomes == v, axis=1)[:, looks - 1] for v in values], axis=-1)
+    for is_above in (True, False):
+        log_e = betting_log_e(values, counts, mean, is_above=is_above)
+        assert np.isfinite(first_looks(log_e, looks)).mean() <= ALPHA
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.5, 0.9])
+@pytest.mark.parametrize(("baseline", "num_pairs"), [(0.01, 2016), (0.05, 416)])
+def test_a_verdict_takes_about_as_many_pairs_as_with_a_mixture_of_all_shares(
+    baseline, num_pairs, shared
+):
+    differences = failures(np.random.default_rng(5), baseline, 2 * baseline, 5000, shared)
+    counts = counted(differences, LOOKS)
+    found = first_looks(betting_log_e(OUTCOMES, counts, 0.0, is_above=True), LOOKS)
+    other = first_looks(naive.mixture_log_e(counts[..., 2], counts[..., 0]), LOOKS)
+    assert np.median(found) <= 1.15 * np.median(other)
+    assert np.isfinite(found).mean() >= np.isfinite(other).mean() - 0.01
+    if not shared:
+        # A batch test of the same power needs 2529 episodes of each loop, and 473.
+        assert np.median(found) == pytest.approx(num_pairs, rel=0.15)
+    assert np.median(found) <= num_pairs * (1 - shared / 2)
+
+
+def test_evidence_is_that_of_a_mixture_of_all_shares_but_for_a_factor():
+    for more, less in ((5, 0), (12, 1), (30, 10), (9, 9), (60, 30)):
+        counts = np.array([less, 0, more])
+        found = betting_log_e(OUTCOMES, counts, 0.0, is_above=True)
+        assert abs(found - naive.mixture_log_e(more, less)) < math.log(2.5)
+
+
+def test_it_is_soon_known_that_a_loop_which_never_fails_more_is_not_worse():
+    for difference, most in ((0.01, 500), (0.02, 240), (0.1, 48)):
+        sequence = ConfidenceSequence(ALPHA)
+        sequence.look(np.zeros(most))
+        assert sequence.high[0] < difference
