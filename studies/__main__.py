@@ -12,7 +12,6 @@ from studies.adaptation import adaptation
 from studies.animation import animation
 from studies.anomalies import anomalies
 from studies.bench import bench
-from studies.compare import compare
 from studies.converged import converged
 from studies.evaluate import evaluate
 from studies.monitor import monitor
@@ -32,7 +31,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
-    *(evaluate, compare, promises),
+    *(evaluate, promises),
     *(ablate, plan_study, monitor, anomalies, adaptation, readings, converged, scale),
     *(truth, walking),
     *(animation, bench, store, readme, ship),

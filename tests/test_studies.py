@@ -15,7 +15,7 @@ from PIL import Image
 from command_line import call, study
 from drake_safety.assessments import shipped_folder
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
-from drake_safety.evaluation.metrics import Estimate, proportion
+from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import training_segments
@@ -26,7 +26,6 @@ from shuttle_task import shuttling, train_shuttle
 from studies.__main__ import app
 from studies.animation import save_animation
 from studies.anomalies import anomalies
-from studies.compare import comparison_figure, standing_still
 from studies.documents import render
 from studies.injections import SENSORS, changed_episode
 from studies.publish import DOCUMENTS
@@ -275,37 +274,6 @@ def test_a_gif_shows_every_instant_in_real_time(tmp_path):
         assert np.abs(before - after)[robot.stop :].max() > 50.0
 
 
-FIGURES = {
-    "episodes.sharpened.auc": Estimate(0.95, 0.93, 0.97, 100),
-    "throws.falls_without_recovery": Estimate(0.4, 0.25, 0.55, 40),
-    "throws.sharpened.falls_with_recovery": Estimate(0.025, 0.0, 0.1, 40),
-}
-
-
-def test_a_run_is_a_row_and_a_robot_with_its_figures(monkeypatch, capsys, tmp_path):
-    for name in ("pendulum", "laikago_balancing"):
-        (tmp_path / name).mkdir()
-        Results(FIGURES, {"scenario": name}).write(tmp_path / name / "evaluation.json")
-    runs = (tmp_path / "pendulum", tmp_path / "laikago_balancing")
-    assert study(monkeypatch, "compare", *runs, "--out", tmp_path) == 0
-    printed = capsys.readouterr().out
-    # Two runs with three figures, each an interval, and with five dashes.
-    assert printed.count("95.0") == 2 and "40.0" in printed and printed.count("–") == 2 * (3 + 5)
-    assert (tmp_path / "comparison.png").is_file()
-    assert study(monkeypatch, "compare", runs[0], "--out", tmp_path) == 0
-    assert "picture" not in capsys.readouterr().out  # A pendulum has none.
-
-
-def test_the_picture_shows_each_robot_with_what_its_run_says():
-    assert standing_still(shuttling().make_loop()) is None
-    still = standing_still(load_scenario("laikago_balancing").make_loop())
-    middle, corner = still[still.shape[0] // 2, still.shape[1] // 2], still[2, 2]
-    assert np.abs(middle.astype(int) - corner).max() > 20
-    (axes,) = comparison_figure({"laikago_balancing": FIGURES}, {"laikago_balancing": still}).axes
-    assert axes.get_title(loc="left") == "laikago balancing"
-    assert axes.texts[0].get_text() == "AUC at planning time 0.950\nfalls 40 % → 2.5 %"
-
-
 def test_studies_are_stored_with_the_evaluation_of_their_run(monkeypatch, tmp_path):
     Results({"plans.sharpened.auc": proportion(29, 30)}, {"command": "x"}).write(
         tmp_path / "evaluation.json"
@@ -332,6 +300,6 @@ def test_documents_are_written_again_as_they_are(monkeypatch, tmp_path):
 def test_every_study_is_tried_and_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
     assert all(command.help for command in commands.values())
-    others = {"truth", "anomalies", "walking", "animation", "compare", "store", "readme"}
+    others = {"truth", "anomalies", "walking", "animation", "store", "readme"}
     elsewhere = {"bench", "ship"}  # In test_bench and test_shipped_assessments.
     assert {line.split(" ")[0] for line in STUDIES} | others | elsewhere == set(commands)
