@@ -232,7 +232,7 @@ def run_changed(
     )
     found = collect_episodes(
         info,
-        num,
+        range(num),
         make,
         partial(_drawn_episode, scenario=scenario, seed=seed),
         num_workers=num_workers,

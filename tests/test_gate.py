@@ -19,6 +19,7 @@ from drake_safety.control.policy import network_file, read_policy_file
 from drake_safety.diagrams.walking import policy_files
 from drake_safety.evaluation import loop_comparison
 from drake_safety.evaluation.loop_comparison import Loop
+from drake_safety.evaluation.outcomes import Outcomes
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.simulation.dataset import load_episodes
@@ -33,7 +34,10 @@ def pendulum(**changes):
 
 
 def numbers(verdict):
-    return [verdict.verdict, verdict.pairs, verdict.difference, verdict.survival_s, verdict.changes]
+    return [
+        *(verdict.verdict, verdict.pairs, verdict.difference, verdict.survival_s),
+        *(verdict.newly_failing, verdict.no_longer_failing),
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -42,16 +46,15 @@ def worse():
 
 
 def test_a_weaker_motor_is_found_to_be_worse_and_what_it_changes_is_named(worse):
-    assert (worse.verdict, worse.only_baseline) == ("worse", 0)
+    assert (worse.verdict, worse.no_longer_failing) == ("worse", [])
     assert worse.pairs % 16 == 0
     assert worse.difference.low[-1] > 0 >= worse.difference.low[-2]
-    assert worse.e_worse >= 20 > 1 > worse.e_better
     assert worse.survival_s.mean[-1] < 0
-    assert worse.neither + worse.both + worse.only_candidate == worse.pairs
-    assert len(worse.changes) == worse.only_candidate
-    assert all(one.newly_fails and one.probability is None for one in worse.changes)
-    first = worse.changes[0]
-    assert first.time_s == min(one.time_s for one in worse.changes)
+    changes = worse.newly_failing
+    assert worse.neither + worse.both + len(changes) == worse.pairs
+    assert all(one.value == 1 and one.belief is None for one in changes)
+    first = changes[0]
+    assert first.time_s == min(one.time_s for one in changes)
     # Episodes are those that seed and index give.
     loops = [scenario.make_loop() for scenario in (pendulum(), pendulum(effort_share=0.2))]
     one, two = (run_episode(loop, first.episode, seed=11_000_000) for loop in loops)
@@ -65,14 +68,17 @@ def test_a_stronger_motor_is_better_by_the_same_numbers(worse):
     better = COMPARED(pendulum(effort_share=0.2), pendulum(), worse_by=0.01)
     assert (better.verdict, better.pairs) == ("better", worse.pairs)
     assert better.difference.high == pytest.approx([-low for low in worse.difference.low])
-    assert better.e_better == pytest.approx(worse.e_worse)
-    assert not any(one.newly_fails for one in better.changes)
+    assert better.newly_failing == []
+    assert [one.episode for one in better.no_longer_failing] == [
+        one.episode for one in worse.newly_failing
+    ]
 
 
 def test_a_loop_that_differs_in_nothing_that_matters_is_not_worse():
     looks = []
     same = COMPARED(pendulum(), pendulum(damping=0.0501), each_look=looks.append)
-    assert (same.verdict, same.pairs, same.changes) == ("not worse", 32, [])
+    assert (same.verdict, same.pairs) == ("not worse", 32)
+    assert same.newly_failing == same.no_longer_failing == []
     assert [one.verdict for one in looks] == ["undecided", "not worse"]
     assert [one.pairs for one in looks] == [16, 32]
     assert same.difference.high[-1] < 0.2 <= same.difference.high[0]
@@ -88,14 +94,17 @@ def test_metrics_are_a_constraint_the_tracking_error_or_a_function():
     unsafe = COMPARED(pendulum(), weak, **options)
     sides = [COMPARED(pendulum(), weak, metric=name, **options) for name in ("front", "back")]
     # Outside the safe set a motion goes on, so that it may violate the other constraint, too.
-    assert sum(one.both + one.only_candidate for one in sides) >= unsafe.both
+    assert sum(one.both + len(one.newly_failing) for one in sides) >= unsafe.both
     loose = COMPARED(pendulum(), weak, metric="tracking=100", **options)
     assert loose.neither == 16
     tight = COMPARED(pendulum(), weak, metric="tracking=0.001", **options)
     assert tight.both == 16
     as_function = COMPARED(pendulum(), weak, metric=lambda one: 0.5 * (not one.is_safe), **options)
     assert as_function.difference.mean[-1] == pytest.approx(0.5 * unsafe.difference.mean[-1])
-    assert numbers(as_function)[3:] == numbers(unsafe)[3:]
+    assert as_function.survival_s == unsafe.survival_s
+    assert [one.episode for one in as_function.newly_failing] == [
+        one.episode for one in unsafe.newly_failing
+    ]
 
 
 def test_a_fall_and_a_diverged_simulation_are_failures():
@@ -108,16 +117,14 @@ def test_a_fall_and_a_diverged_simulation_are_failures():
     one = run_episode(pendulum(effort_share=0.2).make_loop(), 6)
     num_rows = len(one.time_s)
     margins = np.ones((num_rows, 2))
-    margins[5:, 0], margins[9:, 1] = -1.0, -0.1
+    margins[1:, 0], margins[3:, 1] = -1.0, -0.1
     fallen = replace(one, margins=margins)
-    for metric, first in (("tilt", 5), ("fall", 9)):
-        is_bad = loop_comparison._bad_rows(loop, metric)(fallen)
-        np.testing.assert_array_equal(is_bad, np.arange(num_rows) >= first)
-    pairing = loop_comparison._Pairing(
-        (Loop(pendulum()), Loop(pendulum(effort_share=0.2))), "front", 0, {}, None
-    )
+    for metric, first in (("tilt", 1), ("fall", 3)):
+        found = Outcomes(loop, metric).of(fallen)
+        assert (found.value, found.time_s) == (1.0, one.time_s[first])
     diverged = replace(one, margins=np.ones((num_rows, 2)), cause=DIVERGED, is_safe=False)
-    assert pairing.read(0, diverged)[:2] == (1.0, one.time_s[-1])
+    found = Outcomes(pendulum().make_loop(), "front").of(diverged)
+    assert (found.value, found.time_s) == (1.0, one.time_s[-1])
 
 
 def test_gamma_says_of_each_change_whether_it_was_to_be_expected(worse):
@@ -125,12 +132,12 @@ def test_gamma_says_of_each_change_whether_it_was_to_be_expected(worse):
 
     def predict_one(state, preview, features):
         seen.append(state)
-        return SimpleNamespace(probability=np.float64(0.25))
+        return SimpleNamespace(belief=np.array([0.25, 0.5, 0.25]))
 
     gamma = SimpleNamespace(predict_one=predict_one)
     found = COMPARED(pendulum(), pendulum(effort_share=0.2), assessment=gamma)
     assert found.pairs == len(seen) == worse.pairs
-    assert {one.probability for one in found.changes} == {0.25}
+    assert {one.belief for one in found.newly_failing} == {(0.25, 0.5, 0.25)}
 
 
 @pytest.mark.parametrize(
@@ -225,7 +232,11 @@ def test_the_command_says_which_candidate_is_worse_and_replays_an_episode(
     assert (suite.get("tests"), suite.get("failures"), suite.get("errors")) == ("2", "1", "0")
     (failure,) = suite.iter("failure")
     assert failure.get("message").startswith(f"worse after {first['pairs']} pairs: +")
-    index = first["changes"][0]["episode"]
+    index = first["newly_failing"][0]["episode"]
+    assert "by cause" in printed and "by what was commanded" in printed
+    parts = first["by_command"]
+    assert sum(part[3] for part in parts) == first["pairs"]
+    assert sum(part[4] for part in parts) == len(first["newly_failing"])
     assert f"--replay={index}" in printed
     assert call(monkeypatch, *command, "--replay", index) == 0
     printed = capsys.readouterr().out

@@ -38,13 +38,15 @@ COMMANDS = {
     "play": ("play", "live"),
     "evaluate": ("evaluate", "train"),
     "gate": ("gate", ""),
+    "rate": ("gate", ""),
     "adapt": ("adapt", "train"),
     "monitor": ("monitor", ""),
     "export": ("export", ""),
     "report": ("report", "report"),
 }
 """In the order of the help: module, and the extra that it needs, said before it does anything."""
-_RESUMED = {"train": "--resume", "calibrate": "", "evaluate": "", "gate": "", "adapt": ""}
+_KEEPING = ("calibrate", "evaluate", "gate", "rate", "adapt")
+_RESUMED = {"train": "--resume"} | dict.fromkeys(_KEEPING, "")
 """Commands that the same line continues after Ctrl-C, and the option that does so."""
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.

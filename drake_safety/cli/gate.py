@@ -1,27 +1,30 @@
-"""``drake-safety gate``: whether a candidate may replace a baseline, in paired episodes."""
+"""``drake-safety gate`` and ``rate``: how often loops fail, in as few episodes as it takes."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 import shlex
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 from xml.etree import ElementTree
 
+import numpy as np
 from typer import Argument, Exit, Option
 
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
+from drake_safety.evaluation.failure_rate import FailureRate, estimate_failure_rate
 from drake_safety.evaluation.figure_style import save, spoken
 from drake_safety.evaluation.gate_figure import gate_figure
 from drake_safety.evaluation.loop_comparison import (
     UNDECIDED,
-    UNSAFE,
     WORSE,
     Loop,
     Verdict,
@@ -29,18 +32,32 @@ from drake_safety.evaluation.loop_comparison import (
     make_paired,
 )
 from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.outcomes import BELIEFS, UNSAFE, Outcome
 from drake_safety.evaluation.paired_test import ConfidenceSequence
 from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.tables import Column
 from drake_safety.files.atomic import replacing
 from drake_safety.files.reading import parse_yaml
-from drake_safety.learning.seeds import GATE
-from drake_safety.simulation.motion import simulate
-from drake_safety.simulation.rollouts import episode_rng
-from drake_safety.simulation.scenario import load_scenario
+from drake_safety.learning.seeds import GATE, RATE
+from drake_safety.simulation.rollouts import run_episode
+from drake_safety.simulation.scenario import Scenario, load_scenario
 
-_MOST_CHANGES = 20  # Printed of a candidate.
-_FAILING = ("both", "only_baseline", "only_candidate")
-_COLUMNS = ("candidate", "verdict", "pairs", *(f"fail: {spoken(one)}" for one in _FAILING))
+_MOST_SHOWN = 10  # Of a table of episodes.
+_FAILING = ("both", "only baseline", "only candidate")
+_COLUMNS = (
+    *("candidate", "verdict", "pairs", *(f"fail: {one}" for one in _FAILING)),
+    *("difference [points]", "survival [s]"),
+)
+_OF_RATE = (
+    *("failure rate [%]", "episodes", "failures found"),
+    "random episodes with the same variance",
+)
+_OF_STRATA = ("probability of a failure", "starts", "simulated", "failures")
+_OF_EPISODES = ("episode", "cause", "at [s]", "commanded", "Γ at its start: safe, unsafe, unknown")
+
+MetricOption = Annotated[
+    str, Option(help="Failure: unsafe, fall, a constraint's name, or tracking=BOUND.")
+]
 
 
 def gate(
@@ -60,9 +77,7 @@ def gate(
     baseline: Annotated[
         str, Option(metavar="KEY=VALUE", help="The same for the baseline and all candidates.")
     ] = "",
-    metric: Annotated[
-        str, Option(help="Failure: unsafe, fall, a constraint's name, or tracking=BOUND.")
-    ] = UNSAFE,
+    metric: MetricOption = UNSAFE,
     worse_by: Annotated[float, Option(help="Difference of the failure rates that matters.")] = 0.02,
     alpha: Annotated[
         float, Option(help="Probability of a wrong verdict, over all candidates.")
@@ -88,7 +103,7 @@ def gate(
     first = _changed(scenario, baseline)
     others = {Path(one).stem: _changed(one, baseline) for one in candidates or []}
     others |= {text: _changed(scenario, f"{baseline} {text}") for text in candidate or []}
-    if not others or len(others) < len([*(candidates or []), *(candidate or [])]):
+    if len(others) < max(replay is None, len(candidates or []) + len(candidate or [])):
         raise ValueError("gate: name different candidates: YAML files, or --candidate KEY=VALUE")
     folder = out or Path("runs") / f"{first.scenario.name}-gate"
     folders.check_writable(folder, *([] if junit is None else [junit.parent]))
@@ -130,6 +145,76 @@ def gate(
     raise Exit(1 if WORSE in verdicts else 2 if UNDECIDED in verdicts else 0)
 
 
+def rate(
+    scenario: console.ScenarioArgument,
+    assessment: console.AssessmentOption = None,
+    variation: console.VariationOption = "actual",
+    metric: MetricOption = UNSAFE,
+    starts: Annotated[int, Option(help="Starts of which Γ is asked.", min=10)] = 10_000,
+    episodes: Annotated[int, Option(help="Starts that are simulated.", min=10)] = 500,
+    out: Annotated[
+        Path | None, Option(help="Folder of episodes and results; by default runs/SCENARIO-rate.")
+    ] = None,
+    seed: Annotated[int, Option(help="Seed of the episodes.")] = RATE.first,
+    workers: console.WorkersOption = None,
+    cluster: console.ClusterOption = None,
+) -> None:
+    """Estimate a failure rate from few episodes, chosen where Γ says that they tell most.
+
+    The estimate is unbiased however wrong Γ is. Episodes are kept in OUT: the same command
+    continues.
+    """
+    loaded, _, gamma = folders.open_assessment(scenario, assessment)
+    gamma.check_unused(seed)
+    folder = out or Path("runs") / f"{loaded.name}-rate"
+    folders.check_writable(folder)
+
+    def report(found: FailureRate) -> None:
+        title, share = f"{loaded.name}, {variation}: {metric}", Column("", "", "points", digits=2)
+        row = (
+            *(share.text(found.rate), f"{found.rate.n}", f"{len(found.failures)}"),
+            f"{found.plain_rollouts:.0f}",
+        )
+        console.show(console.new_table(*_OF_RATE, rows=[row], title=title))
+        rows = (
+            (
+                f"{one.low:.4f} to {one.high:.4f}",
+                f"{one.starts}",
+                f"{one.rollouts}",
+                f"{one.failures:g}",
+            )
+            for one in found.strata
+        )
+        console.show(console.new_table(*_OF_STRATA, rows=rows, title="What Γ said of the starts"))
+        _show_episodes("Failures", found.failures, metric)
+        if found.failures:
+            options = f"--baseline variation={variation} --seed {seed}"
+            index = found.failures[0].episode
+            console.say(f"to see one: drake-safety gate {scenario} {options} --replay {index}")
+        figures = {
+            "failure_rate": found.rate,
+            "plain_rollouts": Estimate.exact(found.plain_rollouts, found.rate.n),
+        }
+        entries = {"variation": variation} | asdict(found)
+        _write(folder / "rate.json", figures, loaded, metric, seed, entries)
+
+    with console.open_stages() as stages:
+        found = estimate_failure_rate(
+            loaded,
+            gamma,
+            variation=variation,
+            metric=metric,
+            num_starts=starts,
+            num_rollouts=episodes,
+            seed=seed,
+            num_workers=workers,
+            path=folder / "episodes",
+            progress=stages,
+            if_stopped=report,
+        )
+    report(found)
+
+
 def _changed(scenario: str, changes: str) -> Loop:
     """A scenario with KEY=VALUE pairs; files are relative to the working directory."""
     values, variation = {}, "nominal"
@@ -158,41 +243,31 @@ def _record(pair: tuple[Loop, Loop], side: int, index: int, seed: int, file: Pat
     viewer = console.open_viewer(console.LOOPBACK)
     loop = make_paired(pair, side, meshcat=viewer)
     viewer.StartRecording()
-    motion = simulate(
-        loop,
-        lambda context: loop.reset(context, episode_rng(seed, index)),
-        ("margins",),
-        duration_s=loop.scenario.episode_duration_s,
-        watch_period_s=loop.scenario.watch_period_s,
-        may_fail=True,
-        who=f"episode {index} of '{loop.scenario.name}' (seed {seed})",
-    )
+    episode = run_episode(loop, index, seed=seed, after_leaving_s=math.inf)
     viewer.StopRecording()
     viewer.PublishRecording()
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(viewer.StaticHtml(), encoding="utf-8")
-    left = f"leaves the safe set at {motion.leave_time_s:.2f} s: {spoken(motion.cause)}"
-    fell = f", falls at {motion.fall_time_s:.2f} s" if motion.has_fallen else ""
-    told = motion.failure or (left + fell if motion.has_left else "stays in the safe set")
-    console.say("recording", f"{file}: {told}")
+    left_s = episode.time_s[(episode.margins < 0).any(axis=1)][:1].tolist()
+    when = "".join(f" at {time_s:.2f} s" for time_s in left_s)
+    left = f"leaves the safe set{when}: {spoken(episode.cause)}"
+    console.say("recording", f"{file}: {'stays in the safe set' if episode.is_safe else left}")
 
 
 def _report(
     first: Loop, found: Mapping[str, Verdict], metric: str, folder: Path, seed: int
 ) -> None:
     """Prints and writes what is known."""
+    title = f"{first.scenario.name}, {first.variation}: {metric}"
     rows = [
         (
-            *(name, one.verdict, f"{one.pairs}"),
-            *(f"{getattr(one, who)}" for who in _FAILING),
-            _interval(one.difference, 100.0, 1),
-            _interval(one.survival_s, 1.0, 3),
+            *(name, one.verdict, f"{one.pairs}", f"{one.both}"),
+            *(f"{len(each)}" for each in (one.no_longer_failing, one.newly_failing)),
+            *(_interval(one.difference, 100.0, 1), _interval(one.survival_s, 1.0, 3)),
         )
         for name, one in found.items()
     ]
-    columns = (*_COLUMNS, "difference [points]", "survival [s]")
-    title = f"{first.scenario.name}, {first.variation}: {metric}"
-    console.show(console.new_table(*columns, rows=rows, title=title))
+    console.show(console.new_table(*_COLUMNS, rows=rows, title=title))
     for name, one in found.items():
         _show_changes(name, metric, one)
     one = next(iter(found.values()))
@@ -201,20 +276,14 @@ def _report(
         f"{100 * one.difference.alpha:.3g} % a candidate, whenever one looks; 'not worse': by "
         f"{100 * one.worse_by:g} points"
     )
-    entries = {
-        "seed": seed,
-        "metric": metric,
-        "variation": first.variation,
-        "candidates": {name: {"pairs": one.pairs} | asdict(one) for name, one in found.items()},
-    }
+    candidates = {name: {"pairs": one.pairs} | asdict(one) for name, one in found.items()}
+    entries = {"variation": first.variation, "candidates": candidates}
     figures = {
         f"{_plain(name)}.{what}": Estimate(s.mean[-1], s.low[-1], s.high[-1], one.pairs)
         for name, one in found.items()
         for what, s in {"difference": one.difference, "survival_s": one.survival_s}.items()
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    Results(figures, console.made_by(first.scenario.name) | entries).write(folder / "gate.json")
-    console.say("figures", folder / "gate.json")
+    _write(folder / "gate.json", figures, first.scenario, metric, seed, entries)
     for picture in save(gate_figure(found), folder / "gate"):
         console.say("picture", picture)
 
@@ -226,29 +295,64 @@ def _interval(sequence: ConfidenceSequence, scale: float, digits: int) -> str:
 
 
 def _show_changes(name: str, metric: str, one: Verdict) -> None:
-    """Prints the episodes that end differently, and how to see one."""
-    if not one.changes:
+    """Prints the episodes that end differently, by cause and command, and how to see one."""
+    new, old = one.newly_failing, one.no_longer_failing
+    if not (new or old):
         return console.say(f"{name}: no episode ends differently")
-    columns = ["episode", "change", "cause", "at [s]"]
-    has_gamma = one.changes[0].probability is not None
-    if has_gamma:
-        columns.append("probability of staying safe, at its start")
+    _show_episodes(f"{name}: episodes that newly fail", new, metric)
+    _show_episodes(f"{name}: episodes that fail no longer", old, metric)
+    causes = [[one.cause for one in each] for each in (new, old)]
+    rows = []
+    for cause in dict.fromkeys([*causes[0], *causes[1]]):
+        seen = Counter(_expected(one) for one in new if one.cause == cause)
+        counts = (causes[0].count(cause), *(seen[what] for what in BELIEFS), causes[1].count(cause))
+        rows.append((spoken(cause or metric), *map(str, counts)))
+    columns = (*("cause", "newly fail"), *(f"Γ: {what}" for what in BELIEFS), "fail no longer")
+    console.show(console.new_table(*columns, rows=rows, title=f"{name}: by cause"))
+    rows = [
+        (f"{part.output}: {part.low:.3g} to {part.high:.3g}", *map(str, part[3:]))
+        for part in one.by_command
+    ]
+    columns = ("commanded", "pairs", "newly fail", "fail no longer")
+    console.show(console.new_table(*columns, rows=rows, title=f"{name}: by what was commanded"))
+    index = [*new, *old][0].episode
+    return console.say("to see one:", console.command_line(option=f"--replay={index}"))
+
+
+def _expected(one: Outcome) -> str:
+    """What Γ believed most at a start."""
+    return BELIEFS[int(np.argmax(one.belief))] if one.belief else ""
+
+
+def _show_episodes(title: str, episodes: Sequence[Outcome], metric: str) -> None:
+    """Prints episodes that failed, the first ones in full."""
     rows = [
         (
-            f"{change.episode}",
-            "newly fails" if change.newly_fails else "fails no longer",
-            spoken(change.cause or metric),
-            f"{change.time_s:.2f}",
-            *([f"{change.probability:.2f}"] if has_gamma else []),
+            *(f"{one.episode}", spoken(one.cause or metric), f"{one.time_s:.2f}"),
+            ", ".join(f"{value:.3g}" for value in one.commanded),
+            ", ".join(f"{mass:.2f}" for mass in one.belief or ()) or "–",
         )
-        for change in one.changes[:_MOST_CHANGES]
+        for one in episodes[:_MOST_SHOWN]
     ]
-    more = len(one.changes) - len(rows)
-    told = f", {more} of them only in gate.json" if more else ""
-    title = f"{name}: episodes that end differently: {len(one.changes)}{told}"
-    console.show(console.new_table(*columns, rows=rows, title=title))
-    console.say("to see one:", console.command_line(option=f"--replay={one.changes[0].episode}"))
-    return None
+    if rows:
+        told = f"; the others are in the file: {len(episodes)} in all"
+        title += told if len(episodes) > len(rows) else ""
+        console.show(console.new_table(*_OF_EPISODES, rows=rows, title=title))
+
+
+def _write(
+    file: Path,
+    figures: Mapping[str, Estimate],
+    scenario: Scenario,
+    metric: str,
+    seed: int,
+    entries: Mapping[str, Any],
+) -> None:
+    """Writes results."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    made = console.made_by(scenario.name) | {"seed": seed, "metric": metric}
+    Results(figures, made | entries).write(file)
+    console.say("figures", file)
 
 
 def _write_junit(file: Path, suite: str, found: Mapping[str, Verdict]) -> None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import inspect
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -16,12 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydrake.systems.framework import Context
 
-from drake_safety.evaluation.paired_test import ConfidenceSequence, betting_log_e
-from drake_safety.files.reading import did_you_mean, is_number
+from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, Outcomes
+from drake_safety.evaluation.paired_test import ConfidenceSequence
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import GATE
-from drake_safety.learning.segments import DIVERGED, Episode
-from drake_safety.simulation.capabilities import CanFall, CanStartAnywhere, IsDisturbed, require
+from drake_safety.learning.segments import Episode
+from drake_safety.simulation.capabilities import CanStartAnywhere, IsDisturbed
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
 from drake_safety.simulation.rollouts import check_kept, episode_rng, episodes_info, run_episode
@@ -29,16 +28,9 @@ from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import MadeOnce, Progress, map_items
 
 WORSE, BETTER, NOT_WORSE, UNDECIDED = "worse", "better", "not worse", "undecided"
-UNSAFE = "unsafe"
 _LOOK = 16  # Pairs between two looks.
 _BATCH = 2  # Pairs sent to a worker at a time.
 _SAME = 1e-9  # Largest difference of two starts, by the rounding of two engines.
-_LARGEST_LOG = 700.0  # Of an e-value.
-
-Metric = str | Callable[[Episode], float]
-"""How bad an episode is, in [0, 1]: ``unsafe``, ``fall``, a constraint, ``tracking=BOUND``, or a
-function of an episode. Episodes of the first and the last end where they leave the safe set; others
-go on until a fall."""
 
 
 class Loop(NamedTuple):
@@ -48,23 +40,15 @@ class Loop(NamedTuple):
     variation: str = "nominal"
 
 
-@dataclass(frozen=True)
-class Change:
-    """An episode that ends differently in the candidate.
+class Commanded(NamedTuple):
+    """The pairs in which an entry of the desired output is in a range, a third of all."""
 
-    Attributes:
-        newly_fails: Whether the candidate is the one that fails, or does worse.
-        cause: The constraint that it violated first; "" for none.
-        time_s: When it failed [s].
-        probability: Γ's probability that the baseline stays safe, in the first undisturbed row;
-            None without Γ.
-    """
-
-    episode: int
-    newly_fails: bool
-    cause: str
-    time_s: float
-    probability: float | None
+    output: str
+    low: float
+    high: float
+    pairs: int
+    newly_failing: int
+    no_longer_failing: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,24 +58,23 @@ class Verdict:
     Attributes:
         verdict: "worse", "better", "not worse" (by `worse_by`), or "undecided". Each is wrong with
             a probability of at most alpha, whenever one looks.
-        neither, both, only_baseline, only_candidate: Numbers of pairs in which these fail; of a
-            function as metric, the last two are those in which one does worse.
+        neither, both: Numbers of pairs in which neither fails, and both alike.
         difference: Mean outcome of the candidate minus that of the baseline, and its alpha.
         survival_s: The same of the time until the failure, or the end [s].
-        e_worse, e_better: E-values for either verdict, which is known from 1 / alpha on.
-        changes: The episodes that end differently: first those that newly fail, by time.
+        newly_failing: The candidate's episodes that fail, or do worse than the baseline's, by time,
+            with Γ's belief at the baseline's start.
+        no_longer_failing: The baseline's that do worse.
+        by_command: The same by what was commanded.
     """
 
     verdict: str
     neither: int
     both: int
-    only_baseline: int
-    only_candidate: int
     difference: ConfidenceSequence
     survival_s: ConfidenceSequence
-    e_worse: float
-    e_better: float
-    changes: list[Change]
+    newly_failing: list[Outcome]
+    no_longer_failing: list[Outcome]
+    by_command: list[Commanded]
     worse_by: float
 
     @property
@@ -114,7 +97,6 @@ def compare_loops(
     progress: Progress | bool | None = None,
     assessment: SafetyAssessment | None = None,
     each_look: Callable[[Verdict], object] = lambda verdict: None,
-    **loop_options: Any,
 ) -> Verdict:
     """Simulates two closed loops in the same episodes until it is known which one fails more.
 
@@ -130,7 +112,6 @@ def compare_loops(
         path: Folder in which episodes are kept; those that it holds are not simulated again.
         assessment: Γ of the baseline's scenario, which says whether a change was foreseen.
         each_look: Called with what is known at each look.
-        **loop_options: Options of the task, for both.
 
     Raises:
         ValueError: Both are the same, there is no such metric, or the starts, plans or disturbances
@@ -143,22 +124,36 @@ def compare_loops(
     if max_pairs < 1:
         raise ValueError(f"compare_loops: max_pairs must be at least 1; got {max_pairs}")
     one, two = (Loop(x) if isinstance(x, Scenario) else x for x in (baseline, candidate))
-    pairing = _Pairing((one, two), metric, seed, loop_options, assessment)
-    difference = ConfidenceSequence(alpha)
-    survival_s = ConfidenceSequence(alpha, one.scenario.episode_duration_s)
-    runs: tuple[dict[int, _Run], ...] = ({}, {})
+    hashes = [scenario.simulation_hash(variation) for scenario, variation in (one, two)]
+    if hashes[0] == hashes[1]:
+        raise ValueError(
+            f"the candidate is the baseline: scenario '{one.scenario.name}', variation "
+            f"'{one.variation}', with hash {hashes[0][:12]}"
+        )
+    # The texts say what the hashes leave out.
+    texts = (scenario.to_yaml() for scenario, _ in (one, two))
+    make = MadeOnce((*hashes, *texts), partial(_make_both, (one, two)))
+    loops = make()
+    readers = Outcomes(loops[0], metric, assessment), Outcomes(loops[0], metric)
+    options = readers[0].simulated
+    run = partial(make.run, _run_pair, seed=seed, **options)
+    starts = {"starts_of": hashes[0]} if _takes_starts(two.scenario) else {}
+    runs: tuple[dict[int, Outcome], ...] = ({}, {})
     with ExitStack() as stack:
         writers = []
-        for side, info in enumerate(pairing.infos if path is not None else ()):
+        for side in (0, 1) if path is not None else ():
+            known = _pair_options((one, two)) | options | (starts if side else {})
+            info = episodes_info(loops[side], seed, known)
             folder = Path(path or "") / f"{info.scenario_hash[:12]}-{seed}"
             writers.append(stack.enter_context(EpisodeWriter(folder, info)))
             if kept := [episode for episode in load_episodes(folder) if episode.index < max_pairs]:
-                check_kept(folder, kept, partial(pairing.run_one, side))
-            runs[side].update({episode.index: pairing.read(side, episode) for episode in kept})
+                is_wanted = [side == 0, side == 1]
+                check_kept(folder, kept, lambda i, s=side, w=is_wanted: run((i, w))[s])
+            runs[side].update({episode.index: readers[side].of(episode) for episode in kept})
         is_missing = ((index, [index not in each for each in runs]) for index in range(max_pairs))
         items = [item for item in is_missing if any(item[1])]
         found = map_items(
-            pairing.run,
+            run,
             items,
             num_workers=num_workers,
             batch_size=_BATCH,
@@ -167,20 +162,69 @@ def compare_loops(
             stage="pairs",
         )
         results = stack.enter_context(closing(found))
+        difference = ConfidenceSequence(alpha)
+        survival_s = ConfidenceSequence(alpha, one.scenario.episode_duration_s)
         for index in range(max_pairs):
             while not all(index in each for each in runs):
                 for side, episode in enumerate(next(results)):
                     if episode is not None:
-                        runs[side][episode.index] = pairing.read(side, episode)
+                        runs[side][episode.index] = readers[side].of(episode)
                         if writers:
                             writers[side].append(episode)
             if (index + 1) % _LOOK == 0 or index + 1 == max_pairs:
                 pairs = [(runs[0][i], runs[1][i]) for i in range(index + 1)]
-                verdict = _look(pairs, difference, survival_s, worse_by)
+                verdict = _look(pairs, difference, survival_s, worse_by, loops[0].output_names)
                 each_look(verdict)
                 if verdict.verdict != UNDECIDED:
                     break
     return verdict
+
+
+def _look(
+    pairs: Sequence[tuple[Outcome, Outcome]],
+    difference: ConfidenceSequence,
+    survival_s: ConfidenceSequence,
+    worse_by: float,
+    output_names: Sequence[str],
+) -> Verdict:
+    """Looks at all pairs so far; later looks do not change what is returned."""
+    outcomes = np.array([[one.value for one in pair] for pair in pairs])
+    apart = outcomes[:, 1] - outcomes[:, 0]
+    difference.look(apart)
+    survival_s.look(np.array([two.time_s - one.time_s for one, two in pairs]))
+    is_known = {
+        WORSE: difference.low[-1] > 0.0,
+        BETTER: difference.high[-1] < 0.0,
+        NOT_WORSE: difference.high[-1] < worse_by,
+        UNDECIDED: True,
+    }
+    newly = [replace(two, belief=one.belief) for one, two in pairs if two.value > one.value]
+    no_longer = [one for one, two in pairs if two.value < one.value]
+    return Verdict(
+        verdict=next(name for name, is_so in is_known.items() if is_so),
+        neither=int((outcomes == 0).all(axis=1).sum()),
+        both=int(((outcomes > 0).all(axis=1) & (apart == 0)).sum()),
+        difference=deepcopy(difference),
+        survival_s=deepcopy(survival_s),
+        newly_failing=sorted(newly, key=lambda one: one.time_s),
+        no_longer_failing=sorted(no_longer, key=lambda one: one.time_s),
+        by_command=_by_command(output_names, pairs, apart),
+        worse_by=worse_by,
+    )
+
+
+def _by_command(
+    names: Sequence[str], pairs: Sequence[tuple[Outcome, Outcome]], apart: np.ndarray
+) -> list[Commanded]:
+    """Changes in each third of what was commanded; fewer parts of a command with few values."""
+    found = []
+    for name, values in zip(names, np.array([one.commanded for one, _ in pairs]).T, strict=True):
+        third = np.searchsorted(np.quantile(values, [1 / 3, 2 / 3]), values)
+        for part in (third == k for k in np.unique(third)):
+            ends = float(values[part].min()), float(values[part].max())
+            counts = (int((part & is_so).sum()) for is_so in (apart == apart, apart > 0, apart < 0))
+            found.append(Commanded(name, *ends, *counts))
+    return found
 
 
 def make_paired(pair: tuple[Loop, Loop], side: int, **options: Any) -> ClosedLoop:
@@ -201,141 +245,12 @@ def _takes_starts(scenario: Scenario) -> bool:
     return "starts_of" in inspect.signature(scenario.task_class()).parameters
 
 
-def _make_both(pair: tuple[Loop, Loop], options: dict[str, Any]) -> tuple[ClosedLoop, ClosedLoop]:
-    return make_paired(pair, 0, **options), make_paired(pair, 1, **options)
-
-
-class _Run(NamedTuple):
-    """What is kept of an episode: its outcome in [0, 1], when and why it failed, and Γ."""
-
-    outcome: float
-    time_s: float
-    cause: str
-    probability: float | None
-
-
-def _look(
-    runs: list[tuple[_Run, _Run]],
-    difference: ConfidenceSequence,
-    survival_s: ConfidenceSequence,
-    worse_by: float,
-) -> Verdict:
-    """Looks at all pairs so far; later looks do not change what is returned."""
-    outcomes = np.array([[run.outcome for run in pair] for pair in runs])
-    apart = outcomes[:, 1] - outcomes[:, 0]
-    difference.look(apart)
-    survival_s.look(np.array([two.time_s - one.time_s for one, two in runs]))
-    is_known = {
-        WORSE: difference.low[-1] > 0.0,
-        BETTER: difference.high[-1] < 0.0,
-        NOT_WORSE: difference.high[-1] < worse_by,
-        UNDECIDED: True,
-    }
-    changes = []
-    for index in np.flatnonzero(apart).tolist():
-        failed = runs[index][int(apart[index] > 0)]
-        known = (failed.cause, failed.time_s, runs[index][0].probability)
-        changes.append(Change(index, bool(apart[index] > 0), *known))
-    values = np.unique(apart, return_counts=True)
-    log_e = [float(betting_log_e(*values, 0.0, is_above=is_above)) for is_above in (True, False)]
-    return Verdict(
-        verdict=next(name for name, is_so in is_known.items() if is_so),
-        neither=int((outcomes == 0).all(axis=1).sum()),
-        both=int(((outcomes > 0).all(axis=1) & (apart == 0)).sum()),
-        only_baseline=int((apart < 0).sum()),
-        only_candidate=int((apart > 0).sum()),
-        difference=deepcopy(difference),
-        survival_s=deepcopy(survival_s),
-        e_worse=math.exp(min(log_e[0], _LARGEST_LOG)),
-        e_better=math.exp(min(log_e[1], _LARGEST_LOG)),
-        changes=sorted(changes, key=lambda one: (not one.newly_fails, one.time_s)),
-        worse_by=worse_by,
-    )
-
-
-class _Pairing:
-    """How the episodes of a pair are simulated, and what is read of one."""
-
-    def __init__(
-        self,
-        pair: tuple[Loop, Loop],
-        metric: Metric,
-        seed: int,
-        loop_options: dict[str, Any],
-        gamma: SafetyAssessment | None,
-    ) -> None:
-        hashes = [scenario.simulation_hash(variation) for scenario, variation in pair]
-        if hashes[0] == hashes[1]:
-            raise ValueError(
-                f"the candidate is the baseline: scenario '{pair[0].scenario.name}', variation "
-                f"'{pair[0].variation}', with hash {hashes[0][:12]}"
-            )
-        self._metric, self._gamma = metric, gamma
-        self._duration_s = pair[0].scenario.episode_duration_s
-        goes_on = isinstance(metric, str) and metric != UNSAFE
-        self._options: Any = {"seed": seed, "after_leaving_s": math.inf if goes_on else 0.0}
-        # The texts say what the hashes leave out.
-        key = (*hashes, *(one.to_yaml() for one, _ in pair), repr(sorted(loop_options.items())))
-        self._make = MadeOnce(key, partial(_make_both, pair, loop_options))
-        self.run = partial(self._make.run, _run_pair, **self._options)
-        loops = self._make()
-        known = _pair_options(pair) | loop_options | ({"goes_on": True} if goes_on else {})
-        starts = {"starts_of": hashes[0]} if _takes_starts(pair[1].scenario) else {}
-        both = zip(loops, (known, known | starts), strict=True)
-        self.infos = [episodes_info(loop, seed, options) for loop, options in both]
-        self._bad_rows = _bad_rows(loops[0], metric if isinstance(metric, str) else UNSAFE)
-
-    def run_one(self, side: int, index: int) -> Episode:
-        """The episode of one loop."""
-        return run_episode(self._make()[side], index, **self._options)
-
-    def read(self, side: int, episode: Episode) -> _Run:
-        """What is kept of an episode, Γ of the baseline's."""
-        is_bad = self._bad_rows(episode) | _last_row(episode, episode.cause == DIVERGED)
-        outcome = float(is_bad.any() if isinstance(self._metric, str) else self._metric(episode))
-        if not 0.0 <= outcome <= 1.0:
-            raise ValueError(f"metric: episode {episode.index} has {outcome}, expected 0 to 1")
-        time_s = float(episode.time_s[is_bad.argmax()]) if is_bad.any() else self._duration_s
-        probability, row = None, episode.first_step
-        if self._gamma is not None and side == 0:
-            rows = (episode.state, episode.desired_preview, episode.features)
-            probability = float(self._gamma.predict_one(*(one[row] for one in rows)).probability)
-        return _Run(outcome, time_s, episode.cause, probability)
-
-
-def _bad_rows(loop: ClosedLoop, metric: str) -> Callable[[Episode], np.ndarray]:
-    """The rows of an episode in which it fails, (N,), by a metric."""
-    names, num_steps = loop.constraint_names, loop.scenario.num_steps
-    kind, _, bound = metric.partition("=")
-    if metric == UNSAFE:
-        return lambda one: _last_row(one, not one.is_safe)
-    if kind == "tracking" and is_number(bound) and float(bound) > 0:
-        # A motion that ends early has fallen.
-        return lambda one: (
-            (np.linalg.norm(one.output - one.desired_output, axis=1) > float(bound))
-            | _last_row(one, one.num_steps < num_steps)
-        )
-    name = require(loop, CanFall, "metric 'fall'").fall_name if metric == "fall" else metric
-    if name not in names:
-        known = [UNSAFE, "fall", "tracking=BOUND", *names]
-        raise ValueError(
-            f"metric '{metric}'{did_you_mean(metric, known)}: expected one of {known}, or in "
-            "Python a function of an episode"
-        )
-    return lambda one: one.margins[:, names.index(name)] < 0.0
-
-
-def _last_row(episode: Episode, is_bad: bool) -> np.ndarray:
-    """Rows that are bad, (N,): the last one or none."""
-    return np.arange(len(episode.time_s)) >= episode.num_steps + (not is_bad)
+def _make_both(pair: tuple[Loop, Loop]) -> tuple[ClosedLoop, ClosedLoop]:
+    return make_paired(pair, 0), make_paired(pair, 1)
 
 
 def _run_pair(
-    loops: tuple[ClosedLoop, ClosedLoop],
-    item: tuple[int, list[bool]],
-    *,
-    seed: int,
-    after_leaving_s: float,
+    loops: tuple[ClosedLoop, ClosedLoop], item: tuple[int, list[bool]], **options: Any
 ) -> list[Episode | None]:
     """The episodes of a pair that are missing; the starts of both are compared."""
     index, is_missing = item
@@ -347,11 +262,10 @@ def _run_pair(
             starts.append(_start_of(loop, context))
 
         if is_wanted:
-            options: Any = {"seed": seed, "after_leaving_s": after_leaving_s}
             episodes.append(run_episode(loop, index, at_start=at_start, **options))
         else:
             context = loop.CreateDefaultContext()
-            loop.reset(context, episode_rng(seed, index))
+            loop.reset(context, episode_rng(options["seed"], index))
             at_start(context)
             episodes.append(None)
     _check_alike(index, loops[0], *starts)

@@ -155,6 +155,7 @@ def simulate(
     watch_period_s: float = math.inf,
     after_leaving_s: float = math.inf,
     after_fall_s: float = 0.0,
+    until_first_row: bool = False,
     events: Iterable[tuple[float, Callable[[Context], object]]] = (),
     each_row: Callable[[Context, float], None] = lambda context, time_s: None,
     monitor: Callable[[Context], None] | None = None,
@@ -181,6 +182,7 @@ def simulate(
             is sampled at rows.
         after_leaving_s: Time for which a motion goes on outside the safe set [s].
         after_fall_s: Time for which it goes on after a fall [s]; only a :class:`CanFall` falls.
+        until_first_row: Whether it ends at the first row whose future is undisturbed.
         events: Times [s] and what is done then with the Context.
         each_row: Called with Context and time [s] after each row.
         monitor: Called with the Context after each step of the simulator.
@@ -231,7 +233,8 @@ def simulate(
 
     try:
         simulator.Initialize()
-        for row in range(round(duration_s / step_s) + 1):
+        num_steps = first_row or 0 if until_first_row else round(duration_s / step_s)
+        for row in range(num_steps + 1):
             for time_s in _watch_times(row, step_s, watch_period_s):
                 while waiting and waiting[0][0] <= time_s:
                     event_s, act = waiting.pop(0)

@@ -134,7 +134,7 @@ def record_episodes(
     )
     return collect_episodes(
         info,
-        num_episodes,
+        range(num_episodes),
         make,
         partial(_record, reset=Sent(reset), ports=used, watch_period_s=period_s, info=info),
         num_workers=num_workers,

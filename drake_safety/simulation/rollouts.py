@@ -101,9 +101,8 @@ def run_episode(
     is_standing: bool = False,
     start: EpisodeStart | None = None,
     plan: Any = None,
-    monitor: Callable[[Context], None] | None = None,
-    after_leaving_s: float = 0.0,
     at_start: Callable[[Context], object] = lambda context: None,
+    **options: Any,
 ) -> Episode:
     """Simulates one episode, which ends when it leaves the safe set or its time is over.
 
@@ -115,9 +114,8 @@ def run_episode(
         start: Initial state and plan, in place of random ones. The noise is that of the seed and
             the index.
         plan: Replaces the initial plan: one of the loop's ``candidate_plans``.
-        monitor: Called with the Context after each step of the simulator.
-        after_leaving_s: Time for which it goes on outside the safe set, until a fall [s].
         at_start: Called with the root Context at the start.
+        **options: Those of :func:`~drake_safety.simulation.motion.simulate`, as ``monitor``.
 
     Returns:
         The episode. If the simulation fails, its cause is ``diverged`` and it has the rows that
@@ -156,11 +154,10 @@ def run_episode(
         duration_s=scenario.episode_duration_s,
         step_s=scenario.step_s,
         watch_period_s=scenario.watch_period_s,
-        after_leaving_s=after_leaving_s,
-        monitor=monitor,
         may_fail=True,
         index=index,
         who=f"episode {index} of '{scenario.name}' (seed {seed})",
+        **({"after_leaving_s": 0.0} | options),
     ).episode()
 
 
@@ -251,7 +248,7 @@ def run_motions(
     step_s = scenario.monitor_step_s
     return collect_episodes(
         replace(info, step_s=step_s, num_steps=round(piece_s / step_s)),
-        math.ceil(duration_s / piece_s - 1e-6),
+        range(math.ceil(duration_s / piece_s - 1e-6)),
         make,
         partial(run_motion, seed=seed, until_s=until_s),
         num_workers=num_workers,
@@ -357,7 +354,7 @@ def run_episodes(
 
     return collect_episodes(
         episodes_info(make(), seed, loop_options),
-        num_episodes,
+        range(num_episodes),
         make,
         run,
         num_workers=num_workers,
@@ -370,7 +367,7 @@ def run_episodes(
 
 def collect_episodes(
     info: EpisodesInfo,
-    num_episodes: int,
+    indices: Sequence[int],
     make: MadeOnce[Any],
     function: Callable[..., Episode],
     *,
@@ -384,22 +381,24 @@ def collect_episodes(
     """Simulates the episodes of a set that a folder does not hold yet, in worker processes.
 
     Args:
+        indices: Of the episodes, in the order in which they begin.
         make: Makes the diagram.
         function: Returns the episode of a diagram and an index.
         is_repeated: Whether the first episode is simulated again after the next, by a new diagram,
             and must be the same; ``function`` then takes a ``monitor``.
     """
+    wanted = set(indices)
     with nullcontext() if path is None else EpisodeWriter(path, info, extra) as writer:
         episodes: list[Episode] = []
         if writer is not None:
-            episodes += (e for e in load_episodes(writer.path) if e.index < num_episodes)
+            episodes += (e for e in load_episodes(writer.path) if e.index in wanted)
             if episodes:
                 check_kept(writer.path, episodes, partial(make.run, function))
                 _LOGGER.warning(
-                    "%d of %d episodes are kept from %s", len(episodes), num_episodes, path
+                    "%d of %d episodes are kept from %s", len(episodes), len(indices), path
                 )
         kept = {episode.index for episode in episodes}
-        pending = [index for index in range(num_episodes) if index not in kept]
+        pending = [index for index in indices if index not in kept]
 
         def run(index: int) -> Episode:
             found = make.run(function, index)
@@ -429,7 +428,7 @@ def collect_episodes(
         _LOGGER.warning(
             "%d of %d simulations of '%s' diverged and have no safety label: episodes %s",
             len(which),
-            num_episodes,
+            len(indices),
             info.scenario,
             ", ".join(map(str, which[:10])) + (", ..." if len(which) > 10 else ""),
         )

@@ -1,0 +1,113 @@
+"""What counts as the failure of an episode, and what is kept of one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drake_safety.files.reading import did_you_mean, is_number
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.segments import DIVERGED, Episode
+from drake_safety.simulation.capabilities import CanFall, require
+from drake_safety.simulation.closed_loop import ClosedLoop
+
+UNSAFE = "unsafe"
+BELIEFS = ("safe", "unsafe", "don't know")
+"""Names of the entries of a belief."""
+
+Metric = str | Callable[[Episode], float]
+"""How bad an episode is, in [0, 1]: ``unsafe``, ``fall``, a constraint, ``tracking=BOUND``, or a
+function of an episode. Episodes of the first and the last end where they leave the safe set; others
+go on until a fall."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What is kept of an episode.
+
+    Attributes:
+        value: How bad it is, in [0, 1].
+        time_s: When it failed, or ended [s].
+        cause: The constraint that it violated first; "" for none.
+        commanded: The desired output as far ahead as Γ sees it, (n_z,).
+        belief: Γ's belief (safe, unsafe, don't know); None without Γ. This and what is commanded
+            are those of the first undisturbed row.
+    """
+
+    episode: int
+    value: float
+    time_s: float
+    cause: str
+    commanded: tuple[float, ...]
+    belief: tuple[float, ...] | None
+
+
+class Outcomes:
+    """Reads what is kept of the episodes of a loop.
+
+    Raises:
+        ValueError: There is no such metric.
+    """
+
+    def __init__(self, loop: ClosedLoop, metric: Metric, gamma: SafetyAssessment | None = None):
+        self._metric, self._gamma = metric, gamma
+        self._scenario = loop.scenario
+        self._bad_rows = _bad_rows(loop, metric if isinstance(metric, str) else UNSAFE)
+        goes_on = isinstance(metric, str) and metric != UNSAFE
+        self.simulated: dict[str, Any] = {"after_leaving_s": math.inf} if goes_on else {}
+        """Options of the simulation."""
+
+    def of(self, episode: Episode) -> Outcome:
+        """What is kept of an episode.
+
+        Raises:
+            ValueError: The metric is not in [0, 1].
+        """
+        is_bad = self._bad_rows(episode) | _last_row(episode, episode.cause == DIVERGED)
+        value = float(is_bad.any() if isinstance(self._metric, str) else self._metric(episode))
+        if not 0.0 <= value <= 1.0:
+            raise ValueError(f"metric: episode {episode.index} has {value}, expected 0 to 1")
+        row, duration_s = episode.first_step, self._scenario.episode_duration_s
+        preview, belief = episode.desired_preview[row], None
+        if self._gamma is not None:
+            found = self._gamma.predict_one(episode.state[row], preview, episode.features[row])
+            belief = tuple(found.belief.tolist())
+        return Outcome(
+            episode=episode.index,
+            value=value,
+            time_s=float(episode.time_s[is_bad.argmax()]) if is_bad.any() else duration_s,
+            cause=episode.cause,
+            commanded=tuple(preview[-episode.output.shape[1] :].tolist()),
+            belief=belief,
+        )
+
+
+def _bad_rows(loop: ClosedLoop, metric: str) -> Callable[[Episode], np.ndarray]:
+    """The rows of an episode in which it fails, (N,), by a metric."""
+    names, num_steps = loop.constraint_names, loop.scenario.num_steps
+    kind, _, bound = metric.partition("=")
+    if metric == UNSAFE:
+        return lambda one: _last_row(one, not one.is_safe)
+    if kind == "tracking" and is_number(bound) and float(bound) > 0:
+        # A motion that ends early has fallen.
+        return lambda one: (
+            (np.linalg.norm(one.output - one.desired_output, axis=1) > float(bound))
+            | _last_row(one, one.num_steps < num_steps)
+        )
+    name = require(loop, CanFall, "metric 'fall'").fall_name if metric == "fall" else metric
+    if name not in names:
+        known = [UNSAFE, "fall", "tracking=BOUND", *names]
+        raise ValueError(
+            f"metric '{metric}'{did_you_mean(metric, known)}: expected one of {known}, or in "
+            "Python a function of an episode"
+        )
+    return lambda one: one.margins[:, names.index(name)] < 0.0
+
+
+def _last_row(episode: Episode, is_bad: bool) -> np.ndarray:
+    """Rows that are bad, (N,): the last one or none."""
+    return np.arange(len(episode.time_s)) >= episode.num_steps + (not is_bad)
