@@ -14,6 +14,7 @@ from studies.anomalies import anomalies
 from studies.bench import bench
 from studies.converged import converged
 from studies.evaluate import evaluate
+from studies.gate import gate
 from studies.monitor import monitor
 from studies.planning import plan_study
 from studies.promises import promises
@@ -31,7 +32,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
-    *(evaluate, promises),
+    *(evaluate, promises, gate),
     *(ablate, plan_study, monitor, anomalies, adaptation, readings, converged, scale),
     *(truth, walking),
     *(animation, bench, store, readme, ship),

@@ -24,6 +24,7 @@ from drake_safety.evaluation.results import Results
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.rollouts import episode_rng
+from studies import gate as study
 
 WEAK = {"parameters.effort_share": 0.2}
 COMPARED = partial(compare_loops, num_workers=1, worse_by=0.2)
@@ -343,3 +344,21 @@ def test_a_network_alone_is_a_policy(tmp_path):
     assert copy in changed.task_class().model_files(changed)
     starts = [start_of(load_scenario("go2_walking").make_loop()), start_of(changed.make_loop())]
     loop_comparison._check_alike(5, changed.make_loop(), *starts)
+
+
+def test_the_study_counts_wrong_verdicts_and_the_pairs_until_a_right_one():
+    rng = np.random.default_rng(1)
+    baseline = rng.random(400) < 0.3
+    candidate = baseline | (rng.random(400) < 0.1)
+    found = study.rows(baseline.astype(int), candidate.astype(int), 100)
+    assert found["candidate.failures"].value - found["baseline.failures"].value == pytest.approx(
+        found["only one.failures"].value
+    )
+    for key in ("equal loops.false_worse", "low end.misses", "high end.misses"):
+        assert found[key].value <= 0.08
+    assert found["paired.power"].value == 1.0
+    pairs = [found[f"{name}.pairs_until_worse"].value for name in ("paired", "batch", "unpaired")]
+    assert 2 * pairs[0] < min(pairs[1:])
+    # By the usual formula for two shares.
+    assert (study.batch_size(0.01, 0.02), study.batch_size(0.05, 0.1)) == (2529, 474)
+    assert study.batch_size(0.1, 0.1) == np.inf

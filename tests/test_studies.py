@@ -301,5 +301,5 @@ def test_every_study_is_tried_and_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
     assert all(command.help for command in commands.values())
     others = {"truth", "anomalies", "walking", "animation", "store", "readme"}
-    elsewhere = {"bench", "ship"}  # In test_bench and test_shipped_assessments.
+    elsewhere = {"bench", "ship", "gate"}  # In test_bench, test_shipped_assessments, test_gate.
     assert {line.split(" ")[0] for line in STUDIES} | others | elsewhere == set(commands)

@@ -1,0 +1,126 @@
+"""``python -m studies gate``: how often verdicts of `gate` are wrong, and how soon they are known.
+
+Real pairs of episodes are drawn again, a thousand times, so that errors can be counted. The
+candidates are the same robot with weaker motors.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from scipy.stats import norm
+
+from drake_safety.cli.console import ScenarioArgument, VariationOption, WorkersOption
+from drake_safety.evaluation.metrics import Estimate, median, proportion
+from drake_safety.evaluation.paired_test import betting_log_e
+from drake_safety.evaluation.shifts import PlantShift, shifted_scenario
+from drake_safety.learning.seeds import GATE
+from drake_safety.robots.shift import JointShift, Shift
+from drake_safety.simulation.rollouts import run_episodes
+from studies.harness import Study, open_study
+
+_ALPHA, _POWER = 0.05, 0.9
+_OUTCOMES = np.array([-1.0, 0.0, 1.0])
+_LOOKS = np.arange(16, 5001, 16)
+
+
+def gate(
+    scenario: ScenarioArgument,
+    variation: VariationOption = "actual",
+    efforts: Annotated[str, typer.Option(help="Factors on the motors' largest torques.")] = (
+        "0.6,0.5,0.4"
+    ),
+    episodes: Annotated[int, typer.Option(help="Real episodes of each plant.", min=50)] = 1500,
+    replays: Annotated[int, typer.Option(help="Sets of pairs drawn from them.", min=100)] = 1000,
+    out: Annotated[Path, typer.Option(help="Folder of episodes and results.")] = Path("runs/gate"),
+    workers: WorkersOption = None,
+) -> None:
+    """Count wrong verdicts of `gate`, and the pairs until a verdict, on real episodes drawn again.
+
+    The rows: how many failed; false "worse" of two loops that are equal (a side of each pair is the
+    candidate's by a coin), and ends of intervals that excluded the true difference, at any look;
+    pairs until "worse", beside episodes of each loop of a batch test with power 0.9, and of a
+    sequential one without pairs.
+    """
+    with open_study("gate", scenario, out, seed=GATE.first, workers=workers, out=out) as study:
+        baseline = failures(study, variation, 1.0, episodes)
+        for effort in map(float, efforts.split(",")):
+            candidate = failures(study, variation, effort, episodes)
+            study.add(f"effort {effort:g}", rows(baseline, candidate, replays))
+
+
+def failures(study: Study, variation: str, effort: float, number: int) -> np.ndarray:
+    """Which episodes of a robot with weaker motors leave the safe set, (N,) of 0 and 1."""
+    shift = Shift(joints={".*": JointShift(effort_scale=effort)})
+    plant = replace(study.scenario.variation(variation), shift=shift if effort < 1 else None)
+    name = f"effort {effort:g}"
+    shifted = shifted_scenario(study.scenario, name, PlantShift(kind="plant", variation=plant))
+    options = study.scenario.options_for("pairs", variation)
+    episodes = run_episodes(
+        shifted,
+        number,
+        variation=name,
+        seed=study.seed,
+        num_workers=study.workers,
+        path=study.folder / "gate" / f"{name.replace(' ', '-')}-{study.seed}",
+        progress=partial(study.stages, f"episodes, {name}"),
+        **options,
+    )
+    return np.array([not one.is_safe for one in episodes], dtype=int)
+
+
+def rows(baseline: np.ndarray, candidate: np.ndarray, num_replays: int) -> dict[str, Estimate]:
+    """The rows of one candidate, from outcomes of pairs, (N,) of 0 and 1."""
+    rng, size = np.random.default_rng(0), (num_replays, _LOOKS[-1])
+    index, other = rng.integers(len(baseline), size=(2, *size))
+    apart = candidate - baseline
+    swapped = apart[index] * rng.choice([-1, 1], size)
+    either = first_looks(swapped, 0.0, is_above=True)
+    found = {
+        "baseline.failures": proportion(int(baseline.sum()), len(baseline)),
+        "candidate.failures": proportion(int(candidate.sum()), len(candidate)),
+        "only one.failures": proportion(int(np.abs(apart).sum()), len(apart)),
+        "equal loops.false_worse": _share_known(either),
+    }
+    for end, is_above in {"low": True, "high": False}.items():
+        known = first_looks(apart[index], float(apart.mean()), is_above=is_above)
+        found[f"{end} end.misses"] = _share_known(known)
+    alone = candidate[other] - baseline[index]
+    for name, differences in {"paired": apart[index], "unpaired": alone}.items():
+        known = first_looks(differences, 0.0, is_above=True)
+        found[f"{name}.pairs_until_worse"] = median(known)
+        found[f"{name}.power"] = _share_known(known)
+    number = batch_size(float(baseline.mean()), float(candidate.mean()))
+    found["batch.pairs_until_worse"] = Estimate.exact(number, len(baseline))
+    return found
+
+
+def first_looks(differences: np.ndarray, mean: float, *, is_above: bool) -> np.ndarray:
+    """Pairs at which it is known that a mean is above or below, (R,), of differences (R, N)."""
+    seen = [np.cumsum(differences == one, axis=1, dtype=np.int32) for one in _OUTCOMES]
+    counts = np.stack([one[:, _LOOKS - 1] for one in seen], axis=-1)
+    is_known = betting_log_e(_OUTCOMES, counts, mean, is_above=is_above) >= -math.log(_ALPHA)
+    return np.where(is_known.any(axis=1), _LOOKS[is_known.argmax(axis=1)], math.inf)
+
+
+def batch_size(baseline: float, candidate: float) -> float:
+    """Episodes of each loop for a one-sided test of two failure rates with a power of 0.9."""
+    if candidate <= baseline:
+        return math.inf
+    both = 0.5 * (baseline + candidate)
+    spread = (
+        math.sqrt(2.0 * both * (1.0 - both)),
+        math.sqrt(baseline * (1.0 - baseline) + candidate * (1.0 - candidate)),
+    )
+    reach = norm.ppf(1.0 - _ALPHA) * spread[0] + norm.ppf(_POWER) * spread[1]
+    return float(math.ceil((reach / (candidate - baseline)) ** 2))
+
+
+def _share_known(first: np.ndarray) -> Estimate:
+    return proportion(int(np.isfinite(first).sum()), len(first))
