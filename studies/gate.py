@@ -16,17 +16,22 @@ import numpy as np
 import typer
 from scipy.stats import norm
 
+from drake_safety.assessments import assessed_scenarios
 from drake_safety.cli.console import ScenarioArgument, VariationOption, WorkersOption
+from drake_safety.cli.training_folder import MODES, assessment_folder, load_assessment
+from drake_safety.evaluation.failure_rate import in_turns, strata_of, stratified_rate
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.paired_test import betting_log_e
 from drake_safety.evaluation.shifts import PlantShift, shifted_scenario
 from drake_safety.learning.seeds import GATE
+from drake_safety.learning.segments import Episodes
 from drake_safety.robots.shift import JointShift, Shift
 from drake_safety.simulation.rollouts import run_episodes
 from studies.harness import Study, open_study
 
 _ALPHA, _POWER = 0.05, 0.9
 _OUTCOMES = np.array([-1.0, 0.0, 1.0])
+_STARTS, _ROLLOUTS = 5000, 200  # Of an estimated failure rate.
 _LOOKS = np.arange(16, 5001, 16)
 
 
@@ -49,20 +54,26 @@ def gate(
     sequential one without pairs.
     """
     with open_study("gate", scenario, out, seed=GATE.first, workers=workers, out=out) as study:
-        baseline = failures(study, variation, 1.0, episodes)
+        real = simulated(study, variation, 1.0, episodes)
         for effort in map(float, efforts.split(",")):
-            candidate = failures(study, variation, effort, episodes)
-            study.add(f"effort {effort:g}", rows(baseline, candidate, replays))
+            candidate = failures(simulated(study, variation, effort, episodes))
+            study.add(f"effort {effort:g}", rows(failures(real), candidate, replays))
+        if study.scenario.name in assessed_scenarios():
+            gamma = load_assessment(assessment_folder(study.scenario, None).path, MODES[0])
+            first = [(e.state, e.desired_preview, e.features, e.first_step) for e in real]
+            inputs = (np.array([row[i][row[-1]] for row in first]) for i in range(3))
+            score = 1.0 - gamma.predict(*inputs).probability
+            study.add("rate", rate_rows(score, failures(real), replays))
 
 
-def failures(study: Study, variation: str, effort: float, number: int) -> np.ndarray:
-    """Which episodes of a robot with weaker motors leave the safe set, (N,) of 0 and 1."""
+def simulated(study: Study, variation: str, effort: float, number: int) -> Episodes:
+    """Episodes of a robot with weaker motors."""
     shift = Shift(joints={".*": JointShift(effort_scale=effort)})
     plant = replace(study.scenario.variation(variation), shift=shift if effort < 1 else None)
     name = f"effort {effort:g}"
     shifted = shifted_scenario(study.scenario, name, PlantShift(kind="plant", variation=plant))
     options = study.scenario.options_for("pairs", variation)
-    episodes = run_episodes(
+    return run_episodes(
         shifted,
         number,
         variation=name,
@@ -72,6 +83,10 @@ def failures(study: Study, variation: str, effort: float, number: int) -> np.nda
         progress=partial(study.stages, f"episodes, {name}"),
         **options,
     )
+
+
+def failures(episodes: Episodes) -> np.ndarray:
+    """Which episodes leave the safe set, (N,) of 0 and 1."""
     return np.array([not one.is_safe for one in episodes], dtype=int)
 
 
@@ -99,6 +114,29 @@ def rows(baseline: np.ndarray, candidate: np.ndarray, num_replays: int) -> dict[
     number = batch_size(float(baseline.mean()), float(candidate.mean()))
     found["batch.pairs_until_worse"] = Estimate.exact(number, len(baseline))
     return found
+
+
+def rate_rows(score: np.ndarray, failed: np.ndarray, num_replays: int) -> dict[str, Estimate]:
+    """Rows of failure rates that are estimated with Γ's scores of real starts, (N,)."""
+    rng, truth, found = np.random.default_rng(0), float(failed.mean()), []
+    for _ in range(num_replays):
+        drawn = rng.integers(len(score), size=_STARTS)
+        stratum = strata_of(score[drawn], rng)
+        index = in_turns(stratum)[:_ROLLOUTS]
+        counts = np.bincount(stratum[index], weights=failed[drawn[index]])
+        found.append(stratified_rate(np.bincount(stratum), np.bincount(stratum[index]), counts))
+    values = np.array([one.value for one in found])
+    misses = sum(not one.low <= truth <= one.high for one in found)
+    error = values.std() / math.sqrt(num_replays)
+    ratio = truth * (1.0 - truth) / _ROLLOUTS / values.var()
+    return {
+        "real episodes.failures": proportion(int(failed.sum()), len(failed)),
+        "gamma.failures": Estimate(
+            values.mean(), values.mean() - 2 * error, values.mean() + 2 * error, num_replays
+        ),
+        "gamma.misses": proportion(misses, num_replays),
+        "gamma.variance_ratio": Estimate.exact(ratio, num_replays),
+    }
 
 
 def first_looks(differences: np.ndarray, mean: float, *, is_above: bool) -> np.ndarray:

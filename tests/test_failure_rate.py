@@ -1,6 +1,5 @@
 """Failure rates from few episodes: unbiased however wrong Γ is, and the command."""
 
-import itertools
 from functools import partial
 from types import SimpleNamespace
 
@@ -10,7 +9,12 @@ import pytest
 from command_line import call
 from drake_safety import load_scenario, run_episodes
 from drake_safety.evaluation import failure_rate
-from drake_safety.evaluation.failure_rate import estimate_failure_rate, strata_of, stratified_rate
+from drake_safety.evaluation.failure_rate import (
+    estimate_failure_rate,
+    in_turns,
+    strata_of,
+    stratified_rate,
+)
 from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from shuttle_task import train_shuttle
@@ -27,18 +31,12 @@ def common(z):
     return 1.0 / (1.0 + np.exp(-60.0 * (z - 0.5)))
 
 
-def simulated_starts(stratum, num_rollouts):
-    members = [np.flatnonzero(stratum == k).tolist() for k in range(stratum.max() + 1)]
-    turns = itertools.chain(*itertools.zip_longest(*members))
-    return [index for index in turns if index is not None][:num_rollouts]
-
-
 def replay(rng, probability, score_of):
     """The estimate of one set of starts, each of which fails with its probability."""
     p = probability(rng.random(NUM_STARTS))
     score = rng.random(NUM_STARTS) if score_of == RANDOM else score_of(p)
     stratum = strata_of(score, rng)
-    index = simulated_starts(stratum, NUM_ROLLOUTS)
+    index = in_turns(stratum)[:NUM_ROLLOUTS]
     failed = rng.random(NUM_ROLLOUTS) < p[index]
     counted = partial(np.bincount, minlength=10)
     failures = counted(stratum[index], weights=failed)
@@ -75,7 +73,7 @@ def test_a_start_is_simulated_as_often_as_its_outcome_is_uncertain():
     score = np.repeat([0.0, 0.5], 5000)
     stratum = strata_of(score, np.random.default_rng(0))
     assert np.bincount(stratum).min() > 0
-    index = simulated_starts(stratum, 400)
+    index = in_turns(stratum)[:400]
     # Half of the simulations are spread evenly, the other half are where Γ is not certain.
     assert np.mean(score[index] == 0.5) == pytest.approx(0.75, abs=0.06)
     # Where Γ tells nothing apart all are spread evenly.

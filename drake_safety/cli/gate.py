@@ -7,7 +7,7 @@ import math
 import re
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -48,11 +48,8 @@ _COLUMNS = (
     *("candidate", "verdict", "pairs", *(f"fail: {one}" for one in _FAILING)),
     *("difference [points]", "survival [s]"),
 )
-_OF_RATE = (
-    *("failure rate [%]", "episodes", "failures found"),
-    "random episodes with the same variance",
-)
-_OF_STRATA = ("probability of a failure", "starts", "simulated", "failures")
+_OF_RATE = ("failure rate [%]", "episodes", "failures", "random episodes of the same variance")
+_OF_STRATA = ("probability of a failure", "to", "starts", "simulated", "failures")
 _OF_EPISODES = ("episode", "cause", "at [s]", "commanded", "Γ at its start: safe, unsafe, unknown")
 
 MetricOption = Annotated[
@@ -170,22 +167,11 @@ def rate(
     folders.check_writable(folder)
 
     def report(found: FailureRate) -> None:
-        title, share = f"{loaded.name}, {variation}: {metric}", Column("", "", "points", digits=2)
-        row = (
-            *(share.text(found.rate), f"{found.rate.n}", f"{len(found.failures)}"),
-            f"{found.plain_rollouts:.0f}",
-        )
-        console.show(console.new_table(*_OF_RATE, rows=[row], title=title))
-        rows = (
-            (
-                f"{one.low:.4f} to {one.high:.4f}",
-                f"{one.starts}",
-                f"{one.rollouts}",
-                f"{one.failures:g}",
-            )
-            for one in found.strata
-        )
-        console.show(console.new_table(*_OF_STRATA, rows=rows, title="What Γ said of the starts"))
+        text = Column("", "", "points", digits=2).text(found.rate)
+        row = (text, found.rate.n, len(found.failures), f"{found.plain_rollouts:.0f}")
+        _show(f"{loaded.name}, {variation}: {metric}", _OF_RATE, [row])
+        strata = [vars(one).values() for one in found.strata]
+        _show("What Γ said of the starts", _OF_STRATA, strata)
         _show_episodes("Failures", found.failures, metric)
         if found.failures:
             options = f"--baseline variation={variation} --seed {seed}"
@@ -261,13 +247,13 @@ def _report(
     title = f"{first.scenario.name}, {first.variation}: {metric}"
     rows = [
         (
-            *(name, one.verdict, f"{one.pairs}", f"{one.both}"),
-            *(f"{len(each)}" for each in (one.no_longer_failing, one.newly_failing)),
+            *(name, one.verdict, one.pairs, one.both),
+            *(len(one.no_longer_failing), len(one.newly_failing)),
             *(_interval(one.difference, 100.0, 1), _interval(one.survival_s, 1.0, 3)),
         )
         for name, one in found.items()
     ]
-    console.show(console.new_table(*_COLUMNS, rows=rows, title=title))
+    _show(title, _COLUMNS, rows)
     for name, one in found.items():
         _show_changes(name, metric, one)
     one = next(iter(found.values()))
@@ -301,43 +287,40 @@ def _show_changes(name: str, metric: str, one: Verdict) -> None:
         return console.say(f"{name}: no episode ends differently")
     _show_episodes(f"{name}: episodes that newly fail", new, metric)
     _show_episodes(f"{name}: episodes that fail no longer", old, metric)
-    causes = [[one.cause for one in each] for each in (new, old)]
     rows = []
-    for cause in dict.fromkeys([*causes[0], *causes[1]]):
-        seen = Counter(_expected(one) for one in new if one.cause == cause)
-        counts = (causes[0].count(cause), *(seen[what] for what in BELIEFS), causes[1].count(cause))
-        rows.append((spoken(cause or metric), *map(str, counts)))
-    columns = (*("cause", "newly fail"), *(f"Γ: {what}" for what in BELIEFS), "fail no longer")
-    console.show(console.new_table(*columns, rows=rows, title=f"{name}: by cause"))
-    rows = [
-        (f"{part.output}: {part.low:.3g} to {part.high:.3g}", *map(str, part[3:]))
-        for part in one.by_command
-    ]
-    columns = ("commanded", "pairs", "newly fail", "fail no longer")
-    console.show(console.new_table(*columns, rows=rows, title=f"{name}: by what was commanded"))
+    for cause in dict.fromkeys(each.cause for each in (*new, *old)):
+        here = [each for each in new if each.cause == cause]
+        believed = [BELIEFS[int(np.argmax(each.belief))] for each in here if each.belief]
+        lost = sum(each.cause == cause for each in old)
+        rows.append((spoken(cause or metric), len(here), *map(believed.count, BELIEFS), lost))
+    columns = ("cause", "newly fail", *(f"Γ: {what}" for what in BELIEFS), "fail no longer")
+    _show(f"{name}: by cause", columns, rows)
+    ends = ("from", "to", "pairs", "newly fail", "fail no longer")
+    _show(f"{name}: by what was commanded", ("commanded", *ends), one.by_command)
     index = [*new, *old][0].episode
     return console.say("to see one:", console.command_line(option=f"--replay={index}"))
 
 
-def _expected(one: Outcome) -> str:
-    """What Γ believed most at a start."""
-    return BELIEFS[int(np.argmax(one.belief))] if one.belief else ""
-
-
 def _show_episodes(title: str, episodes: Sequence[Outcome], metric: str) -> None:
     """Prints episodes that failed, the first ones in full."""
+    if len(episodes) > _MOST_SHOWN:
+        title += f": the first {_MOST_SHOWN} of {len(episodes)}"
     rows = [
         (
-            *(f"{one.episode}", spoken(one.cause or metric), f"{one.time_s:.2f}"),
+            *(one.episode, spoken(one.cause or metric), f"{one.time_s:.2f}"),
             ", ".join(f"{value:.3g}" for value in one.commanded),
             ", ".join(f"{mass:.2f}" for mass in one.belief or ()) or "–",
         )
         for one in episodes[:_MOST_SHOWN]
     ]
-    if rows:
-        told = f"; the others are in the file: {len(episodes)} in all"
-        title += told if len(episodes) > len(rows) else ""
-        console.show(console.new_table(*_OF_EPISODES, rows=rows, title=title))
+    _show(title, _OF_EPISODES, rows)
+
+
+def _show(title: str, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
+    """Prints a table, unless it is empty."""
+    cells = [[f"{one:.4g}" if isinstance(one, float) else f"{one}" for one in row] for row in rows]
+    if cells:
+        console.show(console.new_table(*columns, rows=cells, title=title))
 
 
 def _write(
@@ -358,9 +341,9 @@ def _write(
 def _write_junit(file: Path, suite: str, found: Mapping[str, Verdict]) -> None:
     """Writes JUnit XML, a test case a candidate: worse is a failure, undecided an error."""
     kinds = {WORSE: "failure", UNDECIDED: "error"}
-    root = ElementTree.Element("testsuite", name=f"gate {suite}", tests=f"{len(found)}")
-    for kind in kinds.values():
-        root.set(f"{kind}s", f"{sum(kinds.get(one.verdict) == kind for one in found.values())}")
+    counts = Counter(f"{kinds.get(one.verdict)}s" for one in found.values())
+    totals = {name: f"{counts[name]}" for name in ("failures", "errors")}
+    root = ElementTree.Element("testsuite", totals, name=f"gate {suite}", tests=f"{len(found)}")
     for name, one in found.items():
         case = ElementTree.SubElement(root, "testcase", classname=suite, name=name)
         difference = _interval(one.difference, 100.0, 1)

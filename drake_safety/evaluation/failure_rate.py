@@ -135,10 +135,7 @@ def estimate_failure_rate(
     inputs = (np.array([row[i][row[-1]] for row in rows]) for i in range(3))
     score = 1.0 - assessment.predict(*inputs).probability
     stratum = strata_of(score, np.random.default_rng(seed))
-    # One start of each stratum after the other.
-    members = [np.flatnonzero(stratum == k).tolist() for k in range(_NUM_STRATA)]
-    turns = itertools.chain(*itertools.zip_longest(*members))
-    order = [index for index in turns if index is not None][:num_rollouts]
+    order = in_turns(stratum)[:num_rollouts]
     try:
         return known(collected("episodes", order, **outcomes.simulated))
     except KeyboardInterrupt:
@@ -162,6 +159,13 @@ def strata_of(score: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     found = np.empty(len(score), dtype=int)
     found[order] = _NUM_STRATA * (np.cumsum(weight) - 0.5 * weight) / weight.sum()
     return found
+
+
+def in_turns(stratum: np.ndarray) -> list[int]:
+    """Starts in the order in which they are simulated, one of each stratum (N,) after the other."""
+    members = [np.flatnonzero(stratum == k).tolist() for k in range(_NUM_STRATA)]
+    turns = itertools.chain(*itertools.zip_longest(*members))
+    return [index for index in turns if index is not None]
 
 
 def _estimate(score: np.ndarray, stratum: np.ndarray, outcomes: Sequence[Outcome]) -> FailureRate:

@@ -25,10 +25,7 @@ def gate_figure(verdicts: Mapping[str, Verdict]) -> Figure:
             axes.fill_between(pairs, low, high, color=colour, alpha=0.2, linewidth=0)
             axes.plot(pairs, mean, color=colour, linewidth=1.8, marker="o", markersize=2.5)
             axes.axhline(0.0, color=style.FAINT_INK, linewidth=0.8)
-            axes.axhline(bound, color=style.INK, linewidth=0.8, linestyle="--")
-            place = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
-            words = f"worse by {bound:g}"
-            axes.annotate(words, (1.0, bound), xytext=(6, 0), va="center", fontsize=9, **place)
+            style.draw_threshold(axes, bound, style.INK)
             # The first looks exclude little.
             ends = [*mean, 0.0, bound, low[-1], high[-1]]
             room = 0.4 * (max(ends) - min(ends))

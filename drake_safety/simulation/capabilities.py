@@ -141,14 +141,6 @@ class CanBePushed(Protocol):
 
 
 @runtime_checkable
-class IsDisturbed(Protocol):
-    """Something acts on the robot, such as a ball or a push."""
-
-    def disturbances(self, context: Context) -> dict[str, np.ndarray]:
-        """What acts on the robot from the present state on, in SI units, (n,) each by name."""
-
-
-@runtime_checkable
 class FollowsCommands(Protocol):
     """Goals are commands that can change while the robot moves."""
 
@@ -207,7 +199,6 @@ _DESCRIPTIONS: dict[type, str] = {
     MovesUndisturbed: "long undisturbed motion",
     CanFall: "a fall",
     CanBePushed: "pushes on its robot",
-    IsDisturbed: "disturbances that are drawn",
     FollowsCommands: "commands that change while it moves",
     OffersPlans: "plans to choose from",
     CanStartAnywhere: "episodes from a given start",

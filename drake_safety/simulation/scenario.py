@@ -19,6 +19,7 @@ from drake_safety.files.reading import did_you_mean, parse_yaml, reading
 from drake_safety.files.schema import Positive, load_typed, schema
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.robots.robot import PlantVariation
+from drake_safety.robots.robot_size import overlaid
 from drake_safety.simulation.closed_loop import ClosedLoop, Purpose, check_ports
 from drake_safety.systems.safety_assessor import OnAlarm
 
@@ -333,13 +334,9 @@ def _changed(text: str, name: str, changes: Mapping[str, Any]) -> str:
     """The text of a scenario with other values by dotted key."""
     raw = parse_yaml(text, f"scenario '{name}'")
     for key, value in changes.items():
-        *outer, last = key.split(".")
-        place = raw
-        for part in outer:
-            if not isinstance(place.get(part), dict):
-                place[part] = {}
-            place = place[part]
-        place[last] = value
+        for part in reversed(key.split(".")):
+            value = {part: value}
+        raw = overlaid(raw, value)
     return yaml.safe_dump(raw, sort_keys=False)
 
 
