@@ -21,6 +21,7 @@ from drake_safety.cli.console import ScenarioArgument, VariationOption, WorkersO
 from drake_safety.cli.training_folder import MODES, assessment_folder, load_assessment
 from drake_safety.evaluation.failure_rate import in_turns, strata_of, stratified_rate
 from drake_safety.evaluation.metrics import Estimate, median, proportion
+from drake_safety.evaluation.outcomes import first_inputs
 from drake_safety.evaluation.paired_test import betting_log_e
 from drake_safety.evaluation.shifts import PlantShift, shifted_scenario
 from drake_safety.learning.seeds import GATE
@@ -60,9 +61,7 @@ def gate(
             study.add(f"effort {effort:g}", rows(failures(real), candidate, replays))
         if study.scenario.name in assessed_scenarios():
             gamma = load_assessment(assessment_folder(study.scenario, None).path, MODES[0])
-            first = [(e.state, e.desired_preview, e.features, e.first_step) for e in real]
-            inputs = (np.array([row[i][row[-1]] for row in first]) for i in range(3))
-            score = 1.0 - gamma.predict(*inputs).probability
+            score = 1.0 - gamma.predict(*first_inputs(real)).probability
             study.add("rate", rate_rows(score, failures(real), replays))
 
 

@@ -76,6 +76,11 @@ def test_a_start_is_simulated_as_often_as_its_outcome_is_uncertain():
     index = in_turns(stratum)[:400]
     # Half of the simulations are spread evenly, the other half are where Γ is not certain.
     assert np.mean(score[index] == 0.5) == pytest.approx(0.75, abs=0.06)
+    # A single start of which Γ is not certain is simulated, and leaves no stratum empty.
+    score = np.append(np.zeros(999), 0.5)
+    stratum = strata_of(score, np.random.default_rng(0))
+    assert 999 in in_turns(stratum)[:10]
+    assert np.bincount(stratum).min() > 0
     # Where Γ tells nothing apart all are spread evenly.
     assert np.bincount(strata_of(np.zeros(1000), np.random.default_rng(0))).tolist() == [100] * 10
 
@@ -152,4 +157,4 @@ def test_the_command_prints_the_rate_and_the_failures(monkeypatch, capsys, tmp_p
     assert f"{100 * rate.value:.2f} (" in printed
     assert sum(one["failures"] for one in entries["strata"]) == len(entries["failures"]) > 0
     first = entries["failures"][0]["episode"]
-    assert f"--baseline variation=actual --seed 11100000 --replay {first}" in printed
+    assert f"--baseline variation=actual --seed 12000000 --replay {first}" in printed

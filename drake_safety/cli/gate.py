@@ -333,8 +333,8 @@ def _write(
 ) -> None:
     """Writes results."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    made = console.made_by(scenario.name) | {"seed": seed, "metric": metric}
-    Results(figures, made | entries).write(file)
+    made = {**console.made_by(scenario.name), "seed": seed, "metric": metric, **entries}
+    Results(figures, made).write(file)
     console.say("figures", file)
 
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, Outcomes
+from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, Outcomes, first_inputs
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import RATE
-from drake_safety.learning.segments import Episode, Episodes
+from drake_safety.learning.segments import Episode
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.rollouts import (
     collect_episodes,
@@ -109,43 +109,39 @@ def estimate_failure_rate(
     make = worker_loop(scenario, variation, **options)
     outcomes = Outcomes(make(), metric, assessment)
 
-    def collected(stage: str, indices: Sequence[int], **simulated: Any) -> Episodes:
-        return collect_episodes(
-            episodes_info(make(), seed, options | simulated),
-            indices,
-            make,
-            partial(run_episode, seed=seed, **simulated),
-            num_workers=num_workers,
-            path=folder(simulated),
-            progress=None if progress is None else partial(progress, stage),
-        )
-
-    def folder(simulated: dict[str, Any]) -> Path | None:
+    def collected(stage: str, indices: Sequence[int], **simulated: Any) -> Iterable[Episode]:
         info = episodes_info(make(), seed, options | simulated)
-        return None if path is None else Path(path) / f"{info.scenario_hash[:12]}-{seed}"
+        folder = None if path is None else Path(path) / f"{info.scenario_hash[:12]}-{seed}"
+        try:
+            return collect_episodes(
+                info,
+                indices,
+                make,
+                partial(run_episode, seed=seed, **simulated),
+                num_workers=num_workers,
+                path=folder,
+                progress=None if progress is None else partial(progress, stage),
+            )
+        except KeyboardInterrupt:
+            kept = {} if folder is None else {one.index: one for one in load_episodes(folder)}
+            # Of several workers an episode that fails is done sooner than an earlier one.
+            finished = [kept[index] for index in itertools.takewhile(kept.__contains__, indices)]
+            if not simulated.get("until_first_row") and len(finished) >= _NUM_STRATA:
+                if_stopped(estimate(finished))
+            raise
 
-    def known(episodes: Iterable[Episode]) -> FailureRate:
-        """The estimate of the first ones in their order that have all finished."""
-        found = {one.index: outcomes.of(one) for one in episodes}
-        finished = itertools.takewhile(found.__contains__, order)
-        return _estimate(score, stratum, [found[index] for index in finished])
+    def estimate(episodes: Iterable[Episode]) -> FailureRate:
+        return _estimate(score, stratum, [outcomes.of(one) for one in episodes])
 
     starts = collected("starts", range(num_starts), until_first_row=True)
-    rows = [(one.state, one.desired_preview, one.features, one.first_step) for one in starts]
-    inputs = (np.array([row[i][row[-1]] for row in rows]) for i in range(3))
-    score = 1.0 - assessment.predict(*inputs).probability
+    score = 1.0 - assessment.predict(*first_inputs(starts)).probability
     stratum = strata_of(score, np.random.default_rng(seed))
     order = in_turns(stratum)[:num_rollouts]
-    try:
-        return known(collected("episodes", order, **outcomes.simulated))
-    except KeyboardInterrupt:
-        if (kept := folder(outcomes.simulated)) is not None:
-            if_stopped(known(load_episodes(kept)))
-        raise
+    return estimate(collected("episodes", order, **outcomes.simulated))
 
 
 def strata_of(score: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The stratum of each start, (N,), from Γ's probabilities of a failure, (N,).
+    """The stratum of each start, (N,) from 0, at most ten, from Γ's failure probabilities, (N,).
 
     If equally many of each stratum are simulated, a start is with a probability in proportion to
     the standard deviation of its outcome, as Γ has it (Neyman's allocation); but for half of the
@@ -158,36 +154,37 @@ def strata_of(score: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     weight = (1.0 - _EVEN) * spread / max(spread.mean(), 1e-12) + _EVEN
     found = np.empty(len(score), dtype=int)
     found[order] = _NUM_STRATA * (np.cumsum(weight) - 0.5 * weight) / weight.sum()
-    return found
+    return np.unique(found, return_inverse=True)[1]  # None is empty.
 
 
 def in_turns(stratum: np.ndarray) -> list[int]:
     """Starts in the order in which they are simulated, one of each stratum (N,) after the other."""
-    members = [np.flatnonzero(stratum == k).tolist() for k in range(_NUM_STRATA)]
+    members = [np.flatnonzero(stratum == k).tolist() for k in range(stratum.max() + 1)]
     turns = itertools.chain(*itertools.zip_longest(*members))
     return [index for index in turns if index is not None]
 
 
 def _estimate(score: np.ndarray, stratum: np.ndarray, outcomes: Sequence[Outcome]) -> FailureRate:
     """The estimate from the outcomes of some starts."""
-    strata = []
-    for k in range(_NUM_STRATA):
+    strata, means = [], []
+    for k in range(stratum.max() + 1):
         inside, own = score[stratum == k], [one for one in outcomes if stratum[one.episode] == k]
         ends = float(inside.min()), float(inside.max())
         strata.append(Stratum(*ends, len(inside), len(own), sum(one.value for one in own)))
+        means.append(float(inside.mean()))
     starts, rollouts, failures = (
         np.array([getattr(one, name) for one in strata])
         for name in ("starts", "rollouts", "failures")
     )
     rate = stratified_rate(starts, rollouts, failures)
     # With one more simulation that ends as Γ says, as a stratum without failures has no variance.
-    likely = (failures + [score[stratum == k].mean() for k in range(_NUM_STRATA)]) / (rollouts + 1)
+    likely = (failures + np.array(means)) / (rollouts + 1)
     share = starts / starts.sum()
     variance = share**2 @ (likely * (1.0 - likely) / rollouts)
     variance += share @ (likely - rate.value) ** 2 / starts.sum()
     return FailureRate(
         rate=rate,
-        plain_rollouts=rate.value * (1.0 - rate.value) / variance,
+        plain_rollouts=float(share @ likely * (1.0 - share @ likely) / variance),
         strata=strata,
         failures=sorted((one for one in outcomes if one.value), key=lambda one: one.time_s),
     )

@@ -139,6 +139,10 @@ def compare_loops(
     run = partial(make.run, _run_pair, seed=seed, **options)
     starts = {"starts_of": hashes[0]} if _takes_starts(two.scenario) else {}
     runs: tuple[dict[int, Outcome], ...] = ({}, {})
+
+    def again(side: int, index: int) -> Any:
+        return run((index, [side == 0, side == 1]))[side]
+
     with ExitStack() as stack:
         writers = []
         for side in (0, 1) if path is not None else ():
@@ -147,8 +151,7 @@ def compare_loops(
             folder = Path(path or "") / f"{info.scenario_hash[:12]}-{seed}"
             writers.append(stack.enter_context(EpisodeWriter(folder, info)))
             if kept := [episode for episode in load_episodes(folder) if episode.index < max_pairs]:
-                is_wanted = [side == 0, side == 1]
-                check_kept(folder, kept, lambda i, s=side, w=is_wanted: run((i, w))[s])
+                check_kept(folder, kept, partial(again, side))
             runs[side].update({episode.index: readers[side].of(episode) for episode in kept})
         is_missing = ((index, [index not in each for each in runs]) for index in range(max_pairs))
         items = [item for item in is_missing if any(item[1])]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,6 +84,15 @@ class Outcomes:
             commanded=tuple(preview[-episode.output.shape[1] :].tolist()),
             belief=belief,
         )
+
+
+def first_inputs(episodes: Iterable[Episode]) -> list[np.ndarray]:
+    """Γ's inputs in the first undisturbed rows: (N, n_s), (N, H*n_z) and (N, n_f)."""
+    rows = [
+        [getattr(one, name)[one.first_step] for name in ("state", "desired_preview", "features")]
+        for one in episodes
+    ]
+    return [np.array(column) for column in zip(*rows, strict=True)]
 
 
 def _bad_rows(loop: ClosedLoop, metric: str) -> Callable[[Episode], np.ndarray]:

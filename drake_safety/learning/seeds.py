@@ -69,7 +69,7 @@ ANOMALIES = SeedBlock(10_000_000, ("unperturbed", "perturbed", "thresholds"))
 """Motion with and without an anomaly, and that for thresholds."""
 GATE = SeedBlock(11_000_000, ("pairs of two loops",))
 """Both loops of a pair draw from the same generator."""
-RATE = SeedBlock(11_100_000, ("failure rate",))
+RATE = SeedBlock(12_000_000, ("failure rate",))
 BLOCKS = (
     *(TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION),
     *(DEMONSTRATION, SHIFTS, MOTION, FRESH_MOTION, ANOMALIES, WALKING, GATE, RATE),
