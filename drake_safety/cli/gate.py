@@ -287,13 +287,13 @@ def _show_changes(name: str, metric: str, one: Verdict) -> None:
         return console.say(f"{name}: no episode ends differently")
     _show_episodes(f"{name}: episodes that newly fail", new, metric)
     _show_episodes(f"{name}: episodes that fail no longer", old, metric)
-    rows = []
+    rows, sides = [], BELIEFS if any(one.belief for one in new) else ()
     for cause in dict.fromkeys(each.cause for each in (*new, *old)):
         here = [each for each in new if each.cause == cause]
         believed = [BELIEFS[int(np.argmax(each.belief))] for each in here if each.belief]
         lost = sum(each.cause == cause for each in old)
-        rows.append((spoken(cause or metric), len(here), *map(believed.count, BELIEFS), lost))
-    columns = ("cause", "newly fail", *(f"Γ: {what}" for what in BELIEFS), "fail no longer")
+        rows.append((spoken(cause or metric), len(here), *map(believed.count, sides), lost))
+    columns = ("cause", "newly fail", *(f"Γ: {what}" for what in sides), "fail no longer")
     _show(f"{name}: by cause", columns, rows)
     ends = ("from", "to", "pairs", "newly fail", "fail no longer")
     _show(f"{name}: by what was commanded", ("commanded", *ends), one.by_command)
