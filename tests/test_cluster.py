@@ -114,7 +114,7 @@ def test_a_worker_with_other_versions_is_refused_by_name():
 
 
 @pytest.mark.train
-@pytest.mark.parametrize("command", ["train", "evaluate", "calibrate", "adapt", "gate"])
+@pytest.mark.parametrize("command", ["train", "evaluate", "calibrate", "adapt", "gate", "rate"])
 def test_every_long_command_takes_a_cluster(command, monkeypatch, tmp_path):
     seen = []
 
@@ -127,6 +127,6 @@ def test_every_long_command_takes_a_cluster(command, monkeypatch, tmp_path):
             seen.append("left")
 
     monkeypatch.setattr(cluster, "connected", recorded)
-    out = ["--out" if command in ("train", "gate") else "--assessment", str(tmp_path)]
+    out = ["--out" if command in ("train", "gate", "rate") else "--assessment", str(tmp_path)]
     assert call(monkeypatch, command, "no_such_scenario", *out, "--cluster", "tcp://here:1") == 2
     assert seen == ["tcp://here:1", "left"]
