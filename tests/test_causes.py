@@ -1,6 +1,7 @@
 import numpy as np
+import pytest
 
-from drake_safety.learning.causes import NO_CAUSE, likely_causes
+from drake_safety.learning.causes import NO_CAUSE, cause_words, likely_causes
 
 UNKNOWN = [np.nan, np.nan]
 
@@ -26,3 +27,20 @@ def test_without_margins_the_mass_decides_and_without_either_nothing_is_named():
 
 def test_a_safe_set_without_constraints_has_no_cause():
     np.testing.assert_array_equal(likely_causes(np.zeros((2, 0)), np.zeros((2, 0))), [NO_CAUSE] * 2)
+
+
+@pytest.mark.parametrize(
+    ("margin", "is_known", "words"),
+    [
+        (-0.012, True, ("likely cause", "shelf, -1.2 cm")),
+        (0.01, True, ("nearest to its limit", "shelf, +1.0 cm")),
+        (-0.012, False, ("nearest to its limit", "shelf, -1.2 cm")),
+        (np.nan, True, ("likely cause", "shelf")),
+    ],
+)
+def test_what_keeps_its_limit_or_is_not_known_is_no_cause_of_a_violation(margin, is_known, words):
+    assert cause_words("shelf", margin, (), is_known=is_known) == words
+
+
+def test_without_a_cause_there_are_no_words():
+    assert cause_words("", np.nan, ()) == ("", "")

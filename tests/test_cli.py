@@ -61,7 +61,7 @@ def test_a_table_of_scenarios_and_the_version_are_printed(monkeypatch, capsys):
     assert printed.startswith(f"drake-safety {drake_safety.__version__}, drake ")
 
 
-SCENE, MISSING = "laikago_balancing", "error x holds no 'sharpened'"
+SCENE, MISSING = "laikago_balancing", "error there is no folder 'x': run"
 
 
 @pytest.mark.train

@@ -66,7 +66,6 @@ def assessment_for(loop, **changes):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"scenario": "falling"}, "differ in scenario: .* with falling, the diagram has gliding"),
         ({"horizon": 7}, "differ in horizon: .* with 7, the diagram has 10"),
         ({"preview_stride": 3}, "differ in preview_stride: .* with 3, the diagram has 1"),
         ({"step_s": 0.05}, "differ in step_s: .* with 0.05, the diagram has 0.04"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
+import legged_robots
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.robots.robot_template import write_robot
@@ -23,9 +24,9 @@ KNEES = [f"{leg}_calf_joint" for leg in LEGS]
 BOX = np.array([*product((-0.5, 0.5), repeat=3)])
 
 
-def robot_of(text, folder, task="balancing"):
+def robot_of(text, folder, task="balancing", **options):
     (folder / "q.urdf").write_text(text)
-    return write_robot("q", folder / "q.urdf", task, folder / task)
+    return write_robot("q", folder / "q.urdf", task, folder / task, **options)
 
 
 def problems(written):
@@ -232,6 +233,40 @@ def test_a_joint_of_an_arm_that_cannot_be_held_is_fixed_and_told(limit, note, tm
     assert f"joints ['arm2_joint'{note}" in found
 
 
+def test_an_arm_whose_stops_are_at_zero_stands_off_them_and_is_safe(tmp_path):
+    stops = [LIMIT.format(*one) for one in ((0, 2), (-2, 0), (-0.2, 0), (-1, 1))]
+    written = robot_of(quadruped(above=arm(*stops)), tmp_path, "reaching")
+    angles = [written.posture[f"arm{k}_joint"] for k in range(4)]
+    assert angles == pytest.approx([0.05, -0.05, -0.05, 0.0])
+    legged_robots.edited(written.files[1], posture=written.posture | {"arm3_joint": 0.99})
+    assert [finding.item for finding in problems(written)] == ["safe while it stands"]
+    (finding,) = problems(written)
+    assert (
+        "violates joint_limits, -1.1°; arm3_joint is at 0.99 rad, its stop at 1" in finding.message
+    )
+    assert finding.remedy == "change 'posture' in robot.yaml [rad]"
+
+
+def test_what_ends_in_a_joint_that_is_fixed_still_reaches(tmp_path):
+    passive = arm(ARM, ARM, ARM, ARM, ARM.replace("23.7", "0"))
+    written = robot_of(quadruped(above=passive), tmp_path, "reaching")
+    (limb,) = written.arms
+    assert (limb.body, limb.joints) == ("arm4", [f"arm{k}_joint" for k in range(4)])
+    assert problems(written) == []
+
+
+def test_a_short_arm_is_one_if_its_hand_is_named_and_fixed_and_told_if_not(tmp_path):
+    text = quadruped(above=arm(ARM, ARM))
+    written = robot_of(text, tmp_path)
+    assert written.decided[0].startswith("joints arm0_joint, arm1_joint are fixed: they move nei")
+    assert "arm1_joint" not in written.joints
+    written = robot_of(text, tmp_path, "reaching", hands=["arm1"])
+    assert written.joints[-2:] == ["arm0_joint", "arm1_joint"]
+    assert not any("fixed" in one for one in written.decided)
+    with pytest.raises(ValueError, match=r"no arm ends in links \['arm0'\]; limbs end in .*'arm1'"):
+        robot_of(text, tmp_path, "walking", hands=["arm0"])
+
+
 def test_coupled_joints_of_an_arm_stay_coupled_in_the_posture(tmp_path):
     text = quadruped(above=arm(ARM, ARM, ARM + MIMIC.format("arm1", 2, 0.3), ARM))
     written = robot_of(text, tmp_path)
@@ -251,9 +286,10 @@ def test_coupled_joints_that_are_fixed_keep_their_coupling(tmp_path):
 
 
 def test_feet_on_a_line_are_no_matter_of_gains(tmp_path):
-    remedies = [f.remedy for f in problems(robot_of(biped(FOOT), tmp_path))]
-    assert any("along a line" in one for one in remedies)
-    assert not any("joint_gains" in one for one in remedies)
+    (finding,) = problems(robot_of(biped(FOOT), tmp_path))
+    assert "q: a biped on 2 points along a line cannot balance with this c" in finding.message
+    assert "along a line" in finding.remedy
+    assert "joint_gains" not in finding.remedy
 
 
 PITCH = '<drake:screw_thread_pitch value="0.1"/>'

@@ -182,6 +182,8 @@ def test_a_browser_shows_a_throw_and_the_end(playing, number, state):
             page.goto(address)
             page.locator(".chart canvas").wait_for()
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+            stop = page.get_by_role("button", name="Stop").bounding_box()
+            assert stop["y"] >= 0 and stop["y"] + stop["height"] <= 844
             scene, panel = (page.locator(name).bounding_box() for name in (".scene", ".panel"))
             assert scene["y"] + scene["height"] <= panel["y"] + 1 or (
                 scene["x"] + scene["width"] <= panel["x"] + 1

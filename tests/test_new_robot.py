@@ -114,7 +114,7 @@ def test_feet_that_do_not_fit_are_found(own):
     edited(file, feet=feet | {"tibia_0": feet["tibia_0"] | {"radius_m": 0.03}})
     found = problems(own / "balancing.yaml")["contact spheres"]
     assert "the model file has no such sphere" in found.message
-    edited(file, feet={name: feet[name] for name in list(feet)[::3]})
+    edited(file, feet={name: feet[name] for name in list(feet)[:3]})
     found = problems(own / "balancing.yaml")["centre of mass over the feet"]
     assert "outside their polygon, at (" in found.message
     assert "'contact_points' under" in found.remedy
@@ -162,7 +162,7 @@ def test_a_scenario_without_safety_or_without_danger_is_found(own):
     file = own / "balancing.yaml"
     parameters = yaml.safe_load(file.read_text())["parameters"]
     edited(file, parameters=parameters | {"safe_set": {"height_m": [0.8, 0.9]}})
-    assert "violates ['hei" in problems(file)["safe while it stands"].message
+    assert "violates height" in problems(file)["safe while it stands"].message
     edited(file, parameters=parameters | {"start": CALM, "push": {"share": 0.0}})
     found = problems(file, 2)["share of unsafe episodes"]
     assert "0 % of 2 episodes" in found.message and "expected 10 to 90 %" in found.message
@@ -219,6 +219,8 @@ def test_new_tells_loudly_what_was_lost_and_changed(bare, tmp_path):
     assert "WARNING  2 links have lost their collision meshes, which are missing" in result.output
     assert "everything passes through femur_0, femur_1. Add boxes" in result.output
     assert "note  velocity" in result.output
+    assert "decided mass_scale: 0.8  Γ learns from lighter links" in result.output
+    assert "decided on_alarm: unknown  an alarm of the monitor makes every belief" in result.output
     assert "not where the URDF says are left out: gone.stl" in result.output
     assert "left out: gone.stl" in (out / "README.md").read_text()
     stated = yaml.safe_load((out / "robot.yaml").read_text())

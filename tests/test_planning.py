@@ -102,6 +102,9 @@ def test_a_refusal_names_the_constraint_whose_margin_comes_nearest_to_violation(
     assert told["cause_margin"] == -0.25
     assert sum(told["belief"].values()) == pytest.approx(1.0)
     assert sum(told["cause_probability"].values()) == pytest.approx(told["belief"]["unsafe"])
+    assert verdict.cause_words(()) == ("likely cause", "wall, -25.0 cm")
+    unsure = replace(verdict, reason="of two minds")
+    assert unsure.cause_words(()) == ("nearest to its limit", "wall, -25.0 cm")
 
 
 def test_without_predicted_margins_the_cause_is_what_most_of_the_unsafe_mass_is_for():

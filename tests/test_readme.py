@@ -14,6 +14,7 @@ import pytest
 import typer
 import yaml
 
+import command_line
 import quadrotor
 from drake_safety.cli import make_app
 from drake_safety.learning.assessment import AssessmentParameters
@@ -80,6 +81,21 @@ def test_every_name_in_the_python_of_the_readme_is_defined_in_it():
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and node.module == "quadrotor":
                 assert {one.name for one in node.names} <= set(dir(quadrotor))
+
+
+def test_the_refusal_of_the_readme_is_what_the_command_prints(monkeypatch, capsys):
+    (call,) = [call for call in shell_commands("drake-safety") if call[0] == "ask"]
+    assert command_line.call(monkeypatch, *call) == 1
+    (shown,), printed = blocks("text"), capsys.readouterr().out.splitlines()
+    number = re.compile(r"-?\d+(?:\.\d+)?")
+    alike = {number.sub("#", line): line for line in printed}
+    for line in shown.splitlines():
+        # The words to the letter, the numbers up to what other processors make of them.
+        stated, found = (
+            [float(digits) for digits in number.findall(one)]
+            for one in (line, alike[number.sub("#", line)])
+        )
+        assert found == pytest.approx(stated, abs=0.03, rel=0.05)
 
 
 def test_every_command_of_the_readme_of_the_command_line_page_and_of_the_cards_parses():

@@ -13,6 +13,7 @@ from drake_safety import load_scenario
 from drake_safety.models import load_robot
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.rollouts import episodes_info
 from drake_safety.simulation.scenario import (
     parse_scenario,
     read_scenario,
@@ -254,6 +255,20 @@ def test_every_scenario_loads_and_is_read_again_from_its_canonical_text(name):
 def test_what_changes_a_rollout_and_nothing_else_changes_the_hash(text, is_same):
     assert (parsed(text).simulation_hash() == parsed(SCENARIO).simulation_hash()) == is_same
     assert len(parsed(text).simulation_hash()) == 64
+
+
+@pytest.mark.parametrize(("step_s", "is_same"), [("0.04", True), ("0.02", False)])
+def test_a_copy_is_the_scenario_that_was_learned_from_only_if_it_simulates_the_same(
+    tmp_path, step_s, is_same
+):
+    learned = episodes_info(parsed(SCENARIO).make_loop(), seed=0)
+    path = tmp_path / "copied.yaml"
+    path.write_text(SCENARIO.replace("step_s: 0.04", f"step_s: {step_s}"))
+    copy = load_scenario(path)
+    assert copy.simulation_hash() != learned.scenario_hash
+    assert copy.adopt(learned) == is_same
+    assert (copy.simulation_hash() == learned.scenario_hash) == is_same
+    assert copy.name == "copied"
 
 
 def test_a_default_that_changes_is_another_simulation(monkeypatch):

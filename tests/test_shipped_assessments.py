@@ -214,13 +214,19 @@ def test_a_command_takes_the_shipped_assessment_and_says_so(package, monkeypatch
 
 
 @pytest.mark.slow
+def test_a_copy_of_the_scenario_takes_the_shipped_assessment(package, monkeypatch, tmp_path):
+    copy = tmp_path / "copied.yaml"
+    copy.write_text(SCENARIO)
+    assert call(monkeypatch, "adapt", copy, "--feedback", 4, "--workers", 1) == 0
+    assert (tmp_path / "work" / "runs" / "copied-shipped" / "adapted-actual").is_dir()
+
+
+@pytest.mark.slow
 def test_where_none_is_shipped_or_the_scenario_is_another_one_train_is_named(
     package, monkeypatch, capsys, tmp_path
 ):
-    for name, message in (
-        (tmp_path / "carrying.yaml", "no assessment of scenario 'carrying' comes with the package"),
-        (tmp_path / f"{NAME}.yaml", "was learned from a scenario with hash"),
-    ):
+    for name in (tmp_path / "carrying.yaml", tmp_path / f"{NAME}.yaml"):
+        message = f"no assessment of what scenario '{name.stem}' simulates comes with the package"
         name.write_text(SCENARIO.replace("duration_s: 0.8", "duration_s: 1.2"))
         for command in ("run", "play", "plan-study", "adapt", "calibrate"):
             asked = study if command == "plan-study" else call

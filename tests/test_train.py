@@ -20,7 +20,9 @@ def test_the_monitor_is_learned_from_undisturbed_motion_that_is_kept(monkeypatch
     file.write_text(SCENARIO)
     train = ("train", file, "--episodes", 60, "--workers", 1, "--out")
     assert call(monkeypatch, *train, out, "--motion", 0.4) == 0
-    assert "0 min of motion for its limits" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "0 min of motion for its limits" in printed
+    assert "gradient boosting has an AUC of" in printed
     motions = load_episodes(out / "motion")
     assert (len(motions), motions.info.seed, motions.info.step_s) == (30, MOTION.first, 0.02)
     learned = {mode: load_assessment(out, mode).detector_ for mode in MODES}

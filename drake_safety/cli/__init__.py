@@ -56,8 +56,8 @@ class _Command(TyperCommand):
     """A command whose extra is installed, and whose ``--cluster`` is connected while it runs."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parses the arguments with the numbers of a target joined to one word."""
-        return super().parse_args(ctx, join_targets(args))
+        """Parses the arguments with the numbers of a target joined, and ``--log`` before each."""
+        return super().parse_args(ctx, repeat_log(join_targets(args)))
 
     def invoke(self, ctx: Any) -> Any:
         """Runs the command."""
@@ -82,6 +82,18 @@ def join_targets(args: Sequence[str]) -> list[str]:
             end = i + 1 + max(len(numbers), 1)
             words[i:end] = [f"{word}={' '.join(words[i + 1 : end])}"]
     return words
+
+
+def repeat_log(args: Sequence[str]) -> list[str]:
+    """Puts ``--log`` before every file that follows it, as where a shell expands ``log_*.csv``."""
+    words, option = [""], ""
+    for word in args:
+        if word.startswith("-"):
+            option = word
+        elif option == "--log" != words[-1]:
+            words.append(option)
+        words.append(word)
+    return words[1:]
 
 
 def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
@@ -153,6 +165,7 @@ def run_app(commands: typer.Typer, program: str) -> None:
     """
     handler = RichHandler(console=console.console, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
+    logging.getLogger("drake").setLevel(logging.WARNING)  # Whoever serves a page that stays tells.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     arguments = [argument for argument in sys.argv[1:] if argument != _DEBUG]
     try:

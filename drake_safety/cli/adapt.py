@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import numpy as np
 from typer import Option
 
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
-from drake_safety.evaluation.metrics import Estimate, segment_estimates
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, mean
 from drake_safety.evaluation.results import Results
-from drake_safety.evaluation.tables import Column
-from drake_safety.evaluation.verdict_tables import verdict_table
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.feedback import EpisodePair
 from drake_safety.learning.seeds import ADAPTATION, MOTION
-from drake_safety.learning.segments import Episodes, split
+from drake_safety.learning.segments import Episodes
 from drake_safety.logs.episodes import cut_log, motions_from_log
 from drake_safety.logs.robot_log import RobotLog, read_log, read_pieces
 from drake_safety.models import load_robot
@@ -27,10 +29,9 @@ from drake_safety.simulation.feedback import EpisodePairs, pair_starts, run_pair
 from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
-_COLUMNS = [Column(key, key) for key in ("brier", "auc", "unsafe_recall", "safe_recall")]
 _MOST_CUTS = 3  # Printed of a log.
+_NUM_FOLDS = 5  # Of the feedback, each of which is judged after adapting to the others.
 _MOTION_S = 240.0  # Undisturbed motion of a simulated actual plant, for the monitor.
-_THRESHOLD = 0.5  # Safety probability below which a segment is classified unsafe.
 
 
 def adapt(
@@ -40,10 +41,9 @@ def adapt(
         int, Option(help="Actual episodes, each with a nominal twin.", min=1)
     ] = 160,
     variation: Annotated[str, Option(help="Variation of the actual plant.")] = "actual",
-    evaluate: Annotated[int, Option(help="Fresh actual episodes to evaluate on.", min=0)] = 0,
     log: Annotated[
         list[Path] | None,
-        Option(help="Log of a robot, in place of a variation; may be repeated.", exists=True),
+        Option(help="Logs of a robot, in place of a variation; one or more.", exists=True),
     ] = None,
     log_map: Annotated[Path | None, Option("--map", help="Map of their columns (YAML).")] = None,
     out: Annotated[
@@ -52,13 +52,11 @@ def adapt(
     strict: Annotated[
         bool, Option("--strict", help="Refuse a log with a missing value or a gap: do not cut it.")
     ] = False,
-    seed: Annotated[
-        int, Option(help="Seed of the feedback; that of the evaluation follows.")
-    ] = ADAPTATION.first,
+    seed: Annotated[int, Option(help="Seed of the feedback.")] = ADAPTATION.first,
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
 ) -> None:
-    """Adapt Γ to an actual robot, and evaluate it before and after.
+    """Adapt Γ to an actual robot, and say whether it is better on episodes or logs held out.
 
     Writes ASSESSMENT/adapted-VARIATION, which other commands take in place of ASSESSMENT; with
     --log it is named after the first log. Episodes are kept in ASSESSMENT: a stopped adaptation
@@ -67,44 +65,41 @@ def adapt(
     loaded = load_scenario(scenario)
     learned = folders.assessment_folder(loaded, assessment)
     priors = {mode: folders.load_assessment(learned.path, mode) for mode in MODES}
-    seeds = ADAPTATION.seeds(seed)
     for prior in priors.values():
-        folders.check_fresh(prior, loaded, list(seeds.values())[1:] if evaluate else ())
+        folders.check_fresh(prior, loaded)
         prior.check_unused(seed, purpose="adaptation")
     logs = log or []
     if bool(logs) != (log_map is not None):
         raise ValueError("adapt: --log needs --map, and --map needs --log")
-    if logs and evaluate:
-        raise ValueError("adapt: a log has no fresh episodes for evaluation; leave out --evaluate")
     if len({one.resolve() for one in logs}) < len(logs):
         raise ValueError(f"adapt: logs must differ; got {', '.join(map(str, logs))}")
     name = logs[0].stem if logs else variation
     folder = out or folders.adapted_folder(learned.out, name)
     folders.check_writable(folder)
-    judged: dict[str, Estimate] = {}
     with console.open_stages() as stages:
         plant = ActualPlant(loaded, variation, learned.out, workers, stages)
         if log_map is not None:
-            pieces = log_pieces(loaded, logs, log_map, is_strict=strict)
-            actual, starts = cut_log(pieces, loaded)
+            read = [log_pieces(loaded, [one], log_map, is_strict=strict) for one in logs]
+            loop, pieces = loaded.make_loop("actual"), list(chain.from_iterable(read))
+            cut = [cut_log(one, loop) for one in read]
+            found = enumerate(chain.from_iterable(episodes for episodes, _ in cut))
+            actual = Episodes(cut[0][0].info, [replace(one, index=i) for i, one in found])
+            starts = list(chain.from_iterable(starts for _, starts in cut))
             pairs = pair_starts(loaded, actual, starts, seed=seed)
             step_s = priors[MODES[0]].detector_.step_s
             motions = motions_from_log(pieces, loaded, step_s=step_s)
         else:
             pairs, motions = plant.pairs(feedback, seed), plant.motion(seed)
         sets = pairs.feedback()
+        held, unit = "parts of the log" if logs else "episodes", np.arange(len(pairs.actual))
+        if len(logs) > 1:
+            held, unit = "logs", np.repeat(range(len(logs)), [len(one) for one, _ in cut])
+        units = unit[[pair.actual.index for pair in sets]]
         adapted = {mode: prior.adapt(sets, motions=motions) for mode, prior in priors.items()}
         folder.mkdir(parents=True, exist_ok=True)
         for mode, one in adapted.items():
             one.save(folders.assessment_file(folder, mode))
-        if evaluate:
-            fresh = plant.fresh(evaluate, seeds["evaluation of the adaptation"])
-            for mode in MODES:
-                for when, one in (("before", priors[mode]), ("after", adapted[mode])):
-                    segments = split(fresh, stride=1, discount=1.0, shortest=one.settings.shortest)
-                    unsafe = 1.0 - one.predict_rows(segments, fresh.info.variation).probability
-                    found = segment_estimates(segments, unsafe, threshold=1.0 - _THRESHOLD)
-                    judged |= {f"{mode}.{when}.{key}": value for key, value in found.items()}
+        judged = {mode: _held_out(prior, sets, units) for mode, prior in priors.items()}
     gap = sum(pair.differs for pair in sets), len(sets)
     entries = {
         "scenario_hash": pairs.actual.info.scenario_hash,
@@ -116,13 +111,15 @@ def adapt(
         "differing_pairs": gap[0],
         "change": {mode: one.correction_.change.tolist() for mode, one in adapted.items()},
     }
-    results = Results(judged, console.made_by(loaded.name) | entries)
-    results.write(folder / "adaptation.json")
+    figures = {
+        f"held_out.{mode}.{key}": one
+        for mode, found in judged.items()
+        for key, one in found.items()
+    }
+    Results(figures, console.made_by(loaded.name) | entries).write(folder / "adaptation.json")
     _print_changes(loaded, adapted, gap, name)
-    for mode in MODES if judged else ():
-        title = f"{mode}, before and after feedback: '{variation}', recalls at {_THRESHOLD:g}"
-        table = verdict_table(results, mode, corner="feedback", kind=(title, "", _COLUMNS))
-        console.show(table.to_rich())
+    for mode in MODES:
+        console.say(f"{mode}: {_told_of(judged[mode], held)}")
     for mode in adapted:
         console.say("assessment", folders.assessment_file(folder, mode))
     console.say("figures   ", folder / "adaptation.json")
@@ -190,23 +187,58 @@ def log_pieces(
     return pieces
 
 
+def _held_out(
+    prior: SafetyAssessment, pairs: list[EpisodePair], units: np.ndarray
+) -> dict[str, Estimate]:
+    """Brier scores on actual episodes, before and after adapting to those of other units.
+
+    Units (N,) are the pairs' logs, or the pairs; intervals are over them. One alone has no score.
+    """
+    from sklearn.model_selection import GroupKFold
+
+    errors, num_units = [], len(np.unique(units))
+    folds = GroupKFold(min(num_units, _NUM_FOLDS)) if num_units > 1 else None
+    for others, judged in folds.split(pairs, groups=units) if folds else ():
+        adapted = prior.adapt([pairs[i] for i in others])
+        for i in judged:
+            rows, variation = pairs[i].rows, pairs[i].info.variation
+            safe = [one.predict_rows(rows, variation).probability for one in (prior, adapted)]
+            before, after = (np.array(safe) - ~rows.is_unsafe) ** 2
+            errors.append(np.array([before, after, after - before, np.full(len(rows), units[i])]))
+    if not errors:
+        return {}
+    *values, unit = np.concatenate(errors, axis=1)
+    found = [mean(one, unit, bootstrap=Bootstrap()) for one in values]
+    return dict(zip(("before", "after", "change"), found, strict=True))
+
+
+def _told_of(found: Mapping[str, Estimate], held: str) -> str:
+    """Whether Γ gets better on what it was not adapted to."""
+    if not found:
+        return "one pair, so that none is held out to judge the adaptation"
+    before, after, change = found.values()
+    told = "no clear change"
+    if change.n < _NUM_FOLDS:
+        told = "too few to tell"
+    elif change.low > 0 or change.high < 0:
+        told = "worse" if change.low > 0 else "better"
+    return (
+        f"{told} on {change.n} held-out {held}: Brier score {before.value:.3f} before, "
+        f"{after.value:.3f} after, {change.value:+.3f} ({change.low:+.3f} to {change.high:+.3f})"
+    )
+
+
 def _print_changes(
     scenario: Scenario, adapted: Mapping[str, SafetyAssessment], gap: tuple[int, int], name: str
 ) -> None:
-    """Prints what has changed; or that pairs that all end alike change nothing, and what does."""
-    (differing, num_pairs), rows, unchanged = gap, [], []
-    for mode, one in adapted.items():
-        assert one.adaptation_ is not None
-        change = ["-"] * 3
-        if one.adaptation_.method == "recalibration":
-            change = [f"{value:+.2f}" for value in one.correction_.change]
-            if not one.correction_.is_any:
-                change = ["unchanged"] * 3
-                unchanged.append(mode)
-        rows.append((mode, one.adaptation_.method, *change))
-    columns = ("mode", "method", "added to the offset", "safety slope", "margin slope")
-    title = f"Adapted to '{name}': {differing} of {num_pairs} pairs end differently"
-    console.show(console.new_table(*columns, rows=rows, title=title))
+    """Prints how many pairs differ, and what is needed if that changes nothing."""
+    differing, num_pairs = gap
+    unchanged = [
+        mode
+        for mode, one in adapted.items()
+        if one.adaptation_.method == "recalibration" and not one.correction_.is_any
+    ]
+    console.say(f"adapted to '{name}': {differing} of {num_pairs} pairs end differently")
     if differing or not unchanged:
         return
     num_needed = scenario.assessment.adaptation.update_interval

@@ -12,7 +12,6 @@ from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
 from drake_safety.files.reading import did_you_mean, is_number
-from drake_safety.learning.causes import describe_margin
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.simulation.capabilities import HasGoals, goal_words, require
@@ -104,10 +103,11 @@ def print_verdict(
         safe, unsafe, unknown = verdict.belief.tolist()
         lines["belief"] = f"safe {safe:.2f}, unsafe {unsafe:.2f}, don't know {unknown:.2f}"
     if not verdict.is_accepted and verdict.cause:
-        margin, masses = verdict.cause_margin, verdict.cause_probability
-        lines["likely cause"] = describe_margin(verdict.cause, margin, loop.angular_constraints)
-        if not np.isfinite(margin):
-            lines["likely cause"] += f" ({100 * masses.max() / masses.sum():.0f} %)"
+        masses = verdict.cause_probability
+        label, told = verdict.cause_words(loop.angular_constraints)
+        if not np.isfinite(verdict.cause_margin):
+            told += f" ({100 * masses.max() / masses.sum():.0f} %)"
+        lines[label] = told
     if nearest is not None:
         distance = words.distance(nearest.goal - verdict.goal)
         told = f"{distance} away, probability {nearest.probability:.3f}"
@@ -116,5 +116,6 @@ def print_verdict(
         lines["nearest accepted"] = "none found that is accepted with reserve"
     if nearest is not None or np.isfinite(probability):
         lines["threshold"] = f"{threshold:.3f}, {origin}"
+    width = max(map(len, lines))
     for name, text in lines.items():
-        console.say(f"{name:<16}  {text}")
+        console.say(f"{name:<{width}}  {text}")

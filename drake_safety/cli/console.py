@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.console import Console
-from rich.table import Column, Table
+from rich.table import Table
 from typer import Argument, Option
 
 from drake_safety.files import progress
@@ -81,9 +81,11 @@ open_stages = partial(progress.open_stages, console)
 
 
 def new_table(*columns: str, rows: Iterable[Iterable[str]] = (), title: str | None = None) -> Table:
-    """A table whose cells fold if they do not fit, so that no number is truncated."""
-    table = Table(*(Column(name, overflow="fold") for name in columns), title=title)
-    for row in rows:
+    """A table whose cells fold if they do not fit, columns of single words (names) last."""
+    table, cells = Table(title=title), [[*row] for row in rows]
+    for name, *column in zip(columns, *cells, strict=True):
+        table.add_column(name, overflow="fold", no_wrap=not any(" " in one for one in column))
+    for row in cells:
         table.add_row(*row)
     return table
 

@@ -28,12 +28,12 @@ def scenarios() -> None:
             scenario = load_scenario(name)
             scenario.task_class().model_files(scenario)
         except MissingExtraError as error:
-            rows.append((name, *4 * ["–"], error.needs))
+            rows.append((name, *3 * ["–"], f"needs {error.needs}"))
             continue
-        num_steps, task = scenario.assessment.horizon, scenario.task.rpartition(":")[2]
-        horizon = f"{num_steps} steps, {num_steps * scenario.preview_step_s:g} s"
-        rows.append((name, task, scenario.robot, ", ".join(scenario.variations), horizon, ""))
-    columns = ("scenario", "task", "robot", "plants", "horizon", "needs")
+        horizon = f"{scenario.assessment.horizon * scenario.preview_step_s:g} s"
+        task, plants = scenario.task.rpartition(":")[2], ", ".join(scenario.variations)
+        rows.append((name, task, scenario.robot, horizon, plants))
+    columns = ("scenario", "task", "robot", "horizon", "plants")
     console.show(console.new_table(*columns, rows=rows))
 
 
@@ -58,6 +58,10 @@ def new(
     feet: Annotated[
         str | None, Option(help="Links that touch the ground, with commas; the lowest by default.")
     ] = None,
+    hands: Annotated[
+        str | None,
+        Option(help="Links that arms end in, with commas; of four joints or more by default."),
+    ] = None,
     out: Annotated[Path | None, Option(help="Folder to write; NAME by default.")] = None,
 ) -> None:
     """Write the folder of a robot and a first scenario from a URDF or an MJCF, for review.
@@ -72,9 +76,8 @@ def new(
     # Before anything is written.
     template = None if policy is None else survey_policy(policy, _names(motors))
     moved = () if template is None else template.joints or None
-    written = write_robot(
-        name, model, task, out or Path(name), feet=_names(feet) or None, moved=moved
-    )
+    limbs = {"feet": _names(feet) or None, "hands": _names(hands) or None}
+    written = write_robot(name, model, task, out or Path(name), **limbs, moved=moved)
     files, asked, sizes = written.files, written.asked, written.sizes
     if template is not None:
         more, unknown = template.write(written.folder, written.joints, written.posture)
@@ -89,6 +92,8 @@ def new(
             f"{written.num_hulls} convex hulls replace collision meshes that Drake does not read. "
             f"Look at them: drake-safety check {written.files[-1]} --picture FILE"
         )
+    for what in written.decided:
+        console.say("decided", what)
     for what in (*written.copy.warnings, *written.copy.left_out):
         console.say(f"note  {what}", style="yellow")
     if bare := written.copy.bare_links:
@@ -157,7 +162,7 @@ def check(
         for path in save(robot_figure(loop), picture):
             console.say("picture", path)
     if num_problems:
-        console.say(f"{num_problems} problems", style="red")
+        console.say(f"{num_problems} problem{'s' * (num_problems > 1)}", style="red")
         raise Exit(1)
     if not import_:
         console.say("its files are right; its code was not run")

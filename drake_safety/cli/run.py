@@ -26,8 +26,10 @@ from drake_safety.evaluation.timeline_figure import timeline_figure
 from drake_safety.files.reading import did_you_mean, parse_yaml
 from drake_safety.files.schema import load_typed
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.causes import describe_margin, likely_cause
+from drake_safety.learning.causes import cause_words, likely_cause
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import DEMONSTRATION
+from drake_safety.live.following_camera import FollowingCamera
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import CanBePushed, HasBall, HasGoals, goal_words, require
@@ -128,6 +130,8 @@ def run(
     if meshcat:
         console.say(f"live at {viewer.web_url()}")
         input("Press Enter when the browser shows the robot. ")
+    if isinstance(loop, LeggedLoop):
+        FollowingCamera(loop, viewer).begin(loop.CreateDefaultContext())
     viewer.StartRecording()
     rate = 1.0 if meshcat else 0.0
     shown = simulated(loop, duration_s=duration or duration_s, seed=seed, realtime_rate=rate)
@@ -246,16 +250,19 @@ def _end(motion: Motion, standing: str) -> _Events:
 
 def _expected(loop: Any, motion: Motion, times_s: list[float], happens: str) -> _Events:
     """What happens at given times, with the constraint most likely to be violated then."""
-    names, unit = loop.constraint_names, loop.assessment.parameters.margin_unit
+    names, parameters = loop.constraint_names, loop.assessment.parameters
     events = []
     for time_s in times_s:
         row = int(np.abs(motion.time_s - time_s).argmin())
         margins = motion["predicted_margins"][row]
-        told = cause = likely_cause(names, motion["cause_probability"][row], margins, unit)
-        if cause:
+        mass, unit = motion["cause_probability"][row], parameters.margin_unit
+        told = "unknown cause"
+        if cause := likely_cause(names, mass, margins, unit):
             margin = margins[names.index(cause)]
-            told = describe_margin(cause, margin, loop.angular_constraints)
-        events.append((time_s, f"{happens}; expected violation: {told or 'unknown'}"))
+            is_known = not is_unknown(motion["belief"][row], parameters.initial_uncertainty)
+            words = cause_words(cause, margin, loop.angular_constraints, is_known=is_known)
+            told = ": ".join(words)
+        events.append((time_s, f"{happens}; {told}"))
     return events
 
 

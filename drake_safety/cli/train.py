@@ -13,6 +13,7 @@ from typer import Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
+from drake_safety.evaluation.learning_curve import describe, learning_curve
 from drake_safety.files.progress import StageProgress, stage_of
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import ChangeDetector
@@ -39,7 +40,7 @@ def train(
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
 ) -> None:
-    """Simulate the nominal closed loop and train Γ.
+    """Simulate the nominal closed loop and train Γ; says whether more episodes would help.
 
     Episodes are kept as they finish: a stopped run continues with --resume.
     """
@@ -84,6 +85,7 @@ def train(
         rows = [_learn(loaded, name, out, detector, stages) for name in modes]
     console.show(console.new_table("mode", "segments", "unsafe episodes", "CPU time", rows=rows))
     console.say(folders.load_assessment(out, modes[0]).detector_.describe())
+    console.say(describe(learning_curve(load_episodes(next(iter(sets))), loaded.assessment)))
     for folder in sets:
         console.say("episodes  ", folder)
     for name in modes:

@@ -106,21 +106,20 @@ def open_assessment(
 def assessment_folder(
     scenario: Scenario, given: Path | None, *, is_told: bool = True
 ) -> AssessmentFolder:
-    """The given folder, or by default that of the shipped assessments of this very scenario."""
+    """The given folder, or by default that of the shipped assessments of what is simulated."""
     if given is not None:
         return AssessmentFolder(given, given)
     advice = "`drake-safety train` learns one, in a folder to be passed as --assessment"
-    if scenario.name not in assessed_scenarios():
+    names = assessed_scenarios()
+    # Its own name first: reading an assessment takes half a second.
+    for name in sorted(names, key=lambda one: one != scenario.name):
+        shipped = shipped_folder(name)
+        if scenario.adopt(load_assessment(shipped, MODES[0]).info_):
+            break
+    else:
         raise ValueError(
-            f"no assessment of scenario '{scenario.name}' comes with the package, which has those "
-            f"of {assessed_scenarios()}: {advice}"
-        )
-    shipped, own = shipped_folder(scenario.name), scenario.simulation_hash()
-    learned = load_assessment(shipped, MODES[0]).info_.scenario_hash
-    if learned != own:
-        raise ValueError(
-            f"the assessment of '{scenario.name}' that comes with the package was learned from a "
-            f"scenario with hash {learned[:12]}, this one has {own[:12]}: {advice}"
+            f"no assessment of what scenario '{scenario.name}' simulates comes with the package, "
+            f"which has those of {names} as they are there: {advice}"
         )
     if is_told:
         console.say("assessment        comes with the package,", shipped)
@@ -134,6 +133,8 @@ def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
     if not path.is_file():
         there = sorted(file.stem for file in folder.glob("*.safetensors"))
         holds = f"{folder} holds no '{mode}' assessment; it holds {there}"
+        if not folder.is_dir():
+            holds = f"there is no folder '{folder}'"
         raise ValueError(f"{holds}: run `drake-safety train` first")
     return SafetyAssessment.load(path)
 
@@ -141,9 +142,13 @@ def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
 def check_fresh(
     assessment: SafetyAssessment, scenario: Scenario, seeds: Iterable[int] = ()
 ) -> None:
-    """Checks that the scenario is that of the training, and that no seed has been used."""
-    trained, own = assessment.info_, scenario.simulation_hash()
-    if trained.scenario_hash != own:
+    """Checks that the scenario is that of the training, and that no seed has been used.
+
+    Its hashes are then those of the training, also if its file was copied or renamed since.
+    """
+    trained = assessment.info_
+    if not scenario.adopt(trained):
+        own = scenario.simulation_hash()
         raise ValueError(
             f"the assessment was trained on scenario '{trained.scenario}' with hash "
             f"{trained.scenario_hash[:12]}; '{scenario.name}' now has hash {own[:12]}, as its "

@@ -56,6 +56,7 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
     environment.filters |= {"spoken": spoken, "label": label_of, "set_title": set_title}
     text = files(__package__).joinpath("report.html.j2").read_text(encoding="utf-8")
     page = environment.from_string(text).render(
+        folder=folder.resolve().name,
         name=infos[0].scenario if infos else results[0].entries.get("scenario", folder.name),
         assessments=assessments,
         training=read_info(episodes)[1].get("command", "") if episodes.is_dir() else "",

@@ -52,6 +52,20 @@ def likely_cause(
     return "" if column == NO_CAUSE else names[column]
 
 
+def cause_words(
+    name: str, margin: float, angular_constraints: Collection[str], *, is_known: bool = True
+) -> tuple[str, str]:
+    """What a cause is to a motion, and text of its margin [m, rad]; "" and "" without a name.
+
+    It is the "likely cause" of a violation; if its margin is positive, or the belief is not known,
+    "nearest to its limit".
+    """
+    if not name:
+        return "", ""
+    label = "nearest to its limit" if margin > 0.0 or not is_known else "likely cause"
+    return label, describe_margin(name, margin, angular_constraints)
+
+
 def describe_margin(name: str, margin: float, angular_constraints: Collection[str]) -> str:
     """Text of a constraint and its margin, such as ``collision, -1.2 cm``.
 

@@ -100,7 +100,7 @@ def _build_readings(panel: LivePanel) -> Callable[[], None]:
         state.set_text(status.state)
         is_known = math.isfinite(panel.probability) and not panel.is_stopped
         probability.set_text(f"probability {panel.probability:.2f}" if is_known else "")
-        cause.set_text("expected: " + status.cause.replace("_", " ") if status.cause else "")
+        cause.set_text(status.cause.replace("_", " "))
         note.set_text(status.note)
         box.style(f"background: var(--{status.tone})")
         for part, label, share, name in zip(

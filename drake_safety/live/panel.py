@@ -26,7 +26,7 @@ _UNKNOWN = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Status:
-    """What the robot does, the expected violation, a remark, and a key of `COLOURS`."""
+    """What the robot does, a cause in words, a remark, and a key of `COLOURS`."""
 
     state: str = ""
     cause: str = ""

@@ -17,7 +17,7 @@ from pydrake.geometry import Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from drake_safety.learning.causes import describe_margin, likely_cause
+from drake_safety.learning.causes import cause_words, likely_cause
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import DivergenceError
 from drake_safety.live.following_camera import WORLD, FollowingCamera
@@ -328,13 +328,14 @@ class LiveSession:
         self._said, self._said_until_s = note, self.context.get_time() + seconds
 
     def _cause(self) -> str:
-        """The constraint that is most likely to be violated; "" for none."""
-        return likely_cause(
-            self.loop.constraint_names,
-            self._eval("cause_probability"),
-            self._eval("predicted_margins"),
-            self.assessment.parameters.margin_unit,
-        )
+        """The constraint that is most likely to be violated, in words; "" for none."""
+        names, margins = self.loop.constraint_names, self._eval("predicted_margins")
+        unit = self.assessment.parameters.margin_unit
+        cause = likely_cause(names, self._eval("cause_probability"), margins, unit)
+        margin = margins[names.index(cause)] if cause else math.nan
+        # Without its number, which would flicker.
+        label, _ = cause_words(cause, margin, self.loop.angular_constraints)
+        return f"{label}: {cause}" if cause else ""
 
     def _eval(self, port: str) -> Any:
         return self.loop.GetOutputPort(port).Eval(self.context)
@@ -422,7 +423,7 @@ class LiveSession:
             return
         if verdict.reason:
             told = "don't know"
-        cause = describe_margin(verdict.cause, verdict.cause_margin, self.loop.angular_constraints)
+        cause = ": ".join(filter(None, verdict.cause_words(self.loop.angular_constraints)))
         notes = [] if cause else [verdict.reason]
         if self.nearest is not None:
             distance_m = float(np.linalg.norm(self.nearest.goal - verdict.goal))

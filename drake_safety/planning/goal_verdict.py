@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
-from drake_safety.learning.causes import likely_cause
+from drake_safety.learning.causes import cause_words, likely_cause
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.simulation.capabilities import HasGoals, goal_words, is_in_box, require
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -68,6 +68,11 @@ class GoalVerdict:
         """The margin predicted for the cause [m, rad]; NaN if there is none."""
         names, cause = self.constraint_names, self.cause
         return float(self.predicted_margins[names.index(cause)]) if cause else math.nan
+
+    def cause_words(self, angular_constraints: Collection[str]) -> tuple[str, str]:
+        """What the cause is to the motion, and text of its margin; see the function."""
+        is_known = self.verdict != UNKNOWN
+        return cause_words(self.cause, self.cause_margin, angular_constraints, is_known=is_known)
 
     def to_json(self) -> dict[str, Any]:
         """Returns the verdict as JSON types; unknown values are None."""

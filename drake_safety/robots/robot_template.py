@@ -51,6 +51,7 @@ class NewRobot:
         posture: Its standing joint positions [rad].
         posture_source: Where they come from.
         wheels: Joints that turn wheels at the ends of legs.
+        fixed: Joints that move neither a foot nor a hand.
         asked: Values that the file lacks and the user must supply.
     """
 
@@ -65,6 +66,7 @@ class NewRobot:
     posture: dict[str, float] = field(default_factory=dict)
     posture_source: str = ""
     wheels: list[str] = field(default_factory=list)
+    fixed: list[str] = field(default_factory=list)
     asked: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -80,6 +82,16 @@ class NewRobot:
         """URDF, robot.yaml, README and scenario."""
         names = (f"{self.name}.urdf", "robot.yaml", "README.md", f"{self.task}.yaml")
         return [self.folder / name for name in names]
+
+    @property
+    def decided(self) -> list[str]:
+        """What was decided for it, and why; the scenario says so too."""
+        lines = self.files[-1].read_text(encoding="utf-8").splitlines()
+        found = [line.replace("# DECIDED ", "").strip() for line in lines if "# DECIDED" in line]
+        if self.fixed:
+            reason = "they move neither a foot nor a hand, which --hands would name"
+            found.insert(0, f"joints {', '.join(self.fixed)} are fixed: {reason}")
+        return found
 
     @property
     def joints(self) -> list[str]:
@@ -137,6 +149,7 @@ def write_robot(
     folder: Path,
     *,
     feet: list[str] | None = None,
+    hands: list[str] | None = None,
     moved: Collection[str] | None = (),
 ) -> NewRobot:
     """Writes a robot's folder: a URDF that Drake can simulate, robot.yaml, README and a scenario.
@@ -145,6 +158,7 @@ def write_robot(
         model: Its URDF or MJCF.
         task: ``balancing``, ``reaching`` or ``walking``.
         feet: Links that touch the ground; found by their height by default.
+        hands: Links that arms end in; those of limbs of four joints or more by default.
         moved: Joints that a policy moves: they are not fixed, though they may move neither a foot
             nor a hand; None for all.
 
@@ -168,7 +182,7 @@ def write_robot(
         copy.left_out = facts.left_out + copy.left_out
         copy.notes += [f"it is converted from '{model.name}'", *facts.left_out][urdf == model :]
         found = NewRobot(name=name, task=task, folder=Path(scratch), copy=copy, facts=facts)
-        _find_limbs(found, feet, moved or ())
+        _find_limbs(found, feet, hands, moved or ())
         _fix_joints(found, moved)
         _stand(found)
         # Copied to the target only when complete.
@@ -186,7 +200,9 @@ def write_robot(
     return found
 
 
-def _find_limbs(found: NewRobot, feet: list[str] | None, moved: Collection[str]) -> None:
+def _find_limbs(
+    found: NewRobot, feet: list[str] | None, hands: list[str] | None, moved: Collection[str]
+) -> None:
     copy = found.copy
 
     def set_base(limbs: list[Limb], *, is_up: bool) -> None:
@@ -204,11 +220,11 @@ def _find_limbs(found: NewRobot, feet: list[str] | None, moved: Collection[str])
     set_base(found.survey.legs(feet), is_up=True)
     found.legs = found.survey.legs(feet)
     require_motors(found.survey, found.legs, moved)
-    found.arms = found.survey.arms(found.legs)
+    found.arms = found.survey.arms(found.legs, hands)
     if found.task == "reaching" and not found.arms:
         raise ValueError(
             f"new: '{copy.source}' has no arm (a limb of four joints or more that is not a leg) to "
-            "reach with; use --task balancing"
+            "reach with; name its end by --hands, or use --task balancing"
         )
     found.wheels = found.survey.wheels(found.legs)
 
@@ -263,6 +279,7 @@ def _fix_joints(found: NewRobot, moved: Collection[str] | None) -> None:
         X_BP, X_BC = (survey.pose(body.name()) for body in ends)
         poses[joint.name()] = X_BP.inverse() @ X_BC if joint.name() in drives.mimics else None
     copy.fix_joints(poses)
+    found.fixed = sorted(poses.keys() - loose - set(passive))
     for limb in (*found.legs, *found.arms):
         limb.joints = [name for name in limb.joints if name not in poses]
     found.renew_survey()
@@ -303,7 +320,8 @@ def _stand(found: NewRobot) -> None:
         )
     if min(sizes.half_length_m, sizes.half_width_m) < _LEAST_STANCE * sizes.height_m:
         copy.warn(
-            "the contact points of the feet lie on a line: on them, no posture stands by servos"
+            "the contact points of the feet lie on a line: on them, no posture stands by servos; "
+            "--task walking takes a policy that balances"
         )
     found.asked += [
         f"where foot '{limb.body}' touches: the file has no shape there [m]"
@@ -363,7 +381,8 @@ def _robot_yaml(found: NewRobot) -> str:
     if guessed:
         which = f" of {len(guessed)} joints" if len(guessed) < len(keys) else ""
         found.asked.append(
-            f"the maker's servo gains{which} [N·m/rad, N·m·s/rad]; estimated from the mass"
+            f"the maker's servo gains{which} [N·m/rad, N·m·s/rad]; estimated from mass and height: "
+            f"{_STIFFNESS * sizes.load:.3g} and {_STIFFNESS * _DAMPING_S * sizes.load:.2g} in legs"
         )
     rotors = [f"{keys[j]}: {facts.rotor_inertia[j]:.4g}" for j in names if j in facts.rotor_inertia]
     ask(f"rotor_inertia:  # of {source} [kg·m²]", rotors)

@@ -29,7 +29,10 @@ class Sizes(RobotSize):
 
 def scenario_yaml(task: str, sizes: Sizes) -> str:
     """Writes the scenario of a task as commented YAML."""
-    on_alarm = "on_alarm: unknown  # an alarm makes every belief unknown; report: only says so\n"
+    on_alarm = (
+        'on_alarm: unknown  # DECIDED an alarm of the monitor makes every belief "don\'t know"; '
+        "report: only says so\n"
+    )
     return TASKS[task](sizes) + on_alarm
 
 
@@ -43,9 +46,12 @@ def _variations(sizes: Sizes, mass_scale: float, position: float, velocity: floa
         scale = sizes.factors(BALANCING_REFERENCE)
         friction = 0.4 * scale["mass"] * scale["height"]
     noise = f"{{position: {position:g}, velocity: {velocity:g}}}  # of your sensors [m, rad; 1/s]"
+    reason = "Γ learns from the masses of the URDF"
+    if mass_scale < 1:
+        reason = "Γ learns from lighter links, a reality gap as the paper's; 1: those of the URDF"
     return f"""variations:
   nominal:  # the model that Γ is trained on
-    mass_scale: {mass_scale:g}
+    mass_scale: {mass_scale:g}  # DECIDED {reason}
     input_noise: {noise}
   actual:  # ASK how the real robot differs from its URDF
     joint_friction_nm: {friction:.2g}  # dry friction of a joint [N·m]

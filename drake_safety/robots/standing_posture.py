@@ -30,7 +30,8 @@ def standing_posture(
 
     Keyframes called home or stand come first. In a keyframe in which the robot stands, all joints
     are within their stops, not all joints of legs at zero, all contact points at the same height,
-    and the centre of mass is amid them. Without one, joints of no leg are as in the first.
+    and the centre of mass is amid them. Without one, joints of no leg are as in the first, or
+    at zero, but off their stops.
     """
     names = sorted(keyframes, key=lambda name: not re.search("home|stand", name.lower()))
     for name in names:
@@ -38,10 +39,12 @@ def standing_posture(
         if _stands(survey, legs, posture):
             return posture, f"keyframe '{name}'"
     source = "solved: feet under the hips"
+    resting: Mapping[str, float] = dict.fromkeys(survey.limits, 0.0)
     if names:
-        legged = {joint for leg in legs for joint in leg.joints}
-        survey.rest_joints({j: q for j, q in keyframes[names[0]].items() if j not in legged})
+        resting = keyframes[names[0]]
         source += f", as it stands in no keyframe; other joints as in keyframe '{names[0]}'"
+    legged = {joint for leg in legs for joint in leg.joints}
+    survey.rest_joints({joint: q for joint, q in resting.items() if joint not in legged})
     return solve_standing_posture(survey, legs), source
 
 
@@ -67,8 +70,7 @@ def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]
     centre of mass is then not amid the feet, all feet are moved under it.
 
     Returns:
-        Positions of all joints by name [rad]; those of no leg are as near to zero as their stops
-        allow.
+        Positions of all joints by name [rad]; those of no leg are where they rest.
     """
     survey.set_joints({})
     solvers = [_Leg(survey, leg, len(legs)) for leg in legs]

@@ -125,9 +125,12 @@ class Survey:
         self.plant.SetPositions(self.context, q)
 
     def rest_joints(self, values: Mapping[str, float]) -> None:
-        """Sets the positions [rad] of joints that are not set otherwise, within their limits."""
+        """Sets the positions [rad] of joints that are not set otherwise, off their stops."""
         for name in self.limits.keys() & values.keys():
-            self._neutral[name] = np.clip(values[name], *self.limits[name])
+            low, high = self.limits[name]
+            room = min(_STOP_RAD, 0.25 * (high - low))
+            self._neutral[name] = float(np.clip(values[name], low + room, high - room))
+        self._neutral = self.drives.coupled(self._neutral)
 
     def posture(self) -> dict[str, float]:
         """Returns the present joint positions by name [rad]."""
@@ -218,14 +221,21 @@ class Survey:
         places = [np.round(self.positions(limb).mean(axis=0), 1) for limb in limbs]
         return [limbs[i] for i in np.lexsort([[y for _, y, _ in places], [-p[0] for p in places]])]
 
-    def arms(self, legs: list[Limb]) -> list[Limb]:
-        """Returns other limbs of four joints or more; a hand's fingers are no limbs."""
+    def arms(self, legs: list[Limb], named: list[str] | None = None) -> list[Limb]:
+        """Returns other limbs that end in named links, by default those of four joints or more.
+
+        A hand's fingers are no limbs.
+        """
         feet = {limb.body for limb in legs}
+        ends = [name for group in self.leaves() for name in group if name not in feet]
+        if unknown := [name for name in named or () if name not in ends]:
+            raise ValueError(f"no arm ends in links {unknown}; limbs end in {ends}")
         # Ends of limbs by their first four joints: chains and bodies.
         hands: dict[tuple[str, ...], list[tuple[list[str], str]]] = {}
         for group in self.leaves():
             chain = self.chain(group[0])
-            if len(chain) >= 4 and not feet & set(group):
+            is_arm = len(chain) >= 4 if named is None else bool(set(group) & set(named))
+            if is_arm and not feet & set(group):
                 hands.setdefault(tuple(chain[:4]), []).append((chain, group[-1]))
         arms = []
         for fingers in hands.values():

@@ -179,7 +179,6 @@ class ClosedLoop(Diagram):
     def _check_assessment(self, assessment: SafetyAssessment) -> None:
         info, scenario = assessment.info_, self.scenario
         sides = {
-            "scenario": (info.scenario, scenario.name),
             "horizon": (info.horizon, scenario.assessment.horizon),
             "preview_stride": (info.preview_stride, scenario.assessment.preview_stride),
             "step_s": (info.step_s, scenario.step_s),
@@ -187,7 +186,10 @@ class ClosedLoop(Diagram):
             "output": (list(info.output_names), list(self.output_names)),
             "features": (list(info.feature_names), list(self.feature_names)),
             "constraints": (list(info.constraint_names), list(self.constraint_names)),
-            "scenario hash": (info.scenario_hash, scenario.simulation_hash(info.variation)),
+            "scenario hash": (
+                info.scenario_hash,
+                scenario.simulation_hash(info.variation, name=info.scenario),
+            ),
         }
         for what, (learned, here) in sides.items():
             if learned != here:

@@ -74,7 +74,7 @@ def episodes_info(
         text = f"{scenario_hash} {sorted(loop_options.items())}"
         scenario_hash = hashlib.sha256(text.encode()).hexdigest()
     return EpisodesInfo(
-        scenario=scenario.name,
+        scenario=scenario.identity or scenario.name,
         scenario_hash=scenario_hash,
         variation=loop.variation,
         seed=seed,

@@ -18,6 +18,7 @@ import yaml
 from drake_safety.files.reading import did_you_mean, parse_yaml, reading
 from drake_safety.files.schema import Positive, load_typed, schema
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_size import overlaid
 from drake_safety.simulation.closed_loop import ClosedLoop, Purpose, check_ports
@@ -61,6 +62,7 @@ class Scenario:
 
     parameters = cast(Any, None)  # Set by the loader: an instance of the task's Parameters.
     folder = ""  # Set by the loader: the scenario file's folder, where its task may stand.
+    identity = ""  # Set by `adopt`: the name under which it was learned; its own by default.
 
     def __post_init__(self) -> None:
         for name in ("step_s", "time_step_s", "control_period_s"):
@@ -168,7 +170,17 @@ class Scenario:
 
         return plain(self) | {"parameters": plain(self.parameters)}
 
-    def simulation_hash(self, variation: str = "nominal") -> str:
+    def adopt(self, info: EpisodesInfo) -> bool:
+        """Whether it simulates what an assessment was learned from, whatever its file's name is.
+
+        If so, it has the hashes of the scenario that was learned from.
+        """
+        is_same = self.simulation_hash(info.variation, name=info.scenario) == info.scenario_hash
+        if is_same:
+            self.identity = info.scenario
+        return is_same
+
+    def simulation_hash(self, variation: str = "nominal", *, name: str = "") -> str:
         """SHA-256 of all parameters that determine a rollout, and of the robot's files.
 
         Defaults are included, so that episodes from before and after a change of one do not mix.
@@ -179,6 +191,7 @@ class Scenario:
         Args:
             variation: The simulated plant. The nominal one is always included, because it is the
                 controllers' model.
+            name: That the file may have had, which is part of the hash.
 
         Raises:
             ValueError: No such variation.
@@ -195,6 +208,7 @@ class Scenario:
             for name in ("nominal", variation)
             if name in self.variations
         }
+        text["name"] = name or self.identity or self.name
         # The robot's files are hashed; their folder is irrelevant.
         text["robot"] = Path(self.robot).name
         task = self.task_class()

@@ -17,6 +17,7 @@ from pydrake.systems.analysis import Simulator
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
 from drake_safety.files.progress import StageProgress, ignore
+from drake_safety.learning.causes import describe_margin
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.models import load_robot, robot_files
 from drake_safety.robots.model_files import model_file
@@ -34,6 +35,7 @@ from drake_safety.simulation.scenario import Scenario, load_scenario, read_scena
 _Check = Generator[Finding, None, None]
 _STANDS = "stands for 1 s"
 _SINK_SHARE = 0.1  # Share of the standing height by which a robot may sink.
+_AT_STOP_RAD = 0.05
 _LEVEL_M = 2e-3  # Largest difference of the feet's heights.
 _MATCH_M = 1e-3
 _UNSAFE_SHARES = (0.1, 0.9)
@@ -193,6 +195,8 @@ def _posture(kinematics: RobotKinematics) -> _Check:
         "'radius_m' under 'feet' [m]",
     )
     corners = convex_hull(p_WC[:, :2].tolist())
+    if len(corners) < 3:  # No posture helps: whether it balances is simulated.
+        return
     for item, point in (
         ("centre of mass over the feet", kinematics.center_of_mass(q)),
         ("base over the feet", q[4:7]),
@@ -205,10 +209,8 @@ def _posture(kinematics: RobotKinematics) -> _Check:
             f"{100 * distance:.1f} cm inside their polygon",
             f"{-100 * distance:.1f} cm outside their polygon, at ({x:+.3f}, {y:+.3f}) m in x and y "
             "from its centre",
-            _LINE_REMEDY
-            if len(corners) < 3
-            else "change 'posture' [rad] or 'contact_points' under 'feet' [m] in robot.yaml, so "
-            "that the feet surround it, or correct the masses in the URDF [kg]",
+            "change 'posture' [rad] or 'contact_points' under 'feet' [m] in robot.yaml, so that "
+            "the feet surround it, or correct the masses in the URDF [kg]",
         )
 
 
@@ -364,37 +366,55 @@ def _stands(loop: LeggedLoop) -> _Check:
     context = simulator.get_mutable_context()
     loop.reset_to(context, None, loop.standing_start())
     simulator.Initialize()
-    margins = loop.GetOutputPort("margins").Eval(context)
-    wrong = [one for one, margin in zip(loop.constraint_names, margins, strict=True) if margin < 0]
-    yield _judged(
-        "safe while it stands",
-        not wrong,
-        "the posture is in the safe set",
-        f"the standing posture violates {wrong}",
-        f"for 'height' widen 'height_m' under 'safe_set', such as [{0.71 * height:.3g}, "
-        f"{1.18 * height:.3g}] [m], which must include the standing height {height:.3f}; for "
-        "others change 'posture'",
-    )
+    margins = loop.GetOutputPort("margins").Eval(context).copy()
     simulator.AdvanceTo(1.0)
     state_now = loop.GetOutputPort("plant_state").Eval(context)
     q, v = np.split(state_now, [kinematics.num_positions])
     sunk = height - q[6]
     speed = float(np.abs(v[NUM_BASE_VELOCITIES:]).max(initial=0.0))
+    is_still = abs(sunk) <= _SINK_SHARE * height and speed <= 1.0
+    standing = kinematics.contact_positions(kinematics.standing_positions())
+    is_line = len(convex_hull(standing[:, :2].tolist())) < 3
+    if is_line and not (is_still and margins.min() > 0):
+        kind = "biped" if len(loop.robot.feet) == 2 else "robot"
+        where = f"{kinematics.num_contacts} points along a line"
+        problem = f"{loop.robot.name}: a {kind} on {where} cannot balance with this controller"
+        yield failed(_STANDS, problem, _LINE_REMEDY)
+        return
+    yield from _stands_safely(loop, margins)
     clearance = kinematics.contact_positions(q)[:, 2] - kinematics.foot_radii
     touching = int(np.sum(clearance < 5e-3))
     message = (
         f"after 1 s it has sunk {100 * sunk:.1f} cm, {touching} of {kinematics.num_contacts} "
         f"contact points touch, the fastest joint turns at {speed:.2f} rad/s"
     )
-    standing = kinematics.contact_positions(kinematics.standing_positions())
-    corners = convex_hull(standing[:, :2].tolist())
-    yield _judged(
-        _STANDS,
-        abs(sunk) <= _SINK_SHARE * height and speed <= 1.0 and touching > 0,
-        message,
-        message,
-        _LINE_REMEDY if len(corners) < 3 else _GAINS_REMEDY,
-    )
+    yield _judged(_STANDS, is_still and touching > 0, message, message, _GAINS_REMEDY)
+
+
+def _stands_safely(loop: LeggedLoop, margins: np.ndarray) -> _Check:
+    """Judges the margins of the standing posture."""
+    kinematics, height = loop.kinematics, loop.kinematics.standing_height
+    names = [loop.constraint_names[i] for i in np.flatnonzero(margins < 0)]
+    wrong = [
+        describe_margin(name, margin, loop.angular_constraints)
+        for name, margin in zip(names, margins[margins < 0], strict=True)
+    ]
+    stops = zip(kinematics.joint_names, kinematics.posture, kinematics.position_limits, strict=True)
+    wrong += [
+        f"{joint} is at {value:.3g} rad, its stop at {stop:.3g}"
+        for joint, value, both in stops
+        for stop in both
+        if abs(value - stop) < _AT_STOP_RAD and {*names}.intersection(loop.angular_constraints)
+    ]
+    remedy = "change 'posture' in robot.yaml [rad]"
+    if names == ["height"]:
+        remedy = (
+            f"widen 'height_m' under 'safe_set', such as [{0.71 * height:.3g}, "
+            f"{1.18 * height:.3g}] [m], which must include the standing height {height:.3f}"
+        )
+    problem = f"the standing posture violates {'; '.join(wrong)}"
+    item, ok = "safe while it stands", "the posture is in the safe set"
+    yield _judged(item, not wrong, ok, problem, remedy)
 
 
 def _episodes(loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgress) -> _Check:
