@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.learning_curve import describe, learning_curve
 from drake_safety.learning.assessment_parameters import AssessmentParameters
+from drake_safety.learning.learning_curve import describe, learning_curve
 from drake_safety.learning.segments import Episodes
 from lip_episodes import make_episodes
 

@@ -194,13 +194,10 @@ def _held_out(
 
     Units (N,) are the pairs' logs, or the pairs; intervals are over them. One alone has no score.
     """
-    from sklearn.model_selection import GroupKFold
-
-    errors, num_units = [], len(np.unique(units))
-    folds = GroupKFold(min(num_units, _NUM_FOLDS)) if num_units > 1 else None
-    for others, judged in folds.split(pairs, groups=units) if folds else ():
-        adapted = prior.adapt([pairs[i] for i in others])
-        for i in judged:
+    fold, errors = np.unique(units, return_inverse=True)[1] % _NUM_FOLDS, []
+    for one in range(fold.max() + 1 if fold.any() else 0):
+        adapted = prior.adapt([pairs[i] for i in np.flatnonzero(fold != one)])
+        for i in np.flatnonzero(fold == one):
             rows, variation = pairs[i].rows, pairs[i].info.variation
             safe = [one.predict_rows(rows, variation).probability for one in (prior, adapted)]
             before, after = (np.array(safe) - ~rows.is_unsafe) ** 2
@@ -236,7 +233,7 @@ def _print_changes(
     unchanged = [
         mode
         for mode, one in adapted.items()
-        if one.adaptation_.method == "recalibration" and not one.correction_.is_any
+        if one.base_logit_ is not None and not one.correction_.is_any
     ]
     console.say(f"adapted to '{name}': {differing} of {num_pairs} pairs end differently")
     if differing or not unchanged:

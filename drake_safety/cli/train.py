@@ -13,10 +13,10 @@ from typer import Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
-from drake_safety.evaluation.learning_curve import describe, learning_curve
 from drake_safety.files.progress import StageProgress, stage_of
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import ChangeDetector
+from drake_safety.learning.learning_curve import describe, learning_curve
 from drake_safety.learning.seeds import TRAINING
 from drake_safety.learning.segments import training_segments
 from drake_safety.simulation.dataset import completed, load_episodes
