@@ -19,7 +19,7 @@ WALKING := .venv/.walking
 BENCH ?= runs/bench.json
 
 .DEFAULT_GOAL := help
-.PHONY: help demo walking test light pythons lowest lint bench docs clean
+.PHONY: help demo walking test light pythons lowest lint bench tutorials docs clean
 
 help: ## Show these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -56,6 +56,12 @@ lint: $(DEVELOPED) ## Check style, format and types
 bench: $(DEVELOPED) ## Measure costs beside limits and other libraries: a table, and runs/bench.json
 	mkdir -p $(dir $(BENCH))
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-quiet --benchmark-json=$(BENCH)
+
+tutorials: $(DEVELOPED) ## Run the tutorials, half an hour, so that `make docs` shows their outputs
+	mkdir -p build/tutorials
+	cp tutorials/*.ipynb build/tutorials
+	cd build/tutorials && for one in *.ipynb; do \
+		$(CURDIR)/$(BIN)/jupyter-execute --timeout=-1 --inplace $$one || exit 1; done
 
 docs: $(DEVELOPED) ## Build the pages and the reference into build/site; a warning is an error
 	$(BIN)/mkdocs build --strict

@@ -1,6 +1,7 @@
 """The reference documentation: ports as the docstrings say them, and as the systems have them."""
 
 import ast
+import json
 import re
 import shlex
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 import yaml
 from packaging.specifiers import SpecifierSet
 
+import notebook_pages
 import system_block
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -113,3 +115,22 @@ def test_the_reference_builds_without_a_warning(tmp_path):
     page = (tmp_path / "reference" / "systems" / "safety_assessor" / "index.html").read_text()
     assert "predicted_margins" in page
     assert "<svg" in page
+
+
+def test_every_tutorial_is_a_page_and_shows_the_outputs_of_one_that_was_run(tmp_path):
+    paths = sorted((ROOT / "tutorials").glob("*.ipynb"))
+    pages = notebook_pages.tutorial_pages(tmp_path)
+    assert [*pages] == [f"tutorials/{path.stem}.md" for path in paths]
+    first = next(iter(pages.values()))
+    assert "](../promises.md)" in first and "](2_throw_and_recover.md)" in first
+    assert "`make tutorials` adds its outputs" in first
+    content = json.loads(paths[0].read_text(encoding="utf-8"))
+    code = next(cell for cell in content["cells"] if cell["cell_type"] == "code")
+    printed = {"output_type": "stream", "name": "stdout", "text": ["0.7 ", "0.3\n"]}
+    drawn = {"output_type": "display_data", "data": {"image/png": "iVBORw0KGgo=\n"}}
+    code["outputs"] = [printed, drawn, printed | {"name": "stderr", "text": ["busy"]}]
+    (tmp_path / paths[0].name).write_text(json.dumps(content), encoding="utf-8")
+    first = next(iter(notebook_pages.tutorial_pages(tmp_path).values()))
+    assert "```text\n0.7 0.3\n```" in first and "busy" not in first
+    assert "![output](data:image/png;base64,iVBORw0KGgo=)" in first
+    assert "make tutorials" not in first

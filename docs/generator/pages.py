@@ -15,6 +15,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 sys.path.insert(0, str(Path(__file__).parent))
+from notebook_pages import tutorial_pages
 from system_block import parse_block
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,7 +35,7 @@ _OUTWARD = re.compile(r"\[([^\]]*)\]\(\.\./([^)]+)\)")
 
 def on_files(files: Files, config: Any) -> Files:
     """Adds the generated pages."""
-    for name, content in reference_pages().items():
+    for name, content in (reference_pages() | tutorial_pages()).items():
         files.append(File.generated(config, name, content=content))
     return files
 
