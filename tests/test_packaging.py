@@ -184,6 +184,13 @@ def test_a_motion_is_run_in_the_light_install(light_environment, tmp_path):
     assert (tmp_path / "run" / "timeline.png").is_file()
 
 
+def test_a_robot_is_written_and_checked_in_the_light_install(light_environment, tmp_path):
+    command, folder = light_environment / "bin" / "drake-safety", tmp_path / "mine"
+    urdf = ROOT / "models" / "laikago" / "laikago.urdf"
+    run(command, "new", "mine", "--urdf", urdf, "--out", folder, cwd="/")
+    assert "ready: " in run(command, "check", folder / "balancing.yaml", "--quick", cwd="/")
+
+
 @pytest.mark.parametrize(
     ("command", "extra"),
     [
