@@ -119,7 +119,7 @@ def assessment_folder(
     else:
         raise ValueError(
             f"no assessment of what scenario '{scenario.name}' simulates comes with the package, "
-            f"which has those of {names} as they are there: {advice}"
+            f"which has those of {names}: {advice}"
         )
     if is_told:
         console.say("assessment        comes with the package,", shipped)
