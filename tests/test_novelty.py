@@ -43,7 +43,21 @@ def test_the_distances_are_those_of_whitened_inputs_with_bounded_variances(name)
 def test_an_input_far_outside_the_range_is_novel_though_it_contradicts_nothing(novelty):
     along = np.array([[0.5, 50.0, 1.0, 0.0]])
     distances = novelty.distances(7.0 * np.eye(4)[3] + along * [[1.0], [20.0]]) / novelty.limits
-    np.testing.assert_array_equal(distances > 1.0, [[False, False, False], [True, False, False]])
+    expected = [[False] * 4, [True, False, False, True]]
+    np.testing.assert_array_equal(distances > 1.0, expected)
+
+
+def test_one_entry_far_outside_its_range_is_novel_though_many_others_hide_it():
+    rng = np.random.default_rng(0)
+    # Columns with rare large values make the distance of all of x tolerant.
+    others = rng.standard_t(3, size=(EPISODES * ROWS, 60))
+    episode = np.repeat(np.arange(EPISODES), ROWS)
+    x = np.column_stack([rng.uniform(0.2, 0.4, size=len(episode)), others])
+    novelty = fitted(x, episode)
+    lifted = x[:200] + 0.3 * np.eye(61)[0]
+    assert (novelty.distances(lifted)[:, :3] < novelty.limits[:3]).all(axis=1).mean() > 0.9
+    assert (novelty.of(lifted) > 1.0).all()
+    assert (novelty.of(x + [0.02, *[0.0] * 60]) > 1.0).mean() < 0.01
 
 
 def test_a_contradiction_is_novel_though_every_entry_is_within_its_range(novelty):

@@ -76,7 +76,8 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
         groups[""]["input_range"] = embedding.input_range
     for prefix, one in moments.items():
         if one is not None:
-            groups[prefix] = {"mean": one.mean, "covariance": one.covariance}
+            arrays = {name: value for name, value in vars(one).items() if name != "count"}
+            groups[prefix] = {name: value for name, value in arrays.items() if value is not None}
     adaptation, base_logit = learned["adaptation_"], learned["base_logit_"]
     numbers = {
         "num_margins": embedding.num_margins,

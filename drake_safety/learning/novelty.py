@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-NUM_DISTANCES = 3
+NUM_QUADRATIC = 3
+"""Distances that are quadratic forms."""
 NUM_FOLDS = 5
 """Folds of the episodes for the limits: every distance is from the inputs of other episodes."""
 _SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column]; constant ones would be divided by zero.
@@ -17,21 +18,36 @@ _LEAST_REDUNDANT_VARIANCE = 1e-8  # Lower bound along redundancies.
 _LEAST_VARIANCE = 1e-2  # Lower bound for the range: an actual robot differs that much.
 _LEAST_PLAN_VARIANCE = 1e-4  # The same for the plan alone, which no robot's reality changes.
 _LEAST_LIMIT = 3.0  # Of the root mean square distance along the redundancies; against rounding.
+_LEAST_HALF_WIDTH = 5e-2  # Of a column's range [unit of the column].
+_RANGE_LIMIT = 1.25  # Of a column, in half widths of its range: an actual robot differs.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Moments:
-    """Mean (n_x,) and covariance (n_x, n_x) of inputs x."""
+    """Mean (n_x,), covariance (n_x, n_x) and range of inputs x.
+
+    Attributes:
+        least: Smallest value of each column, (n_x,); None where it is not known.
+        largest: Largest one.
+    """
 
     count: int
     mean: np.ndarray
     covariance: np.ndarray
+    least: np.ndarray | None = None
+    largest: np.ndarray | None = None
 
     @classmethod
     def of(cls, x: np.ndarray) -> Moments:
         """The moments of inputs (N, n_x)."""
         mean = x.mean(axis=0)
-        return cls(count=len(x), mean=mean, covariance=(x - mean).T @ (x - mean) / len(x))
+        return cls(
+            count=len(x),
+            mean=mean,
+            covariance=(x - mean).T @ (x - mean) / len(x),
+            least=x.min(axis=0),
+            largest=x.max(axis=0),
+        )
 
     def joined(self, other: Moments) -> Moments:
         """The moments of both sets of inputs."""
@@ -39,7 +55,25 @@ class Moments:
         share, shift = other.count / count, other.mean - self.mean
         within = (1.0 - share) * self.covariance + share * other.covariance
         between = share * (1.0 - share) * np.outer(shift, shift)
-        return Moments(count=count, mean=self.mean + share * shift, covariance=within + between)
+        least = largest = None
+        if self.least is not None and other.least is not None:
+            least = np.minimum(self.least, other.least)
+            largest = np.maximum(self.largest, other.largest)
+        return Moments(
+            count=count,
+            mean=self.mean + share * shift,
+            covariance=within + between,
+            least=least,
+            largest=largest,
+        )
+
+    def widened(self, factor: np.ndarray) -> Moments:
+        """Returns the same with the width of each column's range times a factor, (n_x,)."""
+        assert self.least is not None and self.largest is not None
+        added = (
+            0.5 * (factor - 1.0) * np.maximum(self.largest - self.least, 2.0 * _LEAST_HALF_WIDTH)
+        )
+        return replace(self, least=self.least - added, largest=self.largest + added)
 
     @property
     def scale(self) -> np.ndarray:
@@ -82,7 +116,7 @@ class Distances:
         self.axes = np.concatenate(parts, axis=1) / known.scale[:, None]
         # The distances are sums of squares of the offset's entries and of those along the axes.
         num_inputs, squared_scale = len(axes), known.scale**2
-        self.terms = np.zeros((num_inputs + self.axes.shape[1], NUM_DISTANCES))
+        self.terms = np.zeros((num_inputs + self.axes.shape[1], NUM_QUADRATIC))
         self.terms[:num_inputs, 0] = 1.0 / (_LEAST_VARIANCE * squared_scale)
         self.terms[plan, 2] = 1.0 / (_LEAST_PLAN_VARIANCE * squared_scale[plan])
         start = num_inputs
@@ -116,7 +150,7 @@ def _above(variance: np.ndarray, axes: np.ndarray, least: float) -> np.ndarray:
 
 
 class Novelty:
-    """Says which inputs are beyond those of training, by three Mahalanobis distances.
+    """Says which inputs are beyond those of training, by three Mahalanobis distances and the range.
 
     One is along all axes of the training inputs, with a tolerance: an input outside their range is
     novel. The second is along their redundancies alone. Features and preview follow from state and
@@ -124,11 +158,18 @@ class Novelty:
     features of another plan, is novel though every entry is within its range, and the maps ignore
     these axes. The two are known in process monitoring as T^2 and SPE. The third is that of the
     plan alone: a planner asks for what it always did, or for something new, whatever the state.
+    The range is that of every column, in half widths from its centre: one entry far from all that
+    training had is novel even where the sum over many others hides it.
     The object is immutable.
 
+    Attributes:
+        centre: Centre of each column's range, (n_x,).
+        inverse_half_width: One over half of its width, with a lower bound, (n_x,); zero where the
+            range is not known.
+
     Args:
-        limits: Largest distances of a known input: of all of it, along redundancies, and of the
-            plan, (3,).
+        limits: Largest distances of a known input: of all of it, along redundancies, of the plan,
+            and from the centre of the range, (4,); (3,) where the range is not known.
         feedback: Moments of an actual robot's inputs, which are known as well; None before
             adaptation.
     """
@@ -140,6 +181,11 @@ class Novelty:
         self.plan = plan
         known = training if feedback is None else training.joined(feedback)
         self._known, self.quadratic = known, Distances(known, plan)
+        self.centre, self.inverse_half_width = known.mean, np.zeros(len(known.mean))
+        if known.least is not None and len(self.limits) > NUM_QUADRATIC:
+            half_width = 0.5 * (known.largest - known.least)
+            self.centre = known.least + half_width
+            self.inverse_half_width = 1.0 / np.maximum(half_width, _LEAST_HALF_WIDTH)
         # Without other episodes to choose them from, the limits are infinite: nothing is novel that
         # is finite.
         self.inverse_limits = 1.0 / np.square(self.limits)
@@ -156,33 +202,38 @@ class Novelty:
         Each limit is exceeded by at most a share of `rate` of the first inputs, which are as drawn,
         and somewhere in at most that share of the safe episodes, each judged by the moments of
         other episodes. Later inputs of unsafe episodes do not count: they lead out of what is
-        known.
+        known. The range of a column is as much wider than that of the inputs as one fold of the
+        episodes exceeds that of the others: columns with rare large values have wider ones.
 
         Args:
             is_unsafe: Whether it ended unsafely, (N,).
             rate: Share of episodes with a novel input, in (0, 1).
         """
         fold = np.unique(episode, return_inverse=True)[1] % NUM_FOLDS
-        distances = np.full((len(x), NUM_DISTANCES), np.inf)
+        distances = np.full((len(x), NUM_QUADRATIC), np.inf)
+        growth = np.ones(x.shape[1])
         for part in range(NUM_FOLDS):
             is_part = fold == part
             if is_part.any() and not is_part.all():
-                others = cls(
-                    training=Moments.of(x[~is_part]), limits=np.ones(NUM_DISTANCES), plan=plan
-                )
-                distances[is_part] = others.distances(x[is_part])
+                known = Moments.of(x[~is_part])
+                others = cls(training=known, limits=np.ones(NUM_QUADRATIC + 1), plan=plan)
+                distances[is_part] = others.distances(x[is_part])[:, :NUM_QUADRATIC]
+                growth = np.maximum(growth, others.offsets(x[is_part]).max(axis=0))
         first = np.unique(episode, return_index=True)[1]
         limits = np.quantile(distances[first], 1.0 - rate, axis=0, method="higher")
         if not is_unsafe.all():
             _, position = np.unique(episode[~is_unsafe], return_inverse=True)
-            farthest = np.zeros((position.max() + 1, NUM_DISTANCES))
+            farthest = np.zeros((position.max() + 1, NUM_QUADRATIC))
             np.maximum.at(farthest, position, distances[~is_unsafe])
             of_safe = np.quantile(farthest, 1.0 - rate, axis=0, method="higher")
             limits = np.maximum(limits, of_safe)
-        training = Moments.of(x)
+        training = Moments.of(x).widened(growth)
         num_redundancies = np.sum(training.axes(slice(None))[0] < _REDUNDANT_VARIANCE)
         least = [1.0, max(1.0, _LEAST_LIMIT * np.sqrt(num_redundancies)), 1.0]
-        return cls(training=training, limits=np.maximum(limits, least), plan=plan)
+        of_range = _RANGE_LIMIT if fold.any() else np.inf
+        return cls(
+            training=training, limits=np.append(np.maximum(limits, least), of_range), plan=plan
+        )
 
     def with_feedback(self, x: np.ndarray, rate: float) -> Novelty:
         """Returns the novelty for which an actual robot's inputs are known as well.
@@ -201,15 +252,22 @@ class Novelty:
         )
 
     def distances(self, x: np.ndarray) -> np.ndarray:
-        """Returns the distances of inputs (N, n_x): all of it, redundancies, plan, (N, 3).
+        """Returns the distances of inputs (N, n_x) in the order of `limits`, (N, 3) or (N, 4).
 
         Those of an input that is not finite are infinite.
         """
         with np.errstate(invalid="ignore", over="ignore"):
-            squared = self.quadratic.squared(x)
-            # Rounding may make a small square negative. `fmin` chooses the number beside NaN.
-            distances: np.ndarray = np.fmin(np.sqrt(np.maximum(squared, 0.0)), np.inf)
+            # Rounding may make a small square negative.
+            quadratic = np.sqrt(np.maximum(self.quadratic.squared(x), 0.0))
+            offset = self.offsets(x).max(axis=1)
+            found = np.column_stack([quadratic, offset])[:, : len(self.limits)]
+            # `fmin` chooses the number beside NaN.
+            distances: np.ndarray = np.fmin(found, np.inf)
         return distances
+
+    def offsets(self, x: np.ndarray) -> np.ndarray:
+        """Returns how far inputs are from the centre of the range, in half widths, (N, n_x)."""
+        return np.abs((x - self.centre) * self.inverse_half_width)
 
     def of(self, x: np.ndarray) -> np.ndarray:
         """Returns the largest distance of inputs (N, n_x) in units of its limit, (N,).
@@ -218,8 +276,12 @@ class Novelty:
         """
         with np.errstate(invalid="ignore", over="ignore"):
             squared = self.quadratic.squared(x)
-            squared *= self.inverse_limits
+            squared *= self.inverse_limits[:NUM_QUADRATIC]
             found = np.maximum.reduce(squared, axis=1)
+            if len(self.limits) > NUM_QUADRATIC:
+                found = np.maximum(
+                    found, self.offsets(x).max(axis=1) ** 2 * self.inverse_limits[-1]
+                )
             distance: np.ndarray = np.fmin(np.sqrt(np.maximum(found, 0.0)), np.inf)
         return distance
 

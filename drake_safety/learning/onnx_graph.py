@@ -15,7 +15,7 @@ from drake_safety.extras import require_extra
 from drake_safety.files.atomic import replacing
 from drake_safety.learning import beliefs as belief_masses
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.novelty import Novelty
+from drake_safety.learning.novelty import NUM_QUADRATIC, Novelty
 from drake_safety.learning.prediction import (
     LOGIT_LIMIT,
     SHIFT_LIMIT,
@@ -275,7 +275,13 @@ def _novelty(nodes: _Nodes, x: str, novelty: Novelty) -> str:
     of = novelty.quadratic
     offset = nodes("Sub", x, of.mean)
     entries = nodes("Concat", offset, nodes("MatMul", offset, of.axes), axis=1)
-    shares = nodes("MatMul", nodes("Mul", entries, entries), of.terms * novelty.inverse_limits)
+    inverse = novelty.inverse_limits
+    terms = of.terms * inverse[:NUM_QUADRATIC]
+    shares = nodes("MatMul", nodes("Mul", entries, entries), terms)
+    if len(inverse) > NUM_QUADRATIC:
+        scale = novelty.inverse_half_width * np.sqrt(inverse[-1])
+        outside = nodes("Mul", nodes("Sub", x, novelty.centre), scale)
+        shares = nodes("Concat", shares, nodes("Mul", outside, outside), axis=1)
     largest = nodes("ReduceMax", shares, axes=[1], keepdims=1)
     # Of inputs that are not finite, some entries are NaN.
     is_finite = nodes("Less", largest, np.inf)
