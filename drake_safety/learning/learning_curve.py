@@ -27,6 +27,7 @@ def learning_curve(episodes: Episodes, parameters: AssessmentParameters) -> np.n
     """
     from sklearn import model_selection
     from sklearn.ensemble import HistGradientBoostingClassifier
+    from threadpoolctl import threadpool_limits
 
     if min(episodes.num_unsafe, len(episodes) - episodes.num_unsafe) < _LEAST_EPISODES:
         return np.empty((3, 0))
@@ -37,15 +38,17 @@ def learning_curve(episodes: Episodes, parameters: AssessmentParameters) -> np.n
     boosting = HistGradientBoostingClassifier(
         max_leaf_nodes=15, max_features=0.5, early_stopping=False, random_state=0
     )
-    return model_selection.learning_curve(
-        boosting,
-        InputColumns(episodes.info, parameters).of_rows(rows),
-        rows.is_unsafe,
-        groups=rows.episode,
-        train_sizes=[0.25, 0.5, 1.0],
-        cv=model_selection.StratifiedGroupKFold(_NUM_FOLDS, shuffle=True, random_state=0),
-        scoring="roc_auc",
-    )[2]
+    # Threads that wait for each other are many times slower on a busy machine.
+    with threadpool_limits(1):
+        return model_selection.learning_curve(
+            boosting,
+            InputColumns(episodes.info, parameters).of_rows(rows),
+            rows.is_unsafe,
+            groups=rows.episode,
+            train_sizes=[0.25, 0.5, 1.0],
+            cv=model_selection.StratifiedGroupKFold(_NUM_FOLDS, shuffle=True, random_state=0),
+            scoring="roc_auc",
+        )[2]
 
 
 def describe(area: np.ndarray) -> str:
