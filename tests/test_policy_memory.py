@@ -192,8 +192,8 @@ def test_a_reset_resets_the_memory(walking):
     def memory():
         return np.concatenate([np.ravel(one) for one in loop.start_of(context).controller_state])
 
-    first = memory()
     loop.reset_to(context, None, loop.standing_start())
+    first = memory()
     simulator.Initialize()
     simulator.AdvanceTo(0.1)
     start, later = loop.start_of(context), memory()

@@ -20,7 +20,7 @@ from drake_safety.evaluation.paired_test import ConfidenceSequence
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import GATE
 from drake_safety.learning.segments import Episode
-from drake_safety.simulation.capabilities import CanStartAnywhere
+from drake_safety.simulation.capabilities import CanStartAnywhere, HasDisturbances
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
 from drake_safety.simulation.rollouts import check_kept, episode_rng, episodes_info, run_episode
@@ -283,7 +283,7 @@ def _start_of(loop: ClosedLoop, context: Context) -> dict[str, np.ndarray]:
         plan, scenario = loop.start_of(context).plan, loop.scenario
         times_s = scenario.step_s * np.arange(scenario.num_steps + 1)
         start["plan"] = np.concatenate([plan.value(time_s).ravel() for time_s in times_s])
-    return start | loop.disturbances(context)
+    return start | (loop.disturbances(context) if isinstance(loop, HasDisturbances) else {})
 
 
 def _check_alike(

@@ -58,6 +58,7 @@ class Moments:
         least = largest = None
         if self.least is not None and other.least is not None:
             least = np.minimum(self.least, other.least)
+        if self.largest is not None and other.largest is not None:
             largest = np.maximum(self.largest, other.largest)
         return Moments(
             count=count,

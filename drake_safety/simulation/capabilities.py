@@ -26,6 +26,14 @@ _Capability = TypeVar("_Capability")
 
 
 @runtime_checkable
+class HasDisturbances(Protocol):
+    """A reset draws what will act on the robot, beside its start and plan."""
+
+    def disturbances(self, context: Context) -> dict[str, np.ndarray]:
+        """What acts from the present state on, in SI units, (n,) each by name."""
+
+
+@runtime_checkable
 class HasGoals(Protocol):
     """Plans lead to a goal: three numbers, a point in the world [m] or what `goal_words` says.
 

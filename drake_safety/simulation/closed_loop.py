@@ -95,11 +95,6 @@ class ClosedLoop(Diagram):
         del purpose, scenario, variation
         return {}
 
-    def disturbances(self, context: Context) -> dict[str, np.ndarray]:
-        """What acts on the robot from the present state on, in SI units, (n,) each by name."""
-        del context
-        return {}
-
     @classmethod
     def model_files(cls, scenario: Any) -> list[Path]:
         """Files besides the scenario that determine the plant; part of the hash."""

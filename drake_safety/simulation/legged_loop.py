@@ -226,7 +226,7 @@ class LeggedLoop(PlannedLoop):
         )
 
     def disturbances(self, context: Context) -> dict[str, np.ndarray]:
-        """The ball's mass and state, and the push; see `ClosedLoop`."""
+        """The ball's mass and state, and the push; see `HasDisturbances`."""
         found = {}
         if self._physics.ball is not None:
             mass = self._physics.ball.mass(self.plant.GetMyContextFromRoot(context))
