@@ -43,9 +43,8 @@ from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
 _MOST_SHOWN = 10  # Of a table of episodes.
-_FAILING = ("both", "only baseline", "only candidate")
 _COLUMNS = (
-    *("candidate", "verdict", "pairs", *(f"fail: {one}" for one in _FAILING)),
+    *("candidate", "verdict", "pairs", "fail: both, only baseline, only candidate"),
     *("difference [points]", "survival [s]"),
 )
 _OF_RATE = ("failure rate [%]", "episodes", "failures", "random episodes of the same variance")
@@ -247,8 +246,8 @@ def _report(
     title = f"{first.scenario.name}, {first.variation}: {metric}"
     rows = [
         (
-            *(name, one.verdict, one.pairs, one.both),
-            *(len(one.no_longer_failing), len(one.newly_failing)),
+            *(name, one.verdict, one.pairs),
+            f"{one.both}, {len(one.no_longer_failing)}, {len(one.newly_failing)}",
             *(_interval(one.difference, 100.0, 1), _interval(one.survival_s, 1.0, 3)),
         )
         for name, one in found.items()
