@@ -160,9 +160,10 @@ def test_the_readme_is_filled_in_and_knows_no_path_of_anyones_machine():
     assert re.findall(r"(?<![\w.])/(?:home|root|tmp|work|Users)/\S*", README) == []
 
 
-def test_the_scenario_of_the_readme_makes_a_loop_with_a_robot_of_ones_own(tmp_path):
+def test_the_scenario_of_the_page_makes_a_loop_with_a_robot_of_ones_own(tmp_path):
     write_hexapod(tmp_path)
-    (text,) = blocks("yaml")
+    page = (ROOT / "docs" / "your_own_robot.md").read_text(encoding="utf-8")
+    (text,) = [one for one in blocks("yaml", page) if one.startswith("task: ")]
     (tmp_path / "balancing.yaml").write_text(text)
     scenario = load_scenario(tmp_path / "balancing.yaml")
     assert Path(scenario.robot) == tmp_path / "robot.yaml"
