@@ -203,7 +203,8 @@ class Pendulum(PlannedLoop):
         self._connect_controller(builder, controller, state)
         builder.Connect(controller.get_output_port(), pendulum.get_input_port())
         safe_set = PendulumSafeSet(parameters, outlook_s / (_NUM_OUTLOOK - 1))
-        self._add_safe_set(builder, safe_set, (1, 1), state)
+        self._add_monitor(builder, safe_set, (1, 1), state)
+        self._add_features(builder, safe_set)
         self.state_names = ["angle", "angle_rate"]
         self.output_names = [f"bob_{axis}" for axis in "xyz"]
         output = observer.GetOutputPort("output")

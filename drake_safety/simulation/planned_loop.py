@@ -24,9 +24,9 @@ class PlannedLoop(ClosedLoop):
     """A closed loop with a planner, a monitor and features of its plan.
 
     A subclass calls in this order: :meth:`_add_planner`, adds its controller,
-    :meth:`_add_safe_set`, sets the names of state and output, :meth:`export`, and
-    ``builder.BuildInto(self)``. It implements :meth:`_set_state`, which sets the plant's state.
-    Episodes can then begin with a given start.
+    :meth:`_add_monitor` and :meth:`_add_features`, sets the names of state and output,
+    :meth:`export`, and ``builder.BuildInto(self)``. It implements :meth:`_set_state`, which sets
+    the plant's state. Episodes can then begin with a given start.
     """
 
     def _check_variation(self, *varied: str) -> None:
@@ -66,19 +66,13 @@ class PlannedLoop(ClosedLoop):
         for name in ("desired_output", "desired_output_rate"):
             builder.Connect(self._planner.GetOutputPort(name), controller.GetInputPort(name))
 
-    def _add_safe_set(
-        self,
-        builder: DiagramBuilder,
-        safe_set: FeaturedSafeSet,
-        sizes: tuple[int, int],
-        plant_state: OutputPort,
-    ) -> None:
-        """Adds monitor and features of a state that is measured exactly."""
-        self._add_monitor(builder, safe_set, sizes, plant_state)
+    def _add_features(self, builder: DiagramBuilder, safe_set: FeaturedSafeSet) -> None:
+        """Adds the features of a monitored state that is measured exactly."""
+        sizes = self.plant_state_sizes
         features = builder.AddNamedSystem(
             "plan_features", PlanFeatures(safe_set, *sizes, horizon=self._num_outlook)
         )
-        builder.Connect(plant_state, features.GetInputPort("plant_state"))
+        builder.Connect(self._plant_state, features.GetInputPort("plant_state"))
         # The features cover the whole plan: safety depends on its end, beyond the H steps.
         outlook = self._planner.GetOutputPort("desired_outlook")
         builder.Connect(outlook, features.GetInputPort("desired_preview"))
