@@ -27,12 +27,11 @@ from drake_safety.simulation.scenario import Scenario
 from studies.alarm_curves import EARLY_S, Watched, alarm_figure, equal_cost_estimates
 from studies.alarms import Alarm, scorer_alarm, threshold_alarms
 from studies.baselines import KINDS, classifier_scorers
-from studies.fall_alarm import fit_fall_alarm
 from studies.harness import ReleaseOption, open_study
 from studies.walking_motions import run_motions
 
 _LEAST = 1e-6  # Of a probability and its complement, in logits.
-_DURATIONS_S = {"tour": 60.0, "push": 5.0, "command": 4.0, "start": 2.6}
+_DURATIONS_S = {"tour": 60.0, "push": 5.0, "command": 4.0}
 _SPEED_S = 12.0
 _CLASSIFIER_SEEDS = (0, 1, 2)
 _OURS = (MODES[0], "fall")
@@ -44,9 +43,6 @@ def walking(
     assessment: TrainingOption,
     tours: Annotated[int, typer.Option(help="Undisturbed tours of a minute.", min=1)] = 300,
     pushes: Annotated[int, typer.Option(help="Pushed motions.", min=1)] = 600,
-    starts: Annotated[
-        int, typer.Option(help="Episodes that the probability of a fall is fitted to.", min=0)
-    ] = 500,
     commands: Annotated[int, typer.Option(help="Commands past the policy's ranges.", min=0)] = 300,
     guarded_tours: Annotated[int, typer.Option(help="Tours with the guard.", min=0)] = 20,
     recovered: Annotated[
@@ -113,11 +109,6 @@ def walking(
         classifiers = classifier_scorers(train_set, study.stages, seeds=_CLASSIFIER_SEEDS)
         alarms = walking_alarms(walker, gamma, classifiers)
         study.entries |= {"variation": variation, "seeds": seeds_of, "assessment_sha256": sha256}
-        if starts:
-            loop = walker.make_loop()
-            features = loop.feature_names, require(loop, CanFall).watched_features
-            fall = fit_fall_alarm(gamma, run("start", range(starts)), *features)
-            alarms = {MODES[0]: alarms.pop(MODES[0]), fall.name: [fall], **alarms}
         study.entries["alarms"] = list(alarms)
         pushed = run("push", range(pushes))
         push_s = walker.parameters.random_pushes.duration_s
@@ -171,6 +162,9 @@ def walking_alarms(
     loop = scenario.make_loop()
     watched = require(loop, CanFall).watched_features
     alarms = {MODES[0]: [_in_logits(assessment_scorer(MODES[0], assessment))]}
+    if assessment.fall_logit_ is not None:
+        fall = Scorer(name="fall", probability=partial(_stays_up, assessment))
+        alarms[fall.name] = [_in_logits(fall)]
     for kind in KINDS:
         seeds = [_in_logits(one) for one in classifiers if one.name.startswith(kind)]
         alarms |= {kind: seeds} if seeds else {}
@@ -179,6 +173,11 @@ def walking_alarms(
     column = loop.feature_names.index("action_change")
     action_change = Alarm(name="action_change", value=lambda one: -one["features"][:, column])
     return alarms | {action_change.name: [action_change]}
+
+
+def _stays_up(assessment: SafetyAssessment, *inputs: np.ndarray) -> np.ndarray:
+    """The probability of no fall."""
+    return 1.0 - assessment.predict(*inputs).fall_probability
 
 
 def _in_logits(scorer: Scorer) -> Alarm:

@@ -18,7 +18,6 @@ from drake_safety.simulation.worker_processes import MadeOnce, Progress
 from studies.harness import Arrays, kept
 
 _AFTER_FALL_S = 0.6  # Until the robot lies.
-_AFTER_LEAVING_S = 1.0  # Until it has fallen, if it does.
 
 
 def unusual_command(loop: Any, rng: np.random.Generator) -> np.ndarray:
@@ -78,23 +77,7 @@ def _walked(
     return motion
 
 
-def run_start(loop: Any, index: int, *, seed: int, duration_s: float) -> Motion:
-    """An episode that starts as in training, and goes on after it leaves the safe set."""
-    return simulate(
-        loop,
-        lambda context: loop.reset(context, episode_rng(seed, index)),
-        (*SEEN, "margins"),
-        duration_s=duration_s,
-        step_s=loop.scenario.step_s,
-        watch_period_s=loop.scenario.watch_period_s,
-        after_leaving_s=_AFTER_LEAVING_S,
-        may_fail=True,
-        index=index,
-    )
-
-
 KINDS: dict[str, Callable[..., Motion]] = {
-    "start": run_start,
     "tour": run_tour,
     "push": run_push,
     "command": run_command,

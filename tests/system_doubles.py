@@ -88,6 +88,7 @@ class AssessmentDouble:
         self.beliefs_ = np.arange(1.0, 31.0).reshape(1, 6, 5)
         self.correction_ = correction(0.0)
         self.base_logit_ = object()
+        self.fall_logit_ = object()
         self.novelty_ = Novelty(training=Moments.of(np.eye(3)), limits=np.ones(3), plan=slice(0))
         self.embedding_ = SimpleNamespace(is_same=lambda other: False)
         self.uses_features = uses_features
@@ -109,6 +110,7 @@ class AssessmentDouble:
             embedding=np.array([3.0, -4.0]),
             predicted_margins=np.array([0.01, np.nan]),
             novelty=NOVELTY,
+            fall_probability=0.125 if np.isfinite(state).all() else np.nan,
         )
 
 
@@ -136,6 +138,7 @@ class SlowIsSafe:
             probability=gamma,
             predicted_margins=np.zeros((n, 1)),
             novelty=np.full(n, self.novelty),
+            fall_probability=np.zeros(n),
         )
 
 

@@ -33,6 +33,7 @@ def test_every_part_of_the_verdict_comes_out_at_its_own_port_and_before_it_nothi
         "cause_probability": [0.2, 0.3],
         "predicted_margins": [0.01, np.nan],
         "novelty": [NOVELTY],
+        "fall_probability": [0.125],
     }
     for name, numbers in expected.items():
         np.testing.assert_allclose(bench.get(name), numbers)

@@ -12,6 +12,7 @@ from packaging.version import Version
 from command_line import call
 from drake_safety.assessments import assessed_scenarios, load_assessment
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.fall_logit import FallLogit
 from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Correction, is_unknown
@@ -29,6 +30,7 @@ FIELDS = {
     "predicted_margins": "predicted_margins",
     "novelty": "novelty",
     "embedding": "embedding",
+    "fall_probability": "fall_probability",
 }
 """Output port and field of `Prediction`."""
 NUM_INPUTS = 1000
@@ -117,6 +119,9 @@ def check_equal(assessment, runtime, ports=None):
         np.testing.assert_array_equal(np.isnan(found[name]), np.isnan(value))
         known = finite & (expected.novelty <= 1.0)
         assert difference(found[name][known], value[known]) <= 1e-3, name
+    fall, value = found["fall_probability"], expected.fall_probability
+    np.testing.assert_array_equal(np.isnan(fall), np.isnan(value))
+    np.testing.assert_allclose(fall[finite], value[finite], atol=1e-3)
     np.testing.assert_array_equal(np.isinf(found["novelty"]), ~finite)
     np.testing.assert_allclose(found["novelty"], expected.novelty, rtol=1e-9)
     assert all(values.dtype == np.float64 for values in found.values())
@@ -184,6 +189,15 @@ def with_trees(assessment):
     return changed
 
 
+def with_falls(assessment):
+    """With a probability of a fall of all margins and two features."""
+    num_columns, num_margins = len(assessment.columns_.names), assessment.embedding_.num_margins
+    changed, columns = copy.copy(assessment), (num_columns - 3, num_columns - 1)
+    weights = np.random.default_rng(6).normal(scale=0.3, size=num_margins + 3)
+    changed.fall_logit_ = FallLogit(columns=columns, weights=tuple(weights), offset=-0.5)
+    return changed
+
+
 def without_velocities(assessment):
     """That of the paper's mode whose x has no velocities."""
     changed, parameters, known = copy.copy(assessment), assessment.parameters, assessment.novelty_
@@ -246,6 +260,7 @@ def test_the_graph_of_an_adapted_assessment_is_that_of_its_present_adaptation(ha
         ("laikago_balancing", "sharpened", without_margins, 0.5),
         ("laikago_balancing", "sharpened", without_safety_heads, 0.5),
         ("laikago_balancing", "sharpened", with_trees, 0.5),
+        ("go2_walking", "sharpened", with_falls, 0.5),
         ("laikago_balancing", "paper", without_velocities, 0.5),
         ("atlas_reaching", "sharpened", with_whole_numbers, 0.0),  # All of it is novel.
     ],

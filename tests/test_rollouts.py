@@ -45,6 +45,22 @@ def test_an_unsafe_episode_ends_as_it_leaves_and_names_the_violated_constraint()
         assert episode.margins[-1, violated] > -0.0801
 
 
+def test_an_episode_until_a_fall_goes_on_outside_the_safe_set_and_only_a_fall_is_unsafe():
+    loop = shuttling().make_loop()
+    pairs = [(run_episode(loop, i), run_episode(loop, i, until_fall=True)) for i in range(40)]
+    assert {one.cause for one, _ in pairs} == {"", "front", "flank"}
+    for until_leaving, until_fall in pairs:
+        assert until_fall.cause in ("", loop.fall_name)
+        num_rows = len(until_leaving.time_s) - (not until_leaving.is_safe)
+        np.testing.assert_array_equal(until_fall.state[:num_rows], until_leaving.state[:num_rows])
+        fall = until_fall.margins[:, loop.constraint_names.index(loop.fall_name)]
+        assert (fall[:-1] >= 0).all() and (fall[-1] < 0) == (not until_fall.is_safe)
+    longer_s = [b.time_s[-1] - a.time_s[-1] for a, b in pairs if not a.is_safe]
+    assert 0.5 < max(longer_s) < 1.0 + 0.04
+    with pytest.raises(ValueError, match="has no fall"):
+        run_episode(gliding().make_loop(), until_fall=True)
+
+
 def test_the_generator_of_an_episode_depends_on_seed_and_index_alone():
     draws = {(s, i): episode_rng(s, i).random() for s in range(3) for i in range(3)}
     assert len(set(draws.values())) == 9

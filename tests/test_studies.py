@@ -235,7 +235,6 @@ def test_walking_is_judged_on_tours_pushes_commands_and_engines(monkeypatch, tmp
     monkeypatch.setattr("studies.walking._SPEED_S", 0.4)
     counts = ("tours", "pushes", "commands", "guarded-tours", "speeds")
     options = itertools.chain.from_iterable((f"--{name}", 1) for name in counts)
-    options = ("--starts", 0, *options)
     arguments = ("go2_walking", "--assessment", tmp_path, "--workers", 1, *options)
     rows = "tours.without_fall, tours.hours, pushes.fallen, "
     rows += "alarm.without_leaving.sharpened.false_alarms_per_hour_at_5, "

@@ -4,7 +4,7 @@ import pytest
 from command_line import call
 from drake_safety.cli.training_folder import MODES, adapted_folder, load_assessment
 from drake_safety.learning.change_detector import usual_rows
-from drake_safety.learning.seeds import MOTION
+from drake_safety.learning.seeds import FALLS, MOTION
 from drake_safety.simulation.dataset import load_episodes
 from shuttle_task import SCENARIO
 
@@ -27,6 +27,12 @@ def test_the_monitor_is_learned_from_undisturbed_motion_that_is_kept(monkeypatch
     assert (len(motions), motions.info.seed, motions.info.step_s) == (30, MOTION.first, 0.02)
     learned = {mode: load_assessment(out, mode).detector_ for mode in MODES}
     assert same_detector(*learned.values())
+    # The shuttle falls where it leaves to one side; that is learned of other episodes.
+    falls = load_episodes(out / "falls")
+    assert (len(falls), falls.info.seed) == (15, FALLS.first)
+    assert {one.cause for one in falls} == {"", "flank"}
+    assert load_assessment(out, MODES[0]).fall_logit_ is not None
+    assert load_assessment(out, MODES[1]).fall_logit_ is None
     halves = [len(one) - 2 for one in usual_rows(motions) if len(one) > 2]
     assert learned["paper"].motion_s == pytest.approx(0.02 * sum(halves[1::2]))
     # Of an actual plant the monitor learns from its motion too, which no pair is.
@@ -44,3 +50,4 @@ def test_the_monitor_is_learned_from_undisturbed_motion_that_is_kept(monkeypatch
     assert call(monkeypatch, *train, alone, "--motion", 0, "--mode", "paper") == 0
     assert not (alone / "motion").exists()
     assert load_assessment(alone, "paper").detector_.step_s == 0.04
+    assert not (alone / "falls").exists()

@@ -12,7 +12,7 @@ from studies.walking import (
     speed_estimates,
     tour_estimates,
 )
-from studies.walking_motions import run_motions, run_push, run_start, unusual_command
+from studies.walking_motions import run_motions, run_push, unusual_command
 
 
 def motion(values, *, push_s=math.inf, leave_s=math.inf, fall_s=math.inf, changed=0.0, impact=0.0):
@@ -82,10 +82,3 @@ def test_a_motion_that_is_kept_is_the_one_that_was_simulated(tmp_path):
     assert kept.ports.keys() == motion.ports.keys()
     for port, rows in motion.ports.items():
         np.testing.assert_array_equal(kept[port], rows.astype(np.float32))
-
-
-def test_a_start_goes_on_for_a_second_after_it_leaves_the_safe_set():
-    loop = load_scenario("go2_walking").make_loop()
-    motion = run_start(loop, 54, seed=5_900_100, duration_s=2.6)
-    assert motion.has_left and not motion.has_fallen
-    assert 1.0 <= motion.time_s[-1] - motion.leave_time_s < 1.0 + loop.scenario.step_s

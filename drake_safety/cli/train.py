@@ -17,8 +17,9 @@ from drake_safety.files.progress import StageProgress, stage_of
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.learning_curve import describe, learning_curve
-from drake_safety.learning.seeds import TRAINING
-from drake_safety.learning.segments import training_segments
+from drake_safety.learning.seeds import FALLS, TRAINING
+from drake_safety.learning.segments import Episodes, training_segments
+from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
@@ -33,6 +34,14 @@ def train(
         float,
         Option(help="Minutes of undisturbed motion, half for the monitor's limits.", min=0.0),
     ] = 48.0,
+    falls: Annotated[
+        int | None,
+        Option(
+            help="Episodes that the probability of a fall is fitted to; 0 for none. A quarter of "
+            "the others by default, where the robot can fall.",
+            min=0,
+        ),
+    ] = None,
     mode: Annotated[
         str, Option(help="'sharpened', 'paper' (the method as published), or 'both'.")
     ] = "both",
@@ -82,7 +91,19 @@ def train(
                 progress=partial(stages, "undisturbed motion"),
             )
             detector = ChangeDetector.fit(motions, stage_of(stages, "monitor"))
-        rows = [_learn(loaded, name, out, detector, stages) for name in modes]
+        num_falls = episodes // 4 if falls is None else falls
+        fallen = None
+        if num_falls and MODES[0] in modes and isinstance(loaded.make_loop(), CanFall):
+            fallen = run_episodes(
+                loaded,
+                num_falls,
+                seed=FALLS.first,
+                until_fall=True,
+                num_workers=workers,
+                path=out / "falls",
+                progress=partial(stages, "episodes until a fall"),
+            )
+        rows = [_learn(loaded, name, out, detector, fallen, stages) for name in modes]
     console.show(console.new_table("mode", "segments", "unsafe episodes", "CPU time", rows=rows))
     console.say(folders.load_assessment(out, modes[0]).detector_.describe())
     console.say(describe(learning_curve(load_episodes(next(iter(sets))), loaded.assessment)))
@@ -93,11 +114,17 @@ def train(
 
 
 def _learn(
-    scenario: Scenario, mode: str, out: Path, detector: ChangeDetector | None, stages: StageProgress
+    scenario: Scenario,
+    mode: str,
+    out: Path,
+    detector: ChangeDetector | None,
+    fallen: Episodes | None,
+    stages: StageProgress,
 ) -> tuple[str, str, str, str]:
     """Trains and saves one mode; returns its row of the table.
 
-    Without a detector, one is learned from the episodes.
+    Without a detector, one is learned from the episodes; without episodes until a fall there is no
+    probability of a fall.
     """
     started = time.process_time()
     parameters = replace(scenario.assessment, mode=mode)  # type: ignore[arg-type]  # Checked.
@@ -107,6 +134,17 @@ def _learn(
     assessment = SafetyAssessment(parameters).fit(
         data, lambda stage, *done: stages(f"{mode}: {stage}", *done), detector=detector
     )
+    if fallen is not None and mode == MODES[0]:
+        if 0 < fallen.num_unsafe < len(fallen):
+            watched = require(scenario.make_loop(), CanFall).watched_features.values()
+            names = data.info.feature_names
+            used = [one for one in names if one in watched or one.startswith("tracking_error_")]
+            assessment.fit_falls(fallen, used)
+        else:
+            console.say(
+                f"{fallen.num_unsafe} of {len(fallen)} episodes end in a fall: it takes both to "
+                "learn its probability; give more with --falls"
+            )
     assessment.save(folders.assessment_file(out, mode))
     unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
     num_segments = len(training_segments(data, parameters))

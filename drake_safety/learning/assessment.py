@@ -19,6 +19,7 @@ from drake_safety.learning.assessment_parameters import AdaptationParameters, As
 from drake_safety.learning.blas_threads import one_blas_thread
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector, usual_rows
+from drake_safety.learning.fall_logit import FallLogit
 from drake_safety.learning.feedback import (
     EpisodePair,
     check_feedback,
@@ -35,6 +36,7 @@ from drake_safety.learning.prediction import BaseLogit, Correction, Prediction
 from drake_safety.learning.recalibration import recalibrated
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
 from drake_safety.learning.segments import (
+    DIVERGED,
     Episode,
     Episodes,
     EpisodesInfo,
@@ -72,6 +74,7 @@ class SafetyAssessment:
     - `base_logit_`: the `BaseLogit`, which scales the maps' heads and the trees to one logit; None
       without heads.
     - `trees_`: the `Trees` beside the maps; None where none are learned.
+    - `fall_logit_`: the `FallLogit`, of `fit_falls`; initially None.
     - `correction_`: the `Correction` that feedback adds to the base logit; initially zero.
     - `adaptation_`: the `Adaptation` to feedback; initially None.
     - `used_`: every set of episodes used for training, calibration or adaptation, as
@@ -95,6 +98,7 @@ class SafetyAssessment:
     novelty_: Novelty
     base_logit_: BaseLogit | None
     trees_: Trees | None
+    fall_logit_: FallLogit | None
     correction_: Correction
     adaptation_: Adaptation | None
     used_: list[UsedEpisodes]
@@ -196,6 +200,7 @@ class SafetyAssessment:
             "embedding_": embedding,
             "base_logit_": base_logit,
             "trees_": trees,
+            "fall_logit_": None,
             "training_": training,
             "beliefs_": beliefs,
             "novelty_": novelty,
@@ -205,6 +210,46 @@ class SafetyAssessment:
             "calibrations_": {},
             "used_": [UsedEpisodes.of("training", info, len(episodes))],
         }
+
+    def fit_falls(self, episodes: Episodes, features: Sequence[str]) -> SafetyAssessment:
+        """Fits the probability of a fall to episodes that go on after they leave the safe set.
+
+        Args:
+            episodes: Episodes whose unsafe end is a fall, as those of `run_episodes` with
+                ``until_fall``, of seeds without other use.
+            features: Features that it reads beside predicted margins and base logit.
+
+        Returns:
+            This assessment.
+
+        Raises:
+            MissingExtraError: The extra "train" is not installed.
+            ValueError: The maps have no margin heads, as in the paper's mode, there is no such
+                feature, the seed was used, or no episode ends in a fall, or every one does.
+        """
+        require_extra("train", "SafetyAssessment.fit_falls", "sklearn")
+        self._check_fitted()
+        if self.base_logit_ is None or not self.embedding_.num_margins:
+            raise ValueError(f"{self._who}: the probability of a fall needs maps with margin heads")
+        names = self.columns_.names
+        if unknown := sorted(set(features) - set(names)):
+            raise ValueError(f"{self._who}: there are no features {unknown} among {names}")
+        self.check_unused(episodes.info.seed, purpose="falls")
+        columns = [names.index(name) for name in features]
+        labelled = [one for one in episodes if one.cause != DIVERGED]
+        inputs = []
+        for one in labelled:
+            x = self.columns_.of_rows(one)[one.first_step : len(one.time_s) - (not one.is_safe)]
+            output = self.embedding_.evaluate(x)
+            margins = prediction.mean_of_maps(output.margins)
+            trees_logit = None if self.trees_ is None else self.trees_.evaluate(x)
+            heads = self.base_logit_.heads(output, trees_logit, margins)
+            unsafe_logit = self.base_logit_.of_heads(heads)
+            inputs.append(FallLogit.inputs(margins, unsafe_logit, x, columns))
+        self.fall_logit_ = FallLogit.fit(inputs, [not one.is_safe for one in labelled], columns)
+        kept = [one for one in self.used_ if one.purpose != "falls"]
+        self.used_ = [*kept, UsedEpisodes.of("falls", episodes.info, len(episodes))]
+        return self
 
     def adapt(
         self,
@@ -410,6 +455,7 @@ class SafetyAssessment:
             correction=self.correction_ if correction is None else correction,
             base_logit=self.base_logit_,
             trees=self.trees_,
+            fall_logit=self.fall_logit_,
             novelty=self.novelty_ if novelty is None else novelty,
             initial_uncertainty=self.parameters.initial_uncertainty,
         )

@@ -20,6 +20,7 @@ from drake_safety.learning.assessment_parameters import (
 )
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector
+from drake_safety.learning.fall_logit import FallLogit
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.novelty import Moments, Novelty
@@ -79,11 +80,13 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
             arrays = {name: value for name, value in vars(one).items() if name != "count"}
             groups[prefix] = {name: value for name, value in arrays.items() if value is not None}
     adaptation, base_logit = learned["adaptation_"], learned["base_logit_"]
+    fall_logit = learned["fall_logit_"]
     numbers = {
         "num_margins": embedding.num_margins,
         "novelty_limits": novelty.limits.tolist(),
         "novelty_counts": [0 if one is None else one.count for one in moments.values()],
         "base_logit": None if base_logit is None else asdict(base_logit),
+        "fall_logit": None if fall_logit is None else asdict(fall_logit),
         "calibrations": [one.to_json() for one in learned["calibrations_"].values()],
         "used": [asdict(one) for one in learned["used_"]],
     }
@@ -173,6 +176,8 @@ def _learned(
         base_logit["margin_range"] = tuple(base_logit["margin_range"])
     correction = Correction(**group("correction."))
     correction.guard = correction.guard.astype(float)
+    # Files from before have none.
+    fall_logit = numbers.get("fall_logit")
     training, trees = group("training_"), group("trees.")
     counts = numbers["novelty_counts"]
     feedback = Moments(count=counts[1], **group("feedback_novelty.")) if counts[1] else None
@@ -188,6 +193,7 @@ def _learned(
         ),
         "base_logit_": None if base_logit is None else _made(BaseLogit, base_logit),
         "trees_": Trees(**trees) if trees else None,
+        "fall_logit_": None if fall_logit is None else _made(FallLogit, fall_logit),
         "beliefs_": tensors["beliefs"],
         "correction_": correction,
         "training_": TrainingScores(**{k: v.astype(_TRAINING[k][1]) for k, v in training.items()}),

@@ -14,6 +14,7 @@ import numpy as np
 from drake_safety.extras import require_extra
 from drake_safety.files.atomic import replacing
 from drake_safety.learning import beliefs as belief_masses
+from drake_safety.learning.fall_logit import FallLogit
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.novelty import NUM_QUADRATIC, Novelty
 from drake_safety.learning.prediction import (
@@ -45,6 +46,8 @@ _DESCRIPTIONS = {
     "predicted_margins": "Smallest margin of each constraint until the motion's end; negative is "
     "violated; NaN for maps that predict none.",
     "novelty": "Distance from the training inputs; novel above 1.",
+    "fall_probability": "Probability of a fall; NaN for inputs that are not finite, or if it was "
+    "not learned.",
     "embedding": "Place of the input in the first map.",
 }
 _UNITS = (
@@ -93,7 +96,7 @@ def write(path: Path, assessment: Any) -> None:
         for column in (belief_masses.SAFE, belief_masses.UNCERTAINTY)
     )
     if base_logit is None:
-        probability = safe
+        probability, fall = safe, None
     else:
         trees = assessment.trees_
         heads = _heads(nodes, logit, margins, base_logit)
@@ -109,9 +112,15 @@ def write(path: Path, assessment: Any) -> None:
             shift = _shift(nodes, heads, activations, guard, correction)
             unsafe_logit = nodes("Add", unsafe_logit, shift)
         probability = nodes("Sigmoid", nodes("Neg", unsafe_logit))
+        fall = _fall(nodes, margins, unsafe_logit, usable, assessment.fall_logit_)
     is_known = nodes("LessOrEqual", uncertainty, unknown_above(parameters.initial_uncertainty))
     probability = nodes("Where", is_known, probability, 0.0)
     nodes("Squeeze", probability, [1], output="safety_probability")
+    if fall is None:
+        # NaN of N rows.
+        fall = nodes("Mul", safe, np.nan)
+    fall = nodes("Where", is_usable, fall, np.nan)
+    nodes("Squeeze", fall, [1], output="fall_probability")
     outputs: dict[str, int | None] = {
         "belief": 3,
         "safety_probability": None,
@@ -119,6 +128,7 @@ def write(path: Path, assessment: Any) -> None:
         "predicted_margins": num_causes,
         "novelty": None,
         "embedding": 2,
+        "fall_probability": None,
     }
     contract = _contract(assessment, inputs)
     graph = onnx.helper.make_graph(
@@ -359,6 +369,18 @@ def _trees(nodes: _Nodes, x: str, trees: Trees) -> str:
     leaf = nodes("Add", nodes("Squeeze", leaf, [2]), num_leaves * np.arange(num_trees))
     found = nodes.double(nodes("Gather", arrays["value"].ravel(), leaf))
     return nodes.clip(nodes("ReduceSum", found, [1], keepdims=1), LOGIT_LIMIT)
+
+
+def _fall(
+    nodes: _Nodes, margins: str | None, unsafe_logit: str, x: str, fall_logit: FallLogit | None
+) -> str | None:
+    """The probability of a fall, (N, 1)."""
+    if fall_logit is None or margins is None:
+        return None
+    columns = nodes("Gather", x, np.array(fall_logit.columns, dtype=np.int64), axis=1)
+    inputs = nodes("Concat", margins, unsafe_logit, columns, axis=1)
+    logit = nodes("MatMul", inputs, np.array(fall_logit.weights)[:, None])
+    return nodes("Sigmoid", nodes("Add", logit, fall_logit.offset))
 
 
 def _shift(nodes: _Nodes, heads: str, activations: str, guard: str, correction: Correction) -> str:

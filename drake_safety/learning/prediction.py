@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from drake_safety.learning import beliefs as belief_masses
+from drake_safety.learning.fall_logit import FallLogit
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
@@ -36,6 +37,9 @@ class Prediction:
             margins], (N, n_c); NaN for inputs that are not finite or without a margin head.
         novelty: Distance of x from the training inputs in units of the largest known one, (N,);
             novel above 1, infinite for inputs that are not finite.
+        fall_probability: Probability of a fall until the episode's end or soon after it left the
+            safe set, (N,), extrapolated for novel inputs; NaN for inputs that are not finite or
+            without a `FallLogit`.
     """
 
     belief: np.ndarray
@@ -44,6 +48,7 @@ class Prediction:
     embedding: np.ndarray
     predicted_margins: np.ndarray
     novelty: Any
+    fall_probability: Any
 
     def one(self, row: int) -> Prediction:
         """Returns the prediction for one of the inputs."""
@@ -244,6 +249,7 @@ def predict(
     novelty: Novelty,
     initial_uncertainty: float,
     trees: Trees | None = None,
+    fall_logit: FallLogit | None = None,
 ) -> Prediction:
     """Assesses inputs; novel ones and those that are not finite get the empty belief.
 
@@ -276,6 +282,7 @@ def predict(
         margins = mean_of_maps(output.margins)
     else:
         margins = np.full((len(x), num_columns - 3), np.nan)
+    fall_probability = np.full(len(x), np.nan)
     if base_logit is not None:
         trees_logit = None if trees is None else trees.evaluate(x)
         heads = base_logit.heads(output, trees_logit, margins)
@@ -287,6 +294,8 @@ def predict(
             residual[is_known] = correction.residual(embedding, x[is_known])
             logit += correction.shift(heads, residual, guard)
         probability = 1.0 / (1.0 + np.exp(logit))
+        if fall_logit is not None:
+            fall_probability = sigmoid(fall_logit.of(margins, logit, x))
     probability[is_unknown(masses, initial_uncertainty)] = 0.0
     return Prediction(
         belief=masses[:, :3],
@@ -295,4 +304,5 @@ def predict(
         cause_probability=masses[:, 3:],
         predicted_margins=margins,
         novelty=distance,
+        fall_probability=fall_probability,
     )

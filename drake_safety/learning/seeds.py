@@ -62,17 +62,18 @@ MOTION = SeedBlock(9_000_000, ("motion", "motion of the actual robot"))
 """Undisturbed motion, of which a monitor learns what is usual."""
 FRESH_MOTION = SeedBlock(9_100_000, ("fresh motion",))
 """Undisturbed motion that shows how often the monitor alarms."""
-WALKING = SeedBlock(6_000_000, ("calibration", "tour", "push", "command", "start"))
-"""Motions of walking robots; of the first, velocities are compared between engines, and the last
-show when a robot falls."""
+WALKING = SeedBlock(6_000_000, ("calibration", "tour", "push", "command"))
+"""Motions of walking robots; of the first, velocities are compared between engines."""
 ANOMALIES = SeedBlock(10_000_000, ("unperturbed", "perturbed", "thresholds"))
 """Motion with and without an anomaly, and that for thresholds."""
 GATE = SeedBlock(11_000_000, ("pairs of two loops",))
 """Both loops of a pair draw from the same generator."""
 RATE = SeedBlock(12_000_000, ("failure rate",))
+FALLS = SeedBlock(13_000_000, ("falls",))
+"""Episodes that go on after they leave the safe set."""
 BLOCKS = (
     *(TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION),
-    *(DEMONSTRATION, SHIFTS, MOTION, FRESH_MOTION, ANOMALIES, WALKING, GATE, RATE),
+    *(DEMONSTRATION, SHIFTS, MOTION, FRESH_MOTION, ANOMALIES, WALKING, GATE, RATE, FALLS),
 )
 
 
@@ -91,7 +92,7 @@ class UsedEpisodes:
     """A set of episodes that an assessment has used.
 
     Attributes:
-        purpose: "training", "calibration" or "adaptation".
+        purpose: "training", "falls", "calibration" or "adaptation".
         seed: Seed of the set, or `NOT_DRAWN`.
         num_episodes: Number of episodes.
     """

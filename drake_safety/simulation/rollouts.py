@@ -29,6 +29,7 @@ from drake_safety.learning.segments import (
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import (
     CanBePushed,
+    CanFall,
     CanStartAnywhere,
     HasGoals,
     MovesUndisturbed,
@@ -45,6 +46,7 @@ from drake_safety.simulation.worker_processes import BATCH_SIZE, MadeOnce, Progr
 
 MOTION_PIECE_S = 60.0
 """Duration of one undisturbed motion [s]."""
+_AFTER_LEAVING_S = 1.0  # Until a robot has fallen, if it does.
 _MANY = 64  # Episodes of which two more are a small share.
 _LOGGER = logging.getLogger("drake_safety")
 
@@ -102,6 +104,7 @@ def run_episode(
     start: EpisodeStart | None = None,
     plan: Any = None,
     at_start: Callable[[Context], object] = lambda context: None,
+    until_fall: bool = False,
     **options: Any,
 ) -> Episode:
     """Simulates one episode, which ends when it leaves the safe set or its time is over.
@@ -115,6 +118,8 @@ def run_episode(
             the index.
         plan: Replaces the initial plan: one of the loop's ``candidate_plans``.
         at_start: Called with the root Context at the start.
+        until_fall: Whether it goes on for a second after it leaves the safe set, and only a fall is
+            an unsafe end; of a :class:`CanFall`.
         **options: Those of :func:`~drake_safety.simulation.motion.simulate`, as ``monitor``.
 
     Returns:
@@ -125,6 +130,8 @@ def run_episode(
         ValueError: The task takes no goal or start, or not this one, or both are given.
         EpisodeError: A system of the loop raised an error, which is its cause.
     """
+    if until_fall:
+        require(loop, CanFall, "run_episode until a fall")
     if start is not None and (goal is not None or is_standing):
         raise ValueError("run_episode: a start has a plan of its own; leave out the goal")
     if is_standing and goal is None:
@@ -147,7 +154,7 @@ def run_episode(
         return first_step
 
     counted = filter(loop.HasOutputPort, ["num_controller_failures"])
-    return simulate(
+    motion = simulate(
         loop,
         begin,
         (*RECORDED, *counted),
@@ -157,8 +164,11 @@ def run_episode(
         may_fail=True,
         index=index,
         who=f"episode {index} of '{scenario.name}' (seed {seed})",
-        **({"after_leaving_s": 0.0} | options),
-    ).episode()
+        **({"after_leaving_s": _AFTER_LEAVING_S if until_fall else 0.0} | options),
+    )
+    if until_fall:
+        motion.cause = require(loop, CanFall).fall_name if motion.has_fallen else ""
+    return motion.episode()
 
 
 def run_to_goal(
@@ -319,6 +329,7 @@ def run_episodes(
     extra: dict[str, Any] | None = None,
     goals: np.ndarray | None = None,
     is_standing: bool = False,
+    until_fall: bool = False,
     **loop_options: Any,
 ) -> Episodes:
     """Simulates a set of episodes, in worker processes.
@@ -333,6 +344,7 @@ def run_episodes(
         goals: Goal of each episode in place of random ones, (num_episodes, n_goal); such episodes
             cannot be stored.
         is_standing: Whether episodes begin in the standing posture; requires goals.
+        until_fall: As of `run_episode`.
         **loop_options: Options of the task; part of the set's hash.
 
     Raises:
@@ -350,10 +362,19 @@ def run_episodes(
 
     def run(loop: ClosedLoop, index: int, **options: Any) -> Episode:
         goal = None if goals is None else goals[index]
-        return run_episode(loop, index, seed=seed, goal=goal, is_standing=is_standing, **options)
+        return run_episode(
+            loop,
+            index,
+            seed=seed,
+            goal=goal,
+            is_standing=is_standing,
+            until_fall=until_fall,
+            **options,
+        )
 
+    kind = {"until_fall": True} if until_fall else {}
     return collect_episodes(
-        episodes_info(make(), seed, loop_options),
+        episodes_info(make(), seed, loop_options | kind),
         range(num_episodes),
         make,
         run,

@@ -33,16 +33,18 @@ class BeliefEvaluator(LeafSystem):
         - embedding: 2
         - predicted_margins: n_c
         - novelty: 1
+        - fall_probability: 1
 
     Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
     ``belief`` is (safe, unsafe, don't know), and its first entry the paper's Γ.
     ``safety_probability`` is the probability of staying safe, by the maps' heads with the
     correction from feedback; the paper's mode has no heads, and it is the belief's first entry. It
     is 0 where the belief is "don't know". ``novelty`` is the distance of the inputs from those of
-    training, novel above 1. The belief of inputs that are novel or not finite is (0, 0, 1), and so
-    is the belief before the first evaluation, and every belief while ``alarm`` is above 0.5, as
-    that of a :class:`~drake_safety.systems.change_monitor.ChangeMonitor`. While one of
-    ``margins``, those of the measured state, is negative, no belief is safe: its mass for "safe"
+    training, novel above 1. ``fall_probability`` is 1 for inputs that are not finite, and 0 for
+    an assessment that has learned no falls. The belief of inputs that are novel or not finite is
+    (0, 0, 1), and so is the belief before the first evaluation, and every belief while ``alarm`` is
+    above 0.5, as that of a :class:`~drake_safety.systems.change_monitor.ChangeMonitor`. While one
+    of ``margins``, those of the measured state, is negative, no belief is safe: its mass for "safe"
     counts as unsafe by the most violated constraint. The beliefs of the grid, the correction and
     the novelty are parameters of the Context: :meth:`adopt` replaces them by those of an adapted
     assessment, between simulations and during them. The embedding is immutable.
@@ -89,6 +91,7 @@ class BeliefEvaluator(LeafSystem):
             "embedding": 2,
             "predicted_margins": n_c,
             "novelty": 1,
+            "fall_probability": 1,
         }
         first = np.concatenate(
             [EMPTY if name == "belief" else np.zeros(size) for name, size in sizes.items()]
@@ -149,6 +152,9 @@ class BeliefEvaluator(LeafSystem):
             margins = self._margins_port.Eval(context)
             if margins.min(initial=0.0) < 0.0:
                 prediction = prediction.outside(int(np.argmin(margins)))
+        fall_probability = prediction.fall_probability
+        if np.isnan(fall_probability):
+            fall_probability = float(self._assessment.fall_logit_ is not None)
         # In the order of the ports.
         discrete_state.set_value(
             np.concatenate(
@@ -159,6 +165,7 @@ class BeliefEvaluator(LeafSystem):
                     prediction.embedding,
                     prediction.predicted_margins,
                     (min(prediction.novelty, _LARGEST_NOVELTY),),
+                    (fall_probability,),
                 ]
             )
         )

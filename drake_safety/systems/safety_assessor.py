@@ -34,6 +34,7 @@ class SafetyAssessor(Diagram):
         - embedding: 2
         - predicted_margins: n_c
         - novelty: 1
+        - fall_probability: 1
         - alarm: 1
         - levels: n_w
         - alarm_cause: abstract

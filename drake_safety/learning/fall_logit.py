@@ -1,0 +1,75 @@
+"""The logit of a fall, fitted to episodes that go on after they leave the safe set."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+_LIMIT = 20.0  # Of the logit, which keeps exp from overflowing.
+_INVERSE_PENALTY = 0.01  # Of inputs with unit variance.
+
+
+@dataclass(frozen=True, kw_only=True)
+class FallLogit:
+    """A logit of a fall, linear in an assessment's outputs and some of its inputs.
+
+    Departure: the paper's Γ has learned whether a motion leaves the safe set, which a walking robot
+    often does without a fall.
+
+    Attributes:
+        columns: The columns of x that it reads.
+        weights: Those of the n_c predicted margins, of the logit of an unsafe end, and of the
+            columns.
+    """
+
+    columns: tuple[int, ...]
+    weights: tuple[float, ...]
+    offset: float
+
+    @classmethod
+    def fit(
+        cls, inputs: Sequence[np.ndarray], has_fallen: Sequence[bool], columns: Sequence[int]
+    ) -> FallLogit:
+        """Fits it to the rows of episodes.
+
+        Args:
+            inputs: Rows of each episode, as many columns as weights; those that are not finite are
+                left out.
+            has_fallen: Whether each episode ended in a fall.
+
+        Raises:
+            ValueError: No episode ends in a fall, or every one does.
+        """
+        from sklearn.linear_model import LogisticRegression
+        from sklearn.preprocessing import StandardScaler
+
+        num_falls = sum(has_fallen)
+        if num_falls in (0, len(has_fallen)):
+            raise ValueError(
+                f"FallLogit: {num_falls} of {len(has_fallen)} episodes end in a fall; the fit "
+                "takes both: give more episodes"
+            )
+        rows = np.concatenate(inputs)
+        labels = np.repeat(has_fallen, [len(one) for one in inputs])
+        is_used = np.isfinite(rows).all(axis=1)
+        scaler = StandardScaler().fit(rows[is_used])
+        model = LogisticRegression(C=_INVERSE_PENALTY, max_iter=500)
+        model.fit(scaler.transform(rows[is_used]), labels[is_used])
+        weights = model.coef_[0] / scaler.scale_
+        offset = model.intercept_[0] - weights @ scaler.mean_
+        return cls(columns=tuple(columns), weights=tuple(weights.tolist()), offset=float(offset))
+
+    def of(self, margins: np.ndarray, unsafe_logit: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Returns the logit (N,) of margins (N, n_c), unsafe logit (N,) and inputs (N, n_x)."""
+        terms = self.inputs(margins, unsafe_logit, x, self.columns) * self.weights
+        logit = np.add.reduce(terms, axis=1) + self.offset
+        return np.minimum(np.maximum(logit, -_LIMIT), _LIMIT)
+
+    @staticmethod
+    def inputs(
+        margins: np.ndarray, unsafe_logit: np.ndarray, x: np.ndarray, columns: Sequence[int]
+    ) -> np.ndarray:
+        """Returns what the weights multiply, (N, n_c + 1 + num_columns)."""
+        return np.concatenate([margins, unsafe_logit[:, None], x[:, columns]], axis=1)
