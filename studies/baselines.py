@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from drake_safety.evaluation.metrics import Bootstrap, Estimate, area_under_curve
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, area_under_curve, mean
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.seeds import UsedEpisodes
@@ -209,10 +210,55 @@ def auc_difference(
         episode: Index of each sample's episode, (N,).
         bootstrap: Settings of the interval.
     """
+    difference = auc_difference_of(unsafe_score, other_score, is_unsafe)
+    return (bootstrap or Bootstrap()).over_episodes(difference, episode)
+
+
+def auc_difference_of(
+    unsafe_score: np.ndarray, other_score: np.ndarray, is_unsafe: np.ndarray
+) -> Callable[[np.ndarray], float]:
+    """The difference of `auc_difference` as a function of the samples' weights, (N,)."""
 
     def difference(weight: np.ndarray) -> float:
         return area_under_curve(unsafe_score, is_unsafe, weight) - area_under_curve(
             other_score, is_unsafe, weight
         )
 
-    return (bootstrap or Bootstrap()).over_episodes(difference, episode)
+    return difference
+
+
+def _mean_of(statistics: Sequence[Callable[[np.ndarray], float]], weight: np.ndarray) -> float:
+    return float(np.mean([one(weight) for one in statistics]))
+
+
+def classifier_differences(
+    gamma: Scorer, classifiers: Sequence[Scorer], test: Episodes
+) -> dict[str, Estimate]:
+    """Γ minus the classifiers of each kind, on every row and on the first rows of fresh episodes.
+
+    The AUC and the Brier score of a kind are means over its seeds; intervals are of paired
+    resamples of the episodes.
+
+    Args:
+        gamma: The probability of Γ.
+        classifiers: Those of each kind, one for each seed.
+        test: The episodes.
+    """
+    segments = split(test, stride=1, discount=1.0, shortest=1)
+    scores = {one.name: one.unsafe_score(segments) for one in (gamma, *classifiers)}
+    found = {}
+    every = np.ones(len(segments), dtype=bool)
+    for place, rows in {"rows": every, "first": segments.is_first}.items():
+        label, episode = segments.is_unsafe[rows], segments.episode[rows]
+        own = scores[gamma.name][rows]
+        for kind in KINDS:
+            others = [one[rows] for name, one in scores.items() if name.startswith(kind)]
+            each = [auc_difference_of(own, other, label) for other in others]
+            found[f"difference.{place}.{kind}.auc"] = Bootstrap().over_episodes(
+                partial(_mean_of, each), episode
+            )
+            error = np.mean([(other - label) ** 2 for other in others], axis=0)
+            found[f"difference.{place}.{kind}.brier"] = mean(
+                (own - label) ** 2 - error, episode, bootstrap=Bootstrap()
+            )
+    return found

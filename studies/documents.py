@@ -41,6 +41,7 @@ _FORMATS = {
     "plain": {"digits": 2},
     "value": {"unit": "=", "digits": 2},
     "seconds": {"unit": "=", "digits": 1},
+    "fine": {"digits": 4},
     "percent": {"unit": "%", "digits": 1},
     "points": {"unit": "points", "digits": 1},
 }

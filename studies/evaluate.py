@@ -7,11 +7,11 @@ inverse kinematics, the other hand, the reachable region, and alarms on pushed m
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from drake_safety.cli.console import (
@@ -34,7 +34,6 @@ from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
 from drake_safety.learning.seeds import EVALUATION, RELEASE, SHIFTS
-from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.capabilities import (
     CanBePushed,
     CanFall,
@@ -55,7 +54,7 @@ from studies.alarms import (
     scorer_alarm,
     threshold_alarms,
 )
-from studies.baselines import KINDS, auc_difference, classifier_scorers
+from studies.baselines import classifier_differences, classifier_scorers
 from studies.harness import CalibrationOption, EpisodesOption, ReleaseOption
 from studies.plans import Plans, Rule, evaluate_plans, plans_of, reachability_rule, scorer_rule
 from studies.pushed_motions import run_pushed_motions
@@ -64,6 +63,7 @@ from studies.reachable_region import reachable_region, region_figure
 from studies.shifts import add_all_shifts
 from studies.throws import classifier_rules
 
+_CLASSIFIER_SEEDS = (0, 1, 2)
 _PLANT = "actual"
 _PROGRAM = "python -m studies"
 
@@ -122,7 +122,11 @@ def evaluate(
         test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
         other = evaluation.fresh("calibration episodes", calibration_episodes, "thresholds")
         shortest = evaluation.assessments["sharpened"].parameters.shortest_segment or None
-        classifiers = classifier_scorers(training, evaluation.stages, shortest=shortest)
+        trained = classifier_scorers(
+            training, evaluation.stages, shortest=shortest, seeds=_CLASSIFIER_SEEDS
+        )
+        of_first_seed = trained[:: len(_CLASSIFIER_SEEDS)]
+        classifiers = [replace(one, name=one.name.rpartition("_")[0]) for one in of_first_seed]
         if isinstance(loop, HasGoals):
             sets = plans_of(loop, other), plans_of(loop, test)
             limit = _add_plans(
@@ -131,7 +135,8 @@ def evaluate(
             if pushes:
                 _add_pushes(evaluation, loop, classifiers, pushes, 1.0 - limit)
         else:
-            _add_differences(evaluation, classifiers, other, test)
+            add_verdicts(evaluation, [*evaluation.scorers, *classifiers], other, test)
+        evaluation.add(classifier_differences(evaluation.scorers[0], trained, test))
         add_reliability(evaluation, test)
         if throws:
             _add_throws(evaluation, loop, classifiers, throws, calibration_throws)
@@ -140,23 +145,6 @@ def evaluate(
 def _tables(results: Results) -> list[Table]:
     alarms = verdict_table(results, "monitoring", corner="alarm", kind=ALARMS)
     return [*verdict_tables(results), *([alarms] if alarms.rows else [])]
-
-
-def _add_differences(
-    evaluation: Evaluation, classifiers: Sequence[Scorer], other: Episodes, test: Episodes
-) -> None:
-    """Verdicts, and the AUC of Γ minus that of the better classifier."""
-    scores, segments = add_verdicts(evaluation, [*evaluation.scorers, *classifiers], other, test)
-    found = evaluation.estimates
-    everywhere = np.ones(len(segments), dtype=bool)
-    for kind, rows in (("segments", everywhere), ("episodes", segments.is_first)):
-        best = max(KINDS, key=lambda name: found[f"{kind}.{name}.auc"].value)
-        found[f"{kind}.sharpened_minus_best_classifier.auc"] = auc_difference(
-            scores["sharpened"][rows],
-            scores[best][rows],
-            segments.is_unsafe[rows],
-            segments.episode[rows],
-        )
 
 
 def _add_plans(

@@ -2,9 +2,16 @@ import numpy as np
 import pytest
 
 from drake_safety.evaluation.metrics import area_under_curve
+from drake_safety.evaluation.scorers import Scorer
 from drake_safety.learning.segments import split
 from lip_episodes import make_episodes
-from studies.baselines import KINDS, DirectClassifier, auc_difference, classifier_scorers
+from studies.baselines import (
+    KINDS,
+    DirectClassifier,
+    auc_difference,
+    classifier_differences,
+    classifier_scorers,
+)
 
 pytestmark = pytest.mark.train
 
@@ -76,6 +83,28 @@ def test_who_learns_from_short_segments_has_seen_how_safe_episodes_end(fresh):
     segments = split(episodes, stride=1, discount=1.0, shortest=1)
     rows = segments.take(~segments.is_unsafe & (segments.length < episodes.info.horizon))
     assert short.unsafe_score(rows).mean() < whole.unsafe_score(rows).mean()
+
+
+def test_gamma_is_compared_with_the_mean_over_the_seeds_of_each_kind():
+    test = make_episodes(60, seed=4)
+
+    def scorer(name, skill):
+        def probability(state, desired_preview, features):
+            noise = np.random.default_rng(round(1e3 * skill)).normal(size=len(state))
+            return 1.0 / (1.0 + np.exp(-skill * features[:, 0] - noise))
+
+        return Scorer(name=name, probability=probability)
+
+    gamma, worse = scorer("sharpened", 1.0), [scorer(f"mlp_{i}", 0.1 * i) for i in range(3)]
+    equal = [scorer(f"gradient_boosting_{i}", 1.0) for i in range(3)]
+    found = classifier_differences(gamma, [*equal, *worse], test)
+    assert {key.split(".")[1] for key in found} == {"rows", "first"}
+    same = found["difference.rows.gradient_boosting.auc"]
+    assert (same.value, same.low, same.high, same.n) == (0.0, 0.0, 0.0, 60)
+    assert found["difference.first.gradient_boosting.brier"].value == pytest.approx(0.0, abs=1e-12)
+    each = [classifier_differences(gamma, [*equal, one], test) for one in worse]
+    for key in ("difference.rows.mlp.auc", "difference.first.mlp.brier"):
+        assert found[key].value == pytest.approx(np.mean([one[key].value for one in each]))
 
 
 def test_a_scorer_does_not_differ_from_itself_and_its_difference_is_antisymmetric(fresh):
