@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated
 
@@ -19,7 +19,12 @@ from drake_safety.cli.console import (
     WorkersOption,
     say,
 )
-from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_folder
+from drake_safety.cli.training_folder import (
+    MODES,
+    adapted_folder,
+    assessment_folder,
+    episodes_folder,
+)
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
 from drake_safety.files.progress import StageProgress
@@ -29,7 +34,8 @@ from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.feedback import EpisodePair
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import ADAPTATION
-from drake_safety.learning.segments import Episodes, Segments, split
+from drake_safety.learning.segments import Episode, Episodes, Segments, split
+from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.worker_processes import map_items
 from studies.adaptation_figure import adaptation_figure
@@ -49,6 +55,7 @@ NUM_NEIGHBOURS = 50
 STEPS = ("x", "psi", "grid", "update", "update_without_gpr")
 """The steps, see `losses`."""
 _SCRATCH_SIZES = (40, 160, 400)
+_BOOSTED_SIZES = (40, 160)
 _POOL_STRIDE = 10  # Between the first seeds of two pools.
 
 
@@ -69,7 +76,8 @@ def adaptation(
         int, typer.Option(help="Other actual episodes to train an oracle on.", min=0)
     ] = 0,
     scratch: Annotated[
-        bool, typer.Option("--scratch", help="Also train from scratch on the feedback itself.")
+        bool,
+        typer.Option("--scratch", help="Also train from scratch, and boosting, on the feedback."),
     ] = False,
     seed: Annotated[
         int, typer.Option(help="First of the seeds of fresh simulations.")
@@ -120,6 +128,9 @@ def adaptation(
                 for one, episodes in zip(sets, fresh, strict=True)
             ]
             study.add(mode, pool_estimates(prior, judged, baselines=baselines, progress=stages))
+            if mode == MODES[0] and scratch:
+                nominal = load_episodes(episodes_folder(learned.path))
+                study.add("boosting", boosting_estimates(nominal, judged, stages))
             if mode == "paper" and oracle:
                 found = losses(prior, sets[0], learned_from["oracle"], judged[0].test)
                 study.add("losses", found)
@@ -276,6 +287,49 @@ def pool_estimates(
                 share = float(np.mean(before - brier[who]) / gap) if gap > 0.0 else math.nan
                 estimates[f"{form}.{who}.gap_closed"] = Estimate.exact(share, num_test)
     return estimates
+
+
+def boosting_estimates(
+    nominal: Episodes,
+    pools: Sequence[Pool],
+    progress: StageProgress,
+    sizes: Sequence[int] = _BOOSTED_SIZES,
+) -> dict[str, Estimate]:
+    """Gradient boosting before feedback, on the feedback alone, and on it and the training.
+
+    Returns:
+        By "WHO.METRIC", where WHO is "prior", "alone N" or "refitted N", the mean over pools, with
+        minimum and maximum as interval.
+    """
+    sizes = [size for size in sizes if size <= min(len(pool.feedback) for pool in pools)]
+    prior = DirectClassifier("gradient_boosting").fit(nominal)
+    found: dict[str, list[dict[str, float]]] = {}
+    for i, pool in enumerate(pools):
+        progress("gradient boosting on feedback", i, len(pools))
+        judged = {"prior": prior}
+        for size in sizes:
+            actual = [pair.actual for pair in pool.feedback[:size]]
+            for who, before in {"alone": [], "refitted": list(nominal)}.items():
+                together = Episodes(nominal.info, _renumbered([*before, *actual]))
+                judged[f"{who} {size}"] = DirectClassifier("gradient_boosting").fit(together)
+        segments = pool.test.segments
+        for who, one in judged.items():
+            rows = segments.state, segments.desired_preview, segments.features
+            unsafe = one.predict_unsafe(*rows)
+            found.setdefault(who, []).append(_metrics(unsafe, segments.is_unsafe))
+    num_test = sum(len(pool.test.episodes) for pool in pools)
+    return {
+        f"{who}.{metric}": Estimate(
+            float(np.mean(values)), float(min(values)), float(max(values)), num_test
+        )
+        for who, of_pools in found.items()
+        for metric in of_pools[0]
+        if (values := [one[metric] for one in of_pools])
+    }
+
+
+def _renumbered(episodes: Sequence[Episode]) -> list[Episode]:
+    return [replace(episode, index=i) for i, episode in enumerate(episodes)]
 
 
 def train_baselines(

@@ -11,6 +11,7 @@ from studies.adaptation import (
     STEPS,
     Pool,
     TestSet,
+    boosting_estimates,
     losses,
     pool_estimates,
     scores,
@@ -83,6 +84,18 @@ def test_pools_differ_and_the_oracle_bounds_the_gap(assessment, judged):
     assert found["gap"].value == pytest.approx(differing / 70)
     with pytest.raises(ValueError, match="only 30 pairs of episodes"):
         pool_estimates(assessment, pools, sizes=(41,))
+
+
+def test_boosting_learns_from_the_feedback_too(judged):
+    nominal, pairs = make_episodes(60, seed=12, noise=0.002), worse()
+    pools = [Pool(feedback=pairs, test=judged), Pool(feedback=pairs[::-1], test=judged)]
+    found = boosting_estimates(nominal, pools, lambda *report: None, sizes=(30, 80))
+    assert {key.partition(".")[0] for key in found} == {"prior", "alone 30", "refitted 30"}
+    prior, alone, refitted = (found[f"{who}.auc"] for who in ("prior", "alone 30", "refitted 30"))
+    # Without feedback both pools are judged alike; a third of the feedback contradicts the test.
+    assert prior.low == prior.high > 0.7
+    assert alone.low < alone.high < prior.low
+    assert alone.value < refitted.value < prior.value
 
 
 def test_what_is_lost_is_told_step_by_step(assessment, judged):
