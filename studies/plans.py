@@ -12,7 +12,7 @@ from drake_safety.evaluation.episode_study import first_segments, promised_miss_
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, proportion, segment_estimates
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.calibration import score_threshold
+from drake_safety.learning.calibration import PLAN, least_miss_rate, score_threshold
 from drake_safety.learning.causes import likely_causes
 from drake_safety.learning.segments import DIVERGED, Episodes, Segments
 from drake_safety.simulation.capabilities import HasGoals, is_fair, require
@@ -80,7 +80,8 @@ def evaluate_plans(
 ) -> tuple[dict[str, Estimate], dict[str, float]]:
     """Evaluates rules on fresh plans, on all goals and on the fair ones.
 
-    Missing thresholds are chosen on the calibration plans as `drake-safety evaluate` does.
+    Missing thresholds are chosen on the calibration plans, with the promise of a calibrated
+    assessment if they can keep it.
 
     Args:
         rules: The rules by name; "sharpened" is that of the assessment.
@@ -94,7 +95,11 @@ def evaluate_plans(
         The estimates by dotted key, and all thresholds.
     """
     label = calibration.first.is_unsafe
-    miss_rate = promised_miss_rate(label)
+    stored = assessment.calibrations_.get(PLAN)
+    if stored is None:
+        miss_rate = promised_miss_rate(label)
+    else:
+        miss_rate = max(stored.miss_rate, least_miss_rate(int(label.sum())))
     limits = {
         name: thresholds[name]
         if name in thresholds

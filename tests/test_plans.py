@@ -1,3 +1,4 @@
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -6,8 +7,9 @@ import pytest
 from drake_safety import SafetyAssessment, run_episodes
 from drake_safety.evaluation.episode_study import promised_miss_rate
 from drake_safety.evaluation.scorers import Scorer
-from drake_safety.learning.calibration import score_threshold
+from drake_safety.learning.calibration import PLAN, score_threshold
 from drake_safety.learning.segments import DIVERGED, Episodes
+from lip_assessments import calibration as promise
 from shuttle_task import FAIR_X_M, shuttling
 from studies.plans import (
     evaluate_plans,
@@ -75,6 +77,15 @@ def test_a_plan_is_what_is_known_at_its_first_instant_and_where_it_leads(fresh, 
     broken = replace(fresh[0], is_safe=False, cause=DIVERGED)
     some = plans_of(shuttling().make_loop(), Episodes(fresh.info, [broken, *fresh[1:10]]))
     assert (len(some.first), len(some.episodes)) == (9, 10)
+
+
+@pytest.mark.train
+def test_rules_make_the_promise_of_a_calibrated_assessment(assessment, calibration, plans):
+    calibrated, label = copy.copy(assessment), calibration.first.is_unsafe
+    calibrated.calibrations_ = {PLAN: promise(miss_rate=0.2)}
+    _, limits = evaluate_plans(RULES, {}, calibrated, calibration, {"plans": plans})
+    for name, rule in RULES.items():
+        assert limits[name] == score_threshold(rule(calibration), label, 0.2)
 
 
 @pytest.mark.train
