@@ -30,14 +30,19 @@ def add_plant(builder):  # Returns the port of its state, and what connects a co
     return physics.state, lambda port: physics.connect_servos(builder, ROBOT.joint_names, port)
 
 
-def compose(add_plant=add_plant, planner=None, controller=None):
+def compose(add_plant=add_plant, planner=None, controller=None, gamma=GAMMA, **trigger):
+    def connect(one, names, other, prefix=""):
+        for name in names:
+            if other.HasInputPort(prefix + name):  # A part of your own reads what it needs.
+                builder.Connect(one.GetOutputPort(name), other.GetInputPort(prefix + name))
+
     builder = DiagramBuilder()
     add, plan = builder.AddNamedSystem, interpolate(BASE, BASE + [0.02, 0.0, -0.03], duration_s=1.0)
     state, connect_servos = add_plant(builder)
     observer = add("observer", StateObserver(ROBOT))
     planner = add("planner", planner or TrajectoryPlanner(plan=plan, **SAMPLES, **TIMES))
     times = {"period_s": 0.01, "offset_s": TICK_S, "threshold": RECOVERY.threshold}
-    switch = add("switch", RecoverySwitch(ROBOT, RECOVERY.step, **times, **SAMPLES))
+    switch = add("switch", RecoverySwitch(ROBOT, RECOVERY.step, **(times | trigger), **SAMPLES))
     times = {"period_s": 0.01, "offset_s": 3 * TICK_S}
     controller = add("controller", controller or InverseKinematicsController(ROBOT, **times))
     options = {"gravity": [0.0, 0.0, -9.81], "servo_loads": True}
@@ -45,13 +50,7 @@ def compose(add_plant=add_plant, planner=None, controller=None):
     seen = {name: inputs.GetOutputPort(name) for name in ("state", "features", "margins")}
     seen["desired_preview"] = switch.GetOutputPort("desired_preview")
     times = {"period_s": 0.02, "hold": switch.GetOutputPort("recovery_active")}
-    assessor = AddSafetyAssessor(builder, GAMMA, **seen, **times, on_alarm="report")
-
-    def connect(one, names, other, prefix=""):
-        for name in names:
-            if other.HasInputPort(prefix + name):  # A part of your own reads what it needs.
-                builder.Connect(one.GetOutputPort(name), other.GetInputPort(prefix + name))
-
+    assessor = AddSafetyAssessor(builder, gamma, **seen, **times, on_alarm="report")
     builder.Connect(state, observer.GetInputPort("plant_state"))
     measured = observer.GetOutputPort("measured_plant_state")
     for system in (switch, controller, inputs):
@@ -63,18 +62,19 @@ def compose(add_plant=add_plant, planner=None, controller=None):
     connect(switch, ["desired_outlook"], inputs)
     connect(controller, ["desired_joint_state"], inputs)
     connect(assessor, ["safety_probability", "belief"], switch)
-    builder.ExportOutput(assessor.GetOutputPort("safety_probability"), "safety_probability")
-    builder.ExportOutput(inputs.GetOutputPort("margins"), "margins")
+    one, other = assessor.GetOutputPort("safety_probability"), observer.GetOutputPort("output")
+    for name, port in {"safety_probability": one, "output": other, **seen}.items():
+        builder.ExportOutput(port, name)
     return builder.Build()
 
 
 if __name__ == "__main__":
     diagram = compose()
     simulator, plant = Simulator(diagram), diagram.GetSubsystemByName("plant")
-    context = simulator.get_mutable_context()
-    push = np.eye(ROBOT.num_velocities)[4]  # The base begins at 1 m/s to the left.
-    plant.SetVelocities(plant.GetMyMutableContextFromRoot(context), push)
+    own = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    plant.SetVelocities(own, np.eye(18)[4])  # The base begins at 1 m/s to the left.
     for time_s in np.arange(0.0, 3.1, 0.25):
         simulator.AdvanceTo(time_s)
-        gamma, margins = (port.Eval(context) for port in map(diagram.get_output_port, (0, 1)))
-        print(f"{time_s:.2f} s  Γ {gamma[0]:.2f}  nearest limit {100 * margins.min():+.1f} cm")
+        (gamma,) = diagram.GetOutputPort("safety_probability").Eval(simulator.get_context())
+        margin = diagram.GetOutputPort("margins").Eval(simulator.get_context()).min()
+        print(f"{time_s:.2f} s  Γ {gamma:.2f}  nearest limit {100 * margin:+.1f} cm")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
@@ -67,7 +68,7 @@ def test_the_picture_of_the_guide_shows_every_connection():
     assert {word for *pair, _ in ends for end in pair for word in end.split(".")} <= words
 
 
-@pytest.mark.parametrize("number", range(3), ids=[name for name, _ in PARTS])
+@pytest.mark.parametrize("number", range(3), ids=[name for name, _ in PARTS[:3]])
 def test_a_part_of_ones_own_takes_the_place_of_ours(number):
     names = {}
     for _, lines in PARTS[: number + 1]:
@@ -80,6 +81,36 @@ def test_a_part_of_ones_own_takes_the_place_of_ours(number):
         gamma, margins = (port.Eval(simulator.get_context()) for port in values)
         assert gamma[0] > 0.8
         assert margins.min() > 0.05
+
+
+def test_episodes_of_a_diagram_of_ones_own_begin_with_what_its_assessor_sees():
+    names = {}
+    for _, lines in PARTS:
+        exec(lines, names)
+    episode = next(iter(names["episodes"]))
+    diagram = names["make_diagram"]()
+    simulator = Simulator(diagram)
+    names["reset"](diagram, context := simulator.get_mutable_context(), np.random.default_rng(0))
+    v = diagram.GetSubsystemByName("plant")
+    v.SetVelocities(v.GetMyMutableContextFromRoot(context), np.pad(episode.state[0, 9:11], (3, 13)))
+    simulator.AdvanceTo(0.001)  # Assessed at 0 s, and not yet again.
+    rows = (getattr(episode, one)[0] for one in ("state", "desired_preview", "features"))
+    assessed = diagram.GetOutputPort("safety_probability").Eval(context)
+    assert assessed == pytest.approx([compose.GAMMA.predict_one(*rows).probability])
+
+
+def test_a_plant_that_shows_its_next_state_is_warned_of(caplog):
+    def add_plant(builder):
+        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.001)
+        plant.set_name("other_plant")
+        plant.Finalize()
+        scene_graph.set_name("other_scene_graph")
+        return compose.add_plant(builder)
+
+    compose.compose()
+    assert not caplog.records
+    compose.compose(add_plant)
+    assert "use_sampled_output_ports=False" in caplog.text
 
 
 def test_the_assessors_inputs_are_what_the_assessment_reads_and_what_they_lack_is_named():

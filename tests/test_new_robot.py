@@ -4,8 +4,10 @@ import re
 import shutil
 import xml.etree.ElementTree as ElementTree
 
+import numpy as np
 import pytest
 import yaml
+from pydrake.systems.analysis import Simulator
 
 from command_line import invoked
 from drake_safety.robots.robot_template import write_robot
@@ -78,6 +80,27 @@ def test_a_reaching_robot_gets_its_arms_and_a_box_of_targets(tmp_path):
     assert hands == {"left_palm", "right_palm"}
     assert robot["mirror"]["left_elbow"] == "right_elbow"
     assert problems(written.folder / "reaching.yaml") == {}
+
+
+@pytest.mark.parametrize(("wrist", "hands"), [("continuous", None), ("fixed", ["left_palm"])])
+def test_a_balancing_robot_has_a_plant_whose_arms_turn_while_it_stands(tmp_path, wrist, hands):
+    write_porter(tmp_path)
+    model = tmp_path / "porter.urdf"
+    model.write_text(model.read_text().replace('type="continuous"', f'type="{wrist}"'))
+    written = write_robot("carrier", model, "balancing", tmp_path / "carrier", hands=hands)
+    assert any("arms turn while it balances" in line for line in written.decided)
+    scenario = load_scenario(written.folder / "balancing.yaml")
+    turned = {}
+    for variation in ("actual", "arms"):
+        loop = scenario.make_loop(variation, ball=False)
+        simulator = Simulator(loop)
+        loop.reset_calm(simulator.get_mutable_context(), np.random.default_rng(0))
+        simulator.AdvanceTo(1.0)
+        q = loop.GetOutputPort("state").Eval(simulator.get_context())
+        turned[variation] = dict(zip(loop.state_names, q, strict=True))
+    for arm in written.arms:
+        (name,) = (one for one in loop.state_names if one == arm.joints[0])
+        assert turned["arms"][name] - turned["actual"][name] == pytest.approx(0.5, abs=0.1)
 
 
 WEAK = {".*": {"stiffness": 0.05, "damping": 0.05}}

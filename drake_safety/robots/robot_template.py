@@ -138,6 +138,7 @@ class NewRobot:
             reach_m=reach,
             shoulder_m=shoulder.tolist(),
             base=survey.base,
+            arm_joints=[arm.joints[0] for arm in self.arms],
             joint_friction_nm=float(np.median(friction)) if friction else None,
         )
 

@@ -17,6 +17,7 @@ class Sizes(RobotSize):
         lateral_m: Smallest distance of a foot from the midline.
         reach_m: Length of an arm; 0 without arms.
         shoulder_m: First joint of that arm, relative to the feet's centroid on the ground, (3,).
+        arm_joints: First joint of every arm.
         joint_friction_nm: Median dry friction of the joints; None if the URDF has none.
     """
 
@@ -24,6 +25,7 @@ class Sizes(RobotSize):
     reach_m: float
     shoulder_m: list[float]
     base: str
+    arm_joints: list[str]
     joint_friction_nm: float | None = None
 
 
@@ -65,10 +67,16 @@ def _balancing(sizes: Sizes) -> str:
         f"mass_kg: {mass * scale['mass']:.3g}, speed_m_s: {speed * scale['speed_y']:.3g}"
         for mass, speed in ((2.0, 3.5), (3.0, 9.0))
     )
+    arms = ""
+    if sizes.arm_joints:
+        joints = ", ".join(map(yaml_text, sizes.arm_joints))
+        arms = f"""  arms:  # DECIDED a plant for --variation, whose arms turn while it balances
+    shift: {{command_faults: [{{kind: drift, entries: [{joints}], value: 0.5}}]}}  # [rad/s]
+"""
     return f"""# Balancing: {sizes.mass_kg:.1f} kg, a base {sizes.height_m:.3f} m high.
 task: drake_safety.diagrams.balancing:Balancing
 robot: robot.yaml
-{_variations(sizes, 0.8, 0.004, 0.016)}parameters:
+{_variations(sizes, 0.8, 0.004, 0.016)}{arms}parameters:
   # Safe heights, starts, plans, balls and steps are the task's defaults, scaled to the robot; what
   # is stated here replaces them, such as safe_set: {{height_m: [lowest, highest]}}.
   scale_to_robot: true

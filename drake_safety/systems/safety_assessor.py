@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Literal, get_args
 
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_safety.learning.assessment import SafetyAssessment
@@ -13,6 +15,7 @@ from drake_safety.systems.change_monitor import ChangeMonitor
 OnAlarm = Literal["unknown", "report"]
 """What an alarm does: every belief is unknown, or only the port ``alarm`` says so."""
 ON_ALARM = get_args(OnAlarm)
+_LOGGER = logging.getLogger("drake_safety")
 
 
 class SafetyAssessor(Diagram):
@@ -121,6 +124,8 @@ def AddSafetyAssessor(
 ) -> SafetyAssessor:
     """Adds a :class:`SafetyAssessor` named ``safety_assessor`` to a diagram, and connects it.
 
+    It warns of plants whose ports show the next state to what updates at the same time.
+
     Args:
         state: Port of the state, as in the training episodes.
         desired_preview: Port of the desired preview, as in the training episodes.
@@ -158,6 +163,14 @@ def AddSafetyAssessor(
             raise ValueError(
                 f"AddSafetyAssessor: port '{port.get_name()}' for {name} has size {port.size()}; "
                 f"the assessment was fitted with {size}{_lacking(name, port, assessment)}"
+            )
+    for one in builder.GetSystems():
+        if isinstance(one, MultibodyPlant) and one.has_sampled_output_ports():
+            _LOGGER.warning(
+                "AddSafetyAssessor: plant '%s' steps before what updates at the same time, so that "
+                "Γ sees a later state than in its episodes; make it by AddMultibodyPlant with "
+                "MultibodyPlantConfig(use_sampled_output_ports=False)",
+                one.get_name(),
             )
     builder.AddNamedSystem("safety_assessor", assessor)
     for name, port in ports.items():
