@@ -9,11 +9,11 @@ import typer
 from drake_safety.cli import run_app
 from studies.ablation import ablate
 from studies.adaptation import adaptation
-from studies.animation import animation
 from studies.anomalies import anomalies
 from studies.bench import bench
 from studies.converged import converged
 from studies.evaluate import evaluate
+from studies.figures import figures
 from studies.gate import gate
 from studies.monitor import monitor
 from studies.planning import plan_study
@@ -35,7 +35,7 @@ _COMMANDS: tuple[Callable[..., None], ...] = (
     *(evaluate, promises, gate),
     *(ablate, plan_study, monitor, anomalies, adaptation, readings, converged, scale),
     *(truth, walking),
-    *(animation, bench, store, readme, ship),
+    *(figures, bench, store, readme, ship),
 )
 for _command in _COMMANDS:
     app.command()(_command)

@@ -18,11 +18,20 @@ def test_the_path_is_that_of_the_points_and_events_are_marked_where_they_happen(
     time_s = one.time_s
     middle = len(time_s) // 2
     events = {"ball": float(time_s[middle]), "start": 0.0}
-    fig = path_figure(assessment, time_s, found.embedding, found.probability, 0.6, events)
+    is_known = np.arange(len(time_s)) != 1
+    curve = time_s, found.embedding, is_known, found.probability
+    fig = path_figure(assessment, *curve, 0.6, events)
     plane, history = fig.axes[:2]
-    np.testing.assert_array_equal(plane.lines[1].get_xydata(), found.embedding)
+    np.testing.assert_array_equal(plane.lines[0].get_xydata(), found.embedding[is_known])
     np.testing.assert_array_equal(history.lines[0].get_ydata(), found.probability)
-    marks = {text.get_text(): text.xy for text in plane.texts}
+    marks = {text.get_text(): text.xy for text in plane.texts if text.get_text()}
     assert marks["1"] == pytest.approx(found.embedding[0])
     assert marks["2"] == pytest.approx(found.embedding[middle])
+    # An arrow from each point to the next one known, if it is in another place.
+    arrows = [(text.xyann, text.xy) for text in plane.texts if not text.get_text()]
+    points, cell = found.embedding[is_known], assessment.grid_.cell_length
+    far = np.linalg.norm(np.diff(points, axis=0), axis=1) > cell
+    np.testing.assert_array_equal(
+        np.reshape(arrows, (-1, 4)), np.hstack([points[:-1], points[1:]])[far]
+    )
     assert history.get_xlabel() == "time [s]\n1 start, 2 ball"

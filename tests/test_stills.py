@@ -91,6 +91,19 @@ def test_stills_are_spread_evenly_and_give_way_to_events():
     assert still_times(time_s) == [0.0, 4.0]
 
 
+def test_points_of_the_world_are_found_in_the_still(loop, camera, standing):
+    ball = standing.copy()
+    start = loop.plant.GetBodyByName("ball").floating_positions_start()
+    ball[start + 4 : start + 7] = [0.1, -0.5, 0.4]
+    red, green, blue = np.moveaxis(camera.render(ball).astype(int), -1, 0)
+    rows, columns = np.nonzero((red > 150) & (red > 1.5 * green) & (green > 1.5 * blue))
+    (place,) = camera.project(ball[None, start + 4 : start + 7])
+    np.testing.assert_allclose(place, [columns.mean(), rows.mean()], atol=2.0)
+    base = camera.position(loop.robot.base)
+    np.testing.assert_allclose(base[:2], [0.0, 0.0], atol=0.1)
+    assert base[2] == pytest.approx(loop.kinematics.standing_height, abs=0.1)
+
+
 def test_a_view_with_more_room_shows_the_robot_smaller(loop, camera, standing, monkeypatch):
     monkeypatch.setattr(loop, "view", View(room=2 * loop.view.room))
     far = StillCamera(loop, standing, **SIZE)

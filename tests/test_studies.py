@@ -6,6 +6,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,15 +20,18 @@ from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import training_segments
+from drake_safety.plants.pushes import Push
 from drake_safety.simulation.dataset import load_episodes
+from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import shuttling, train_shuttle
 from studies.__main__ import app
-from studies.animation import save_animation
 from studies.anomalies import anomalies
 from studies.documents import render
+from studies.figures import PICTURES
 from studies.injections import SENSORS, changed_episode
+from studies.moving_pictures import Take, first_saved, save_moving_picture
 from studies.publish import DOCUMENTS
 from studies.scale import counts_for
 
@@ -244,35 +248,75 @@ def test_walking_is_judged_on_tours_pushes_commands_and_engines(monkeypatch, tmp
     assert (tmp_path / "walking_alarms.png").is_file()
 
 
-def frames_of(path):
+@pytest.fixture(scope="module")
+def standing_twice():
+    """Two runs of half a second in which a robot rises, and the second one's probability falls."""
+    loop = load_scenario("laikago_balancing").make_loop(ball=False)
+    state = np.tile(loop.standing_start().q, (26, 1))
+    state[:, 6] += np.linspace(0.0, 0.1, 26)
+    gamma = np.linspace(1.0, 0.0, 26)[:, None]
+    ports = {"plant_state": state, "safety_probability": gamma, "belief": np.eye(3)[[0] * 26]}
+    return loop, Motion(time_s=0.02 * np.arange(26), ports=ports)
+
+
+def test_a_moving_picture_stops_where_something_happens(standing_twice, tmp_path):
+    loop, motion = standing_twice
+    push = Push(body=loop.robot.base, force_n=[0.0, 100.0, 0.0], time_s=0.2, duration_s=0.1)
+    takes = [Take("without", motion, []), Take("with", motion, [(0.4, "steps")])]
+    path = save_moving_picture(loop, takes, (0.2, "pushed"), tmp_path / "run.gif", push)
+    frames, durations = [], []
     with Image.open(path) as gif:
-        assert gif.n_frames == 6
-        assert gif.info["duration"] == 100
         for i in range(gif.n_frames):
             gif.seek(i)
-            yield np.asarray(gif.convert("RGB"), dtype=float)
+            frames.append(np.asarray(gif.convert("RGB"), dtype=float))
+            durations.append(gif.info["duration"])
+    assert durations.count(1000) == 2
+    stop = durations.index(1000)
+    assert durations[:stop] == [100] * stop
+    # Robots and curve move in every frame until the end of the log.
+    half = frames[0].shape[1] // 2
+    for before, after in itertools.pairwise(frames[: stop + 2]):
+        changed = np.abs(before - after).max(axis=-1)
+        assert changed[:300, :half].max() > 50.0
+        assert changed[:300, half:].max() > 50.0
+        assert changed[-150:].max() > 50.0
+    # The arrow is there while it is pushed.
+    orange = [np.abs(one - [232, 115, 12]).max(axis=-1) < 60 for one in frames]
+    assert orange[stop].sum() > 100 > orange[0].sum()
 
 
-@pytest.mark.slow
-def test_a_run_becomes_a_gif(monkeypatch, tmp_path):
-    path = tmp_path / "run.gif"
-    options = ("--push", "ball", "--duration", 0.5, "--out", path)
-    assert study(monkeypatch, "animation", "laikago_balancing", *options) == 0
-    first, *_, last = frames_of(path)
-    assert np.abs(first - last).max() > 50.0
+def test_the_first_disturbance_after_which_only_recovery_helps_is_shown(standing_twice):
+    loop, motion = standing_twice
+    scenario, active = loop.scenario, np.zeros((26, 1))
+    active[10:20] = 1.0
+    ports = motion.ports | {"recovery_active": active}
+
+    guarded = SimpleNamespace(scenario=scenario, assessment=SimpleNamespace())
+    guarded.assessment.parameters = SimpleNamespace(initial_uncertainty=0.3)
+
+    def run(one, strength, logged):
+        falls = strength > (2 if one is guarded else 1)
+        return replace(motion, ports=ports, fall_time_s=0.3 if falls else math.inf)
+
+    strength, takes = first_saved([None, guarded], [3, 1, 2], run, "steps")
+    assert strength == 2
+    assert [one.motion.has_fallen for one in takes] == [True, False]
+    words = [told for _, told in takes[1].captions]
+    threshold = scenario.parameters.recovery.threshold
+    assert words == [f"probability below {threshold:g}: recovery", "steps", "stands"]
+    with pytest.raises(ValueError, match="no disturbance of 'laikago_balancing'"):
+        first_saved([None, guarded], [3, 1], run, "steps")
 
 
-def test_a_gif_shows_every_instant_in_real_time(tmp_path):
-    loop = load_scenario("laikago_balancing").make_loop(ball=False)
-    positions = np.tile(loop.kinematics.standing_positions(), (6, 1))
-    positions[:, 6] += np.linspace(0.0, 0.1, 6)  # It rises.
-    gamma, path = np.linspace(1.0, 0.0, 6), tmp_path / "run.gif"
-    save_animation(loop, 0.1 * np.arange(6), positions, gamma, 0.5, path, [0.3])
-    # The robot moves, and so does the curve of the probability below it.
-    for before, after in itertools.pairwise(frames_of(path)):
-        robot = slice(0, round(0.75 * len(before)))
-        assert np.abs(before - after)[robot].max() > 50.0
-        assert np.abs(before - after)[robot.stop :].max() > 50.0
+def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypatch, tmp_path):
+    monkeypatch.chdir(ROOT)
+    assert study(monkeypatch, "figures", "adaptation_study", "--out", tmp_path) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["adaptation_study.png"]
+    assert study(monkeypatch, "figures", "nothing", "--out", tmp_path) == 1
+    there = {path.stem for path in (ROOT / "docs/pictures").iterdir()}
+    assert there == {*PICTURES, "compose"}
+    text = "".join(path.read_text() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+    assert set(re.findall(r"pictures/(\w+)\.", text)) == there
 
 
 def test_studies_are_stored_with_the_evaluation_of_their_run(monkeypatch, tmp_path):
@@ -301,6 +345,6 @@ def test_documents_are_written_again_as_they_are(monkeypatch, tmp_path):
 def test_every_study_is_tried_and_says_in_a_sentence_what_it_does():
     commands = typer.main.get_command(app).commands
     assert all(command.help for command in commands.values())
-    others = {"truth", "anomalies", "walking", "animation", "store", "readme"}
+    others = {"truth", "anomalies", "walking", "figures", "store", "readme"}
     elsewhere = {"bench", "ship", "gate"}  # In test_bench, test_shipped_assessments, test_gate.
     assert {line.split(" ")[0] for line in STUDIES} | others | elsewhere == set(commands)

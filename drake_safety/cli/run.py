@@ -293,7 +293,7 @@ def motion_threshold(gamma: SafetyAssessment, rule: folders.GoalThreshold) -> tu
 
 def _timeline(loop: Any, shown: _Shown) -> Figure:
     """The probability along a motion, with stills of a robot."""
-    motion, options = shown.motion, {"trigger_label": "probability falls"} | shown.timeline
+    motion, options = shown.motion, {"trigger_label": "alarm"} | shown.timeline
     if shown.instants is not None and isinstance(loop, LeggedLoop):
         states = {loop.robot.name: motion["plant_state"]}
         if "ball_state" in motion.ports:
@@ -337,7 +337,8 @@ def _save(folder: Path, viewer: Meshcat, loop: Any, shown: _Shown) -> None:
     """Writes recording, figures and events, and prints the events and the paths."""
     motion, figures = shown.motion, {"timeline": _timeline(loop, shown)}
     if shown.marked is not None:
-        curve = (motion.time_s, motion["embedding"], motion["safety_probability"][:, 0])
+        unknown = is_unknown(motion["belief"], loop.assessment.parameters.initial_uncertainty)
+        curve = motion.time_s, motion["embedding"], ~unknown, motion["safety_probability"][:, 0]
         figures["path"] = path_figure(loop.assessment, *curve, shown.threshold, shown.marked)
     viewer.StopRecording()
     viewer.PublishRecording()

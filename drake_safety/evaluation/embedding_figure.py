@@ -20,18 +20,22 @@ from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import Episodes, split
 
 _MAX_POINTS = 12000
+_LEAST_CAUSE = 0.05
 
 
 def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure:
     """Plots the map: segments in the embedding, beliefs of the cells, and causes.
 
-    It shows the first map of an ensemble. The episodes should not be those of the training.
+    It shows the first map of an ensemble, and causes if two of them have 5 % of what is unsafe. The
+    episodes should not be those of the training.
     """
     cells, grid = assessment.beliefs_[0], assessment.grid_
     count = assessment.training_.counts(grid)[0]
+    unsafe = (count[:, None] * cells[:, 3:]).sum(axis=0)  # By cause; see `learning.beliefs`.
+    has_causes = (unsafe >= _LEAST_CAUSE * unsafe.sum()).sum() > 1
     with style.drawing_style():
-        fig = style.new_figure(14.0, 4.6)
-        left, middle, last = fig.subplots(1, 3)
+        fig = style.new_figure(14.0 if has_causes else 9.4, 4.6)
+        left, middle, *others = fig.subplots(1, 2 + has_causes)
         _draw_segments(fig, left, assessment, episodes)
         most = max(1.0 - assessment.parameters.initial_uncertainty, cells[:, SAFE].max())
         is_empty = cells[:, UNCERTAINTY] >= 1.0
@@ -45,7 +49,8 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
             middle.text(*grid.centres[i], _short(count[i]), color=ink[i], **place)
         middle.set_title("Belief of each cell: safe")
         middle.set_xlabel("numbers: training segments; hatched: don't know")
-        _draw_causes(last, grid, cells, assessment.info_.constraint_names)
+        for last in others:
+            _draw_causes(last, grid, cells, assessment.info_.constraint_names)
     return fig
 
 
@@ -93,7 +98,7 @@ def _draw_causes(axes: Axes, grid: Grid, cells: np.ndarray, names: Sequence[str]
     # The first colour of the series is that of safe.
     series = [*map(to_rgb, style.SERIES_COLOURS)]
     palette = np.array([series[(1 + i) % len(series)] for i in range(len(names))])
-    cause = cells[:, 3:].argmax(axis=1)  # See `learning.beliefs`.
+    cause = cells[:, 3:].argmax(axis=1)
     is_empty = cells[:, UNCERTAINTY] >= 1.0
     # From white, nothing unsafe, to the colour of the cause, all that is known unsafe.
     depth = (cells[:, UNSAFE] / np.where(is_empty, 1.0, 1.0 - cells[:, UNCERTAINTY]))[:, None]

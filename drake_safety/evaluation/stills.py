@@ -11,15 +11,19 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 from pydrake.geometry import (
+    Box,
     ClippingRange,
     ColorRenderCamera,
+    GeometryInstance,
     LightParameter,
     MakeRenderEngineVtk,
     Mesh,
+    PerceptionProperties,
     RenderCameraCore,
     RenderEngineVtkParams,
     Rgba,
     Role,
+    SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import ModelInstanceIndex
@@ -32,6 +36,7 @@ _BACKGROUND = [0.80, 0.84, 0.88]
 _FIELD_OF_VIEW_RAD = math.radians(34.0)
 _SUPERSAMPLING = 2
 _PBR_BRIGHTNESS = 2.2  # With a glTF mesh all shading is physically based, which is darker.
+_LINE_M, _TILE_M, _NUM_LINES = 0.012, 0.5, 25  # Of the lines on the ground.
 _LEAST_GAP_S = 0.3  # Between a still at an event and others.
 
 
@@ -78,6 +83,7 @@ class StillCamera:
             ),
         )
         self._world = scene_graph.world_frame_id()
+        self._draw_lines(scene_graph)
 
     def render(self, positions: np.ndarray) -> np.ndarray:
         """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8."""
@@ -85,13 +91,39 @@ class StillCamera:
         base = self._base.EvalPoseInWorld(self._plant_context).translation()
         target = np.append(base[:2] + self._offset, self._look_at_height)
         query = self._plant.get_geometry_query_input_port().Eval(self._plant_context)
-        image = query.RenderColorImage(
-            self._camera, self._world, _look_at(target + self._eye, target)
-        )
+        self._X_WC = _look_at(target + self._eye, target)
+        image = query.RenderColorImage(self._camera, self._world, self._X_WC)
         pixels = np.asarray(image.data[..., :3], dtype=np.uint16)
         rows, columns = pixels.shape[0] // _SUPERSAMPLING, pixels.shape[1] // _SUPERSAMPLING
         blocks = pixels.reshape(rows, _SUPERSAMPLING, columns, _SUPERSAMPLING, 3)
         return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+    def position(self, body: str) -> np.ndarray:
+        """Centre of mass of a body of the robot in the last still, in the world, (3,) [m]."""
+        found = self._plant.GetBodyByName(body, self._instance)
+        p_BoBcm_B = found.CalcCenterOfMassInBodyFrame(self._plant_context)
+        return found.EvalPoseInWorld(self._plant_context) @ p_BoBcm_B
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Column and row of points (N, 3) of the world [m] in the last still, (N, 2)."""
+        intrinsics = self._camera.core().intrinsics().intrinsic_matrix() / _SUPERSAMPLING
+        seen = intrinsics @ self._X_WC.inverse().multiply(np.asarray(points, dtype=float).T)
+        return (seen[:2] / seen[2]).T
+
+    def _draw_lines(self, scene_graph: SceneGraph) -> None:
+        """Adds lines to the ground, by which motions of the robot are seen."""
+        context = scene_graph.GetMyMutableContextFromRoot(self.context)
+        properties = PerceptionProperties()
+        properties.AddProperty("phong", "diffuse", Rgba(0.55, 0.58, 0.62, 1.0))
+        for number in range(2 * _NUM_LINES):
+            at, axis = (number // 2 - _NUM_LINES // 2) * _TILE_M, number % 2
+            sides = np.array([_LINE_M, _LINE_M, 0.002])
+            sides[axis] = _NUM_LINES * _TILE_M
+            pose = RigidTransform([0.0, at, 0.0] if axis == 0 else [at, 0.0, 0.0])
+            line = GeometryInstance(pose, Box(*sides), f"line {number} of the ground")
+            line.set_perception_properties(properties)
+            source = self._plant.get_source_id()
+            scene_graph.RegisterGeometry(context, source, self._world, line)
 
     def _pose(self, positions: np.ndarray) -> None:
         if not np.isfinite(positions).all():

@@ -1,0 +1,235 @@
+"""The moving pictures of README and docs: one disturbance without and with recovery, and Γ."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from PIL import Image
+
+from drake_safety.assessments import shipped_folder
+from drake_safety.cli.training_folder import MODES, load_assessment
+from drake_safety.evaluation import figure_style as style
+from drake_safety.evaluation.stills import StillCamera, stack_positions
+from drake_safety.learning.prediction import is_unknown
+from drake_safety.learning.seeds import DEMONSTRATION
+from drake_safety.plants.balls import Throw
+from drake_safety.plants.pushes import Push
+from drake_safety.simulation.legged_loop import LeggedLoop
+from drake_safety.simulation.motion import Motion
+from drake_safety.simulation.rollouts import run_to_goal
+from drake_safety.simulation.scenario import load_scenario
+from drake_safety.simulation.throws import run_throw
+
+_WIDTH, _PICTURE, _CAPTION, _CURVE = 8.8, 3.7, 0.45, 1.5  # [inches]
+_DOTS_PER_INCH = 100
+_STEP_S, _FRAME_MS, _EVENT_MS, _END_MS = 0.04, 100, 1000, 2500  # At 0.4 of real time.
+_BEFORE_S, _AFTER_S = 0.32, 0.6  # Shown before the disturbance and after the last event.
+_ACTS_S = 0.12  # From the trigger until the recovery is seen.
+_NUM_COLOURS, _PALETTE_FRAMES = 127, 8
+_ARROW_M = 0.5
+_PORTS = ("safety_probability", "belief")
+_OPTIONS: dict[str, Any] = {"seed": DEMONSTRATION.first, "duration_s": 3.0, "after_fall_s": 0.8}
+_TURNS = np.radians([90.0, -90.0, 135.0, 45.0, -135.0, -45.0])  # From the camera's direction.
+_COLOURS = (style.INK, style.UNSAFE_COLOUR, style.RECOVERY_COLOUR, style.SAFE_COLOUR)
+
+
+class Take(NamedTuple):
+    """A run, and what is told of it: times [s] in order, and words."""
+
+    title: str
+    motion: Motion
+    captions: Sequence[tuple[float, str]]
+
+
+def recovery(folder: Path) -> Path:
+    """Laikago and the fastest ball of 3 kg that makes it fall without recovery only."""
+    plain, guarded = loops = _loops("laikago_balancing", ball=True)
+    slowest, fastest = plain.scenario.parameters.push.speed_m_s
+    balls = [
+        Throw(time_s=0.5, mass_kg=3.0, speed_m_s=speed, direction_rad=direction)
+        for direction in plain.view.azimuth_rad + _TURNS
+        for speed in np.arange(fastest, slowest, -1.0).tolist()
+    ]
+
+    def run(loop: Any, ball: Throw, ports: Sequence[str]) -> Motion:
+        return run_throw(loop, 0, throws=[ball], ports=(*ports, "ball_state"), **_OPTIONS)
+
+    ball, takes = first_saved(loops, balls, run, "steps until it stands")
+    hit = ball.time_s, f"hit by a ball of 3 kg at {ball.speed_m_s:g} m/s"
+    return save_moving_picture(guarded, takes, hit, folder / "recovery.gif")
+
+
+def walking(folder: Path) -> Path:
+    """A walking Go2 and the strongest push that makes it fall without recovery only."""
+    plain, guarded = loops = _loops("go2_walking")
+    parameters = plain.scenario.parameters
+    random = parameters.random_pushes
+    pushes = [
+        Push(body=random.body or plain.robot.base, force_n=force, duration_s=random.duration_s)
+        for direction in plain.view.azimuth_rad + _TURNS
+        for strength in np.arange(random.force_n[1], random.force_n[0], -100.0)
+        for force in [[strength * np.cos(direction), strength * np.sin(direction), 0.0]]
+    ]
+
+    def run(loop: Any, push: Push, ports: Sequence[str]) -> Motion:
+        command = np.array(parameters.named_commands["forward"])
+        return run_to_goal(loop, command, push=push, ports=ports, **_OPTIONS)
+
+    push, takes = first_saved(loops, pushes, run, "stops")
+    hit = push.time_s, f"pushed with {push.strength_n:.0f} N for {push.duration_s:g} s"
+    return save_moving_picture(guarded, takes, hit, folder / "walking.gif", push)
+
+
+def _loops(name: str, **options: Any) -> list[Any]:
+    """The loop of the actual plant without and with recovery."""
+    scenario, gamma = load_scenario(name), load_assessment(shipped_folder(name), MODES[0])
+    options |= {"assessment": gamma}
+    return [scenario.make_loop("actual", recovery=is_on, **options) for is_on in (False, True)]
+
+
+def first_saved(
+    loops: Sequence[Any],
+    disturbances: Iterable[Any],
+    run: Callable[[Any, Any, Sequence[str]], Motion],
+    acts: str,
+) -> tuple[Any, list[Take]]:
+    """The first disturbance after which a robot falls without recovery only, and both runs.
+
+    Args:
+        loops: Without and with recovery.
+        run: Simulates a loop with a disturbance, and logs further ports.
+        acts: What the robot does after the trigger.
+
+    Raises:
+        ValueError: There is none.
+    """
+    plain, guarded = loops
+    threshold = guarded.scenario.parameters.recovery.threshold
+    for one in disturbances:
+        fallen = run(plain, one, _PORTS)
+        if not fallen.has_fallen:
+            continue
+        saved = run(guarded, one, (*_PORTS, "recovery_active"))
+        is_implausible = saved.ports.get("violations", np.zeros(1)).any()
+        if saved.has_fallen or is_implausible or len(saved.recovery_intervals_s) != 1:
+            continue
+        ((start_s, end_s),) = saved.recovery_intervals_s
+        belief = saved["belief"][np.abs(saved.time_s - start_s).argmin()]
+        is_lost = is_unknown(belief, guarded.assessment.parameters.initial_uncertainty)
+        why = "don't know" if is_lost else f"probability below {threshold:g}"
+        told = [(start_s, f"{why}: recovery"), (start_s + _ACTS_S, acts), (end_s, "stands")]
+        falls = Take("without recovery", fallen, [(fallen.fall_time_s, "falls")])
+        return one, [falls, Take("with recovery, triggered by Γ", saved, told)]
+    raise ValueError(f"no disturbance of '{guarded.scenario.name}' calls for recovery")
+
+
+def save_moving_picture(
+    loop: LeggedLoop,
+    takes: Sequence[Take],
+    hit: tuple[float, str],
+    path: Path,
+    push: Push | None = None,
+) -> Path:
+    """Writes a GIF of runs side by side, with the probability of the last one below.
+
+    Args:
+        loop: A loop with their plant, and the threshold of recovery.
+        takes: The runs; the picture stops for a moment at each caption.
+        hit: Time of the disturbance [s], and its caption in all of them.
+        path: Path of the GIF, which is returned.
+        push: Shown by an arrow while it acts.
+    """
+    takes = [one._replace(captions=[hit, *one.captions]) for one in takes]
+    stops = {round(time_s, 2) for one in takes for time_s, _ in one.captions}
+    begin_s, end_s = hit[0] - _BEFORE_S, max(stops) + _AFTER_S
+    instants = sorted(stops | set(np.arange(begin_s, end_s, _STEP_S).round(2).tolist()))
+    durations = [_EVENT_MS if instant in stops else _FRAME_MS for instant in instants]
+    height, share = _PICTURE + _CAPTION + _CURVE, 1.0 / len(takes)
+    with style.drawing_style():
+        fig = style.new_figure(_WIDTH, height)
+        fig.set_dpi(_DOTS_PER_INCH)
+        fig.set_layout_engine("none")
+        canvas, frames = FigureCanvasAgg(fig), []
+        place = 1.0 - _PICTURE / height, share - 0.004, _PICTURE / height
+        updates = [
+            _draw_scene(fig.add_axes((i * share, *place)), loop, one, push)
+            for i, one in enumerate(takes)
+        ]
+        curve = fig.add_axes((0.04, 0.42 / height, 0.82, (_CURVE - 0.75) / height))
+        curve.set_xlim(begin_s, end_s)
+        threshold = loop.scenario.parameters.recovery.threshold
+        updates.append(_draw_curve(curve, takes[-1], threshold))
+        for instant in instants:
+            for update in updates:
+                update(instant)
+            canvas.draw()
+            frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    # With a common palette, unchanged pixels are stored once.
+    joined = Image.fromarray(np.concatenate(frames[:: max(len(frames) // _PALETTE_FRAMES, 1)]))
+    # The median cut would drop the colour of a ball, which has few pixels.
+    palette = joined.quantize(_NUM_COLOURS, method=Image.Quantize.FASTOCTREE)
+    first, *others = [
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames
+    ]
+    durations[-1] = _END_MS
+    first.save(path, save_all=True, append_images=others, duration=durations, loop=0)
+    return path
+
+
+def _draw_scene(
+    axes: Any, loop: LeggedLoop, take: Take, push: Push | None
+) -> Callable[[float], None]:
+    """Prepares the picture of a run, with captions below; returns what draws an instant [s]."""
+    motion = take.motion
+    states = {loop.robot.name: motion["plant_state"]}
+    if "ball_state" in motion.ports:
+        states["ball"] = motion["ball_state"]
+    positions = stack_positions(loop, states)
+    width, height = (round(size * _DOTS_PER_INCH) for size in (_WIDTH / 2, _PICTURE))
+    camera = StillCamera(loop, positions[0], width=width, height=height)
+    axes.set_axis_off()
+    picture = axes.imshow(camera.render(positions[0]))
+    place: dict[str, Any] = {"transform": axes.transAxes, "ha": "center", "weight": "bold"}
+    axes.text(0.5, 0.97, take.title, va="top", fontsize=13, **place)
+    words = axes.text(0.5, -0.03, "", va="top", fontsize=12.5, **place)
+    look = {"arrowstyle": "-|>,head_width=0.5,head_length=0.9", "color": style.BALL_COLOUR}
+    arrow = axes.annotate("", (0, 0), (0, 0), arrowprops=look | {"lw": 5.0})
+
+    def update(instant: float) -> None:
+        picture.set_data(camera.render(positions[np.abs(motion.time_s - instant).argmin()]))
+        count = sum(time_s <= instant + 0.01 for time_s, _ in take.captions)
+        words.set_text(take.captions[count - 1][1] if count else "")
+        words.set_color(_COLOURS[count - 1])
+        arrow.set_visible(False)
+        if push is not None and 0.0 <= instant - push.time_s <= push.duration_s:
+            head = camera.position(push.body)
+            tail = head - _ARROW_M * np.array(push.force_n) / push.strength_n
+            arrow.xy, arrow.xyann = camera.project(np.array([head, tail]))
+            arrow.set_visible(True)
+
+    return update
+
+
+def _draw_curve(axes: Any, take: Take, threshold: float) -> Callable[[float], None]:
+    """Prepares the curve of the probability; returns what draws it until an instant [s]."""
+    time_s, probability = take.motion.time_s, take.motion["safety_probability"][:, 0]
+    axes.set(ylim=(-0.06, 1.06), yticks=[0.0, 1.0])
+    axes.set_title(f"probability of staying safe, {take.title}", fontsize=10.5)
+    axes.set_xlabel("time [s]", labelpad=0)
+    style.draw_threshold(axes, threshold, style.UNSAFE_COLOUR)
+    (curve,) = axes.step([], [], where="post", color=style.SAFE_COLOUR, linewidth=2.2)
+    (dot,) = axes.plot([], [], marker="o", markersize=8, clip_on=False)
+
+    def update(instant: float) -> None:
+        until = int(np.searchsorted(time_s, instant + 1e-9))
+        curve.set_data(time_s[:until], probability[:until])
+        dot.set_data(time_s[until - 1 : until], probability[until - 1 : until])
+        is_safe = probability[until - 1] >= threshold
+        dot.set_color(style.SAFE_COLOUR if is_safe else style.UNSAFE_COLOUR)
+
+    return update
