@@ -118,11 +118,12 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
     "timeline": partial(_of_run, "timeline.png", "laikago_balancing", push=["ball"]),
     "path": partial(_of_run, "path.png", "laikago_balancing", push=["ball"], mode="paper"),
     "reaching": partial(
-        _of_run, "timeline.png", "atlas_reaching", target="blue_box", push=["torso"]
+        *(_of_run, "timeline.png", "atlas_reaching"),
+        **{"target": "blue_box", "push": ["torso"], "force": True},
     ),
     "walking_timeline": partial(
         *(_of_run, "timeline.png", "g1_walking"),
-        **{"target": "0.5 0 0", "push": ["side"], "variation": "nominal"},
+        **{"target": "0.5 0 0", "push": ["side"], "variation": "nominal", "force": True},
     ),
     "embedding": _embedding,
     "adaptation": _adaptation,

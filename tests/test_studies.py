@@ -289,23 +289,24 @@ def test_the_first_disturbance_after_which_only_recovery_helps_is_shown(standing
     loop, motion = standing_twice
     scenario, active = loop.scenario, np.zeros((26, 1))
     active[10:20] = 1.0
-    ports = motion.ports | {"recovery_active": active}
+    lying = np.full((26, 3), -1.0)
 
     guarded = SimpleNamespace(scenario=scenario, assessment=SimpleNamespace())
     guarded.assessment.parameters = SimpleNamespace(initial_uncertainty=0.3)
 
     def run(one, strength, logged):
         falls = strength > (2 if one is guarded else 1)
+        ports = motion.ports | {"recovery_active": active, "margins": lying if falls else -lying}
         return replace(motion, ports=ports, fall_time_s=0.3 if falls else math.inf)
 
-    strength, takes = first_saved([None, guarded], [3, 1, 2], run, "steps")
+    strength, takes = first_saved([loop, guarded], [3, 1, 2], run, "steps")
     assert strength == 2
     assert [one.motion.has_fallen for one in takes] == [True, False]
     words = [told for _, told in takes[1].captions]
     threshold = scenario.parameters.recovery.threshold
     assert words == [f"probability below {threshold:g}: recovery", "steps", "stands"]
     with pytest.raises(ValueError, match="no disturbance of 'laikago_balancing'"):
-        first_saved([None, guarded], [3, 1], run, "steps")
+        first_saved([loop, guarded], [3, 1], run, "steps")
 
 
 def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypatch, tmp_path):

@@ -23,7 +23,6 @@ from pydrake.geometry import (
     RenderEngineVtkParams,
     Rgba,
     Role,
-    SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import ModelInstanceIndex
@@ -36,7 +35,8 @@ _BACKGROUND = [0.80, 0.84, 0.88]
 _FIELD_OF_VIEW_RAD = math.radians(34.0)
 _SUPERSAMPLING = 2
 _PBR_BRIGHTNESS = 2.2  # With a glTF mesh all shading is physically based, which is darker.
-_LINE_M, _TILE_M, _NUM_LINES = 0.012, 0.5, 25  # Of the lines on the ground.
+_GROUND, _LINES = Rgba(0.78, 0.80, 0.83), Rgba(0.55, 0.58, 0.62)
+_LINE_M, _TILE_M, _NUM_LINES = 0.012, 0.5, 33
 _LEAST_GAP_S = 0.3  # Between a still at an event and others.
 
 
@@ -82,8 +82,26 @@ class StillCamera:
                 _lighting(centre, radius, brightness=_PBR_BRIGHTNESS if self._has_gltf() else 1.0)
             ),
         )
-        self._world = scene_graph.world_frame_id()
-        self._draw_lines(scene_graph)
+        self._scene_graph, self._world = scene_graph, scene_graph.world_frame_id()
+
+    def draw_ground(self) -> None:
+        """Adds a wide ground, with lines by which motions of the robot are seen."""
+        context = self._scene_graph.GetMyMutableContextFromRoot(self.context)
+        source, length = self._plant.get_source_id(), _NUM_LINES * _TILE_M
+
+        def draw(sides: list[float], place: list[float], colour: Rgba, name: str) -> None:
+            shown = GeometryInstance(RigidTransform(place), Box(*sides), f"shown {name}")
+            properties = PerceptionProperties()
+            properties.AddProperty("phong", "diffuse", colour)
+            shown.set_perception_properties(properties)
+            self._scene_graph.RegisterGeometry(context, source, self._world, shown)
+
+        # Below that of the plant, which is smaller.
+        draw([100.0, 100.0, 0.01], [0.0, 0.0, -0.01], _GROUND, "ground")
+        for i in range(_NUM_LINES):
+            at = (i - _NUM_LINES // 2) * _TILE_M
+            draw([length, _LINE_M, 0.002], [0.0, at, 0.0], _LINES, f"line {i} along x")
+            draw([_LINE_M, length, 0.002], [at, 0.0, 0.0], _LINES, f"line {i} along y")
 
     def render(self, positions: np.ndarray) -> np.ndarray:
         """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8."""
@@ -106,24 +124,9 @@ class StillCamera:
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Column and row of points (N, 3) of the world [m] in the last still, (N, 2)."""
-        intrinsics = self._camera.core().intrinsics().intrinsic_matrix() / _SUPERSAMPLING
+        intrinsics = self._camera.core().intrinsics().intrinsic_matrix()
         seen = intrinsics @ self._X_WC.inverse().multiply(np.asarray(points, dtype=float).T)
-        return (seen[:2] / seen[2]).T
-
-    def _draw_lines(self, scene_graph: SceneGraph) -> None:
-        """Adds lines to the ground, by which motions of the robot are seen."""
-        context = scene_graph.GetMyMutableContextFromRoot(self.context)
-        properties = PerceptionProperties()
-        properties.AddProperty("phong", "diffuse", Rgba(0.55, 0.58, 0.62, 1.0))
-        for number in range(2 * _NUM_LINES):
-            at, axis = (number // 2 - _NUM_LINES // 2) * _TILE_M, number % 2
-            sides = np.array([_LINE_M, _LINE_M, 0.002])
-            sides[axis] = _NUM_LINES * _TILE_M
-            pose = RigidTransform([0.0, at, 0.0] if axis == 0 else [at, 0.0, 0.0])
-            line = GeometryInstance(pose, Box(*sides), f"line {number} of the ground")
-            line.set_perception_properties(properties)
-            source = self._plant.get_source_id()
-            scene_graph.RegisterGeometry(context, source, self._world, line)
+        return (seen[:2] / seen[2]).T / _SUPERSAMPLING
 
     def _pose(self, positions: np.ndarray) -> None:
         if not np.isfinite(positions).all():
