@@ -93,19 +93,20 @@ def _own_task(folder: Path) -> Figure:
 
 
 def _shifts(name: str, folder: Path) -> Figure:
-    """How often Γ and gradient boosting are sure and wrong, and when the monitor alarms."""
+    """How often Γ is sure and wrong and says "don't know", and when the monitor alarms."""
     results = Results.read(_ROOT / f"docs/results/{name}.json")
+    shown = ("gamma", "confident_error"), ("gamma", "unknown"), ("monitor", "delay_s")
     rows = [
-        replace(row, set=row.method, method=row.set.removeprefix("shifts."))
-        for metric in ("confident_error", "unknown", "delay_s")
-        for row in results.select(metric=metric)
-        if row.set.startswith("shifts.") and row.method in ("gamma", "gradient_boosting", "monitor")
+        replace(row, set="", method=row.set.removeprefix("shifts."))
+        for method, metric in shown
+        for row in results.select(method=method, metric=metric)
+        if row.set.startswith("shifts.")
     ]
     return interval_figure(rows)
 
 
 def _adaptation_study(folder: Path) -> Figure:
-    results = Results.read(_ROOT / "docs/results/adaptation/laikago-actual-pools.json")
+    results = Results.read(_ROOT / "docs/results/adaptation/laikago-actual.json")
     kinds = "sharpened.calibrated", "paper.grid"
     metrics = "brier", "auc", "unsafe_recall"
     rows = [row for row in results.values() if row.set in kinds and row.metric in metrics]

@@ -30,7 +30,7 @@ _DOTS_PER_INCH = 100
 _STEP_S, _FRAME_MS, _EVENT_MS, _END_MS = 0.04, 100, 1000, 2500  # At 0.4 of real time.
 _BEFORE_S, _AFTER_S = 0.32, 0.6  # Shown before the disturbance and after the last event.
 _ACTS_S = 0.12  # From the trigger until the recovery is seen.
-_NUM_COLOURS, _PALETTE_FRAMES = 127, 8
+_NUM_COLOURS = 127
 _ARROW_M = 0.5
 _PORTS = ("safety_probability", "belief")
 _OPTIONS: dict[str, Any] = {"seed": DEMONSTRATION.first, "duration_s": 3.0, "after_fall_s": 0.8}
@@ -144,9 +144,10 @@ def save_moving_picture(
         push: Shown by an arrow while it acts.
     """
     takes = [one._replace(captions=[hit, *one.captions]) for one in takes]
-    stops = {round(time_s, 2) for one in takes for time_s, _ in one.captions}
-    begin_s, end_s = hit[0] - _BEFORE_S, max(stops) + _AFTER_S
-    instants = sorted(stops | set(np.arange(begin_s, end_s, _STEP_S).round(2).tolist()))
+    stops = sorted({round(time_s, 2) for one in takes for time_s, _ in one.captions})
+    begin_s = max(hit[0] - _BEFORE_S, 0.0)
+    end_s = min(max(stops) + _AFTER_S, max(one.motion.time_s[-1] for one in takes))
+    instants = sorted({*stops, *np.arange(begin_s, end_s, _STEP_S).round(2).tolist()})
     durations = [_EVENT_MS if instant in stops else _FRAME_MS for instant in instants]
     height, share = _PICTURE + _CAPTION + _CURVE, 1.0 / len(takes)
     with style.drawing_style():
@@ -169,7 +170,7 @@ def save_moving_picture(
             canvas.draw()
             frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     # With a common palette, unchanged pixels are stored once.
-    joined = Image.fromarray(np.concatenate(frames[:: max(len(frames) // _PALETTE_FRAMES, 1)]))
+    joined = Image.fromarray(np.concatenate([frames[instants.index(stop)] for stop in stops]))
     # The median cut would drop the colour of a ball, which has few pixels.
     palette = joined.quantize(_NUM_COLOURS, method=Image.Quantize.FASTOCTREE)
     first, *others = [

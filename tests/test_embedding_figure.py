@@ -55,8 +55,9 @@ def test_the_map_shows_every_segment_at_its_point_and_every_count(assessment, fr
 
 
 def test_empty_cells_are_hatched_the_others_show_their_belief_and_causes_are_named(
-    assessment, fresh
+    assessment, fresh, monkeypatch
 ):
+    monkeypatch.setattr("drake_safety.evaluation.embedding_figure._LEAST_CAUSE", 0.0)
     _, middle, right, *_ = embedding_figure(assessment, fresh).axes
     legend = right.get_legend().get_texts()
     assert [text.get_text() for text in legend] == ["support", "height"]

@@ -281,7 +281,7 @@ def test_a_moving_picture_stops_where_something_happens(standing_twice, tmp_path
         assert changed[:300, half:].max() > 50.0
         assert changed[-150:].max() > 50.0
     # The arrow is there while it is pushed.
-    orange = [np.abs(one - [232, 115, 12]).max(axis=-1) < 60 for one in frames]
+    orange = [np.abs(one - [232, 115, 12]).max(axis=-1) < 25 for one in frames]
     assert orange[stop].sum() > 100 > orange[0].sum()
 
 
