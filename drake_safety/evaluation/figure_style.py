@@ -70,6 +70,9 @@ _LABELS = {
     "smallest_margin": "smallest margin (true state)",
     "by_cause_probability": "all, by unsafe mass alone",
     "right_cause": "all",
+    "confident_error": "sure and wrong",
+    "unknown": "don't know",
+    "delay_s": "alarm after [s]",
 }
 _DPI = 200
 

@@ -125,7 +125,8 @@ class StillCamera:
     def project(self, points: np.ndarray) -> np.ndarray:
         """Column and row of points (N, 3) of the world [m] in the last still, (N, 2)."""
         intrinsics = self._camera.core().intrinsics().intrinsic_matrix()
-        seen = intrinsics @ self._X_WC.inverse().multiply(np.asarray(points, dtype=float).T)
+        X_CW = self._X_WC.inverse()
+        seen = intrinsics @ (X_CW.rotation().matrix() @ points.T + X_CW.translation()[:, None])
         return (seen[:2] / seen[2]).T / _SUPERSAMPLING
 
     def _pose(self, positions: np.ndarray) -> None:
