@@ -200,7 +200,7 @@ def _draw_belief(axes: Axes, time_s: np.ndarray, belief: np.ndarray) -> None:
     axes.stackplot(
         time_s,
         *belief[:, [SAFE, UNCERTAINTY, UNSAFE]].T,
-        labels=["safe", "unknown", "unsafe"],
+        labels=["safe", "don't know", "unsafe"],
         colors=[style.SAFE_COLOUR, style.UNKNOWN_COLOUR, style.UNSAFE_COLOUR],
         step="post",
         linewidth=0,
