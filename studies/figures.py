@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,6 +38,9 @@ from studies.reachable_region import reachable_region, region_figure
 
 _ROOT = Path(__file__).resolve().parents[1]
 _SEED = DEMONSTRATION.first
+_REACHING: dict[str, Any] = {"target": "blue_box", "push": ["torso"], "force": True}
+_WALKING: dict[str, Any] = {"target": "0.5 0 0", "push": ["side"], "force": True}
+_WALKING |= {"variation": "nominal"}  # On another one the monitor may alarm before the push.
 _ELSEWHERE = "compose.svg, which `python docs/generator/diagram_picture.py` draws by GraphViz"
 
 
@@ -74,8 +78,7 @@ def _shapes(folder: Path) -> Figure:
 
 def _own_task(folder: Path) -> Figure:
     sys.path.insert(0, str(_ROOT / "examples"))
-    import quadrotor
-
+    quadrotor = import_module("quadrotor")
     plane = np.zeros((41, 41, 12))
     plane[..., 2], plane[..., 8] = np.linspace(0.0, 2.2, 41)[:, None], np.linspace(-11.0, 5.0, 41)
     starts = plane.reshape(-1, 12)
@@ -118,14 +121,8 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
     "walking": walking,
     "timeline": partial(_of_run, "timeline.png", "laikago_balancing", push=["ball"]),
     "path": partial(_of_run, "path.png", "laikago_balancing", push=["ball"], mode="paper"),
-    "reaching": partial(
-        *(_of_run, "timeline.png", "atlas_reaching"),
-        **{"target": "blue_box", "push": ["torso"], "force": True},
-    ),
-    "walking_timeline": partial(
-        *(_of_run, "timeline.png", "g1_walking"),
-        **{"target": "0.5 0 0", "push": ["side"], "variation": "nominal", "force": True},
-    ),
+    "reaching": partial(_of_run, "timeline.png", "atlas_reaching", **_REACHING),
+    "walking_timeline": partial(_of_run, "timeline.png", "g1_walking", **_WALKING),
     "embedding": _embedding,
     "adaptation": _adaptation,
     "adaptation_study": _adaptation_study,
