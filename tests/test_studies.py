@@ -272,7 +272,7 @@ def test_a_moving_picture_stops_where_something_happens(standing_twice, tmp_path
             durations.append(gif.info["duration"])
     assert durations.count(1000) == 2
     stop = durations.index(1000)
-    assert durations[:stop] == [100] * stop
+    assert durations[:stop] == [120] * stop
     # Robots and curve move in every frame until the end of the log.
     half = frames[0].shape[1] // 2
     for before, after in itertools.pairwise(frames[: stop + 2]):
