@@ -23,10 +23,7 @@ def assessed_scenarios() -> list[str]:
 
 
 def shipped_folder(scenario: str) -> Path:
-    """Returns the folder of a scenario's shipped assessments.
-
-    Args:
-        scenario: The scenario's name.
+    """Returns the folder of a scenario's shipped assessments, by its name.
 
     Raises:
         ValueError: The scenario has none; the message lists those that do.
@@ -40,11 +37,7 @@ def shipped_folder(scenario: str) -> Path:
 
 
 def load_assessment(scenario: str, mode: str = "sharpened") -> SafetyAssessment:
-    """Loads a shipped assessment.
-
-    Args:
-        scenario: The scenario's name.
-        mode: "sharpened" or "paper".
+    """Loads the shipped assessment of a scenario, by its name, in a mode, "sharpened" or "paper".
 
     Raises:
         ValueError: The scenario or mode has none; the message lists those that exist.

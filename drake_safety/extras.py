@@ -34,12 +34,7 @@ class MissingExtraError(ValueError):
 
 
 def missing_extra(extra: str, message: str) -> MissingExtraError:
-    """Returns the error for an extra that is not installed.
-
-    Args:
-        extra: The extra.
-        message: Who needs what.
-    """
+    """Returns the error for an extra that is not installed; the message says who needs what."""
     return MissingExtraError(message, f"drake_safety[{extra}]")
 
 
@@ -47,8 +42,6 @@ def require_extra(extra: str, who: str, *modules: str) -> None:
     """Checks that an extra is installed, before anything else is done; nothing is imported.
 
     Args:
-        extra: The extra.
-        who: Who needs it.
         *modules: Its modules that are needed; all of them by default.
 
     Raises:

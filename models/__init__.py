@@ -33,14 +33,7 @@ def load_robot(name: str) -> RobotModel:
 
 
 def robot_files(name: str) -> list[Path]:
-    """Returns the files that define a robot: its ``robot.yaml`` and its model file.
-
-    Args:
-        name: See :func:`load_robot`.
-
-    Raises:
-        ValueError: As :func:`load_robot`.
-    """
+    """Returns the ``robot.yaml`` and the model file of a robot; see :func:`load_robot`."""
     robot = load_robot(name)
     folder = Path(robot.source_dir)
     model = model_file(robot.urdf, robot.source_dir, robot.requires)

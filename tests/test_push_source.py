@@ -5,6 +5,7 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
+from drake_safety.plants.pushes import Push
 from drake_safety.systems.push_source import PushSource
 
 MASS_KG = 4.0
@@ -35,7 +36,8 @@ class FloatingBox(Diagram):
 
     def set_push(self, context, body="trunk", *, start_s=0.125, duration_s=0.25):
         source_context = self.source.GetMyMutableContextFromRoot(context)
-        self.source.set_push(source_context, body, FORCE_N, start_s=start_s, duration_s=duration_s)
+        push = Push(body=body, force_n=FORCE_N.tolist(), time_s=start_s, duration_s=duration_s)
+        self.source.set_push(source_context, push)
 
     def velocity(self, context):
         """Angular velocity and velocity of the centre of mass, (6,)."""

@@ -57,10 +57,10 @@ CASES = {
     ),
     "TrajectoryPlanner": (
         lambda: TrajectoryPlanner(
-            horizon=7, step_s=0.1, num_outputs=6, plan=PiecewisePolynomial(np.zeros((6, 1)))
+            horizon=7, step_s=0.1, plan=PiecewisePolynomial(np.zeros((3, 1)))
         ),
-        "stance_pose? 3 -> desired_output 6 < *, desired_output_rate 6 < *, "
-        "desired_preview 42, desired_outlook 30",
+        "stance_pose? 3 -> desired_output 3 < *, desired_output_rate 3 < *, "
+        "desired_preview 21, desired_outlook 15",
     ),
     "BeliefEvaluator": (
         lambda: BeliefEvaluator(AssessmentDouble(), **PERIOD),
@@ -217,7 +217,7 @@ INNER = {
 
 SYMBOLS = {
     "SensorFaults": {"n": 2},
-    "TrajectoryPlanner": {"n_z": 6, "H": 7, "M": 5},
+    "TrajectoryPlanner": {"n_z": 3, "H": 7, "M": 5},
     "BeliefEvaluator": {"n_s": 2, "n_z": 3, "H": 2, "n_f": 3, "n_c": 2},
     "CommandGuard": {"n_s": 1, "n_z": 3, "H": 4, "M": 3, "n_f": 3},
     "FeedbackRecorder": {"n_s": 1, "n_z": 3, "H": 3, "n_f": 1, "n_c": 2, "n_q": 1, "n_v": 1},

@@ -123,19 +123,6 @@ def test_a_plan_lives_in_the_context_not_in_the_planner():
     assert planner.get_plan(context).end_time() == 1.0
 
 
-def test_six_outputs_are_two_points_of_one_stance():
-    plan = PiecewisePolynomial(np.array([[1.0], [0.0], [0.1], [0.0], [1.0], [0.2]]))
-    planner, context = planner_at(
-        0.0, plan, np.array([0.0, 0.0, math.pi / 2]), num_outputs=6, horizon=1
-    )
-    np.testing.assert_allclose(
-        evaluated(planner, context, "desired_output"), [0, 1, 0.1, -1, 0, 0.2], atol=1e-12
-    )
-    np.testing.assert_array_equal(
-        evaluated(planner, context, "desired_preview"), [1, 0, 0.1, 0, 1, 0.2]
-    )
-
-
 def test_a_plan_of_another_size_is_refused():
     planner = TrajectoryPlanner(horizon=2, step_s=0.1)
     with pytest.raises(ValueError, match="must have 3 rows and one column; got 2 x 1"):
@@ -147,7 +134,6 @@ def test_a_plan_of_another_size_is_refused():
     [
         ({"horizon": 0, "step_s": 0.1}, "horizon and step_s must be positive; got 0, 0.1"),
         ({"horizon": 2, "step_s": 0.0}, "horizon and step_s must be positive"),
-        ({"horizon": 2, "step_s": 0.1, "num_outputs": 4}, "multiple of 3; got 4"),
     ],
 )
 def test_impossible_sizes_are_refused(options, message):

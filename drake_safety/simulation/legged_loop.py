@@ -217,13 +217,7 @@ class LeggedLoop(PlannedLoop):
         """
         if self._push_source is None:
             raise ValueError(f"task '{type(self).__name__}' has no pushes on its robot")
-        self._push_source.set_push(
-            self._push_source.GetMyMutableContextFromRoot(context),
-            push.body,
-            np.asarray(push.force_n, dtype=float),
-            start_s=push.time_s,
-            duration_s=push.duration_s,
-        )
+        self._push_source.set_push(self._push_source.GetMyMutableContextFromRoot(context), push)
 
     def disturbances(self, context: Context) -> dict[str, np.ndarray]:
         """The ball's mass and state, and the push; see `HasDisturbances`."""

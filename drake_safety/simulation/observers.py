@@ -83,10 +83,8 @@ class Observers:
         """Reseeds every noise source and the noise of faults; without ``rng`` with fixed seeds."""
         rng = np.random.default_rng(0) if rng is None else rng
         for source in self._sources:
-            source.SetRandomContext(
-                source.GetMyMutableContextFromRoot(context),
-                RandomGenerator(int(rng.integers(2**31))),
-            )
+            generator = RandomGenerator(int(rng.integers(2**31)))
+            source.SetRandomContext(source.GetMyMutableContextFromRoot(context), generator)
         for faulty in self._faults:
             faulty.set_seed(faulty.GetMyMutableContextFromRoot(context), int(rng.integers(2**31)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_safety.systems.safety_monitor import FeaturedSafeSet
@@ -27,24 +28,20 @@ class PlanFeatures(LeafSystem):
         num_velocities: int,
         *,
         horizon: int,
-        num_outputs: int = 3,
     ):
         super().__init__()
         self._safe_set = safe_set
         self._n_q = num_positions
-        self._preview_shape = (horizon, num_outputs)
         self.feature_names = list(safe_set.feature_names)
         self._state_port = self.DeclareVectorInputPort(
             "plant_state", num_positions + num_velocities
         )
-        self._preview_port = self.DeclareVectorInputPort("desired_preview", horizon * num_outputs)
+        self._preview_port = self.DeclareVectorInputPort("desired_preview", 3 * horizon)
         self.DeclareVectorOutputPort(
             "features", BasicVector(len(self.feature_names)), self._calc_features
         )
 
     def _calc_features(self, context: Context, output: BasicVector) -> None:
-        state = self._state_port.Eval(context)
-        preview = self._preview_port.Eval(context).reshape(self._preview_shape)
-        output.SetFromVector(
-            self._safe_set.features(state[: self._n_q], state[self._n_q :], preview)
-        )
+        q, v = np.split(self._state_port.Eval(context), [self._n_q])
+        preview = self._preview_port.Eval(context).reshape(-1, 3)
+        output.SetFromVector(self._safe_set.features(q, v, preview))

@@ -9,6 +9,8 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlan
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_safety.plants.pushes import Push
+
 _BODY, _FORCE, _START, _DURATION = 0, slice(1, 4), 4, 5
 _SIZE = 6
 _TOLERANCE_S = 1e-9
@@ -30,10 +32,8 @@ class PushSource(LeafSystem):
     def __init__(self, plant: MultibodyPlant, instance: ModelInstanceIndex, *, period_s: float):
         super().__init__()
         self._robot_name = plant.GetModelInstanceName(instance)
-        self._bodies = {
-            plant.get_body(index).name(): plant.get_body(index)
-            for index in plant.GetBodyIndices(instance)
-        }
+        bodies = map(plant.get_body, plant.GetBodyIndices(instance))
+        self._bodies = {body.name(): body for body in bodies}
         self._parameter = self.DeclareNumericParameter(BasicVector(np.zeros(_SIZE)))
         state = self.DeclareDiscreteState(1)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)
@@ -44,22 +44,20 @@ class PushSource(LeafSystem):
             {self.discrete_state_ticket(state)},
         )
 
-    def set_push(
-        self, context: Context, body: str, force_n: np.ndarray, *, start_s: float, duration_s: float
-    ) -> None:
+    def set_push(self, context: Context, push: Push) -> None:
         """Sets the push; it replaces an earlier one.
 
         Raises:
             ValueError: The robot has no such body.
         """
-        if body not in self._bodies:
+        if push.body not in self._bodies:
             raise ValueError(
-                f"push: robot '{self._robot_name}' has no body '{body}'; its bodies are "
+                f"push: robot '{self._robot_name}' has no body '{push.body}'; its bodies are "
                 f"{list(self._bodies)}"
             )
-        index = float(int(self._bodies[body].index()))
+        index = float(int(self._bodies[push.body].index()))
         context.get_mutable_numeric_parameter(self._parameter).SetFromVector(
-            np.array([index, *force_n, start_s, duration_s], dtype=float)
+            [index, *push.force_n, push.time_s, push.duration_s]
         )
 
     def push(self, context: Context) -> np.ndarray:

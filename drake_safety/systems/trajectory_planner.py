@@ -101,14 +101,13 @@ class TrajectoryPlanner(LeafSystem):
     Args:
         horizon: H, samples of the preview.
         step_s: Time between them [s].
-        num_outputs: n_z, a multiple of three.
         outlook_s: Duration of the outlook [s]; that of the preview by default.
         num_outlook: M, samples of the outlook.
         plan: The plan of a default Context, (n_z, 1) [m].
 
     Raises:
-        ValueError: ``num_outputs`` is not a multiple of three, or horizon, step or number of
-            samples of the outlook is too small, or the plan's size is not n_z.
+        ValueError: Horizon, step or number of samples of the outlook is too small, or the plan's
+            size is not n_z.
     """
 
     def __init__(
@@ -116,21 +115,17 @@ class TrajectoryPlanner(LeafSystem):
         *,
         horizon: int,
         step_s: float,
-        num_outputs: int = 3,
         outlook_s: float | None = None,
         num_outlook: int = 5,
         plan: PiecewisePolynomial | None = None,
     ):
         super().__init__()
-        if num_outputs % 3 or num_outputs <= 0:
-            raise ValueError(f"planner: num_outputs must be a multiple of 3; got {num_outputs}")
         if not (horizon >= 1 and step_s > 0):
             raise ValueError(
                 f"planner: horizon and step_s must be positive; got {horizon}, {step_s}"
             )
         if num_outlook < 2:
             raise ValueError(f"planner: num_outlook must be at least 2; got {num_outlook}")
-        self._num_outputs = num_outputs
         outlook_s = step_s * (horizon - 1) if outlook_s is None else outlook_s
         no_plan = None, None
         self._plan_index = self.DeclareAbstractParameter(
@@ -138,17 +133,15 @@ class TrajectoryPlanner(LeafSystem):
         )
         self._stance_index = self.DeclareNumericParameter(BasicVector(np.zeros(3)))
         self._stance_port = self.DeclareVectorInputPort("stance_pose", 3)
-        self.DeclareVectorOutputPort("desired_output", BasicVector(num_outputs), self._calc_output)
-        self.DeclareVectorOutputPort(
-            "desired_output_rate", BasicVector(num_outputs), self._calc_rate
-        )
+        self.DeclareVectorOutputPort("desired_output", BasicVector(3), self._calc_output)
+        self.DeclareVectorOutputPort("desired_output_rate", BasicVector(3), self._calc_rate)
         for name, offsets in (
             ("desired_preview", step_s * np.arange(horizon)),
             ("desired_outlook", np.linspace(0.0, outlook_s, num_outlook)),
         ):
             self.DeclareVectorOutputPort(
                 name,
-                BasicVector(len(offsets) * num_outputs),
+                BasicVector(3 * len(offsets)),
                 lambda context, output, offsets=offsets: self._calc_samples(
                     context, output, offsets
                 ),
@@ -182,12 +175,11 @@ class TrajectoryPlanner(LeafSystem):
         plan.shiftRight(-context.get_time())
         return plan
 
-    def _with_rate(
-        self, plan: PiecewisePolynomial
-    ) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
-        if (plan.rows(), plan.cols()) != (self._num_outputs, 1):
+    @staticmethod
+    def _with_rate(plan: PiecewisePolynomial) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
+        if (plan.rows(), plan.cols()) != (3, 1):
             raise ValueError(
-                f"planner: the plan must have {self._num_outputs} rows and one column; got "
+                "planner: the plan must have 3 rows and one column; got "
                 f"{plan.rows()} x {plan.cols()}"
             )
         return plan, plan.MakeDerivative()
@@ -205,17 +197,15 @@ class TrajectoryPlanner(LeafSystem):
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
         z = self.get_plan(context).value(context.get_time())
-        output.SetFromVector(to_world(self._stance_pose(context), z.reshape(-1, 3)).ravel())
+        output.SetFromVector(to_world(self._stance_pose(context), z.T).ravel())
 
     def _calc_rate(self, context: Context, output: BasicVector) -> None:
         plan, derivative = self._plan_and_rate(context)
-        time = context.get_time()
+        time, rate = context.get_time(), np.zeros((3, 1))
         if plan.start_time() <= time <= plan.end_time():
-            rate = derivative.value(time).reshape(-1, 3)
-        else:
-            rate = np.zeros((self._num_outputs // 3, 3))
+            rate = derivative.value(time)
         yaw = self._stance_pose(context)[2]
-        output.SetFromVector(to_world(np.array([0.0, 0.0, yaw]), rate).ravel())
+        output.SetFromVector(to_world(np.array([0.0, 0.0, yaw]), rate.T).ravel())
 
     def _calc_samples(self, context: Context, output: BasicVector, offsets: np.ndarray) -> None:
         times = context.get_time() + offsets
