@@ -152,20 +152,18 @@ class WholeBodyModel:
             self._stances[key] = Stance(self, is_stance)
         return self._stances[key]
 
-    def reference(self, q: np.ndarray, *, posture: np.ndarray | None = None) -> WholeBodyReference:
-        """The reference for standing on the feet of ``q`` in a posture (n_j,) [rad].
+    def reference(self, q: np.ndarray) -> WholeBodyReference:
+        """The reference for standing on the feet of ``q`` in the standing posture.
 
         The centre of mass is over the stance at its height in ``q``, the bodies have the
         orientations of the standing posture with the yaw of the stance, and the hand is at rest.
         """
         kinematics = self.kinematics
-        x, y, yaw = kinematics.stance_pose(q)
+        (x, y, yaw), height = kinematics.stance_pose(q), kinematics.center_of_mass(q)[2]
         reference = WholeBodyReference(
-            center_of_mass=PointReference(
-                position=np.array([x, y, kinematics.center_of_mass(q)[2]])
-            ),
+            center_of_mass=PointReference(position=np.array([x, y, height])),
             orientations=[],
-            posture=np.array(kinematics.posture if posture is None else posture, dtype=float),
+            posture=np.array(kinematics.posture, dtype=float),
             is_stance=np.ones(len(self.feet), bool),
         )
         if self.hand is not None:

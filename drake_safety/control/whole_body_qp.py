@@ -13,12 +13,7 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
 from drake_safety.control.observation import rotation_vector
-from drake_safety.control.whole_body_model import (
-    PointReference,
-    Stance,
-    WholeBodyModel,
-    WholeBodyReference,
-)
+from drake_safety.control.whole_body_model import Stance, WholeBodyModel, WholeBodyReference
 from drake_safety.learning.blas_threads import one_blas_thread
 
 SOLVED = 0
@@ -82,20 +77,6 @@ class WholeBodySolution:
     status: int
 
 
-class _TaskRows:
-    """Rows of the stacked tasks, three per task, with accelerations J v̇ + J̇v."""
-
-    def __init__(self, num_rows: int, num_velocities: int):
-        self.J = np.empty((num_rows, num_velocities))
-        self.Jdot_v, self.error, self.rate, self.feedforward = np.zeros((4, num_rows))
-
-    def follow(self, rows: slice, point: PointReference, p: np.ndarray) -> None:
-        """Sets the rows of a point at ``p``."""
-        self.error[rows] = point.position - p
-        self.rate[rows] = point.rate
-        self.feedforward[rows] = point.acceleration
-
-
 def build_qp(
     model: WholeBodyModel, q: np.ndarray, v: np.ndarray, reference: WholeBodyReference
 ) -> WholeBodyQP:
@@ -113,17 +94,22 @@ def build_qp(
     bias = C - model.weight_W @ J_com
 
     n_v = model.num_velocities
-    tasks = _TaskRows(model.num_task_rows, n_v)
-    tasks.J[:3] = J_com
-    tasks.Jdot_v[:3] = C[3:NUM_BASE_VELOCITIES] / model.mass
+    # Rows of the stacked tasks, three per task, with accelerations J v̇ + J̇v.
+    J = np.empty((model.num_task_rows, n_v))
+    Jdot_v, error, rate, feedforward = np.zeros((4, model.num_task_rows))
+    J[_FIRST] = J_com
+    Jdot_v[_FIRST] = C[3:NUM_BASE_VELOCITIES] / model.mass
     # The base's columns of J_com contain -[p]x of the centre of mass relative to the base.
     p_com = q[4:7] + (J_com[1, 2], J_com[2, 0], J_com[0, 1])
-    tasks.follow(_FIRST, reference.center_of_mass, p_com)
-    _set_orientations(model, reference, tasks)
-    _set_hand(model, reference, tasks)
-    J = tasks.J
-    wanted = tasks.feedforward - tasks.Jdot_v
-    wanted += model.stiffness * tasks.error + model.damping * (tasks.rate - J @ v)
+    error[_FIRST] = reference.center_of_mass.position - p_com
+    _set_body_rows(model, reference, J, error)
+    _set_body_biases(model, Jdot_v)
+    reaching = reference.reaching if model.hand else None
+    for rows, point in ((_FIRST, reference.center_of_mass), (_LAST, reaching)):
+        if point is not None:
+            rate[rows], feedforward[rows] = point.rate, point.acceleration
+    wanted = feedforward - Jdot_v
+    wanted += model.stiffness * error + model.damping * (rate - J @ v)
     _check_size(model, "the set points' acceleration", wanted.dot(wanted))
     weighted = model.task_weights * J
     posture = model.parameters.posture
@@ -202,14 +188,23 @@ def task_errors(
     model: WholeBodyModel, reference: WholeBodyReference
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns Jacobian (num_task_rows, n_v) and error (num_task_rows,) of all tasks at rest."""
-    kinematics = model.kinematics
-    plant, context, world = kinematics.plant, kinematics.context, kinematics.world_frame
-    kv = JacobianWrtVariable.kV
+    plant, context = model.kinematics.plant, model.kinematics.context
+    world, kv = model.kinematics.world_frame, JacobianWrtVariable.kV
     J = np.empty((model.num_task_rows, model.num_velocities))
     error = np.zeros(model.num_task_rows)
     J[_FIRST] = plant.CalcJacobianCenterOfMassTranslationalVelocity(context, kv, world, world)
     p_com = plant.CalcCenterOfMassPositionInWorld(context)
     error[_FIRST] = reference.center_of_mass.position - p_com
+    _set_body_rows(model, reference, J, error)
+    return J, error
+
+
+def _set_body_rows(
+    model: WholeBodyModel, reference: WholeBodyReference, J: np.ndarray, error: np.ndarray
+) -> None:
+    """Sets Jacobian and error of the bodies' orientations and of the hand."""
+    kinematics, kv = model.kinematics, JacobianWrtVariable.kV
+    plant, context, world = kinematics.plant, kinematics.context, kinematics.world_frame
     oriented = zip(model.orientation_rows, model.bodies, reference.orientations, strict=True)
     for rows, body, R_WBd in oriented:
         if body is kinematics.base:
@@ -222,44 +217,28 @@ def task_errors(
         frame, p = model.hand.frame, model.hand.point
         J[_LAST] = plant.CalcJacobianTranslationalVelocity(context, kv, frame, p, world, world)
         error[_LAST] = reference.reaching.position - model.hand.present_position(kinematics)
-    return J, error
+
+
+def _set_body_biases(model: WholeBodyModel, Jdot_v: np.ndarray) -> None:
+    """Sets J̇v of the bodies' orientations, zero for the base, and of the hand."""
+    kinematics, kv = model.kinematics, JacobianWrtVariable.kV
+    plant, context, world = kinematics.plant, kinematics.context, kinematics.world_frame
+    for rows, body in zip(model.orientation_rows, model.bodies, strict=True):
+        if body is not kinematics.base:
+            acceleration = plant.CalcBiasSpatialAcceleration(
+                context, kv, body.body_frame(), _ORIGIN, world, world
+            )
+            Jdot_v[rows] = acceleration.rotational()
+    if model.hand is not None:
+        frame, p = model.hand.frame, model.hand.point
+        acceleration = plant.CalcBiasTranslationalAcceleration(context, kv, frame, p, world, world)
+        Jdot_v[_LAST] = acceleration[:, 0]
 
 
 def _turn_to(R_WBd: RotationMatrix, R_WB: RotationMatrix) -> np.ndarray:
     """Rotation vector from an orientation to the wanted one, in the world (3,) [rad]."""
     # R_WBd R_WBᵀ. Drake's product of rotations is wrapped in Python, and twice as slow.
     return rotation_vector(R_WBd.inverse().InvertAndCompose(R_WB.inverse()))
-
-
-def _set_orientations(
-    model: WholeBodyModel, reference: WholeBodyReference, tasks: _TaskRows
-) -> None:
-    plant, context = model.kinematics.plant, model.kinematics.context
-    world, kv = model.kinematics.world_frame, JacobianWrtVariable.kV
-    oriented = zip(model.orientation_rows, model.bodies, reference.orientations, strict=True)
-    for rows, body, R_WBd in oriented:
-        if body is model.kinematics.base:
-            tasks.J[rows], tasks.Jdot_v[rows] = model.base_turns, 0.0
-        else:
-            frame = body.body_frame()
-            tasks.J[rows] = plant.CalcJacobianAngularVelocity(context, kv, frame, world, world)
-            tasks.Jdot_v[rows] = plant.CalcBiasSpatialAcceleration(
-                context, kv, frame, _ORIGIN, world, world
-            ).rotational()
-        tasks.error[rows] = _turn_to(R_WBd, body.EvalPoseInWorld(context).rotation())
-
-
-def _set_hand(model: WholeBodyModel, reference: WholeBodyReference, tasks: _TaskRows) -> None:
-    if model.hand is None or reference.reaching is None:
-        return
-    plant, context = model.kinematics.plant, model.kinematics.context
-    world, kv = model.kinematics.world_frame, JacobianWrtVariable.kV
-    frame, p = model.hand.frame, model.hand.point
-    tasks.J[_LAST] = plant.CalcJacobianTranslationalVelocity(context, kv, frame, p, world, world)
-    tasks.Jdot_v[_LAST] = plant.CalcBiasTranslationalAcceleration(
-        context, kv, frame, p, world, world
-    )[:, 0]
-    tasks.follow(_LAST, reference.reaching, model.hand.present_position(model.kinematics))
 
 
 @one_blas_thread

@@ -23,9 +23,6 @@ class AdaptiveThreshold:
         calibration: The promise, with the initial threshold.
         step: Step of the threshold's logit; larger ones follow faster, and vary more.
 
-    Attributes:
-        threshold: Present lower bound of the probability for "safe"; above 1 if none is.
-
     Raises:
         ValueError: The step is not positive.
     """

@@ -28,12 +28,10 @@ class DiscrepancyFunction:
         if not len(points):
             raise ValueError("DiscrepancyFunction: none of the feedback's points is finite")
         kernel = _fitted_kernel(points, difference)
-        self.length_scale = float(kernel.k1.k2.length_scale)
-        self.noise = float(kernel.k2.noise_level)
+        scale, noise = float(kernel.k1.k2.length_scale), float(kernel.k2.noise_level)
         # As `alpha`, the noise of the observations is no part of sigma.
-        self._process: Any = GaussianProcessRegressor(
-            RBF(self.length_scale), alpha=self.noise, optimizer=None
-        ).fit(points, difference)
+        process = GaussianProcessRegressor(RBF(scale), alpha=noise, optimizer=None)
+        self._process: Any = process.fit(points, difference)
         return self
 
     def predict(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
