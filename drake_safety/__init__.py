@@ -8,55 +8,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from drake_safety.assessments import load_assessment
-    from drake_safety.evaluation.loop_comparison import compare_loops
-    from drake_safety.learning.assessment import SafetyAssessment
-    from drake_safety.learning.assessment_parameters import AssessmentParameters
-    from drake_safety.learning.change_detector import ChangeDetector
-    from drake_safety.learning.segments import Episode, Episodes
-    from drake_safety.robots.shift import Fault
-    from drake_safety.simulation.closed_loop import ClosedLoop
-    from drake_safety.simulation.contract import check_contract
-    from drake_safety.simulation.episode_start import EpisodeStart
-    from drake_safety.simulation.recording import record_episodes
-    from drake_safety.simulation.rollouts import (
-        inputs_at,
-        run_episode,
-        run_episodes,
-        run_motions,
-    )
-    from drake_safety.simulation.scenario import Scenario, load_scenario
-    from drake_safety.systems.change_monitor import ChangeMonitor
-    from drake_safety.systems.recovery_switch import RecoverySwitch
-    from drake_safety.systems.safety_assessor import AddSafetyAssessor, SafetyAssessor
-    from drake_safety.systems.sensor_faults import SensorFaults
-
-__all__ = [
-    "AddSafetyAssessor",
-    "AssessmentParameters",
-    "ChangeDetector",
-    "ChangeMonitor",
-    "ClosedLoop",
-    "Episode",
-    "EpisodeStart",
-    "Episodes",
-    "Fault",
-    "RecoverySwitch",
-    "SafetyAssessment",
-    "SafetyAssessor",
-    "Scenario",
-    "SensorFaults",
-    "__version__",
-    "check_contract",
-    "compare_loops",
-    "inputs_at",
-    "load_assessment",
-    "load_scenario",
-    "record_episodes",
-    "run_episode",
-    "run_episodes",
-    "run_motions",
-]
+    from drake_safety.assessments import load_assessment as load_assessment
+    from drake_safety.evaluation.loop_comparison import compare_loops as compare_loops
+    from drake_safety.learning.assessment import AssessmentParameters as AssessmentParameters
+    from drake_safety.learning.assessment import SafetyAssessment as SafetyAssessment
+    from drake_safety.learning.change_detector import ChangeDetector as ChangeDetector
+    from drake_safety.learning.segments import Episode as Episode
+    from drake_safety.learning.segments import Episodes as Episodes
+    from drake_safety.robots.shift import Fault as Fault
+    from drake_safety.simulation.closed_loop import ClosedLoop as ClosedLoop
+    from drake_safety.simulation.contract import check_contract as check_contract
+    from drake_safety.simulation.episode_start import EpisodeStart as EpisodeStart
+    from drake_safety.simulation.recording import record_episodes as record_episodes
+    from drake_safety.simulation.rollouts import inputs_at as inputs_at
+    from drake_safety.simulation.rollouts import run_episode as run_episode
+    from drake_safety.simulation.rollouts import run_episodes as run_episodes
+    from drake_safety.simulation.rollouts import run_motions as run_motions
+    from drake_safety.simulation.scenario import Scenario as Scenario
+    from drake_safety.simulation.scenario import load_scenario as load_scenario
+    from drake_safety.systems.change_monitor import ChangeMonitor as ChangeMonitor
+    from drake_safety.systems.recovery_switch import RecoverySwitch as RecoverySwitch
+    from drake_safety.systems.safety_assessor import AddSafetyAssessor as AddSafetyAssessor
+    from drake_safety.systems.safety_assessor import SafetyAssessor as SafetyAssessor
+    from drake_safety.systems.sensor_faults import SensorFaults as SensorFaults
 
 _PACKAGE = Path(__file__).resolve().parent
 _BESIDE = ("assessments", "diagrams", "models")
@@ -110,6 +84,7 @@ _HOMES = {
     "run_episodes": "drake_safety.simulation.rollouts",
     "run_motions": "drake_safety.simulation.rollouts",
 }
+__all__ = [*_HOMES, "__version__"]
 
 
 def __getattr__(name: str) -> Any:

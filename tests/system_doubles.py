@@ -152,7 +152,7 @@ def guard(assessment, **options):
 
 
 class Kinematics:
-    num_positions, num_velocities, num_joints = 9, 8, 2
+    num_positions, num_velocities, num_states, num_joints = 9, 8, 17, 2
 
 
 def controller(evaluate=lambda batch, parts: (batch[:, :2] + 1.0, {}), **start):

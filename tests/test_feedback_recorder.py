@@ -5,6 +5,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
+from drake_safety.systems import feedback_recorder
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
 from gliding_task import declare_outputs
 from system_doubles import INFO, STEP_S
@@ -132,9 +133,9 @@ def test_a_jump_in_time_drops_the_open_window_and_forgets_what_was_left(x, v, un
     assert window.episode.is_safe
 
 
-def test_taking_empties_and_what_nobody_takes_is_dropped_and_counted():
-    running = Running(0.0, 0.0, capacity=2).advance(4 * NUM_STEPS * STEP_S + 0.001)
-    assert running.recorder.recording(running.context).num_dropped == 2
+def test_taking_empties_and_of_what_nobody_takes_the_newest_are_kept(monkeypatch):
+    monkeypatch.setattr(feedback_recorder, "_MOST_WINDOWS", 2)
+    running = Running(0.0, 0.0).advance(4 * NUM_STEPS * STEP_S + 0.001)
     assert running.recorder.GetOutputPort("num_finished").Eval(running.context)[0] == 4
     assert [window.episode.index for window in running.take()] == [2, 3]
     assert running.take() == []
@@ -158,9 +159,6 @@ def test_contexts_do_not_share_what_they_record():
     assert copy.deepcopy(recording) is recording
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"), [({"num_steps": 2}, "horizon of 3"), ({"capacity": 0}, "capacity is 0")]
-)
-def test_windows_too_short_or_none_at_all_are_refused(wrong, message):
-    with pytest.raises(ValueError, match=message):
-        Running(0.0, 0.0, **wrong)
+def test_windows_that_are_too_short_are_refused():
+    with pytest.raises(ValueError, match="horizon of 3"):
+        Running(0.0, 0.0, num_steps=2)

@@ -67,14 +67,6 @@ def test_each_map_reads_its_own_cells(seed):
         np.testing.assert_array_equal(GRID.interpolate(points, values)[0][k], alone[0])
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: GRID.scale(np.ones((5, 2))), "extent is 0"),
-        (lambda: Grid(resolution=0, cell_length=1.0), "resolution is 0"),
-        (lambda: Grid(resolution=3, cell_length=0.0), "cell_length is 0"),
-    ],
-)
-def test_a_grid_without_an_extent_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_points_without_an_extent_are_refused():
+    with pytest.raises(ValueError, match="extent is 0"):
+        GRID.scale(np.ones((5, 2)))

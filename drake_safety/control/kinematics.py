@@ -78,6 +78,7 @@ class RobotKinematics:
         self._scratch = Scratch(lambda: _Instant(model.Clone()))
         self.num_positions = self.plant.num_positions()
         self.num_velocities = self.plant.num_velocities()
+        self.num_states = self.num_positions + self.num_velocities
         self.num_joints = self.num_velocities - NUM_BASE_VELOCITIES
         instance = self.plant.GetModelInstanceByName(robot.name)
         self.joint_names = servo_joints(self.plant, robot)

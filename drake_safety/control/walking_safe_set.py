@@ -185,15 +185,11 @@ class WalkingSafeSet:
         return changed
 
 
-def _up(q: np.ndarray) -> tuple[float, float, float]:
-    """The vertical's components along the base's axes."""
-    w, x, y, z = (q[:4] / math.sqrt(q[:4] @ q[:4])).tolist()
-    return 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-
-
 def _tilt(q: np.ndarray) -> float:
-    x, y, z = _up(q)
-    return math.atan2(math.hypot(x, y), z)
+    """The angle between the base's z axis and the vertical [rad]."""
+    w, x, y, z = (q[:4] / math.sqrt(q[:4] @ q[:4])).tolist()
+    level = math.hypot(2 * (x * z - w * y), 2 * (y * z + w * x))
+    return math.atan2(level, 1 - 2 * (x * x + y * y))
 
 
 def _tilt_rate(q: np.ndarray, v: np.ndarray) -> float:

@@ -60,8 +60,8 @@ def neighbour_graph(
     score_weight: float,
     num_neighbours: int,
     num_candidates: int | None = None,
-    cost: str = "squared",
-    backend: str = "dtaidistance",
+    cost: WarpingCost = "squared",
+    backend: Backend = "dtaidistance",
     progress: Callable[[float], object] = ignore,
 ) -> NeighbourGraph:
     """Finds the nearest neighbours under the safety distance Omega.
@@ -76,30 +76,17 @@ def neighbour_graph(
         num_candidates: Segments with the smallest bounds of Omega among which the neighbours of a
             segment are sought, at least k; None for all others, with which they are exact and the
             cost grows as N^2.
-        cost: One of `WARPING_COSTS`.
+        cost: Cost of a warping path.
         backend: "dtaidistance", or "tslearn", which ignores the bounds and has no "absolute" cost.
 
     Returns:
         The graph, with distances Omega = DTW / w_max + delta |lambda_i - lambda_j|.
     """
-    for name, value, known in (("backend", backend, BACKENDS), ("cost", cost, WARPING_COSTS)):
-        if value not in known:
-            raise ValueError(f"distance: unknown {name} '{value}'; it is one of {list(known)}")
     if backend == "tslearn" and cost == "absolute":
         raise ValueError("distance: the backend 'tslearn' has no cost 'absolute'")
     error = np.asarray(error, dtype=float)
     score = np.asarray(score, dtype=float)
     num_segments = len(error)
-    if not 0 < num_neighbours < num_segments:
-        raise ValueError(
-            f"neighbour_graph: got {num_neighbours} neighbours among {num_segments} segments, "
-            "expected fewer neighbours than segments"
-        )
-    if num_candidates is not None and num_candidates < num_neighbours:
-        raise ValueError(
-            f"neighbour_graph: got {num_candidates} candidates for {num_neighbours} neighbours, "
-            "expected no fewer candidates than neighbours"
-        )
     if not np.all(np.isfinite(error)):
         raise ValueError("neighbour_graph: the errors contain values that are not finite")
     from scipy.spatial import cKDTree

@@ -45,12 +45,6 @@ class Grid:
             interpolates=mode_settings(parameters).interpolates,
         )
 
-    def __post_init__(self) -> None:
-        if self.resolution < 1:
-            raise ValueError(f"Grid: resolution is {self.resolution}, expected >= 1")
-        if not self.cell_length > 0.0:
-            raise ValueError(f"Grid: cell_length is {self.cell_length}, expected > 0")
-
     @property
     def num_cells(self) -> int:
         """R * R."""

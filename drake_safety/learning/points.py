@@ -114,12 +114,6 @@ def tsne(
         perplexity: Effective number of neighbours.
         exaggeration: Factor of the attraction after the early phase, 1 for plain t-SNE.
     """
-    num_neighbours = graph.indices.shape[1]
-    if num_neighbours < int(3 * perplexity):
-        raise ValueError(
-            f"tsne: perplexity {perplexity} needs {int(3 * perplexity)} neighbours per segment, "
-            f"the graph has {num_neighbours}"
-        )
     import openTSNE
     from openTSNE.affinity import PerplexityBasedNN
     from openTSNE.initialization import spectral

@@ -357,10 +357,7 @@ def _changed(text: str, name: str, changes: Mapping[str, Any]) -> str:
 def read_scenario(name: str | Path) -> Scenario:
     """Reads a scenario's file without importing its task, so that no code of a stranger runs.
 
-    Its parameters are those that stand in the file, unchecked.
-
-    Raises:
-        ValueError: See :func:`load_scenario`.
+    Its parameters are those that stand in the file, unchecked; errors are as of `load_scenario`.
     """
     path = _scenario_file(name)
     with reading(path):
@@ -382,13 +379,10 @@ def _scenario_file(name: str | Path) -> Path:
 
 
 def parse_scenario(text: str, *, name: str, folder: Path, task_folder: str = "") -> Scenario:
-    """Reads a scenario from YAML text.
+    """Reads a scenario from YAML text; errors are as of `load_scenario`.
 
     Args:
         task_folder: Folder in which the task's module may stand; "" for none.
-
-    Raises:
-        ValueError: See :func:`load_scenario`.
     """
     scenario = _parsed(text, name, folder)
     scenario.folder = task_folder

@@ -76,8 +76,7 @@ class AssessorInputs(LeafSystem):
         self.feature_names = list(safe_set.feature_names)
         if gravity is not None:
             self.feature_names += ["gravity_x", "gravity_y"]
-        state = kinematics.num_positions + kinematics.num_velocities
-        self._state_port = self.DeclareVectorInputPort("plant_state", state)
+        self._state_port = self.DeclareVectorInputPort("plant_state", kinematics.num_states)
         self._outlook_port = self.DeclareVectorInputPort("desired_outlook", 3 * num_outlook)
         self._command_port = self._memory_port = None
         if servo_loads:

@@ -71,9 +71,8 @@ class CommandGuard(LeafSystem):
         self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
         self._features_port = self.DeclareVectorInputPort("features", len(info.feature_names))
         self._is_acting = self.DeclareNumericParameter(BasicVector([1.0]))
-        command = self.DeclareDiscreteState(3)
-        self._decision = self.DeclareDiscreteState(2)
-        self._command = command
+        command = self._command = self.DeclareDiscreteState(3)
+        self._is_changed, self._probability = map(self.DeclareDiscreteState, (1, 1))
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
         self.DeclareStateOutputPort("desired_output", command)
@@ -86,15 +85,8 @@ class CommandGuard(LeafSystem):
                 ),
                 {self.discrete_state_ticket(command)},
             )
-        for i, name in enumerate(("is_changed", "safety_probability")):
-            self.DeclareVectorOutputPort(
-                name,
-                BasicVector(1),
-                lambda context, output, i=i: output.SetFromVector(
-                    context.get_discrete_state(self._decision).get_value()[i : i + 1]
-                ),
-                {self.discrete_state_ticket(self._decision)},
-            )
+        self.DeclareStateOutputPort("is_changed", self._is_changed)
+        self.DeclareStateOutputPort("safety_probability", self._probability)
 
     def set_acting(self, context: Context, is_acting: bool) -> None:
         """Sets whether the guard acts, from its next decision on."""
@@ -144,5 +136,5 @@ class CommandGuard(LeafSystem):
         else:
             command, probability = np.clip(asked, self._lowest, self._highest), 0.0
         discrete_state.set_value(self._command, command)
-        is_changed = bool(np.any(command != asked))
-        discrete_state.set_value(self._decision, [float(is_changed), probability])
+        discrete_state.set_value(self._is_changed, [float(np.any(command != asked))])
+        discrete_state.set_value(self._probability, [probability])

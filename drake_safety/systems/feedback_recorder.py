@@ -11,6 +11,8 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drake_safety.learning.segments import RECORDED, Episode, Episodes, EpisodesInfo
 
+_MOST_WINDOWS = 400
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RecordedWindow:
@@ -30,7 +32,6 @@ class Recording:
     plant_state: np.ndarray | None = None
     windows: tuple[RecordedWindow, ...] = ()
     num_finished: int = 0
-    num_dropped: int = 0
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Recording:
         return self
@@ -63,14 +64,14 @@ class FeedbackRecorder(LeafSystem):
     A row is recorded every ``info.step_s``. A window ends safe after ``num_steps`` steps, and the
     next one begins with its last row. It ends unsafe as soon as ``safe``, sampled every
     ``watch_period_s``, is below one, and the next one begins when it is one again. When time
-    jumps, as at a reset, the open window is dropped. The windows are state of the Context;
-    :meth:`take_windows` removes them. ``true_state`` defaults to ``state``, as on a robot. A window
-    with a row at which ``recovery_active`` is not zero is dropped: its twin has no recovery.
+    jumps, as at a reset, the open window is dropped. The windows, at most the newest 400, are state
+    of the Context; :meth:`take_windows` removes them. ``true_state`` defaults to ``state``, as on a
+    robot. A window with a row at which ``recovery_active`` is not zero is dropped: its twin has no
+    recovery.
 
     Args:
         num_steps: Steps of a safe window.
         watch_period_s: Sampling period of ``safe`` [s].
-        capacity: Largest number of finished windows kept; the oldest are dropped.
 
     Raises:
         ValueError: A window is shorter than the horizon.
@@ -83,7 +84,6 @@ class FeedbackRecorder(LeafSystem):
         num_steps: int,
         plant_state_size: int,
         watch_period_s: float,
-        capacity: int = 400,
     ):
         super().__init__()
         if num_steps < info.horizon * info.preview_stride:
@@ -91,10 +91,8 @@ class FeedbackRecorder(LeafSystem):
                 f"feedback recorder: num_steps is {num_steps}, expected at least the horizon of "
                 f"{info.horizon * info.preview_stride} steps"
             )
-        if capacity < 1:
-            raise ValueError(f"feedback recorder: capacity is {capacity}, expected >= 1")
         self.info = info
-        self._num_steps, self._capacity = num_steps, capacity
+        self._num_steps = num_steps
         num_outputs, num_margins = len(info.output_names), len(info.constraint_names)
         sizes = {
             "state": len(info.state_names),
@@ -202,10 +200,5 @@ class FeedbackRecorder(LeafSystem):
         window = RecordedWindow(
             episode=episode, plant_state=recording.plant_state, start_time_s=float(times_s[0])
         )
-        windows = (*recording.windows, window)
-        return replace(
-            recording,
-            windows=windows[-self._capacity :],
-            num_finished=recording.num_finished + 1,
-            num_dropped=recording.num_dropped + max(len(windows) - self._capacity, 0),
-        )
+        windows = (*recording.windows, window)[-_MOST_WINDOWS:]
+        return replace(recording, windows=windows, num_finished=recording.num_finished + 1)

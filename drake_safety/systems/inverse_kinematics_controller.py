@@ -73,9 +73,7 @@ class InverseKinematicsController(LeafSystem):
         n_j = kinematics.num_joints
         self._limits = np.ascontiguousarray(kinematics.position_limits.T)
         # Looking up ports by name in every update would cost more than evaluating them.
-        self._state_port = self.DeclareVectorInputPort(
-            "plant_state", kinematics.num_positions + kinematics.num_velocities
-        )
+        self._state_port = self.DeclareVectorInputPort("plant_state", kinematics.num_states)
         self._desired_port = self.DeclareVectorInputPort("desired_output", 3)
         self._feet_port = self.DeclareVectorInputPort(
             "desired_foot_positions", 3 * kinematics.num_contacts

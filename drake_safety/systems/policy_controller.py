@@ -39,9 +39,7 @@ class PolicyController(LeafSystem):
         self.policy = policy
         self._n_q = kinematics.num_positions
         n_a, n_p, n_j = len(policy.joints), len(policy.initial_phases), kinematics.num_joints
-        self._state_port = self.DeclareVectorInputPort(
-            "plant_state", kinematics.num_positions + kinematics.num_velocities
-        )
+        self._state_port = self.DeclareVectorInputPort("plant_state", kinematics.num_states)
         self._command_port = self.DeclareVectorInputPort("command", 3)
         standing = np.concatenate([policy.default_positions, np.zeros(n_j)])
         self._set_point = self.DeclareDiscreteState(standing)

@@ -85,9 +85,7 @@ class RecoveryStepPlanner(LeafSystem):
         )
         self._groups = gait_groups(self._nominal_feet)
         n_p = 3 * kinematics.num_contacts
-        self._state_port = self.DeclareVectorInputPort(
-            "plant_state", kinematics.num_positions + kinematics.num_velocities
-        )
+        self._state_port = self.DeclareVectorInputPort("plant_state", kinematics.num_states)
         self._active_port = self.DeclareVectorInputPort("recovery_active", 1)
         self._nominal_port = self.DeclareVectorInputPort("nominal_desired_output", 3)
         # One discrete state group per quantity.
@@ -156,7 +154,7 @@ class RecoveryStepPlanner(LeafSystem):
             discrete_state.set_value(self._mode, [_DONE if is_active else _IDLE])
             discrete_state.set_value(self._set_point, self._nominal_port.Eval(context))
             return
-        time = context.get_time()
+        time, swing_s = context.get_time(), self._parameters.step_duration_s - 1e-9
         q, v = np.split(self._state_port.Eval(context), [self._kinematics.num_positions])
         if mode == _RETURNING:
             if self._stays_standing(discrete_state, q, v):
@@ -167,16 +165,12 @@ class RecoveryStepPlanner(LeafSystem):
             discrete_state.set_value(self._num_steps, [0])
             discrete_state.set_value(self._heading, discrete_state.get_value(self._stance)[2:])
             self._begin(discrete_state, q, v, time)
-        elif time - discrete_state.get_value(self._start_s)[0] >= self._swing_s:
+        elif time - discrete_state.get_value(self._start_s)[0] >= swing_s:
             self._plant(discrete_state, q, time)
             if self._can_stand(discrete_state, q, v):
                 self._stand(discrete_state, q, v)
                 return
         self._swing(discrete_state, q, v, time)
-
-    @property
-    def _swing_s(self) -> float:
-        return self._parameters.step_duration_s - 1e-9
 
     def _contacts(self, discrete_state: DiscreteValues) -> np.ndarray:
         return discrete_state.get_value(self._planted).reshape(-1, 3).copy()
@@ -227,12 +221,9 @@ class RecoveryStepPlanner(LeafSystem):
         return self._margin(discrete_state, q, v) >= parameters.settle_margin_m
 
     def _stays_standing(self, discrete_state: DiscreteValues, q: np.ndarray, v: np.ndarray) -> bool:
-        parameters = self._parameters
-        num_steps = discrete_state.get_value(self._num_steps)[0]
-        return (
-            num_steps >= parameters.max_steps
-            or self._margin(discrete_state, q, v) >= parameters.resume_margin_m
-        )
+        if discrete_state.get_value(self._num_steps)[0] >= self._parameters.max_steps:
+            return True
+        return self._margin(discrete_state, q, v) >= self._parameters.resume_margin_m
 
     def _stand(self, discrete_state: DiscreteValues, q: np.ndarray, v: np.ndarray) -> None:
         contacts = self._contacts(discrete_state)
@@ -250,8 +241,7 @@ class RecoveryStepPlanner(LeafSystem):
         p_WB, v_WB = np.split(discrete_state.get_value(self._return_start), 2)
         resting = come_to_rest(p_WB, v_WB, elapsed_s)
         s = min(elapsed_s / self._parameters.return_duration_s, 1.0)
-        blend = minimum_jerk(s)
-        discrete_state.set_value(self._set_point, resting + blend * (goal - resting))
+        discrete_state.set_value(self._set_point, resting + minimum_jerk(s) * (goal - resting))
         if s >= 1.0:
             discrete_state.set_value(self._mode, [_DONE])
 

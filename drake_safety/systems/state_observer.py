@@ -62,45 +62,40 @@ class StateObserver(LeafSystem):
         self._kinematics = kinematics
         self._noise = noise or ObservationNoise()
         self._is_exact = self._noise.position == 0 and self._noise.velocity == 0
-        n_q, n_v = kinematics.num_positions, kinematics.num_velocities
-        self._n_q = n_q
+        n_x, self._n_q = kinematics.num_states, kinematics.num_positions
         self.state_names = (walking_state_names if is_walking else state_names)(kinematics)
         self.output_names = [f"{'base' if hand is None else 'hand'}_{axis}" for axis in "xyz"]
         if is_walking:
             self.output_names = ["forward_velocity", "left_velocity", "yaw_rate"]
-        self._state_port = self.DeclareVectorInputPort("plant_state", n_q + n_v)
-        self._noise_port = self.DeclareVectorInputPort("noise", 2 * n_v)
-        measured = self.DeclareVectorOutputPort(
-            "measured_plant_state", BasicVector(n_q + n_v), self._calc_measured
+        self._state_port = self.DeclareVectorInputPort("plant_state", n_x)
+        self._noise_port = self.DeclareVectorInputPort("noise", 2 * kinematics.num_velocities)
+        self._measured_port = self.DeclareVectorOutputPort(
+            "measured_plant_state", BasicVector(n_x), self._calc_measured
         )
         self.DeclareVectorOutputPort("state", BasicVector(len(self.state_names)), self._calc_state)
         self.DeclareVectorOutputPort("output", BasicVector(3), self._calc_output)
-        self._measured_port = measured
 
     def _calc_measured(self, context: Context, output: BasicVector) -> None:
         state = self._state_port.Eval(context)
         is_noisy = not self._is_exact and self._noise_port.HasValue(context)
         if is_noisy and np.isfinite(state).all():
-            q, v = add_noise(
-                state[: self._n_q], state[self._n_q :], self._noise_port.Eval(context), self._noise
-            )
-            state = np.concatenate([q, v])
+            q, v = np.split(state, [self._n_q])
+            state = np.concatenate(add_noise(q, v, self._noise_port.Eval(context), self._noise))
         output.SetFromVector(state)
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
-        measured = self._measured_port.Eval(context)
-        state_of = walking_state if self._is_walking else stance_state
-        state = state_of(self._kinematics, measured[: self._n_q], measured[self._n_q :])
+        q, v = np.split(self._measured_port.Eval(context), [self._n_q])
+        state = (walking_state if self._is_walking else stance_state)(self._kinematics, q, v)
         output.SetFromVector(state if self._mirror is None else self._mirror.stance_state(state))
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
         measured = self._measured_port.Eval(context)
+        q, v = np.split(measured, [self._n_q])
         if self._is_walking and np.isfinite(measured).all():
-            output.SetFromVector(heading_velocity(measured[: self._n_q], measured[self._n_q :]))
+            output.SetFromVector(heading_velocity(q, v))
         elif self._hand is None:
-            output.SetFromVector(measured[4:7])
+            output.SetFromVector(q[4:7])
         elif np.isfinite(measured).all():
-            q = measured[: self._n_q]
             output.SetFromVector(self._kinematics.reaching_position(q, self._hand))
         else:
             output.SetFromVector(np.full(3, np.nan))

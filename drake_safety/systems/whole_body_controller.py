@@ -75,9 +75,7 @@ class WholeBodyController(LeafSystem):
         self._matrix = matrix
         self._n_q = kinematics.num_positions
         # Looking up ports by name in every update would cost more than evaluating them.
-        self._state_port = self.DeclareVectorInputPort(
-            "plant_state", kinematics.num_positions + kinematics.num_velocities
-        )
+        self._state_port = self.DeclareVectorInputPort("plant_state", kinematics.num_states)
         self._desired_port = self.DeclareVectorInputPort("desired_output", 3)
         self._rate_port = self.DeclareVectorInputPort("desired_output_rate", 3)
         standing = self.model.reference(kinematics.standing_positions())
