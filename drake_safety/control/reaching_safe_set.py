@@ -60,7 +60,6 @@ class ReachingSafeSet:
 
     Args:
         model: Tasks and weights of the controller, with the reaching hand.
-        is_mirrored: Whether features are mirrored.
     """
 
     names = ("support_polygon", "collision", "joint_limits", "fall")

@@ -14,9 +14,6 @@ from filelock import BaseFileLock, FileLock, Timeout
 def replacing(final: Path) -> Iterator[Path]:
     """A temporary file beside a final one, renamed to it on success and removed on any exception.
 
-    Args:
-        final: Path of the complete file.
-
     Raises:
         OSError: It cannot be written; the message names the file.
     """

@@ -60,7 +60,6 @@ class ChangeDetector:
     learned from failures.
 
     Attributes:
-        predictor: The prediction.
         columns: Which entries of (state, desired preview, features) it sees, (n_u,).
         watched: Which states it predicts, (n_w,).
         deviation: Standard deviations of the innovations, (n_w,).

@@ -38,8 +38,6 @@ class EpisodePair:
 
     Attributes:
         info: That of the actual episode.
-        actual: The actual episode.
-        twin: The nominal one.
         nominal_hash: Scenario hash of the nominal plant.
         twin_seed: Seed of the twin's set.
     """

@@ -72,10 +72,6 @@ def learned_maps(
     cells of others, so the 0.1 and 99.9 % quantiles of training clip every column of x; of a
     clipped input a map knows at least the other columns, as a decision tree does.
 
-    Args:
-        points: Those of the segments.
-        columns: The columns of x.
-
     Returns:
         The maps, the base logit of their heads and of the trees, and the trees. Without heads, both
         are None; without held-out episodes of both labels, to weigh them on, trees are.

@@ -94,7 +94,6 @@ class UsedEpisodes:
     Attributes:
         purpose: "training", "falls", "calibration" or "adaptation".
         seed: Seed of the set, or `NOT_DRAWN`.
-        num_episodes: Number of episodes.
     """
 
     purpose: str

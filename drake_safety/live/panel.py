@@ -54,8 +54,6 @@ class LivePanel:
         probability: The probability; NaN before the first.
         belief: (safe, unsafe, don't know), of sum one.
         buttons: Key of each button by its name, as `KeyboardEvent.code`; "" for none.
-        sliders: By name.
-        is_stopped: Whether the session has ended.
     """
 
     def __init__(self, *, title: str, threshold: float):

@@ -94,7 +94,6 @@ class LiveSession:
     Attributes:
         threshold: Lowest probability that is shown as "safe", and of accepted targets.
         unsafe_below: Probability below which a target is unsafe; in between is "don't know".
-        pace: Simulated and real time.
         cause: The constraint that was violated first since the start; "" for none.
         command: The present command, (3,), of a loop that follows commands.
         is_guarded: Whether a guard replaces commands that are not accepted.

@@ -27,7 +27,6 @@ class Channel:
         topic: Topic of the messages; empty for a table.
         time: Time in the log's unit, integers or floats, (N,); dates and durations in ns
             become integers.
-        time_unit: Unit of ``time``.
         frame: The requested columns, N rows of floats; the index is their number in the file.
         row_name: Name of a row: "line", "row" or "message".
         origin: Instant from which ``time_s`` counts, in the log's unit.

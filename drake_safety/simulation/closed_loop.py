@@ -54,7 +54,6 @@ class ClosedLoop(Diagram):
     which the controller found no command; episodes store its last value.
 
     Attributes:
-        variation: Name of the plant variation.
         state_names, output_names, feature_names, constraint_names: Names of the ports' entries.
     """
 

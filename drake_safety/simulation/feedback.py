@@ -59,7 +59,6 @@ def run_pairs(
     Both episodes of a pair draw from the same generator, so their initial states are the same.
 
     Args:
-        variation: The actual plant.
         path: Folder for the episodes, with a folder for either plant; episodes that it already
             holds are not simulated again.
         **loop_options: Options of the task; they replace those for pairs.

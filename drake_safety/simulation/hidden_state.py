@@ -26,7 +26,6 @@ def difference(found: Episode, make: Callable[[], Diagram], run: Callable[..., E
     systems are compared after each step.
 
     Args:
-        make: Makes a new diagram.
         run: Simulates an episode of a diagram and an index; ``monitor`` is called with the Context
             after each step.
     """

@@ -140,12 +140,9 @@ def undisturbed_start(
     sampling: StartSampling,
     duration_s: float,
 ) -> EpisodeStart:
-    """Samples a start at rest with base motions one after another.
+    """Samples a start at rest with base motions one after another, for a duration [s].
 
     Their ends are within half of the range of training's plans, most of which are then safe.
-
-    Args:
-        duration_s: Duration of all motions together [s].
     """
     xy = rng.uniform(-1, 1, (kinematics.num_contacts, 2)) * sampling.foot_offset_m
     p_WC = np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])

@@ -40,7 +40,6 @@ class InverseKinematicsController(LeafSystem):
 
     Args:
         stiffness: Servo stiffness of every joint, (n_j,) [N·m/rad]; robot.yaml's by default.
-        period_s: Control period [s].
         offset_s: Time of the first update, after those of its inputs [s].
 
     Raises:

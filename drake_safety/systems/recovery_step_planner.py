@@ -62,7 +62,6 @@ class RecoveryStepPlanner(LeafSystem):
     set points. No output has direct feedthrough.
 
     Args:
-        period_s: Planning period [s].
         horizon: H, samples of the preview.
         num_outlook: M, samples of the outlook.
     """

@@ -36,7 +36,6 @@ class RecoveryTrigger(LeafSystem):
             is "don't know" [s]; none by default, as in the paper.
         initial_uncertainty: μ_ini of the assessment, which says what is "don't know"; see
             :func:`~drake_safety.learning.prediction.is_unknown`.
-        period_s: Update period [s].
 
     Raises:
         ValueError: The threshold is outside [0, 1], or the persistence negative.

@@ -20,16 +20,10 @@ def interpolate(
     *,
     detour: np.ndarray | None = None,
 ) -> PiecewisePolynomial:
-    """The minimum-jerk motion from rest at ``start`` to rest at ``goal``.
+    """The minimum-jerk motion from rest at ``start`` to rest at ``goal``, (n_z,) [m] each.
 
     With s the minimum-jerk progress from 0 to 1, ``z*(s) = start + s (goal - start) + 4 s (1 - s)
-    detour``: at s = 0.5 the motion is offset from the straight line by the detour.
-
-    Args:
-        start: (n_z,) [m].
-        goal: (n_z,) [m].
-        duration_s: Duration of the motion [s].
-        detour: (n_z,) [m]; none for the straight line.
+    detour``: at s = 0.5 the motion is offset from the straight line by the detour, (n_z,) [m].
     """
     if not duration_s > 0:
         raise ValueError(f"plan: duration_s must be positive; got {duration_s}")

@@ -46,7 +46,6 @@ class WholeBodyController(LeafSystem):
         actuation_matrix: Maps joint torques (n_j,) onto the plant's actuators, (n_u, n_j), see
             :func:`~drake_safety.robots.robot.actuation_matrix`; the joints' own order by
             default.
-        period_s: Control period [s].
         offset_s: Time of the first update, after those of its inputs [s].
 
     Raises:
