@@ -54,7 +54,7 @@ class StartSampling:
         X_WS = planar_pose(fit_stance(p_WC, kinematics.nominal_contacts))
         start = np.append(
             kinematics.nominal_base_offset + rng.uniform(-1, 1, 2) * self.base_offset_m,
-            rng.uniform(*self.base_height_m),
+            _between(rng, self.base_height_m),
         )
         rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * self.tilt_rad)
         error = np.asarray(self.tracking_offset_m)
@@ -66,9 +66,9 @@ class StartSampling:
         offsets = rng.normal(size=kinematics.num_joints) * self.joint_std_rad
         goal = np.append(
             kinematics.nominal_base_offset + rng.uniform(-1, 1, 2) * self.target_offset_m,
-            rng.uniform(*self.target_height_m),
+            _between(rng, self.target_height_m),
         )
-        plan = interpolate(start, goal, rng.uniform(*self.plan_duration_s))
+        plan = interpolate(start, goal, _between(rng, self.plan_duration_s))
         V_WB = np.concatenate([w_WB, v_WB])
         return _start(kinematics, X_WB, p_WC, plan, V_WB, joint_offsets=offsets)
 
@@ -94,8 +94,8 @@ class PushSampling:
         """Samples a ball from any horizontal direction."""
         return Throw(
             time_s=time_s,
-            mass_kg=rng.uniform(*self.mass_kg),
-            speed_m_s=rng.uniform(*self.speed_m_s),
+            mass_kg=_between(rng, self.mass_kg),
+            speed_m_s=_between(rng, self.speed_m_s),
             direction_rad=rng.uniform(-math.pi, math.pi),
             offset_m=rng.uniform(-self.offset_m, self.offset_m),
             height_m=rng.uniform(-self.height_m, self.height_m),
@@ -120,7 +120,7 @@ def calm_start(
     nominal = np.array([*kinematics.nominal_base_offset, kinematics.standing_height])
     start = nominal + rng.uniform(-half, half)
     goal = nominal + rng.uniform(-half, half)
-    duration_s = rng.uniform(*plan_duration_s)
+    duration_s = _between(rng, plan_duration_s)
     plan = interpolate(start, goal, duration_s, start_time_s=-elapsed_s)
     p_WC = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
     X_WB = RigidTransform(plan.value(0.0).ravel())
@@ -155,7 +155,7 @@ def undisturbed_start(
     X_WB = planar_pose(fit_stance(p_WC, kinematics.nominal_contacts)) @ RigidTransform(point)
     while time_s < duration_s:
         goal = middle + rng.uniform(-half, half)
-        pieces.append(interpolate(point, goal, rng.uniform(*sampling.plan_duration_s), time_s))
+        pieces.append(interpolate(point, goal, _between(rng, sampling.plan_duration_s), time_s))
         time_s = pieces[-1].end_time()
         rest_s = rng.uniform(*_RESTS_S)
         pieces.append(_rest(goal, time_s, time_s + rest_s))
@@ -204,3 +204,8 @@ def _start(
     joints = np.clip(joints + joint_offsets, *kinematics.position_limits.T)
     q = kinematics.positions_at(X_WB, joints)
     return EpisodeStart(q=q, v=v, plan=plan, foot_positions=p_WC)
+
+
+def _between(rng: np.random.Generator, bounds: list[float]) -> float:
+    low, high = bounds
+    return rng.uniform(low, high)
