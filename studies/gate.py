@@ -21,7 +21,6 @@ from drake_safety.cli.console import ScenarioArgument, VariationOption, WorkersO
 from drake_safety.cli.training_folder import MODES, assessment_folder, load_assessment
 from drake_safety.evaluation.failure_rate import in_turns, strata_of, stratified_rate
 from drake_safety.evaluation.metrics import Estimate, median, proportion
-from drake_safety.evaluation.outcomes import first_inputs
 from drake_safety.evaluation.paired_test import betting_log_e
 from drake_safety.evaluation.shifts import PlantShift, shifted_scenario
 from drake_safety.learning.seeds import GATE
@@ -61,7 +60,8 @@ def gate(
             study.add(f"effort {effort:g}", rows(failures(real), candidate, replays))
         if study.scenario.name in assessed_scenarios():
             gamma = load_assessment(assessment_folder(study.scenario, None).path, MODES[0])
-            score = 1.0 - gamma.predict(*first_inputs(real)).probability
+            inputs = zip(*(one.first_inputs for one in real), strict=True)
+            score = 1.0 - gamma.predict(*map(np.array, inputs)).probability
             study.add("rate", rate_rows(score, failures(real), replays))
 
 
@@ -95,19 +95,19 @@ def rows(baseline: np.ndarray, candidate: np.ndarray, num_replays: int) -> dict[
     index, other = rng.integers(len(baseline), size=(2, *size))
     apart = candidate - baseline
     swapped = apart[index] * rng.choice([-1, 1], size)
-    either = first_looks(swapped, 0.0, is_above=True)
+    either = first_looks(swapped, 0.0)
     found = {
         "baseline.failures": proportion(int(baseline.sum()), len(baseline)),
         "candidate.failures": proportion(int(candidate.sum()), len(candidate)),
         "only one.failures": proportion(int(np.abs(apart).sum()), len(apart)),
         "equal loops.false_worse": _share_known(either),
     }
-    for end, is_above in {"low": True, "high": False}.items():
-        known = first_looks(apart[index], float(apart.mean()), is_above=is_above)
+    for end, sign in {"low": 1, "high": -1}.items():
+        known = first_looks(sign * apart[index], float(sign * apart.mean()))
         found[f"{end} end.misses"] = _share_known(known)
     alone = candidate[other] - baseline[index]
     for name, differences in {"paired": apart[index], "unpaired": alone}.items():
-        known = first_looks(differences, 0.0, is_above=True)
+        known = first_looks(differences, 0.0)
         found[f"{name}.pairs_until_worse"] = median(known)
         found[f"{name}.power"] = _share_known(known)
     number = batch_size(float(baseline.mean()), float(candidate.mean()))
@@ -123,7 +123,8 @@ def rate_rows(score: np.ndarray, failed: np.ndarray, num_replays: int) -> dict[s
         stratum = strata_of(score[drawn], rng)
         index = in_turns(stratum)[:_ROLLOUTS]
         counts = np.bincount(stratum[index], weights=failed[drawn[index]])
-        found.append(stratified_rate(np.bincount(stratum), np.bincount(stratum[index]), counts))
+        numbers = np.bincount(stratum), np.bincount(stratum[index])
+        found.append(stratified_rate(*numbers, counts)[0])
     values = np.array([one.value for one in found])
     misses = sum(not one.low <= truth <= one.high for one in found)
     error = values.std() / math.sqrt(num_replays)
@@ -138,11 +139,11 @@ def rate_rows(score: np.ndarray, failed: np.ndarray, num_replays: int) -> dict[s
     }
 
 
-def first_looks(differences: np.ndarray, mean: float, *, is_above: bool) -> np.ndarray:
-    """Pairs at which it is known that a mean is above or below, (R,), of differences (R, N)."""
+def first_looks(differences: np.ndarray, mean: float) -> np.ndarray:
+    """Pairs at which it is known that a mean is above, (R,), of differences (R, N)."""
     seen = [np.cumsum(differences == one, axis=1, dtype=np.int32) for one in _OUTCOMES]
     counts = np.stack([one[:, _LOOKS - 1] for one in seen], axis=-1)
-    is_known = betting_log_e(_OUTCOMES, counts, mean, is_above=is_above) >= -math.log(_ALPHA)
+    is_known = betting_log_e(_OUTCOMES, counts, mean) >= -math.log(_ALPHA)
     return np.where(is_known.any(axis=1), _LOOKS[is_known.argmax(axis=1)], math.inf)
 
 

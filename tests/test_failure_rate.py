@@ -40,7 +40,7 @@ def replay(rng, probability, score_of):
     failed = rng.random(NUM_ROLLOUTS) < p[index]
     counted = partial(np.bincount, minlength=10)
     failures = counted(stratum[index], weights=failed)
-    return stratified_rate(counted(stratum), counted(stratum[index]), failures)
+    return stratified_rate(counted(stratum), counted(stratum[index]), failures)[0]
 
 
 @pytest.mark.parametrize(
@@ -87,11 +87,21 @@ def test_a_start_is_simulated_as_often_as_its_outcome_is_uncertain():
 
 def test_without_strata_it_is_a_share_with_nearly_the_exact_interval():
     for count in (0, 3, 40, 197, 200):
-        found = stratified_rate(np.array([10**9]), np.array([200]), np.array([count]))
+        found, number = stratified_rate(np.array([10**9]), np.array([200]), np.array([count]))
+        assert number == pytest.approx(200, rel=1e-3)
         exact = proportion(count, 200)
         assert found.value == exact.value
-        assert found.low == pytest.approx(exact.low, abs=0.006)
-        assert found.high == pytest.approx(exact.high, abs=0.006)
+        assert found.low == pytest.approx(exact.low, abs=1e-4)
+        assert found.high == pytest.approx(exact.high, abs=1e-4)
+
+
+def test_it_is_the_prediction_powered_estimate_of_ppi_python():
+    # By ppi-python 0.2.3: ppi_mean_pointestimate and ppi_mean_ci with lam 1, as predictions the share
+    # of failures of each stratum, and as weights its share over its rollouts. Its interval is normal.
+    starts, rollouts = np.array([4000, 3000, 2000, 1000]), np.full(4, 100)
+    found, _ = stratified_rate(starts, rollouts, np.array([2, 10, 40, 80]))
+    assert found.value == pytest.approx(0.198)
+    assert (found.low, found.high) == pytest.approx((0.16825271, 0.22774729), abs=0.003)
 
 
 class Angle:
@@ -112,7 +122,7 @@ def test_an_estimate_is_that_of_ordinary_episodes_and_is_continued(monkeypatch, 
     scenario = load_scenario("pendulum", WEAK)
     options = {"num_starts": 120, "num_rollouts": 60, "num_workers": 1, "seed": 3}
     options |= {"path": tmp_path, "variation": "actual"}
-    stopped, collect = [], failure_rate.collect_episodes
+    collect = failure_rate.collect_episodes
 
     def stop(info, indices, *arguments, **known):
         if len(indices) == 120:
@@ -122,17 +132,13 @@ def test_an_estimate_is_that_of_ordinary_episodes_and_is_continued(monkeypatch, 
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(failure_rate, "collect_episodes", stop)
-        estimate_failure_rate(scenario, Angle(), if_stopped=stopped.append, **options)
-    assert [one.rate.n for one in stopped] == [25]
+        estimate_failure_rate(scenario, Angle(), **options)
     found = estimate_failure_rate(scenario, Angle(), **options)
-    assert sum(one.rollouts for one in found.strata) == found.rate.n == 60
-    assert sum(one.starts for one in found.strata) == 120
-    assert [one.low for one in found.strata] == sorted(one.low for one in found.strata)
+    assert found.rate.n == 60
     ordinary = run_episodes(scenario, 120, variation="actual", seed=3, num_workers=1)
     failed = {one.index: one for one in ordinary if not one.is_safe}
     assert {one.episode for one in found.failures} <= failed.keys()
     assert all(failed[one.episode].time_s[-1] == one.time_s for one in found.failures)
-    assert sum(one.failures for one in found.strata) == len(found.failures)
     assert found.rate.low <= len(failed) / 120 <= found.rate.high
     all_of_them = estimate_failure_rate(scenario, Angle(), **(options | {"num_rollouts": 120}))
     assert all_of_them.rate.value == pytest.approx(len(failed) / 120)
@@ -154,7 +160,5 @@ def test_the_command_prints_the_rate_and_the_failures(monkeypatch, capsys, tmp_p
     rate, entries = results["failure_rate"], results.entries
     assert rate.n == 40
     assert 0.0 < rate.low < rate.value < rate.high < 1.0
-    assert f"{100 * rate.value:.2f} (" in printed
-    assert sum(one["failures"] for one in entries["strata"]) == len(entries["failures"]) > 0
-    first = entries["failures"][0]["episode"]
-    assert f"--baseline variation=actual --seed 12000000 --replay {first}" in printed
+    assert f"{100 * rate.value:.2f} % (" in printed
+    assert len(entries["failures"]) > 0

@@ -10,8 +10,8 @@ import naive
 from drake_safety.evaluation.paired_test import (
     _SHARES,
     _WEIGHTS,
-    ConfidenceSequence,
     betting_log_e,
+    look,
 )
 
 ALPHA = 0.05
@@ -47,24 +47,16 @@ def test_the_capital_is_that_of_one_bet_after_the_other(mean, is_above):
     outcomes = np.random.default_rng(1).choice([-1.0, -0.3, 0.0, 0.25, 1.0], 60)
     values, counts = np.unique(outcomes, return_counts=True)
     expected = naive.capital(outcomes, mean, _SHARES, _WEIGHTS, is_above)
-    found = betting_log_e(values, counts, mean, is_above=is_above)
+    sign = 1 if is_above else -1
+    found = betting_log_e(sign * values, counts, sign * mean)
     assert math.exp(found) == pytest.approx(expected)
 
 
 def test_a_bet_is_fair_at_its_mean_and_loses_where_the_null_hypothesis_holds():
-    for mean, is_above in ((0.3, True), (-0.2, False)):
-        # One pair, whose outcome is 1 or -1.
-        for truth, compare in (
-            (mean, math.isclose),
-            (mean - 0.1 if is_above else mean + 0.1, None),
-        ):
-            chances = np.array([1 - truth, 1 + truth]) / 2
-            each = [
-                math.exp(betting_log_e(np.array([d]), np.array([1]), mean, is_above=is_above))
-                for d in (-1.0, 1.0)
-            ]
-            expected = float(chances @ each)
-            assert math.isclose(expected, 1.0) if compare else expected < 1.0
+    # One pair, whose outcome is 1 or -1.
+    each = [math.exp(betting_log_e(np.array([d]), np.array([1]), 0.3)) for d in (-1.0, 1.0)]
+    assert np.array([0.7, 1.3]) / 2 @ each == pytest.approx(1.0)
+    assert np.array([0.8, 1.2]) / 2 @ each < 1.0
 
 
 def test_against_no_difference_only_the_pairs_count_in_which_one_fails_alone():
@@ -73,34 +65,69 @@ def test_against_no_difference_only_the_pairs_count_in_which_one_fails_alone():
         n = more + less
         ratios = binom.pmf(more, n, share) / binom.pmf(more, n, 0.5)
         for none in (0, 1000):
-            found = betting_log_e(OUTCOMES, np.array([less, none, more]), 0.0, is_above=True)
+            found = betting_log_e(OUTCOMES, np.array([less, none, more]), 0.0)
             assert math.exp(found) == pytest.approx(float(_WEIGHTS @ ratios))
 
 
 def test_a_confidence_sequence_ends_where_the_capital_is_one_over_alpha():
     outcomes = np.random.default_rng(2).choice([-0.5, 0.0, 1.0, 2.0], 300)
-    sequence = ConfidenceSequence(ALPHA, bound=2.0)
+    looks = []
     for n in (1, 60, 300):
-        sequence.look(outcomes[:n])
-    assert sequence.pairs == [1, 60, 300]
-    assert sequence.mean[-1] == pytest.approx(outcomes.mean())
-    assert sequence.low == sorted(sequence.low)
-    assert sequence.high == sorted(sequence.high, reverse=True)
-    assert -2 <= sequence.low[0] < sequence.low[-1] < outcomes.mean() < sequence.high[-1] < 2
+        looks.append(look(outcomes[:n], looks, ALPHA, 2.0))
+    assert [one.n for one in looks] == [1, 60, 300]
+    first, *_, last = looks
+    assert last.value == pytest.approx(outcomes.mean())
+    assert -2 <= first.low <= looks[1].low <= last.low < last.value
+    assert last.value < last.high <= looks[1].high <= first.high <= 2
     values, counts = np.unique(outcomes / 2, return_counts=True)
-    for end, is_above in ((sequence.low[-1], True), (sequence.high[-1], False)):
-        log_e = betting_log_e(values, counts, end / 2, is_above=is_above)
+    for sign, end in ((1, last.low), (-1, last.high)):
+        log_e = betting_log_e(sign * values, counts, sign * end / 2)
         assert log_e == pytest.approx(-math.log(ALPHA))
-    with pytest.raises(ValueError, match=r"outcomes must be in ±2; got 2\.5"):
-        sequence.look(np.array([0.0, 2.5]))
+    for wrong in (2.5, np.nan):
+        with pytest.raises(ValueError, match=rf"outcomes must be in ±2; got ±{wrong}"):
+            look([0.0, wrong], [], ALPHA, 2.0)
+
+
+def test_what_a_look_has_excluded_stays_so():
+    first = look(np.ones(50), [], ALPHA)
+    assert look(np.zeros(1000), [first], ALPHA).low == first.low > 0.8
+
+
+REFERENCE_BETS = ((1, 0.0), (-1, 0.0), (-1, 0.05))
+
+
+def spaced_failures(num_pairs):
+    """Of 50 pairs the candidate fails alone in two and the baseline in one."""
+    outcomes = np.zeros(2000)
+    outcomes[7::25], outcomes[3::50] = 1.0, -1.0
+    return outcomes[:num_pairs]
+
+
+@pytest.mark.parametrize(
+    ("num_pairs", "capitals", "low", "high", "theirs"),
+    [
+        (400, (1.68477147, 0.19746072, 4.44609599), -0.01692377, 0.05942813, 0.08605378),
+        (2000, (128.682307, 0.06396619, 37395.6907), 0.00342914, 0.03727799, 0.03536122),
+    ],
+)
+def test_capital_and_ends_are_those_of_confseq(num_pairs, capitals, low, high, theirs):
+    # By confseq 0.0.11 (Waudby-Smith, Ramdas, Howard): betting_mart of (1 + outcome) / 2, for each
+    # share u with bets u / m, theta 1 and trunc_scale 1, weighted; ends where that is 1 / ALPHA.
+    # Theirs: the width of its predmix_empbern_cs with alpha 2 * ALPHA and running_intersection.
+    outcomes = spaced_failures(num_pairs)
+    values, counts = np.unique(outcomes, return_counts=True)
+    log_e = [betting_log_e(sign * values, counts, sign * m) for sign, m in REFERENCE_BETS]
+    assert np.exp(log_e) == pytest.approx(capitals)
+    found = look(outcomes, [], ALPHA)
+    assert (found.low, found.high) == pytest.approx((low, high), abs=1e-7)
+    assert found.high - found.low < theirs
 
 
 @pytest.mark.parametrize("value", [-1.0, 0.0, 1.0])
 def test_equal_outcomes_have_an_interval_too(value):
-    sequence = ConfidenceSequence(ALPHA)
-    sequence.look(np.full(200, value))
-    assert sequence.low[0] <= value <= sequence.high[0]
-    assert sequence.high[0] - sequence.low[0] < 0.06
+    found = look(np.full(200, value), [], ALPHA)
+    assert found.low <= value <= found.high
+    assert found.high - found.low < 0.06
 
 
 @pytest.mark.parametrize(("rate", "shared"), [(0.02, 0.0), (0.3, 0.0), (0.3, 0.8)])
@@ -108,8 +135,8 @@ def test_two_equal_loops_are_rarely_called_different_however_often_one_looks(rat
     every = np.arange(1, 2001)
     differences = failures(np.random.default_rng(3), rate, rate, 2000, shared)
     counts = counted(differences, every)
-    for is_above in (True, False):
-        log_e = betting_log_e(OUTCOMES, counts, 0.0, is_above=is_above)
+    for sign in (1, -1):
+        log_e = betting_log_e(sign * OUTCOMES, counts, 0.0)
         assert np.isfinite(first_looks(log_e, every)).mean() <= ALPHA
 
 
@@ -130,8 +157,8 @@ def test_either_end_excludes_the_true_mean_in_at_most_a_share_alpha_of_replays(k
         assert outcomes.mean() == pytest.approx(mean, abs=0.002)
     looks = np.arange(4, 1601, 4)
     counts = np.stack([np.cumsum(outcomes == v, axis=1)[:, looks - 1] for v in values], axis=-1)
-    for is_above in (True, False):
-        log_e = betting_log_e(values, counts, mean, is_above=is_above)
+    for sign in (1, -1):
+        log_e = betting_log_e(sign * values, counts, sign * mean)
         assert np.isfinite(first_looks(log_e, looks)).mean() <= ALPHA
 
 
@@ -142,7 +169,7 @@ def test_a_verdict_takes_about_as_many_pairs_as_with_a_mixture_of_all_shares(
 ):
     differences = failures(np.random.default_rng(5), baseline, 2 * baseline, 5000, shared)
     counts = counted(differences, LOOKS)
-    found = first_looks(betting_log_e(OUTCOMES, counts, 0.0, is_above=True), LOOKS)
+    found = first_looks(betting_log_e(OUTCOMES, counts, 0.0), LOOKS)
     other = first_looks(naive.mixture_log_e(counts[..., 2], counts[..., 0]), LOOKS)
     assert np.median(found) <= 1.15 * np.median(other)
     assert np.isfinite(found).mean() >= np.isfinite(other).mean() - 0.01
@@ -155,12 +182,10 @@ def test_a_verdict_takes_about_as_many_pairs_as_with_a_mixture_of_all_shares(
 def test_evidence_is_that_of_a_mixture_of_all_shares_but_for_a_factor():
     for more, less in ((5, 0), (12, 1), (30, 10), (9, 9), (60, 30)):
         counts = np.array([less, 0, more])
-        found = betting_log_e(OUTCOMES, counts, 0.0, is_above=True)
+        found = betting_log_e(OUTCOMES, counts, 0.0)
         assert abs(found - naive.mixture_log_e(more, less)) < math.log(2.5)
 
 
 def test_it_is_soon_known_that_a_loop_which_never_fails_more_is_not_worse():
     for difference, most in ((0.01, 500), (0.02, 240), (0.1, 48)):
-        sequence = ConfidenceSequence(ALPHA)
-        sequence.look(np.zeros(most))
-        assert sequence.high[0] < difference
+        assert look(np.zeros(most), [], ALPHA).high < difference

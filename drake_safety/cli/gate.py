@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import html
 import math
 import re
 import shlex
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -20,7 +20,7 @@ from typer import Argument, Exit, Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
-from drake_safety.evaluation.failure_rate import FailureRate, estimate_failure_rate
+from drake_safety.evaluation.failure_rate import estimate_failure_rate
 from drake_safety.evaluation.figure_style import save, spoken
 from drake_safety.evaluation.gate_figure import gate_figure
 from drake_safety.evaluation.loop_comparison import (
@@ -33,34 +33,36 @@ from drake_safety.evaluation.loop_comparison import (
 )
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.outcomes import BELIEFS, UNSAFE, Outcome
-from drake_safety.evaluation.paired_test import ConfidenceSequence
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.tables import Column
 from drake_safety.files.atomic import replacing
 from drake_safety.files.reading import parse_yaml
 from drake_safety.learning.seeds import GATE, RATE
 from drake_safety.simulation.rollouts import run_episode
-from drake_safety.simulation.scenario import Scenario, load_scenario
+from drake_safety.simulation.scenario import load_scenario
 
 _MOST_SHOWN = 10  # Of a table of episodes.
 _COLUMNS = (
     *("candidate", "verdict", "pairs", "fail: both, only baseline, only candidate"),
     *("difference [points]", "survival [s]"),
 )
-_OF_RATE = ("failure rate [%]", "episodes", "failures", "random episodes of the same variance")
-_OF_STRATA = ("probability of a failure", "to", "starts", "simulated", "failures")
+_OF_RATE = ("failure rate", "episodes", "failures", "random episodes of the same variance")
+_OF_COMMANDS = ("commanded", "from", "to", "pairs", "newly fail", "fail no longer")
 _OF_EPISODES = ("episode", "cause", "at [s]", "commanded", "Γ at its start: safe, unsafe, unknown")
+_POINTS = Column("", "", "points", digits=1)
+_PANELS = "<style>body { display: flex; height: 95vh } iframe { flex: 1 }</style>"
 
 MetricOption = Annotated[
     str, Option(help="Failure: unsafe, fall, a constraint's name, or tracking=BOUND.")
+]
+OutOption = Annotated[
+    Path | None, Option(help="Folder of episodes and results; by default runs/SCENARIO-COMMAND.")
 ]
 
 
 def gate(
     scenario: console.ScenarioArgument,
-    candidates: Annotated[
-        list[str] | None, Argument(help="Candidates: names of scenarios, or YAML files.")
-    ] = None,
+    candidates: Annotated[list[str] | None, Argument(help="Candidates, as files or names.")] = None,
     candidate: Annotated[
         list[str] | None,
         Option(
@@ -75,17 +77,11 @@ def gate(
     ] = "",
     metric: MetricOption = UNSAFE,
     worse_by: Annotated[float, Option(help="Difference of the failure rates that matters.")] = 0.02,
-    alpha: Annotated[
-        float, Option(help="Probability of a wrong verdict, over all candidates.")
-    ] = 0.05,
+    alpha: Annotated[float, Option(help="Probability that any verdict is wrong.")] = 0.05,
     episodes: Annotated[int, Option(help="Most pairs of episodes a candidate.", min=1)] = 2000,
-    out: Annotated[
-        Path | None, Option(help="Folder of episodes and results; by default runs/SCENARIO-gate.")
-    ] = None,
+    out: OutOption = None,
     junit: Annotated[Path | None, Option(help="JUnit XML file to write.")] = None,
-    replay: Annotated[
-        int | None, Option(help="Only record this episode, in every loop: no verdict.", min=0)
-    ] = None,
+    replay: Annotated[int | None, Option(help="Only record this episode.", min=0)] = None,
     seed: Annotated[int, Option(help="Seed of the episodes.")] = GATE.first,
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
@@ -104,11 +100,7 @@ def gate(
     folder = out or Path("runs") / f"{first.scenario.name}-gate"
     folders.check_writable(folder, *([] if junit is None else [junit.parent]))
     if replay is not None:
-        _record((first, first), 0, replay, seed, folder / f"episode-{replay}-baseline.html")
-        for name, other in others.items():
-            file = folder / f"episode-{replay}-{_plain(name)}.html"
-            _record((first, other), 1, replay, seed, file)
-        return
+        return _record(first, others, replay, seed, folder / f"episode-{replay}.html")
     gamma = None
     with contextlib.suppress(ValueError):  # That of this very scenario, if one is shipped.
         shipped = folders.assessment_folder(first.scenario, None)
@@ -134,7 +126,7 @@ def gate(
                 stages(f"pairs, {name}", found[name].pairs, found[name].pairs)
     finally:  # After Ctrl-C too.
         if found:
-            _report(first, found, metric, folder, seed)
+            _report(first, found, metric, folder, seed, alpha / len(others))
             if junit is not None:
                 _write_junit(junit, first.scenario.name, found)
     verdicts = {one.verdict for one in found.values()}
@@ -148,9 +140,7 @@ def rate(
     metric: MetricOption = UNSAFE,
     starts: Annotated[int, Option(help="Starts of which Γ is asked.", min=10)] = 10_000,
     episodes: Annotated[int, Option(help="Starts that are simulated.", min=10)] = 500,
-    out: Annotated[
-        Path | None, Option(help="Folder of episodes and results; by default runs/SCENARIO-rate.")
-    ] = None,
+    out: OutOption = None,
     seed: Annotated[int, Option(help="Seed of the episodes.")] = RATE.first,
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
@@ -164,25 +154,6 @@ def rate(
     gamma.check_unused(seed)
     folder = out or Path("runs") / f"{loaded.name}-rate"
     folders.check_writable(folder)
-
-    def report(found: FailureRate) -> None:
-        text = Column("", "", "points", digits=2).text(found.rate)
-        row = (text, found.rate.n, len(found.failures), f"{found.plain_rollouts:.0f}")
-        _show(f"{loaded.name}, {variation}: {metric}", _OF_RATE, [row])
-        strata = [vars(one).values() for one in found.strata]
-        _show("What Γ said of the starts", _OF_STRATA, strata)
-        _show_episodes("Failures", found.failures, metric)
-        if found.failures:
-            options = f"--baseline variation={variation} --seed {seed}"
-            index = found.failures[0].episode
-            console.say(f"to see one: drake-safety gate {scenario} {options} --replay {index}")
-        figures = {
-            "failure_rate": found.rate,
-            "plain_rollouts": Estimate.exact(found.plain_rollouts, found.rate.n),
-        }
-        entries = {"variation": variation} | asdict(found)
-        _write(folder / "rate.json", figures, loaded, metric, seed, entries)
-
     with console.open_stages() as stages:
         found = estimate_failure_rate(
             loaded,
@@ -195,9 +166,13 @@ def rate(
             num_workers=workers,
             path=folder / "episodes",
             progress=stages,
-            if_stopped=report,
         )
-    report(found)
+    rate = Column("", "", "%", digits=2).text(found.rate)
+    row = (rate, found.rate.n, len(found.failures), round(found.plain_rollouts))
+    _show(f"{loaded.name}, {variation}: {metric}", _OF_RATE, [row])
+    _show_episodes("Failures", found.failures, metric)
+    entries = {"seed": seed, "metric": metric, "variation": variation} | asdict(found)
+    _write(folder / "rate.json", {"failure_rate": found.rate}, loaded.name, entries)
 
 
 def _changed(scenario: str, changes: str) -> Loop:
@@ -218,65 +193,51 @@ def _changed(scenario: str, changes: str) -> Loop:
     return Loop(loaded, variation)
 
 
-def _plain(name: str) -> str:
-    """A name for files and keys."""
-    return re.sub(r"[^\w-]+", "_", name)
-
-
-def _record(pair: tuple[Loop, Loop], side: int, index: int, seed: int, file: Path) -> None:
-    """Writes a recording of one episode of a loop."""
-    viewer = console.open_viewer(console.LOOPBACK)
-    loop = make_paired(pair, side, meshcat=viewer)
-    viewer.StartRecording()
-    episode = run_episode(loop, index, seed=seed, after_leaving_s=math.inf)
-    viewer.StopRecording()
-    viewer.PublishRecording()
+def _record(first: Loop, others: Mapping[str, Loop], index: int, seed: int, file: Path) -> None:
+    """Writes recordings of one episode in all loops, side by side."""
+    panels = [_PANELS]
+    for side, (name, loop) in enumerate({"baseline": first, **others}.items()):
+        viewer = console.open_viewer()
+        viewer.StartRecording()
+        diagram = make_paired((first, loop), min(side, 1), meshcat=viewer)
+        episode = run_episode(diagram, index, seed=seed, after_leaving_s=math.inf)
+        viewer.StopRecording()
+        viewer.PublishRecording()
+        cause = spoken(episode.cause)
+        how = "stays in the safe set" if episode.is_safe else f"leaves the safe set: {cause}"
+        console.say(f"{name}: {how}")
+        panels.append(f'<iframe srcdoc="{html.escape(viewer.StaticHtml())}"></iframe>')
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(viewer.StaticHtml(), encoding="utf-8")
-    left_s = episode.time_s[(episode.margins < 0).any(axis=1)][:1].tolist()
-    when = "".join(f" at {time_s:.2f} s" for time_s in left_s)
-    left = f"leaves the safe set{when}: {spoken(episode.cause)}"
-    console.say("recording", f"{file}: {'stays in the safe set' if episode.is_safe else left}")
+    file.write_text("\n".join(panels), encoding="utf-8")
+    console.say("recording, in this order:", file)
 
 
 def _report(
-    first: Loop, found: Mapping[str, Verdict], metric: str, folder: Path, seed: int
+    first: Loop, found: Mapping[str, Verdict], metric: str, folder: Path, seed: int, alpha: float
 ) -> None:
     """Prints and writes what is known."""
-    title = f"{first.scenario.name}, {first.variation}: {metric}"
-    rows = [
-        (
-            *(name, one.verdict, one.pairs),
-            f"{one.both}, {len(one.no_longer_failing)}, {len(one.newly_failing)}",
-            *(_interval(one.difference, 100.0, 1), _interval(one.survival_s, 1.0, 3)),
-        )
-        for name, one in found.items()
-    ]
-    _show(title, _COLUMNS, rows)
+    figures, candidates, rows = {}, {}, []
+    for name, one in found.items():
+        counts = (one.both, len(one.no_longer_failing), len(one.newly_failing))
+        ends = {"difference": one.difference[-1], "survival_s": one.survival_s[-1]}
+        texts = (_POINTS.text(ends["difference"]), Column("", "").text(ends["survival_s"]))
+        rows.append((name, one.verdict, one.pairs, ", ".join(map(str, counts)), *texts))
+        key = re.sub(r"[^\w-]+", "_", name)
+        figures |= {f"{key}.{what}": estimate for what, estimate in ends.items()}
+        candidates[name] = {"pairs": one.pairs} | asdict(one)
+    _show(f"{first.scenario.name}, {first.variation}: {metric}", _COLUMNS, rows)
     for name, one in found.items():
         _show_changes(name, metric, one)
-    one = next(iter(found.values()))
     console.say(
         f"a verdict, or an end of an interval, is wrong with a probability of at most "
-        f"{100 * one.difference.alpha:.3g} % a candidate, whenever one looks; 'not worse': by "
+        f"{100 * alpha:.3g} % a candidate, whenever one looks; 'not worse': by "
         f"{100 * one.worse_by:g} points"
     )
-    candidates = {name: {"pairs": one.pairs} | asdict(one) for name, one in found.items()}
-    entries = {"variation": first.variation, "candidates": candidates}
-    figures = {
-        f"{_plain(name)}.{what}": Estimate(s.mean[-1], s.low[-1], s.high[-1], one.pairs)
-        for name, one in found.items()
-        for what, s in {"difference": one.difference, "survival_s": one.survival_s}.items()
-    }
-    _write(folder / "gate.json", figures, first.scenario, metric, seed, entries)
+    entries = {"seed": seed, "metric": metric, "variation": first.variation}
+    entries |= {"candidates": candidates}
+    _write(folder / "gate.json", figures, first.scenario.name, entries)
     for picture in save(gate_figure(found), folder / "gate"):
         console.say("picture", picture)
-
-
-def _interval(sequence: ConfidenceSequence, scale: float, digits: int) -> str:
-    ends = (sequence.mean, sequence.low, sequence.high)
-    mean, low, high = (f"{scale * end[-1]:+.{digits}f}" for end in ends)
-    return f"{mean} ({low} to {high})"
 
 
 def _show_changes(name: str, metric: str, one: Verdict) -> None:
@@ -294,8 +255,7 @@ def _show_changes(name: str, metric: str, one: Verdict) -> None:
         rows.append((spoken(cause or metric), len(here), *map(believed.count, sides), lost))
     columns = ("cause", "newly fail", *(f"Γ: {what}" for what in sides), "fail no longer")
     _show(f"{name}: by cause", columns, rows)
-    ends = ("from", "to", "pairs", "newly fail", "fail no longer")
-    _show(f"{name}: by what was commanded", ("commanded", *ends), one.by_command)
+    _show(f"{name}: by what was commanded", _OF_COMMANDS, one.by_command)
     index = [*new, *old][0].episode
     return console.say("to see one:", console.command_line(option=f"--replay={index}"))
 
@@ -322,34 +282,25 @@ def _show(title: str, columns: Sequence[str], rows: Iterable[Iterable[object]]) 
         console.show(console.new_table(*columns, rows=cells, title=title))
 
 
-def _write(
-    file: Path,
-    figures: Mapping[str, Estimate],
-    scenario: Scenario,
-    metric: str,
-    seed: int,
-    entries: Mapping[str, Any],
-) -> None:
+def _write(file: Path, figures: Mapping[str, Estimate], scenario: str, entries: Any) -> None:
     """Writes results."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    made = {**console.made_by(scenario.name), "seed": seed, "metric": metric, **entries}
-    Results(figures, made).write(file)
+    Results(figures, console.made_by(scenario) | entries).write(file)
     console.say("figures", file)
 
 
 def _write_junit(file: Path, suite: str, found: Mapping[str, Verdict]) -> None:
     """Writes JUnit XML, a test case a candidate: worse is a failure, undecided an error."""
     kinds = {WORSE: "failure", UNDECIDED: "error"}
-    counts = Counter(f"{kinds.get(one.verdict)}s" for one in found.values())
-    totals = {name: f"{counts[name]}" for name in ("failures", "errors")}
-    root = ElementTree.Element("testsuite", totals, name=f"gate {suite}", tests=f"{len(found)}")
+    root = ElementTree.Element("testsuite", name=f"gate {suite}", tests=f"{len(found)}")
     for name, one in found.items():
         case = ElementTree.SubElement(root, "testcase", classname=suite, name=name)
-        difference = _interval(one.difference, 100.0, 1)
+        difference = _POINTS.text(one.difference[-1])
         told = f"{one.verdict} after {one.pairs} pairs: {difference} points"
         if one.verdict in kinds:
             ElementTree.SubElement(case, kinds[one.verdict], message=told)
         ElementTree.SubElement(case, "system-out").text = told
+    for kind in kinds.values():
+        root.set(f"{kind}s", f"{len(list(root.iter(kind)))}")
     file.parent.mkdir(parents=True, exist_ok=True)
     with replacing(file) as temporary:
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from os import PathLike
@@ -14,12 +13,11 @@ from typing import Any
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, Outcomes, first_inputs
+from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, Outcomes
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import RATE
-from drake_safety.learning.segments import Episode
-from drake_safety.simulation.dataset import load_episodes
+from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.rollouts import (
     collect_episodes,
     episodes_info,
@@ -30,24 +28,6 @@ from drake_safety.simulation.scenario import Scenario
 
 _NUM_STRATA = 10
 _EVEN = 0.5  # Share of the simulations that do not depend on Γ, in case that it is wrong.
-_NORMAL = 1.96  # Of a 95 % interval.
-
-
-@dataclass(frozen=True)
-class Stratum:
-    """Starts for which Γ's probability of a failure is similar.
-
-    Attributes:
-        low, high: Ends of that probability.
-        starts: Number of starts.
-        rollouts, failures: Number of them that were simulated, and of failures.
-    """
-
-    low: float
-    high: float
-    starts: int
-    rollouts: int
-    failures: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,13 +37,11 @@ class FailureRate:
     Attributes:
         rate: With its 95 % interval, of n rollouts.
         plain_rollouts: Number of random episodes whose share of failures has the same variance.
-        strata: By increasing probability of a failure.
         failures: The episodes that failed, by time.
     """
 
     rate: Estimate
     plain_rollouts: float
-    strata: list[Stratum]
     failures: list[Outcome]
 
 
@@ -79,7 +57,6 @@ def estimate_failure_rate(
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
     progress: StageProgress | None = None,
-    if_stopped: Callable[[FailureRate], object] = lambda known: None,
 ) -> FailureRate:
     """Estimates how often a closed loop fails, from few simulations of many starts.
 
@@ -93,7 +70,6 @@ def estimate_failure_rate(
         num_rollouts: Number of them that are simulated.
         path: Folder in which starts and episodes are kept and continued.
         progress: Called with the name of a stage, the number done and the number wanted.
-        if_stopped: Called after Ctrl-C with what is known, if there is a folder.
 
     Raises:
         ValueError: There is no such metric, or there are fewer rollouts than ten strata, or fewer
@@ -109,35 +85,29 @@ def estimate_failure_rate(
     make = worker_loop(scenario, variation, **options)
     outcomes = Outcomes(make(), metric, assessment)
 
-    def collected(stage: str, indices: Sequence[int], **simulated: Any) -> Iterable[Episode]:
+    def collected(stage: str, indices: Sequence[int], **simulated: Any) -> Episodes:
         info = episodes_info(make(), seed, options | simulated)
-        folder = None if path is None else Path(path) / f"{info.scenario_hash[:12]}-{seed}"
-        try:
-            return collect_episodes(
-                info,
-                indices,
-                make,
-                partial(run_episode, seed=seed, **simulated),
-                num_workers=num_workers,
-                path=folder,
-                progress=None if progress is None else partial(progress, stage),
-            )
-        except KeyboardInterrupt:
-            kept = {} if folder is None else {one.index: one for one in load_episodes(folder)}
-            # Of several workers an episode that fails is done sooner than an earlier one.
-            finished = [kept[index] for index in itertools.takewhile(kept.__contains__, indices)]
-            if not simulated.get("until_first_row") and len(finished) >= _NUM_STRATA:
-                if_stopped(estimate(finished))
-            raise
-
-    def estimate(episodes: Iterable[Episode]) -> FailureRate:
-        return _estimate(score, stratum, [outcomes.of(one) for one in episodes])
+        return collect_episodes(
+            info,
+            indices,
+            make,
+            partial(run_episode, seed=seed, **simulated),
+            num_workers=num_workers,
+            path=None if path is None else Path(path) / f"{info.scenario_hash[:12]}-{seed}",
+            progress=None if progress is None else partial(progress, stage),
+        )
 
     starts = collected("starts", range(num_starts), until_first_row=True)
-    score = 1.0 - assessment.predict(*first_inputs(starts)).probability
+    inputs = zip(*(one.first_inputs for one in starts), strict=True)
+    score = 1.0 - assessment.predict(*map(np.array, inputs)).probability
     stratum = strata_of(score, np.random.default_rng(seed))
     order = in_turns(stratum)[:num_rollouts]
-    return estimate(collected("episodes", order, **outcomes.simulated))
+    found = [outcomes.of(one) for one in collected("episodes", order, **outcomes.simulated)]
+    chosen = stratum[[one.episode for one in found]]
+    failures = np.bincount(chosen, [one.value for one in found])
+    rate, plain_rollouts = stratified_rate(np.bincount(stratum), np.bincount(chosen), failures)
+    failed = sorted((one for one in found if one.value), key=lambda one: one.time_s)
+    return FailureRate(rate=rate, plain_rollouts=plain_rollouts, failures=failed)
 
 
 def strata_of(score: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -164,59 +134,25 @@ def in_turns(stratum: np.ndarray) -> list[int]:
     return [index for index in turns if index is not None]
 
 
-def _estimate(score: np.ndarray, stratum: np.ndarray, outcomes: Sequence[Outcome]) -> FailureRate:
-    """The estimate from the outcomes of some starts."""
-    strata, means = [], []
-    for k in range(stratum.max() + 1):
-        inside, own = score[stratum == k], [one for one in outcomes if stratum[one.episode] == k]
-        ends = float(inside.min()), float(inside.max())
-        strata.append(Stratum(*ends, len(inside), len(own), sum(one.value for one in own)))
-        means.append(float(inside.mean()))
-    starts, rollouts, failures = (
-        np.array([getattr(one, name) for one in strata])
-        for name in ("starts", "rollouts", "failures")
-    )
-    rate = stratified_rate(starts, rollouts, failures)
-    # With one more simulation that ends as Γ says, as a stratum without failures has no variance.
-    likely = (failures + np.array(means)) / (rollouts + 1)
-    share = starts / starts.sum()
-    variance = share**2 @ (likely * (1.0 - likely) / rollouts)
-    variance += share @ (likely - rate.value) ** 2 / starts.sum()
-    return FailureRate(
-        rate=rate,
-        plain_rollouts=float(share @ likely * (1.0 - share @ likely) / variance),
-        strata=strata,
-        failures=sorted((one for one in outcomes if one.value), key=lambda one: one.time_s),
-    )
-
-
-def stratified_rate(starts: np.ndarray, rollouts: np.ndarray, failures: np.ndarray) -> Estimate:
+def stratified_rate(
+    starts: np.ndarray, rollouts: np.ndarray, failures: np.ndarray
+) -> tuple[Estimate, float]:
     """The failure rate of all starts, from numbers of starts, rollouts and failures by stratum.
 
-    The 95 % interval joins (Zou and Donner, Statistics in Medicine 2008) that of the failures in
-    strata where these are rare, that of the others' successes (both by Fay and Feuer, Statistics in
-    Medicine 1997), and the uncertainty of the strata's shares.
+    Its 95 % interval is the exact one of the number of random episodes that is also returned, whose
+    share of failures would have the same variance (Korn and Graubard, Survey Methodology 1998).
     """
+    from scipy.stats import beta
+
     share = starts / starts.sum()
     value = float(share @ (failures / rollouts))
-    is_rare = 2 * failures < rollouts
-    weight, rare = share / rollouts, np.where(is_rare, failures, rollouts - failures)
-    few, many = (
-        _weighted_count(weight[one], rare[one], rollouts[one]) for one in (is_rare, ~is_rare)
-    )
-    shares = _NORMAL * math.sqrt(share @ (failures / rollouts - value) ** 2 / starts.sum())
-    below = math.hypot(few.value - few.low, many.high - many.value, shares)
-    above = math.hypot(few.high - few.value, many.value - many.low, shares)
-    return Estimate(value, max(value - below, 0.0), min(value + above, 1.0), int(rollouts.sum()))
-
-
-def _weighted_count(weight: np.ndarray, counts: np.ndarray, sizes: np.ndarray) -> Estimate:
-    """A weighted sum of binomial counts, with a 95 % interval by the gamma distribution."""
-    from scipy.stats import gamma
-
-    value, variance = float(weight @ counts), float(weight**2 @ (counts * (1.0 - counts / sizes)))
-    most = float(weight.max(initial=0.0))
-    low = gamma.ppf(0.025, value**2 / variance, scale=variance / value) if variance else 0.0
-    mean, spread = value + most, variance + most**2
-    high = gamma.ppf(0.975, mean**2 / spread, scale=spread / mean) if mean else 0.0
-    return Estimate(value, float(low), float(high), int(sizes.sum()))
+    # Half a failure and half a success more, as a stratum without one of them has no variance.
+    likely = (failures + 0.5) / (rollouts + 1)
+    mean = share @ likely
+    variance = share**2 @ (likely * (1.0 - likely) / rollouts)
+    variance += share @ (likely - mean) ** 2 / starts.sum()  # Of the strata's shares.
+    number = float(mean * (1.0 - mean) / variance)
+    failed, passed = number * value, number * (1.0 - value)
+    low = beta.ppf(0.025, failed, passed + 1.0) if failed else 0.0
+    high = beta.ppf(0.975, failed + 1.0, passed) if passed else 1.0
+    return Estimate(value, float(low), float(high), int(rollouts.sum())), number

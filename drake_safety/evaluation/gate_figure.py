@@ -20,8 +20,8 @@ def gate_figure(verdicts: Mapping[str, Verdict]) -> Figure:
         panels = fig.subplots(len(verdicts), 1, squeeze=False)[:, 0]
         for axes, (name, one) in zip(panels, verdicts.items(), strict=True):
             found, colour = one.difference, _COLOURS.get(one.verdict, style.FAINT_INK)
-            low, mean, high = 100.0 * np.array([found.low, found.mean, found.high])
-            bound, pairs = 100.0 * one.worse_by, found.pairs
+            pairs, bound = [look.n for look in found], 100.0 * one.worse_by
+            low, mean, high = 100.0 * np.array([[x.low, x.value, x.high] for x in found]).T
             axes.fill_between(pairs, low, high, color=colour, alpha=0.2, linewidth=0)
             axes.plot(pairs, mean, color=colour, linewidth=1.8, marker="o", markersize=2.5)
             axes.axhline(0.0, color=style.FAINT_INK, linewidth=0.8)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
+import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
+from inspect import signature
+from itertools import zip_longest
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,15 +16,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydrake.systems.framework import Context
 
+from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, Outcomes
-from drake_safety.evaluation.paired_test import ConfidenceSequence
+from drake_safety.evaluation.paired_test import look
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import GATE
 from drake_safety.learning.segments import Episode
 from drake_safety.simulation.capabilities import CanStartAnywhere, HasDisturbances
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
-from drake_safety.simulation.rollouts import check_kept, episode_rng, episodes_info, run_episode
+from drake_safety.simulation.rollouts import check_kept, episodes_info, run_episode
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import MadeOnce, Progress, map_items
 
@@ -40,17 +42,6 @@ class Loop(NamedTuple):
     variation: str = "nominal"
 
 
-class Commanded(NamedTuple):
-    """The pairs in which an entry of the desired output is in a range, a third of all."""
-
-    output: str
-    low: float
-    high: float
-    pairs: int
-    newly_failing: int
-    no_longer_failing: int
-
-
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
     """What is known of a candidate after a number of pairs.
@@ -58,29 +49,29 @@ class Verdict:
     Attributes:
         verdict: "worse", "better", "not worse" (by `worse_by`), or "undecided". Each is wrong with
             a probability of at most alpha, whenever one looks.
-        neither, both: Numbers of pairs in which neither fails, and both alike.
-        difference: Mean outcome of the candidate minus that of the baseline, and its alpha.
+        both: Number of pairs in which both fail alike.
+        difference: Mean outcome of the candidate minus that of the baseline at each look.
         survival_s: The same of the time until the failure, or the end [s].
         newly_failing: The candidate's episodes that fail, or do worse than the baseline's, by time,
             with Γ's belief at the baseline's start.
         no_longer_failing: The baseline's that do worse.
-        by_command: The same by what was commanded.
+        by_command: Rows of an entry of the desired output, a range, a third of all pairs, their
+            number, and how many of them newly fail and fail no longer.
     """
 
     verdict: str
-    neither: int
     both: int
-    difference: ConfidenceSequence
-    survival_s: ConfidenceSequence
+    difference: list[Estimate]
+    survival_s: list[Estimate]
     newly_failing: list[Outcome]
     no_longer_failing: list[Outcome]
-    by_command: list[Commanded]
+    by_command: list[tuple[str, float, float, int, int, int]]
     worse_by: float
 
     @property
     def pairs(self) -> int:
         """Number of pairs."""
-        return self.difference.pairs[-1]
+        return self.difference[-1].n
 
 
 def compare_loops(
@@ -118,45 +109,37 @@ def compare_loops(
             of a pair differ.
         EpisodeError: A system of a loop raised an error, which is its cause.
     """
-    for name, value in {"worse_by": worse_by, "alpha": alpha}.items():
-        if not 0.0 < value < 1.0:
-            raise ValueError(f"compare_loops: {name} must be between 0 and 1; got {value}")
-    if max_pairs < 1:
-        raise ValueError(f"compare_loops: max_pairs must be at least 1; got {max_pairs}")
+    if not (0.0 < worse_by < 1.0 and 0.0 < alpha < 1.0 and max_pairs > 0):
+        got = f"{worse_by}, {alpha} and {max_pairs}"
+        raise ValueError(f"worse_by and alpha must be in (0, 1), max_pairs at least 1; got {got}")
     one, two = (Loop(x) if isinstance(x, Scenario) else x for x in (baseline, candidate))
     hashes = [scenario.simulation_hash(variation) for scenario, variation in (one, two)]
     if hashes[0] == hashes[1]:
-        raise ValueError(
-            f"the candidate is the baseline: scenario '{one.scenario.name}', variation "
-            f"'{one.variation}', with hash {hashes[0][:12]}"
-        )
+        who = f"scenario '{one.scenario.name}', variation '{one.variation}'"
+        raise ValueError(f"the candidate is the baseline: {who}, with hash {hashes[0][:12]}")
     # The texts say what the hashes leave out.
     texts = (scenario.to_yaml() for scenario, _ in (one, two))
-    make = MadeOnce((*hashes, *texts), partial(_make_both, (one, two)))
+    make = MadeOnce((*hashes, *texts), lambda: [make_paired((one, two), side) for side in (0, 1)])
     loops = make()
-    readers = Outcomes(loops[0], metric, assessment), Outcomes(loops[0], metric)
-    options = readers[0].simulated
-    run = partial(make.run, _run_pair, seed=seed, **options)
-    starts = {"starts_of": hashes[0]} if _takes_starts(two.scenario) else {}
-    runs: tuple[dict[int, Outcome], ...] = ({}, {})
-
-    def again(side: int, index: int) -> Any:
-        return run((index, [side == 0, side == 1]))[side]
-
+    readers = [Outcomes(loops[0], metric, gamma) for gamma in (assessment, None)]
+    simulated = {"seed": seed} | readers[0].simulated
+    runs: list[dict[int, Outcome]] = [{}, {}]
     with ExitStack() as stack:
         writers = []
-        for side in (0, 1) if path is not None else ():
-            known = _pair_options((one, two)) | options | (starts if side else {})
+        for side, found in enumerate(runs if path is not None else []):
+            known = _pair_options((one, two), side) | readers[0].simulated
+            if "starts_of" in known:
+                known["starts_of"] = hashes[0]
             info = episodes_info(loops[side], seed, known)
             folder = Path(path or "") / f"{info.scenario_hash[:12]}-{seed}"
             writers.append(stack.enter_context(EpisodeWriter(folder, info)))
             if kept := [episode for episode in load_episodes(folder) if episode.index < max_pairs]:
-                check_kept(folder, kept, partial(again, side))
-            runs[side].update({episode.index: readers[side].of(episode) for episode in kept})
-        is_missing = ((index, [index not in each for each in runs]) for index in range(max_pairs))
-        items = [item for item in is_missing if any(item[1])]
-        found = map_items(
-            run,
+                check_kept(folder, kept, partial(run_episode, loops[side], **simulated))
+            found.update({episode.index: readers[side].of(episode) for episode in kept})
+        missing = ((index, [index not in found for found in runs]) for index in range(max_pairs))
+        items = [item for item in missing if any(item[1])]
+        results = map_items(
+            partial(make.run, _run_pair, **simulated),
             items,
             num_workers=num_workers,
             batch_size=_BATCH,
@@ -164,113 +147,96 @@ def compare_loops(
             num_done=max_pairs - len(items),
             stage="pairs",
         )
-        results = stack.enter_context(closing(found))
-        difference = ConfidenceSequence(alpha)
-        survival_s = ConfidenceSequence(alpha, one.scenario.episode_duration_s)
-        for index in range(max_pairs):
-            while not all(index in each for each in runs):
+        stack.enter_context(closing(results))
+        looks: tuple[list[Estimate], list[Estimate]] = ([], [])
+        for number in sorted({*range(_LOOK, max_pairs, _LOOK), max_pairs}):
+            while not all(index in found for found in runs for index in range(number)):
                 for side, episode in enumerate(next(results)):
                     if episode is not None:
                         runs[side][episode.index] = readers[side].of(episode)
                         if writers:
                             writers[side].append(episode)
-            if (index + 1) % _LOOK == 0 or index + 1 == max_pairs:
-                pairs = [(runs[0][i], runs[1][i]) for i in range(index + 1)]
-                verdict = _look(pairs, difference, survival_s, worse_by, loops[0].output_names)
-                each_look(verdict)
-                if verdict.verdict != UNDECIDED:
-                    break
+            pairs = [(runs[0][index], runs[1][index]) for index in range(number)]
+            apart = [after.value - before.value for before, after in pairs]
+            later_s = [after.time_s - before.time_s for before, after in pairs]
+            looks[0].append(look(apart, looks[0], alpha))
+            looks[1].append(look(later_s, looks[1], alpha, one.scenario.episode_duration_s))
+            verdict = _verdict(pairs, *map(list, looks), worse_by, loops[0].output_names)
+            each_look(verdict)
+            if verdict.verdict != UNDECIDED:
+                break
     return verdict
 
 
-def _look(
+def _verdict(
     pairs: Sequence[tuple[Outcome, Outcome]],
-    difference: ConfidenceSequence,
-    survival_s: ConfidenceSequence,
+    difference: list[Estimate],
+    survival_s: list[Estimate],
     worse_by: float,
     output_names: Sequence[str],
 ) -> Verdict:
-    """Looks at all pairs so far; later looks do not change what is returned."""
-    outcomes = np.array([[one.value for one in pair] for pair in pairs])
-    apart = outcomes[:, 1] - outcomes[:, 0]
-    difference.look(apart)
-    survival_s.look(np.array([two.time_s - one.time_s for one, two in pairs]))
-    is_known = {
-        WORSE: difference.low[-1] > 0.0,
-        BETTER: difference.high[-1] < 0.0,
-        NOT_WORSE: difference.high[-1] < worse_by,
-        UNDECIDED: True,
-    }
+    """What is known of all pairs so far."""
+    low, high = difference[-1].low, difference[-1].high
+    known = WORSE if low > 0.0 else BETTER if high < 0.0 else NOT_WORSE
     newly = [replace(two, belief=one.belief) for one, two in pairs if two.value > one.value]
     no_longer = [one for one, two in pairs if two.value < one.value]
     return Verdict(
-        verdict=next(name for name, is_so in is_known.items() if is_so),
-        neither=int((outcomes == 0).all(axis=1).sum()),
-        both=int(((outcomes > 0).all(axis=1) & (apart == 0)).sum()),
-        difference=deepcopy(difference),
-        survival_s=deepcopy(survival_s),
+        verdict=known if high < worse_by or known == WORSE else UNDECIDED,
+        both=sum(one.value == two.value > 0.0 for one, two in pairs),
+        difference=difference,
+        survival_s=survival_s,
         newly_failing=sorted(newly, key=lambda one: one.time_s),
         no_longer_failing=sorted(no_longer, key=lambda one: one.time_s),
-        by_command=_by_command(output_names, pairs, apart),
+        by_command=_by_command(output_names, pairs),
         worse_by=worse_by,
     )
 
 
 def _by_command(
-    names: Sequence[str], pairs: Sequence[tuple[Outcome, Outcome]], apart: np.ndarray
-) -> list[Commanded]:
-    """Changes in each third of what was commanded; fewer parts of a command with few values."""
-    found = []
+    names: Sequence[str], pairs: Sequence[tuple[Outcome, Outcome]]
+) -> list[tuple[str, float, float, int, int, int]]:
+    """Changes in each third of what was commanded, by entry of the desired output."""
+    apart = np.array([two.value - one.value for one, two in pairs])
+    rows = []
     for name, values in zip(names, np.array([one.commanded for one, _ in pairs]).T, strict=True):
-        third = np.searchsorted(np.quantile(values, [1 / 3, 2 / 3]), values)
-        for part in (third == k for k in np.unique(third)):
-            ends = float(values[part].min()), float(values[part].max())
-            counts = (int((part & is_so).sum()) for is_so in (apart == apart, apart > 0, apart < 0))
-            found.append(Commanded(name, *ends, *counts))
-    return found
+        ends = np.quantile(values, [0.0, 1 / 3, 2 / 3, 1.0])
+        parts = (values, values[apart > 0], values[apart < 0])
+        counts = [np.histogram(part, ends)[0].tolist() for part in parts]
+        columns = ([name] * 3, ends[:-1].tolist(), ends[1:].tolist(), *counts)
+        rows += list(zip(*columns, strict=True))
+    return rows
 
 
 def make_paired(pair: tuple[Loop, Loop], side: int, **options: Any) -> ClosedLoop:
     """Makes the baseline, side 0, or the candidate, side 1, whose starts are the baseline's."""
     scenario, variation = pair[side]
-    if side and _takes_starts(scenario):
-        options["starts_of"] = pair[0].scenario
-    return scenario.make_loop(variation, **(_pair_options(pair) | options))
+    return scenario.make_loop(variation, **(_pair_options(pair, side) | options))
 
 
-def _pair_options(pair: tuple[Loop, Loop]) -> dict[str, Any]:
+def _pair_options(pair: tuple[Loop, Loop], side: int) -> dict[str, Any]:
+    """Options of one of two loops, whose starts may be those of the other."""
     one, two = (scenario.options_for("pairs", variation) for scenario, variation in pair)
-    return one | two
-
-
-def _takes_starts(scenario: Scenario) -> bool:
-    """Whether a task's starts depend on its controller, and can be another's."""
-    return "starts_of" in inspect.signature(scenario.task_class()).parameters
-
-
-def _make_both(pair: tuple[Loop, Loop]) -> tuple[ClosedLoop, ClosedLoop]:
-    return make_paired(pair, 0), make_paired(pair, 1)
+    # Whether a task's starts depend on its controller, and can be another's.
+    takes_starts = "starts_of" in signature(pair[side].scenario.task_class()).parameters
+    return one | two | ({"starts_of": pair[0].scenario} if side and takes_starts else {})
 
 
 def _run_pair(
-    loops: tuple[ClosedLoop, ClosedLoop], item: tuple[int, list[bool]], **options: Any
+    loops: Sequence[ClosedLoop], item: tuple[int, list[bool]], **options: Any
 ) -> list[Episode | None]:
     """The episodes of a pair that are missing; the starts of both are compared."""
     index, is_missing = item
     starts: list[dict[str, np.ndarray]] = []
-    episodes: list[Episode | None] = []
-    for loop, is_wanted in zip(loops, is_missing, strict=True):
 
-        def at_start(context: Context, loop: ClosedLoop = loop) -> None:
+    def run(loop: ClosedLoop, is_wanted: bool) -> Episode | None:
+        def at_start(context: Context) -> None:
             starts.append(_start_of(loop, context))
 
-        if is_wanted:
-            episodes.append(run_episode(loop, index, at_start=at_start, **options))
-        else:
-            context = loop.CreateDefaultContext()
-            loop.reset(context, episode_rng(options["seed"], index))
-            at_start(context)
-            episodes.append(None)
+        short = {} if is_wanted else {"until_first_row": True}
+        episode = run_episode(loop, index, at_start=at_start, **options, **short)
+        return episode if is_wanted else None
+
+    episodes = list(map(run, loops, is_missing))
     _check_alike(index, loops[0], *starts)
     return episodes
 
@@ -290,20 +256,13 @@ def _check_alike(
     index: int, loop: ClosedLoop, baseline: dict[str, np.ndarray], other: dict[str, np.ndarray]
 ) -> None:
     """Raises an error that names the first difference of two starts."""
-    who = f"pair {index} does not start alike in both loops"
+    names = {"state": loop.state_names, "margin": loop.constraint_names}
     for what in dict.fromkeys([*baseline, *other]):
-        one, two = baseline.get(what, np.empty(0)), other.get(what, np.empty(0))
-        if one.shape != two.shape:
-            raise ValueError(
-                f"{who}: '{what}' has {one.size} entries in the baseline and {two.size} in the "
-                "candidate"
-            )
-        is_apart = ~(np.abs(one - two) <= _SAME)
-        if is_apart.any():
-            entry = int(np.argmax(is_apart))
-            names = {"state": loop.state_names, "margin": loop.constraint_names}.get(what)
-            name = f" ({names[entry]})" if names else ""
-            raise ValueError(
-                f"{who}: entry {entry}{name} of '{what}' is {one[entry]:.6g} in the baseline and "
-                f"{two[entry]:.6g} in the candidate"
-            )
+        arrays = (start.get(what, []) for start in (baseline, other))
+        for k, (one, two) in enumerate(zip_longest(*arrays, fillvalue=math.nan)):
+            if not abs(one - two) <= _SAME:
+                name = f" ({names[what][k]})" if what in names else ""
+                raise ValueError(
+                    f"pair {index} does not start alike in both loops: entry {k}{name} of '{what}' "
+                    f"is {one:.6g} in the baseline and {two:.6g} in the candidate"
+                )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,17 +49,19 @@ class Outcome:
 class Outcomes:
     """Reads what is kept of the episodes of a loop.
 
+    Attributes:
+        simulated: Options of the simulation.
+
     Raises:
         ValueError: There is no such metric.
     """
 
     def __init__(self, loop: ClosedLoop, metric: Metric, gamma: SafetyAssessment | None = None):
         self._metric, self._gamma = metric, gamma
-        self._scenario = loop.scenario
-        self._bad_rows = _bad_rows(loop, metric if isinstance(metric, str) else UNSAFE)
-        goes_on = isinstance(metric, str) and metric != UNSAFE
+        self._duration_s = loop.scenario.episode_duration_s
+        self._bad_rows = _bad_rows(loop, UNSAFE if callable(metric) else metric)
+        goes_on = not callable(metric) and metric != UNSAFE
         self.simulated: dict[str, Any] = {"after_leaving_s": math.inf} if goes_on else {}
-        """Options of the simulation."""
 
     def of(self, episode: Episode) -> Outcome:
         """What is kept of an episode.
@@ -68,31 +70,20 @@ class Outcomes:
             ValueError: The metric is not in [0, 1].
         """
         is_bad = self._bad_rows(episode) | _last_row(episode, episode.cause == DIVERGED)
-        value = float(is_bad.any() if isinstance(self._metric, str) else self._metric(episode))
+        value = float(self._metric(episode) if callable(self._metric) else is_bad.any())
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"metric: episode {episode.index} has {value}, expected 0 to 1")
-        row, duration_s = episode.first_step, self._scenario.episode_duration_s
-        preview, belief = episode.desired_preview[row], None
+        inputs, belief = episode.first_inputs, None
         if self._gamma is not None:
-            found = self._gamma.predict_one(episode.state[row], preview, episode.features[row])
-            belief = tuple(found.belief.tolist())
+            belief = tuple(self._gamma.predict_one(*inputs).belief.tolist())
         return Outcome(
             episode=episode.index,
             value=value,
-            time_s=float(episode.time_s[is_bad.argmax()]) if is_bad.any() else duration_s,
+            time_s=min([*episode.time_s[is_bad].tolist(), self._duration_s]),
             cause=episode.cause,
-            commanded=tuple(preview[-episode.output.shape[1] :].tolist()),
+            commanded=tuple(inputs[1][-episode.output.shape[1] :].tolist()),
             belief=belief,
         )
-
-
-def first_inputs(episodes: Iterable[Episode]) -> list[np.ndarray]:
-    """Γ's inputs in the first undisturbed rows: (N, n_s), (N, H*n_z) and (N, n_f)."""
-    rows = [
-        [getattr(one, name)[one.first_step] for name in ("state", "desired_preview", "features")]
-        for one in episodes
-    ]
-    return [np.array(column) for column in zip(*rows, strict=True)]
 
 
 def _bad_rows(loop: ClosedLoop, metric: str) -> Callable[[Episode], np.ndarray]:

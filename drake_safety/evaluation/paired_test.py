@@ -8,9 +8,11 @@ Shafer, Game-theoretic statistics and safe anytime-valid inference, Statistical 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 
 import numpy as np
+
+from drake_safety.evaluation.metrics import Estimate
 
 _SHARES = 0.95 * 0.5 ** np.arange(8)
 """Shares u of the capital that are bet. Large ones have larger weights: failures are rare."""
@@ -18,80 +20,61 @@ _WEIGHTS = np.sqrt(_SHARES) / np.sqrt(_SHARES).sum()
 _EDGE = 1e-9  # Of the range of means, where a bet would be infinite.
 
 
-def betting_log_e(
-    values: np.ndarray, counts: np.ndarray, mean: float, *, is_above: bool
-) -> np.ndarray:
-    """Logarithm of the capital of bets against a mean of outcomes in [-1, 1].
+def betting_log_e(values: np.ndarray, counts: np.ndarray, mean: float) -> np.ndarray:
+    """Logarithm of the capital of bets that the mean of outcomes in [-1, 1] is above m.
 
-    Against means of at most m the factor of an outcome d is 1 + λ(d - m) with λ = u / (1 + m),
-    against means of at least m it is 1 - λ(d - m) with λ = u / (1 - m); the capital is a weighted
-    mean over fixed shares u. It is monotone in m (Waudby-Smith and Ramdas, Estimating means of
-    bounded random variables by betting, JRSS B 2024). Of outcomes -1, 0 and 1 and m = 0 it is a
-    mixture of likelihood ratios of the discordant pairs alone, to one half.
+    Where it is at most m, the factor of an outcome d is 1 + λ(d - m) with λ = u / (1 + m) for a
+    share u of the capital; that is a weighted mean over fixed shares. It is monotone in m
+    (Waudby-Smith and Ramdas, Estimating means of bounded random variables by betting, JRSS B 2024).
+    Of outcomes -1, 0 and 1 and m = 0 it is a mixture of likelihood ratios of the discordant pairs
+    alone, to one half. Bets that a mean is below m are bets that the negative one is above -m.
 
     Args:
         values: The different outcomes, (V,).
         counts: How often each was seen, (..., V).
         mean: m, in (-1, 1).
-        is_above: Whether the bets are that the mean is above m.
     """
     from scipy.special import logsumexp
 
-    sign = 1.0 if is_above else -1.0
-    factors = 1.0 - _SHARES + _SHARES * (1.0 + sign * values[:, None]) / (1.0 + sign * mean)
+    factors = 1.0 - _SHARES + _SHARES * (1.0 + values[:, None]) / (1.0 + mean)
     log_e: np.ndarray = logsumexp(np.asarray(counts) @ np.log(factors), axis=-1, b=_WEIGHTS)
     return log_e
 
 
-@dataclass
-class ConfidenceSequence:
-    """A confidence sequence of the mean of outcomes in [-bound, bound], one row a look.
+def look(
+    outcomes: Sequence[float], before: Sequence[Estimate], alpha: float, bound: float = 1.0
+) -> Estimate:
+    """One look of a confidence sequence: the mean of all outcomes so far, (N,), and its ends.
 
     Each end holds at all looks at once with a probability of at least 1 - alpha, and both with
     1 - 2 alpha.
 
-    Attributes:
-        pairs: Number of outcomes at each look.
-        mean: Their means; `low` and `high` are the ends.
+    Args:
+        before: Earlier looks. What they have excluded stays so.
+
+    Raises:
+        ValueError: An outcome is not in [-bound, bound].
     """
+    scaled = np.array(outcomes) / bound
+    if not (worst := np.abs(scaled).max()) <= 1.0 + _EDGE:
+        raise ValueError(f"outcomes must be in ±{bound:g}; got ±{bound * worst}")
+    values, counts = np.unique(np.clip(scaled, -1.0, 1.0), return_counts=True)
+    low, high = (sign * bound * _low(sign * values, counts, alpha) for sign in (1.0, -1.0))
+    low = max([low, *(one.low for one in before[-1:])])
+    high = min([high, *(one.high for one in before[-1:])])
+    return Estimate(float(np.mean(outcomes)), low, high, len(outcomes))
 
-    alpha: float
-    bound: float = 1.0
-    pairs: list[int] = field(default_factory=list)
-    mean: list[float] = field(default_factory=list)
-    low: list[float] = field(default_factory=list)
-    high: list[float] = field(default_factory=list)
 
-    def look(self, outcomes: np.ndarray) -> None:
-        """Adds a look at all outcomes so far, (N,).
+def _low(values: np.ndarray, counts: np.ndarray, alpha: float) -> float:
+    """The mean up to which bets that it is above have won 1 / alpha."""
+    from scipy.optimize import brentq
 
-        Raises:
-            ValueError: An outcome is not in [-bound, bound].
-        """
-        scaled = np.asarray(outcomes, dtype=float) / self.bound
-        if not (np.abs(scaled) <= 1.0 + _EDGE).all():
-            worst = outcomes[np.argmax(~(np.abs(scaled) <= 1.0 + _EDGE))]
-            raise ValueError(
-                f"confidence sequence: outcomes must be in ±{self.bound:g}; got {worst}"
-            )
-        values, counts = np.unique(np.clip(scaled, -1.0, 1.0), return_counts=True)
-        low, high = (self.bound * self._end(values, counts, is_low) for is_low in (True, False))
-        self.pairs.append(len(scaled))
-        self.mean.append(float(np.mean(outcomes)))
-        # What has been excluded once stays so.
-        self.low.append(max([low, *self.low[-1:]]))
-        self.high.append(min([high, *self.high[-1:]]))
+    def excess(mean: float) -> float:
+        return float(betting_log_e(values, counts, mean)) + math.log(alpha)
 
-    def _end(self, values: np.ndarray, counts: np.ndarray, is_low: bool) -> float:
-        from scipy.optimize import brentq
-
-        def excess(mean: float) -> float:
-            found = betting_log_e(values, counts, mean, is_above=is_low)
-            return float(found) + math.log(self.alpha)
-
-        # The capital is below 1 at the mean of the outcomes, where no bet has won.
-        middle = float(np.clip(values @ counts / counts.sum(), -1.0 + _EDGE, 1.0 - _EDGE))
-        edge = -1.0 + _EDGE if is_low else 1.0 - _EDGE
-        if excess(edge) <= 0.0 or excess(middle) >= 0.0:
-            return math.copysign(1.0, edge)
-        return float(brentq(excess, edge, middle, xtol=1e-12))
+    edge = 1.0 - _EDGE
+    if excess(-edge) <= 0.0:
+        return -1.0
+    # At the mean of the outcomes no bet has won.
+    mean = float(np.clip(values @ counts / counts.sum(), -edge, edge))
+    return float(brentq(excess, -edge, mean, xtol=1e-12))

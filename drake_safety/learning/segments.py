@@ -164,6 +164,12 @@ class Episode:
         """K, the number of steps from the first row to the last."""
         return len(self.time_s) - 1
 
+    @property
+    def first_inputs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Γ's inputs in the first undisturbed row: (n_s,), (H*n_z,) and (n_f,)."""
+        row = self.first_step
+        return self.state[row], self.desired_preview[row], self.features[row]
+
 
 class Episodes(Sequence[Episode]):
     """A set of episodes that share one `EpisodesInfo`; a slice is a set."""
