@@ -96,8 +96,8 @@ def test_without_strata_it_is_a_share_with_nearly_the_exact_interval():
 
 
 def test_it_is_the_prediction_powered_estimate_of_ppi_python():
-    # By ppi-python 0.2.3: ppi_mean_pointestimate and ppi_mean_ci with lam 1, as predictions the share
-    # of failures of each stratum, and as weights its share over its rollouts. Its interval is normal.
+    # By ppi-python 0.2.3: ppi_mean_pointestimate and ppi_mean_ci with lam 1, with the share of
+    # failures of each stratum as predictions. Its interval is normal.
     starts, rollouts = np.array([4000, 3000, 2000, 1000]), np.full(4, 100)
     found, _ = stratified_rate(starts, rollouts, np.array([2, 10, 40, 80]))
     assert found.value == pytest.approx(0.198)
