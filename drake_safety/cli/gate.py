@@ -67,14 +67,11 @@ def gate(
         list[str] | None,
         Option(
             metavar="KEY=VALUE",
-            help="A candidate by what it changes: policy=FILE, variation=NAME, robot=FILE, or any "
-            "key of a scenario, such as parameters.push.share=0.1; several in quotes, with spaces "
-            "between them. Each option is one candidate.",
+            help="A candidate by what it changes, several in quotes: policy=FILE, variation=NAME, "
+            "robot=FILE, or any key of a scenario, such as parameters.push.share=0.1.",
         ),
     ] = None,
-    baseline: Annotated[
-        str, Option(metavar="KEY=VALUE", help="The same for the baseline and all candidates.")
-    ] = "",
+    baseline: Annotated[str, Option(metavar="KEY=VALUE", help="The same for all loops.")] = "",
     metric: MetricOption = UNSAFE,
     worse_by: Annotated[float, Option(help="Difference of the failure rates that matters.")] = 0.02,
     alpha: Annotated[float, Option(help="Probability that any verdict is wrong.")] = 0.05,
@@ -229,7 +226,7 @@ def _report(
     for name, one in found.items():
         _show_changes(name, metric, one)
     console.say(
-        f"a verdict, or an end of an interval, is wrong with a probability of at most "
+        "a verdict, or an end of an interval, is wrong with a probability of at most "
         f"{100 * alpha:.3g} % a candidate, whenever one looks; 'not worse': by "
         f"{100 * one.worse_by:g} points"
     )
