@@ -38,9 +38,9 @@ _LOOKS = np.arange(16, 5001, 16)
 def gate(
     scenario: ScenarioArgument,
     variation: VariationOption = "actual",
-    efforts: Annotated[str, typer.Option(help="Factors on the motors' largest torques.")] = (
-        "0.6,0.5,0.4"
-    ),
+    efforts: Annotated[
+        str, typer.Option(help="Factors on the largest torques; '' for only a rate.")
+    ] = ("0.6,0.5,0.4"),
     episodes: Annotated[int, typer.Option(help="Real episodes of each plant.", min=50)] = 1500,
     replays: Annotated[int, typer.Option(help="Sets of pairs drawn from them.", min=100)] = 1000,
     out: Annotated[Path, typer.Option(help="Folder of episodes and results.")] = Path("runs/gate"),
@@ -55,7 +55,7 @@ def gate(
     """
     with open_study("gate", scenario, out, seed=GATE.first, workers=workers, out=out) as study:
         real = simulated(study, variation, 1.0, episodes)
-        for effort in map(float, efforts.split(",")):
+        for effort in map(float, filter(None, efforts.split(","))):
             candidate = failures(simulated(study, variation, effort, episodes))
             study.add(f"effort {effort:g}", rows(failures(real), candidate, replays))
         if study.scenario.name in assessed_scenarios():

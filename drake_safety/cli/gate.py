@@ -50,7 +50,8 @@ _OF_RATE = ("failure rate", "episodes", "failures", "random episodes of the same
 _OF_COMMANDS = ("commanded", "from", "to", "pairs", "newly fail", "fail no longer")
 _OF_EPISODES = ("episode", "cause", "at [s]", "commanded", "Γ at its start: safe, unsafe, unknown")
 _POINTS = Column("", "", "points", digits=1)
-_PANELS = "<style>body { display: flex; height: 95vh } iframe { flex: 1 }</style>"
+_PANELS = """<!doctype html><meta charset="utf-8">
+<style>body { display: flex; height: 95vh } iframe { flex: 1 }</style>"""
 
 MetricOption = Annotated[
     str, Option(help="Failure: unsafe, fall, a constraint's name, or tracking=BOUND.")
