@@ -203,7 +203,7 @@ def _by_command(
         parts = (values, values[apart > 0], values[apart < 0])
         counts = [np.histogram(part, ends)[0].tolist() for part in parts]
         columns = ([name] * 3, ends[:-1].tolist(), ends[1:].tolist(), *counts)
-        rows += list(zip(*columns, strict=True))
+        rows += [row for row in zip(*columns, strict=True) if row[3]]
     return rows
 
 
