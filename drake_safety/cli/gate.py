@@ -214,7 +214,8 @@ def _report(
     first: Loop, found: Mapping[str, Verdict], metric: str, folder: Path, seed: int, alpha: float
 ) -> None:
     """Prints and writes what is known."""
-    figures, candidates, rows = {}, {}, []
+    figures: dict[str, Estimate] = {}
+    candidates, rows = {}, []
     for name, one in found.items():
         counts = (one.both, len(one.no_longer_failing), len(one.newly_failing))
         ends = {"difference": one.difference[-1], "survival_s": one.survival_s[-1]}

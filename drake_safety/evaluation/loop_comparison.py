@@ -161,7 +161,7 @@ def compare_loops(
             later_s = [after.time_s - before.time_s for before, after in pairs]
             looks[0].append(look(apart, looks[0], alpha))
             looks[1].append(look(later_s, looks[1], alpha, one.scenario.episode_duration_s))
-            verdict = _verdict(pairs, *map(list, looks), worse_by, loops[0].output_names)
+            verdict = _verdict(pairs, looks, worse_by, loops[0].output_names)
             each_look(verdict)
             if verdict.verdict != UNDECIDED:
                 break
@@ -170,12 +170,12 @@ def compare_loops(
 
 def _verdict(
     pairs: Sequence[tuple[Outcome, Outcome]],
-    difference: list[Estimate],
-    survival_s: list[Estimate],
+    looks: Sequence[list[Estimate]],
     worse_by: float,
     output_names: Sequence[str],
 ) -> Verdict:
     """What is known of all pairs so far."""
+    difference, survival_s = map(list, looks)  # Later looks do not change it.
     low, high = difference[-1].low, difference[-1].high
     known = WORSE if low > 0.0 else BETTER if high < 0.0 else NOT_WORSE
     newly = [replace(two, belief=one.belief) for one, two in pairs if two.value > one.value]
@@ -232,7 +232,7 @@ def _run_pair(
         def at_start(context: Context) -> None:
             starts.append(_start_of(loop, context))
 
-        short = {} if is_wanted else {"until_first_row": True}
+        short: dict[str, Any] = {} if is_wanted else {"until_first_row": True}
         episode = run_episode(loop, index, at_start=at_start, **options, **short)
         return episode if is_wanted else None
 
@@ -258,7 +258,7 @@ def _check_alike(
     """Raises an error that names the first difference of two starts."""
     names = {"state": loop.state_names, "margin": loop.constraint_names}
     for what in dict.fromkeys([*baseline, *other]):
-        arrays = (start.get(what, []) for start in (baseline, other))
+        arrays: list[Any] = [start.get(what, []) for start in (baseline, other)]
         for k, (one, two) in enumerate(zip_longest(*arrays, fillvalue=math.nan)):
             if not abs(one - two) <= _SAME:
                 name = f" ({names[what][k]})" if what in names else ""
