@@ -41,7 +41,10 @@ _SEED = DEMONSTRATION.first
 _REACHING: dict[str, Any] = {"target": "blue_box", "push": ["torso"], "force": True}
 _WALKING: dict[str, Any] = {"target": "0.5 0 0", "push": ["side"], "force": True}
 _WALKING |= {"variation": "nominal"}  # On another one the monitor may alarm before the push.
-_ELSEWHERE = "compose.svg, which `python docs/generator/diagram_picture.py` draws by GraphViz"
+_ELSEWHERE = (
+    "compose.svg, which `python docs/generator/diagram_picture.py` draws by GraphViz, and "
+    "alarms_*.png of `python -m studies walking`"
+)
 
 
 def _of_run(picture: str, scenario: str, folder: Path, **options: Any) -> Path:

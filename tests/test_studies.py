@@ -315,7 +315,7 @@ def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypat
     assert [path.name for path in tmp_path.iterdir()] == ["adaptation_study.png"]
     assert study(monkeypatch, "figures", "nothing", "--out", tmp_path) == 1
     there = {path.stem for path in (ROOT / "docs/pictures").iterdir()}
-    assert there == {*PICTURES, "compose"}
+    assert there == {*PICTURES, "compose", "alarms_go2_walking", "alarms_g1_walking"}
     text = "".join(path.read_text() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
     assert set(re.findall(r"pictures/(\w+)\.", text)) == there
 
