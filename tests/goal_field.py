@@ -60,4 +60,5 @@ class FieldAssessment:
             predicted_margins=np.column_stack([gamma - 0.5, np.full(n, 0.02)]),
             probability=gamma,
             novelty=np.zeros(len(gamma)),
+            fall_probability=np.full(len(gamma), np.nan),
         )

@@ -79,7 +79,7 @@ def test_a_part_of_ones_own_takes_the_place_of_ours(number):
         simulator.AdvanceTo(time_s)
         values = [diagram.GetOutputPort(one) for one in ("safety_probability", "margins")]
         gamma, margins = (port.Eval(simulator.get_context()) for port in values)
-        assert gamma[0] > 0.8
+        assert gamma[0] > 0.4
         assert margins.min() > 0.05
 
 

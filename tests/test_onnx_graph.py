@@ -33,7 +33,7 @@ FIELDS = {
     "fall_probability": "fall_probability",
 }
 """Output port and field of `Prediction`."""
-NUM_INPUTS = 1000
+NUM_INPUTS = 6000
 TAKES_NO_ROWS = Version("1.32")
 """The first onnxruntime that takes an empty batch through the graph's search of the grid."""
 SINGLE = 2e-5
@@ -138,7 +138,7 @@ def test_the_graph_of_a_shipped_assessment_says_what_predict_says_of_every_kind_
     # All kinds were among them: judged, of empty cells, novel and not finite.
     unknown = is_unknown(expected.belief, assessment.parameters.initial_uncertainty)
     is_novel = expected.novelty > 1.0
-    assert np.mean(~unknown) > 0.5
+    assert np.mean(~unknown) > 0.3
     assert np.sum(unknown & ~is_novel) > 0
     assert np.sum(is_novel & np.isfinite(expected.novelty)) > 50
     assert 20 < np.sum(np.isinf(expected.novelty)) < 100
@@ -233,6 +233,10 @@ def adapted_by_hand(assessment, *, has_hidden=True, seed=1):
     adapted.beliefs_ = assessment.beliefs_[:, ::-1]
     known = assessment.novelty_.training
     wider = dataclasses.replace(known, covariance=100.0 * known.covariance)
+    if known.least is not None:
+        span = known.largest - known.least
+        ends = {"least": known.least - 10.0 * span, "largest": known.largest + 10.0 * span}
+        wider = dataclasses.replace(wider, **ends)
     old = assessment.novelty_
     adapted.novelty_ = Novelty(training=known, limits=old.limits, plan=old.plan, feedback=wider)
     return adapted

@@ -288,10 +288,10 @@ def predict(
         heads = base_logit.heads(output, trees_logit, margins)
         logit = base_logit.of_heads(heads)
         if has_correction:
-            is_known = safe + masses[:, belief_masses.UNSAFE] > 0.0
+            is_usable = np.isfinite(logit)
             guard = summed[:, num_columns] / np.maximum(np.add.reduce(is_inside, axis=0), 1)
             residual = np.zeros(len(x))
-            residual[is_known] = correction.residual(embedding, x[is_known])
+            residual[is_usable] = correction.residual(embedding, x[is_usable])
             logit += correction.shift(heads, residual, guard)
         probability = 1.0 / (1.0 + np.exp(logit))
         if fall_logit is not None:
