@@ -313,7 +313,7 @@ def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypat
     monkeypatch.chdir(ROOT)
     assert study(monkeypatch, "figures", "adaptation_study", "--out", tmp_path) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["adaptation_study.png"]
-    assert study(monkeypatch, "figures", "nothing", "--out", tmp_path) == 1
+    assert study(monkeypatch, "figures", "nothing", "--out", tmp_path) == 2
     there = {path.stem for path in (ROOT / "docs/pictures").iterdir()}
     assert there == {*PICTURES, "compose", "alarms_go2_walking", "alarms_g1_walking"}
     text = "".join(path.read_text() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
