@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -51,9 +50,6 @@ PUBLISHED: dict[str, Callable[[Prediction], np.ndarray]] = {
     "grid": lambda result: safe_share(result.belief),
 }
 """By the key of results: the probability, and the safe share of the grid's belief."""
-NUM_NEIGHBOURS = 50
-STEPS = ("x", "psi", "grid", "update", "update_without_gpr")
-"""The steps, see `losses`."""
 _SCRATCH_SIZES = (40, 160, 400)
 _BOOSTED_SIZES = (40, 160)
 _POOL_STRIDE = 10  # Between the first seeds of two pools.
@@ -131,9 +127,6 @@ def adaptation(
             if mode == MODES[0] and scratch:
                 nominal = load_episodes(episodes_folder(learned.path))
                 study.add("boosting", boosting_estimates(nominal, judged, stages))
-            if mode == "paper" and oracle:
-                found = losses(prior, sets[0], learned_from["oracle"], judged[0].test)
-                study.add("losses", found)
             if len(sets[0]) >= prior.parameters.adaptation.update_interval:
                 picture = adaptation_figure(prior, sets[0])
                 pictures += save(picture, folder / f"adaptation_{mode}")
@@ -248,7 +241,7 @@ def pool_estimates(
         By "FORM.ASSESSMENT.METRIC", where ASSESSMENT is "prior", "adapted N" or the name of a
         baseline, the mean over pools, with minimum and maximum as interval. "gap" is the share of
         pairs that differ, `pools_won` that of pools in which the Brier score is better than the
-        prior's, `gap_closed` that of the distance from the prior to "oracle".
+        prior's.
 
     Raises:
         ValueError: There is less feedback than the smallest N.
@@ -282,10 +275,6 @@ def pool_estimates(
         for who in (f"adapted {size}" for size in sizes):
             won = proportion(int(np.sum(brier[who] < before)), len(pools))
             estimates[f"{form}.{who}.pools_won"] = won
-            if "oracle" in brier:
-                gap = np.mean(before) - np.mean(brier["oracle"])
-                share = float(np.mean(before - brier[who]) / gap) if gap > 0.0 else math.nan
-                estimates[f"{form}.{who}.gap_closed"] = Estimate.exact(share, num_test)
     return estimates
 
 
@@ -371,66 +360,3 @@ def _learned(
         return name, SafetyAssessment(parameters).fit(episodes)
     except ValueError:
         return name, None
-
-
-def losses(
-    prior: SafetyAssessment, feedback: Sequence[EpisodePair], learned: Episodes, test: TestSet
-) -> dict[str, Estimate]:
-    """Brier scores of the steps from x to an adapted grid, each on the fresh episodes.
-
-    - "x": gradient boosting on x, trained on many actual episodes.
-    - "psi": share of unsafe ends among the nearest segments of these episodes in the embedding.
-    - "grid": share of unsafe ends among their segments in the same cell.
-    - "update": the grid after the paper's update from the feedback.
-    - "update_without_gpr": the same without discrepancy function.
-
-    The differences between steps are the losses of Ψ, of the grid and of the update. For an
-    ensemble, "psi" and "grid" are those of the first map.
-
-    Args:
-        prior: The assessment before feedback.
-        feedback: All feedback.
-        learned: Many actual episodes, other than the fresh ones.
-        test: The fresh episodes.
-
-    Raises:
-        ValueError: All actual episodes have the same end.
-    """
-    from sklearn.neighbors import KNeighborsClassifier
-
-    shortest = prior.settings.shortest
-    known = split(learned, stride=1, discount=1.0, shortest=shortest)
-    if np.ptp(known.is_unsafe.astype(int)) == 0:
-        raise ValueError("losses: all actual episodes end alike; expected safe and unsafe ones")
-    judged = test.segments
-    boosting = DirectClassifier(
-        "gradient_boosting", uses_features=prior.uses_features, shortest=shortest
-    ).fit(learned)
-    here, there = (
-        prior.predict(one.state, one.desired_preview, one.features).embedding
-        for one in (judged, known)
-    )
-    neighbours = KNeighborsClassifier(min(NUM_NEIGHBOURS, len(known)))
-    neighbours.fit(there, known.is_unsafe.astype(int))
-    share = neighbours.predict_proba(here)[:, 1]
-    cells, own = prior.grid_.locate(there), prior.grid_.locate(here)
-    inside = cells >= 0
-    count = np.bincount(cells[inside], minlength=prior.grid_.num_cells)
-    unsafe = np.bincount(cells[inside], known.is_unsafe[inside], minlength=prior.grid_.num_cells)
-    overall = known.is_unsafe.mean()
-    by_cell = np.divide(unsafe, count, out=np.full(len(count), overall), where=count > 0)
-    without_gpr = copy.copy(prior)
-    without_gpr.parameters = copy.deepcopy(prior.parameters)
-    without_gpr.parameters.adaptation.gate = 0.0
-    probability = {
-        "x": boosting.predict_unsafe(judged.state, judged.desired_preview, judged.features),
-        "psi": share,
-        "grid": np.where(own >= 0, by_cell[own], overall),
-        "update": test.unsafe_score(prior.adapt(feedback, method="paper")),
-        "update_without_gpr": test.unsafe_score(without_gpr.adapt(feedback, method="paper")),
-    }
-    found = {}
-    for name in STEPS:
-        value = float(np.mean((probability[name] - judged.is_unsafe) ** 2))
-        found[f"{name}.brier"] = Estimate.exact(value, len(test.episodes))
-    return found

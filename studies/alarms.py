@@ -114,15 +114,6 @@ def tilt(rotation: np.ndarray) -> np.ndarray:
     return np.arccos(np.clip(cosine + share**2 * (1.0 - cosine), -1.0, 1.0))
 
 
-def accepted(motions: Sequence[Motion], scorer: Scorer, threshold: float) -> list[Motion]:
-    """The motions whose first row has at least this probability, so that the robot begins them."""
-    if not motions:
-        return []
-    first_rows = (np.stack([motion[port][0] for motion in motions]) for port in SEEN)
-    is_accepted = scorer.probability(*first_rows) >= threshold
-    return [motion for motion, begins in zip(motions, is_accepted, strict=True) if begins]
-
-
 def first_alarm(
     motion: Motion, value: np.ndarray, threshold: float, *, since_s: float = 0.0
 ) -> float:

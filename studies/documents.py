@@ -86,8 +86,8 @@ def today(results: Results, command: str) -> str:
     """A stored command by its present name: the studies evaluate beside baselines."""
     is_beside = any(row.method == "gradient_boosting" for row in results.values())
     old = "drake-safety evaluate "
-    # Alarms need no thresholds any more.
-    command = re.sub(r"^(python -m studies walking .*) --calibration-tours \d+", r"\1", command)
+    # The reachable region is a picture of its own.
+    command = re.sub(r" --plane-step \S+", "", command)
     return command.replace(old, "python -m studies evaluate ") if is_beside else command
 
 

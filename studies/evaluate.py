@@ -1,7 +1,7 @@
 """``python -m studies evaluate``: `drake-safety evaluate` beside baselines, with what docs show.
 
 Its ``evaluation.json`` has what `drake-safety evaluate` writes and, besides, baseline classifiers,
-inverse kinematics, the other hand, the reachable region, and alarms on pushed motions.
+inverse kinematics, the other hand, and alarms on throws.
 """
 
 from __future__ import annotations
@@ -28,18 +28,16 @@ from drake_safety.cli.evaluate import (
     evaluating,
 )
 from drake_safety.cli.training_folder import check_writable, episodes_folder
-from drake_safety.evaluation.metrics import Estimate, proportion
+from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
 from drake_safety.learning.seeds import EVALUATION, RELEASE, SHIFTS
 from drake_safety.simulation.capabilities import (
-    CanBePushed,
     CanFall,
     HasBall,
     HasGoals,
-    goal_words,
     require,
 )
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -49,7 +47,6 @@ from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.throws import run_throws
 from studies.alarms import (
     ALARMS,
-    accepted,
     evaluate_alarms,
     scorer_alarm,
     threshold_alarms,
@@ -57,9 +54,7 @@ from studies.alarms import (
 from studies.baselines import classifier_differences, classifier_scorers
 from studies.harness import CalibrationOption, EpisodesOption, ReleaseOption
 from studies.plans import Plans, Rule, evaluate_plans, plans_of, reachability_rule, scorer_rule
-from studies.pushed_motions import run_pushed_motions
 from studies.reachability import BASELINES, Reachability
-from studies.reachable_region import reachable_region, region_figure
 from studies.shifts import add_all_shifts
 from studies.throws import classifier_rules
 
@@ -79,15 +74,6 @@ def evaluate(
     ] = 200,
     other_hand: Annotated[
         int, typer.Option(help="Targets: number mirrored to the other hand.", min=0)
-    ] = 0,
-    plane_x: Annotated[
-        float | None, typer.Option(help="Targets: x of the reachable region's plane [m].")
-    ] = None,
-    plane_step: Annotated[
-        float, typer.Option(help="Targets: spacing on it [m]; 0 to leave it out.", min=0)
-    ] = 0.0,
-    pushes: Annotated[
-        int, typer.Option(help="Targets: pushed motions, and as many for thresholds.", min=0)
     ] = 0,
     shifts: Annotated[
         int, typer.Option(help="Motions of each shift, instead of all else.", min=0)
@@ -112,8 +98,6 @@ def evaluate(
     loop = loaded.make_loop()
     if throws:
         require(loop, HasBall)
-    if pushes:
-        require(loop, CanBePushed)
     training = load_episodes(episodes_folder(assessment))
     with evaluating(
         loaded, assessment, folder, block, first, workers, _tables, _PROGRAM
@@ -129,11 +113,7 @@ def evaluate(
         classifiers = [replace(one, name=one.name.rpartition("_")[0]) for one in of_first_seed]
         if isinstance(loop, HasGoals):
             sets = plans_of(loop, other), plans_of(loop, test)
-            limit = _add_plans(
-                evaluation, loop, classifiers, *sets, other_hand, plane_x, plane_step
-            )
-            if pushes:
-                _add_pushes(evaluation, loop, classifiers, pushes, 1.0 - limit)
+            _add_plans(evaluation, loop, classifiers, *sets, other_hand)
         else:
             add_verdicts(evaluation, [*evaluation.scorers, *classifiers], other, test)
         evaluation.add(classifier_differences(evaluation.scorers[0], trained, test))
@@ -154,10 +134,8 @@ def _add_plans(
     calibration: Plans,
     test: Plans,
     num_other: int,
-    plane_x: float | None,
-    plane_step: float,
-) -> float:
-    """Verdicts on all, fair and mirrored targets; returns the threshold of the unsafe score."""
+) -> None:
+    """Verdicts on all, fair and mirrored targets."""
     scenario, gamma = evaluation.scenario, evaluation.assessments["sharpened"]
     sets = {"plans": test}
     if num_other:
@@ -179,24 +157,10 @@ def _add_plans(
             reach = {hand: Reachability(robot, hand, is_base_free=is_free) for hand in hands}
             rules[name] = reachability_rule(reach)
             thresholds[name] = 0.5
-    found, limits = evaluate_plans(
+    found, _ = evaluate_plans(
         rules, thresholds, gamma, calibration, sets, [key for key in sets if key != "plans"]
     )
     evaluation.add(found)
-    if plane_step and goal_words(require(loop, HasGoals)).is_point:
-        region = reachable_region(
-            scenario,
-            gamma,
-            evaluation.stages,
-            threshold=1.0 - limits["sharpened"],
-            x_m=plane_x,
-            step_m=plane_step,
-            num_workers=evaluation.workers,
-        )
-        figure = region_figure(region, list(loop.constraint_names))
-        estimates = {f"plans.plane.{key}": one for key, one in region.estimates().items()}
-        evaluation.add(estimates, reachable_region=figure)
-    return limits["sharpened"]
 
 
 def _add_throws(
@@ -218,35 +182,6 @@ def _add_throws(
     rules = classifier_rules(classifiers, calibration, persistence_s)
     logs = add_throws(evaluation, num_throws, rules)
     evaluation.add(_alarm_estimates(evaluation, loop, classifiers, calibration, logs))
-
-
-def _add_pushes(
-    evaluation: Evaluation,
-    loop: ClosedLoop,
-    classifiers: Sequence[Scorer],
-    num_motions: int,
-    threshold: float,
-) -> None:
-    """Alarms on pushed motions to accepted goals that are safe without a push."""
-    calibration, test = (
-        run_pushed_motions(
-            evaluation.scenario,
-            num_motions,
-            seed=evaluation.seeds[purpose],
-            variation=_PLANT,
-            num_workers=evaluation.workers,
-            progress=partial(evaluation.stages, what),
-        )
-        for what, purpose in (
-            ("calibration pushes", "disturbance thresholds"),
-            ("pushes", "disturbances"),
-        )
-    )
-    verdict = evaluation.scorers[0]
-    kept, others = (accepted(one, verdict, threshold) for one in (test, calibration))
-    refused = proportion(len(test) - len(kept), len(test))
-    evaluation.add({"monitoring.motions.refused": refused})
-    evaluation.add(_alarm_estimates(evaluation, loop, classifiers, others, kept))
 
 
 def _alarm_estimates(

@@ -17,7 +17,6 @@ from drake_safety.evaluation.figure_style import (
     new_figure,
     spoken,
 )
-from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
@@ -75,19 +74,6 @@ class ReachableRegion:
     simulated_y_m: np.ndarray
     simulated_z_m: np.ndarray
     outcomes: np.ndarray
-
-    def estimates(self) -> dict[str, Estimate]:
-        """Shares of safe targets, and of correct verdicts on the simulated grid by each method.
-
-        Points of a grid are not a random sample: the intervals only indicate their number.
-        """
-        is_safe = self.outcomes == SAFE
-        verdicts = {"sharpened": self.probability >= self.threshold, **self.is_reachable}
-        estimates = {"share_safe": proportion(int(is_safe.sum()), is_safe.size)}
-        for name, verdict in verdicts.items():
-            on_grid = verdict[::_REFINEMENT, ::_REFINEMENT]
-            estimates[f"{name}.right"] = proportion(int((on_grid == is_safe).sum()), is_safe.size)
-        return estimates
 
 
 def reachable_region(

@@ -4,20 +4,16 @@ import pytest
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.prediction import is_unknown
-from drake_safety.learning.segments import Episodes
 from lip_assessments import QUICK, worse
 from lip_episodes import make_episodes
 from studies.adaptation import (
-    STEPS,
     Pool,
     TestSet,
     boosting_estimates,
-    losses,
     pool_estimates,
     scores,
     train_baselines,
 )
-from studies.adaptation_figure import adaptation_figure
 
 pytestmark = pytest.mark.train
 
@@ -60,7 +56,7 @@ def test_too_few_episodes_give_no_baseline(assessment):
     np.testing.assert_array_equal(baselines["scratch 40"].correction_.change, 0.0)
 
 
-def test_pools_differ_and_the_oracle_bounds_the_gap(assessment, judged):
+def test_pools_differ(assessment, judged):
     other = TestSet.of(make_episodes(40, seed=10, noise=0.002), 10)
     pools = [Pool(feedback=worse(), test=judged), Pool(feedback=worse()[:30], test=other)]
     found = pool_estimates(
@@ -76,10 +72,6 @@ def test_pools_differ_and_the_oracle_bounds_the_gap(assessment, judged):
     before = [scores(assessment, pool.test)["calibrated"]["brier"] for pool in pools]
     won = found["calibrated.adapted 30.pools_won"]
     assert won.value == np.mean(np.array(by_hand) < before)
-    gap = np.mean(before) - found["calibrated.oracle.brier"].value
-    closed = found["calibrated.adapted 30.gap_closed"].value
-    expected = np.mean(np.array(before) - by_hand) / gap if gap > 0.0 else np.nan
-    assert closed == pytest.approx(expected, nan_ok=True)
     differing = sum(one.differs for pool in pools for one in pool.feedback)
     assert found["gap"].value == pytest.approx(differing / 70)
     with pytest.raises(ValueError, match="only 30 pairs of episodes"):
@@ -96,20 +88,3 @@ def test_boosting_learns_from_the_feedback_too(judged):
     assert prior.low == prior.high > 0.7
     assert alone.low < alone.high < prior.low
     assert alone.value < refitted.value < prior.value
-
-
-def test_what_is_lost_is_told_step_by_step(assessment, judged):
-    learned = make_episodes(200, seed=11, noise=0.002)
-    found = losses(assessment, worse(), learned, judged)
-    brier = [found[f"{name}.brier"].value for name in STEPS]
-    assert all(0.0 < value < 1.0 for value in brier)
-    # Neighbours know what x is worth, and a cell of many does not know more than they do.
-    assert brier[STEPS.index("psi")] < brier[STEPS.index("grid")] + 0.01
-    # Feedback that contradicts what the fresh episodes do can but harm.
-    assert brier[STEPS.index("update")] > brier[STEPS.index("grid")]
-    assert found["x.brier"].n == len(judged.episodes)
-    safe = Episodes(learned.info, [one for one in learned if one.is_safe])
-    with pytest.raises(ValueError, match="end alike"):
-        losses(assessment, worse(), safe, judged)
-    with pytest.raises(ValueError, match="fewer than the 40 of update 1"):
-        adaptation_figure(assessment, worse()[:39])

@@ -3,11 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.scorers import Scorer
 from drake_safety.simulation.motion import Motion
 from studies.alarms import (
     Alarm,
-    accepted,
     equal_share_threshold,
     evaluate_alarms,
     first_alarm,
@@ -136,15 +134,3 @@ def test_what_an_engineer_would_watch_is_found_by_name():
         {"support_margin": 0.1, "tracking_error": -5.0, "tilt": -0.2, "smallest_margin": -0.1}
     )
     assert [alarm.name for alarm in threshold_alarms(["x"], ["y"], {})] == ["smallest_margin"]
-
-
-def test_a_motion_begins_where_its_first_row_is_accepted_whatever_comes_later():
-    scorer = Scorer(name="x", probability=lambda state, preview, features: state[:, 0])
-    motions = [
-        motion_of(0, {0.0: 0.7, 1.0: 0.1}),
-        motion_of(1, {0.0: 0.5}, leaves=True),
-        motion_of(2, {0.0: 0.49, 0.1: 1.0}),
-        motion_of(3, {0.0: math.nan, 0.1: 1.0}),
-    ]
-    assert [motion.index for motion in accepted(motions, scorer, 0.5)] == [0, 1]
-    assert accepted([], scorer, 0.5) == []

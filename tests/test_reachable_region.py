@@ -49,17 +49,6 @@ def test_the_assessment_is_asked_from_the_standing_posture(region, assessment):
 
 
 @pytest.mark.train
-def test_verdicts_are_compared_with_the_truth_where_it_is_known(region):
-    estimates = region.estimates()
-    verdict = region.probability >= region.threshold
-    rows = [int(np.argmin(np.abs(region.z_m - z))) for z in region.simulated_z_m]
-    columns = [int(np.argmin(np.abs(region.y_m - y))) for y in region.simulated_y_m]
-    is_right = verdict[np.ix_(rows, columns)] == (region.outcomes == SAFE)
-    assert estimates["sharpened.right"].value == pytest.approx(is_right.mean())
-    assert estimates["sharpened.right"].n == region.outcomes.size
-
-
-@pytest.mark.train
 def test_what_is_not_known_is_hatched_and_not_accepted(region):
     probability = np.full_like(region.probability, 0.9)
     probability[: len(probability) // 2] = np.nan
@@ -71,9 +60,6 @@ def test_what_is_not_known_is_hatched_and_not_accepted(region):
     assert not any(label.startswith("front") for label in labels)
     share = 100 * np.isnan(probability).mean()
     assert f"Γ: don't know, {share:.0f} %" in labels
-    accepted = probability[::4, ::4] >= half.threshold
-    is_right = (accepted == (half.outcomes == SAFE)).mean()
-    assert half.estimates()["sharpened.right"].value == pytest.approx(is_right)
 
 
 @pytest.mark.train

@@ -39,11 +39,10 @@ ROOT = Path(__file__).resolve().parents[1]
 FRESH = "--episodes 40 --calibration-episodes 30 --seed 100"
 # By command line: the file that it writes, and some of its rows.
 STUDIES = {
-    f"evaluate {FRESH} --other-hand 10 --plane-step 0.6 --pushes 15": (
+    f"evaluate {FRESH} --other-hand 10": (
         "evaluation",
         "plans.mlp.auc, plans.fair.gradient_boosting.safe_recall, plans.other_hand.outcomes.safe, "
-        "plans.other_hand.fair.paper.unsafe_recall, plans.plane.sharpened.right, "
-        "monitoring.mlp.auc, monitoring.front_margin.detected, monitoring.smallest_margin.auc",
+        "plans.other_hand.fair.paper.unsafe_recall, difference.first.mlp.brier",
     ),
     "evaluate --shifts 6 --episodes 12": (
         "shifts",
@@ -68,7 +67,7 @@ STUDIES = {
     ),
     "adaptation --feedback 40 --evaluate 20 --pools 2 --oracle 40 --scratch": (
         "adapted-actual/study",
-        "sharpened.calibrated.adapted 40.brier, paper.grid.oracle.auc, losses.update.brier, "
+        "sharpened.calibrated.adapted 40.brier, paper.grid.oracle.auc, boosting.refitted 40.auc, "
         "sharpened.calibrated.scratch 40.brier, paper.grid.adapted 40.pools_won",
     ),
     f"readings {FRESH} --only none --sizes 60": (
