@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from studies.__main__ import main
-from studies.bench import comparison_text, read_run, run_text
+from studies.bench import read_run, run_text
 
 pytest_plugins = ["pytester"]
 
@@ -103,32 +103,6 @@ def test_a_run_is_printed_as_markdown_with_its_machine(tmp_path, monkeypatch, ca
     assert run_text(content) in printed
     assert "| tick | 10 us | <= 12 | OK | solver 20 | n |" in printed
     assert "2030-01-02, commit 0123456789, Some CPU (2 cores), Python 3.11.7, drake 1.0." in printed
-
-
-def test_runs_are_compared_by_the_ratio_to_their_peers_and_ratios_as_they_are():
-    tick, memory = {"name": "tick", "unit": "us"}, {"name": "memory", "unit": "GB"}
-    speed_up, seconds = {"name": "speed-up", "unit": "x"}, {"unit": "s", "value": 1.0}
-    before = run_of(
-        tick | {"value": 10.0, "peers": {"solver": 20.0}},
-        speed_up | {"value": 1.6, "peers": {"one": 5.0}},
-        memory | {"value": 2.0},
-        seconds | {"name": "gone"},
-        cpu="Quick CPU",
-    )
-    # Half as fast a machine, and the tick is a fifth better beside its peer.
-    after = run_of(
-        tick | {"value": 16.0, "peers": {"solver": 40.0}},
-        speed_up | {"value": 2.0, "peers": {"one": 9.0}},
-        memory | {"value": 1.0},
-        seconds | {"name": "new"},
-        cpu="Slow CPU",
-    )
-    text = comparison_text(before, after)
-    assert "| tick | 0.5 | 0.4 | of solver | -20.0 % |" in text
-    assert "Quick CPU (2 cores)" in text and "Slow CPU (2 cores)" in text
-    assert "| speed-up | 1.6 | 2 | x | +25.0 % |" in text
-    assert "| memory | 2 | 1 | GB | -50.0 % |" in text
-    assert "Only before: gone." in text and "Only after: new." in text
 
 
 DAMAGED = json.dumps(run_of({"name": "tick", "value": 1.0}))
