@@ -233,9 +233,7 @@ def test_the_command_says_which_candidate_is_worse_and_replays_an_episode(
     candidates = results.entries["candidates"]
     assert [one["verdict"] for one in candidates.values()] == ["worse", "not worse"]
     first = candidates["parameters.effort_share=0.2 variation=actual"]
-    ends = results["parameters_effort_share_0_2_variation_actual.difference"]
-    assert ends.n == first["pairs"] == first["difference"][-1]["n"]
-    assert ends.low == pytest.approx(first["difference"][-1]["low"], rel=1e-5)
+    assert first["pairs"] == first["difference"][-1]["n"]
     assert (tmp_path / "gate.png").stat().st_size > 10_000
     suite = ElementTree.parse(junit).getroot()
     assert (suite.get("tests"), suite.get("failures"), suite.get("errors")) == ("2", "1", "0")

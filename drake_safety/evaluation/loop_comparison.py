@@ -49,6 +49,7 @@ class Verdict:
     Attributes:
         verdict: "worse", "better", "not worse" (by `worse_by`), or "undecided". Each is wrong with
             a probability of at most alpha, whenever one looks.
+        pairs: Number of pairs.
         both: Number of pairs in which both fail alike.
         difference: Mean outcome of the candidate minus that of the baseline at each look.
         survival_s: The same of the time until the failure, or the end [s].
@@ -60,6 +61,7 @@ class Verdict:
     """
 
     verdict: str
+    pairs: int
     both: int
     difference: list[Estimate]
     survival_s: list[Estimate]
@@ -67,11 +69,6 @@ class Verdict:
     no_longer_failing: list[Outcome]
     by_command: list[tuple[str, float, float, int, int, int]]
     worse_by: float
-
-    @property
-    def pairs(self) -> int:
-        """Number of pairs."""
-        return self.difference[-1].n
 
 
 def compare_loops(
@@ -182,6 +179,7 @@ def _verdict(
     no_longer = [one for one, two in pairs if two.value < one.value]
     return Verdict(
         verdict=known if high < worse_by or known == WORSE else UNDECIDED,
+        pairs=len(pairs),
         both=sum(one.value == two.value > 0.0 for one, two in pairs),
         difference=difference,
         survival_s=survival_s,
@@ -227,18 +225,13 @@ def _run_pair(
     """The episodes of a pair that are missing; the starts of both are compared."""
     index, is_missing = item
     starts: list[dict[str, np.ndarray]] = []
-
-    def run(loop: ClosedLoop, is_wanted: bool) -> Episode | None:
-        def at_start(context: Context) -> None:
-            starts.append(_start_of(loop, context))
-
-        short: dict[str, Any] = {} if is_wanted else {"until_first_row": True}
-        episode = run_episode(loop, index, at_start=at_start, **options, **short)
-        return episode if is_wanted else None
-
-    episodes = list(map(run, loops, is_missing))
+    episodes = []
+    for loop, is_wanted in zip(loops, is_missing, strict=True):
+        options["at_start"] = partial(lambda loop, root: starts.append(_start_of(loop, root)), loop)
+        short = {} if is_wanted else {"until_first_row": True}
+        episodes.append(run_episode(loop, index, **options, **short))
     _check_alike(index, loops[0], *starts)
-    return episodes
+    return [one if is_wanted else None for one, is_wanted in zip(episodes, is_missing, strict=True)]
 
 
 def _start_of(loop: ClosedLoop, context: Context) -> dict[str, np.ndarray]:
