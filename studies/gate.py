@@ -16,9 +16,9 @@ import numpy as np
 import typer
 from scipy.stats import norm
 
-from drake_safety.assessments import assessed_scenarios
-from drake_safety.cli.console import ScenarioArgument, VariationOption, WorkersOption
-from drake_safety.cli.training_folder import MODES, assessment_folder, load_assessment
+from drake_safety.assessments import assessed_scenarios, load_assessment
+from drake_safety.cli.console import ScenarioArgument, WorkersOption
+from drake_safety.cli.gate import changed_loop
 from drake_safety.evaluation.failure_rate import in_turns, strata_of, stratified_rate
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.paired_test import betting_log_e
@@ -37,7 +37,9 @@ _LOOKS = np.arange(16, 5001, 16)
 
 def gate(
     scenario: ScenarioArgument,
-    variation: VariationOption = "actual",
+    baseline: Annotated[
+        str, typer.Option(metavar="KEY=VALUE", help="Changes of the scenario, as of `gate`.")
+    ] = "variation=actual",
     efforts: Annotated[
         str, typer.Option(help="Factors on the largest torques; '' for only a rate.")
     ] = ("0.6,0.5,0.4"),
@@ -54,12 +56,14 @@ def gate(
     sequential one without pairs.
     """
     with open_study("gate", scenario, out, seed=GATE.first, workers=workers, out=out) as study:
+        shipped = study.scenario.name
+        study.scenario, variation = changed_loop(scenario, baseline)
         real = simulated(study, variation, 1.0, episodes)
         for effort in map(float, filter(None, efforts.split(","))):
             candidate = failures(simulated(study, variation, effort, episodes))
             study.add(f"effort {effort:g}", rows(failures(real), candidate, replays))
-        if study.scenario.name in assessed_scenarios():
-            gamma = load_assessment(assessment_folder(study.scenario, None).path, MODES[0])
+        if shipped in assessed_scenarios():
+            gamma = load_assessment(shipped)
             inputs = zip(*(one.first_inputs for one in real), strict=True)
             score = 1.0 - gamma.predict(*map(np.array, inputs)).probability
             study.add("rate", rate_rows(score, failures(real), replays))
@@ -78,7 +82,7 @@ def simulated(study: Study, variation: str, effort: float, number: int) -> Episo
         variation=name,
         seed=study.seed,
         num_workers=study.workers,
-        path=study.folder / "gate" / f"{name.replace(' ', '-')}-{study.seed}",
+        path=study.folder / "gate" / f"{shifted.simulation_hash(name)[:12]}-{study.seed}",
         progress=partial(study.stages, f"episodes, {name}"),
         **options,
     )

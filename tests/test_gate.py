@@ -345,7 +345,7 @@ def test_a_network_alone_is_a_policy(tmp_path):
     network = network_file(read_policy_file(GO2), str(GO2.parent))
     copy = tmp_path / "new.onnx"
     shutil.copyfile(network, copy)
-    changed = gate._changed("go2_walking", f"policy={copy}").scenario
+    changed = gate.changed_loop("go2_walking", f"policy={copy}").scenario
     assert policy_files(changed) == (GO2, str(copy))
     assert copy in changed.task_class().model_files(changed)
     starts = [start_of(load_scenario("go2_walking").make_loop()), start_of(changed.make_loop())]

@@ -89,9 +89,9 @@ def gate(
     code: 1 if a candidate is worse, 2 if one is undecided, else 0. Episodes are kept in OUT: the
     same command continues.
     """
-    first = _changed(scenario, baseline)
-    others = {Path(one).stem: _changed(one, baseline) for one in candidates or []}
-    others |= {text: _changed(scenario, f"{baseline} {text}") for text in candidate or []}
+    first = changed_loop(scenario, baseline)
+    others = {Path(one).stem: changed_loop(one, baseline) for one in candidates or []}
+    others |= {text: changed_loop(scenario, f"{baseline} {text}") for text in candidate or []}
     if len(others) < max(replay is None, len(candidates or []) + len(candidate or [])):
         raise ValueError("gate: name different candidates: YAML files, or --candidate KEY=VALUE")
     folder = out or Path("runs") / f"{first.scenario.name}-gate"
@@ -172,7 +172,7 @@ def rate(
     _write(folder / "rate.json", Loop(loaded, variation), entries, failure_rate=found.rate)
 
 
-def _changed(scenario: str, changes: str) -> Loop:
+def changed_loop(scenario: str, changes: str) -> Loop:
     """A scenario with KEY=VALUE pairs; files are relative to the working directory."""
     values, variation = {}, "nominal"
     for text in shlex.split(changes):

@@ -228,7 +228,7 @@ def _run_pair(
     episodes = []
     for loop, is_wanted in zip(loops, is_missing, strict=True):
         options["at_start"] = partial(lambda loop, root: starts.append(_start_of(loop, root)), loop)
-        short = {} if is_wanted else {"until_first_row": True}
+        short: dict[str, Any] = {} if is_wanted else {"until_first_row": True}
         episodes.append(run_episode(loop, index, **options, **short))
     _check_alike(index, loops[0], *starts)
     return [one if is_wanted else None for one, is_wanted in zip(episodes, is_missing, strict=True)]
