@@ -126,6 +126,13 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
     printed = " ".join(capsys.readouterr().out.split())
     assert "start as the 120 'nominal' episodes of its calibration" in printed
     assert "choose another seed, such as 2000001" in printed
+    # A robot may be trained in one mode.
+    (folder / "paper.safetensors").unlink()
+    assert evaluate_shuttle(monkeypatch, run) == 0
+    alone = Results.read(folder / "evaluation.json")
+    own = {key: row for key, row in found.items() if row.method == "sharpened"}
+    assert own.items() <= alone.items()
+    assert "paper" not in {row.method for row in alone.values()}
 
 
 @pytest.mark.train

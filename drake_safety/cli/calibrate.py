@@ -53,11 +53,7 @@ def calibrate(
         check_share("--confidence", confidence)
     loaded = load_scenario(scenario)
     folder = folders.assessment_folder(loaded, assessment)
-    learned = {
-        mode: folders.load_assessment(folder.path, mode)
-        for mode in MODES
-        if mode == MODES[0] or folders.assessment_file(folder.path, mode).is_file()
-    }
+    learned = folders.load_assessments(folder.path)
     adaptation = learned[MODES[0]].adaptation_
     plant = variation or ("nominal" if adaptation is None else adaptation.variation)
     for gamma in learned.values():

@@ -160,7 +160,7 @@ def evaluating(
 
     Seeds are those of `block`, from `seed` or its default on.
     """
-    assessments = {mode: folders.load_assessment(run_folder, mode) for mode in MODES}
+    assessments = folders.load_assessments(run_folder)
     seeds = block.seeds(seed)
     for gamma in assessments.values():
         folders.check_fresh(gamma, scenario, seeds.values())
@@ -169,7 +169,7 @@ def evaluating(
         yield evaluation
     sharpened = assessments[MODES[0]]
     trained = next(one for one in sharpened.used_ if one.purpose == "training")
-    hashes = {mode: file_hash(folders.assessment_file(run_folder, mode)) for mode in MODES}
+    hashes = {mode: file_hash(folders.assessment_file(run_folder, mode)) for mode in assessments}
     made = console.made_by(scenario.name, program) | {
         "scenario_hash": sharpened.info_.scenario_hash,
         "seed": next(iter(seeds.values())),
@@ -228,9 +228,8 @@ def add_throws(
 ) -> list[Motion]:
     """Evaluates either mode, and other rules, as triggers of recovery; returns the throws."""
     recovery = evaluation.scenario.parameters.recovery
-    thresholds = recovery.threshold, PAPER_THRESHOLD
-    modes = zip(evaluation.scorers, thresholds, strict=True)
-    own = [TriggerRule(scorer=scorer, threshold=threshold) for scorer, threshold in modes]
+    thresholds = dict(zip(MODES, (recovery.threshold, PAPER_THRESHOLD), strict=True))
+    own = [TriggerRule(scorer=one, threshold=thresholds[one.name]) for one in evaluation.scorers]
     found, logs = evaluate_throws(
         evaluation.scenario,
         [*own, *rules],
@@ -261,11 +260,10 @@ def add_shifts(
         others: Further sets, made of the nominal motions.
         more: Further estimates of a shift.
     """
-    gamma, paper = evaluation.assessments.values()
-    judges = judges or {
-        "gamma": shift_study.assessment_judge(gamma),
-        "paper": shift_study.assessment_judge(paper),
-    }
+    assessments = evaluation.assessments
+    gamma = assessments[MODES[0]]
+    names = {"gamma" if mode == MODES[0] else mode: one for mode, one in assessments.items()}
+    judges = judges or {name: shift_study.assessment_judge(one) for name, one in names.items()}
     scenario, seed, stages = evaluation.scenario, evaluation.seeds["shifts"], evaluation.stages
     folder, workers = evaluation.run_folder, evaluation.workers
     nominal = shift_study.motions_of(evaluation.fresh("nominal motions", num_nominal, "shifts"))

@@ -139,6 +139,12 @@ def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
     return SafetyAssessment.load(path)
 
 
+def load_assessments(folder: Path) -> dict[str, SafetyAssessment]:
+    """Loads the assessments of a folder by mode; that of `paper` may be missing."""
+    wanted = [mode for mode in MODES if mode == MODES[0] or assessment_file(folder, mode).is_file()]
+    return {mode: load_assessment(folder, mode) for mode in wanted}
+
+
 def check_fresh(
     assessment: SafetyAssessment, scenario: Scenario, seeds: Iterable[int] = ()
 ) -> None:
