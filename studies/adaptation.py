@@ -68,9 +68,6 @@ def adaptation(
     pools: Annotated[
         int, typer.Option(help="Independent pools of feedback and test episodes.", min=1)
     ] = 3,
-    oracle: Annotated[
-        int, typer.Option(help="Other actual episodes to train an oracle on.", min=0)
-    ] = 0,
     scratch: Annotated[
         bool,
         typer.Option("--scratch", help="Also train from scratch, and boosting, on the feedback."),
@@ -110,13 +107,8 @@ def adaptation(
         drawn = [plant.pairs(feedback, block["adaptation"]) for block in seeds]
         sets = [pairs.feedback() for pairs in drawn]
         fresh = [plant.fresh(evaluate, block["evaluation of the adaptation"]) for block in seeds]
-        learned_from = {}
-        if oracle:
-            learned_from["oracle"] = plant.fresh(oracle, seeds[0]["oracle"])
-        if scratch:
-            learned_from |= {
-                f"scratch {n}": drawn[0].actual[:n] for n in _SCRATCH_SIZES if n <= feedback
-            }
+        sizes = [size for size in _SCRATCH_SIZES if scratch and size <= feedback]
+        learned_from = {f"scratch {size}": drawn[0].actual[:size] for size in sizes}
         for mode, prior in priors.items():
             baselines = train_baselines(prior, learned_from, num_workers=workers, progress=stages)
             judged = [

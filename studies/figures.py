@@ -112,7 +112,7 @@ def _shifts(name: str, folder: Path) -> Figure:
 
 
 def _adaptation_study(folder: Path) -> Figure:
-    results = Results.read(_ROOT / "docs/results/adaptation/laikago-actual.json")
+    results = Results.read(_ROOT / "docs/results/adaptation/laikago-payload-pools.json")
     kinds = "sharpened.calibrated", "paper.grid"
     metrics = "brier", "auc", "unsafe_recall"
     rows = [row for row in results.values() if row.set in kinds and row.metric in metrics]

@@ -60,7 +60,7 @@ def test_pools_differ(assessment, judged):
     other = TestSet.of(make_episodes(40, seed=10, noise=0.002), 10)
     pools = [Pool(feedback=worse(), test=judged), Pool(feedback=worse()[:30], test=other)]
     found = pool_estimates(
-        assessment, pools, sizes=(10, 30, 40), baselines={"oracle": assessment.adapt(worse())}
+        assessment, pools, sizes=(10, 30, 40), baselines={"other": assessment.adapt(worse())}
     )
     assert not any("adapted 40" in key for key in found)
     estimate = found["calibrated.adapted 30.brier"]

@@ -65,10 +65,10 @@ STUDIES = {
         "monitor",
         "monitor.variation_actual.confident_error_60s, monitor.nominal.false_alarms_per_hour",
     ),
-    "adaptation --feedback 40 --evaluate 20 --pools 2 --oracle 40 --scratch": (
+    "adaptation --feedback 40 --evaluate 20 --pools 2 --scratch": (
         "adapted-actual/study",
-        "sharpened.calibrated.adapted 40.brier, paper.grid.oracle.auc, boosting.refitted 40.auc, "
-        "sharpened.calibrated.scratch 40.brier, paper.grid.adapted 40.pools_won",
+        "sharpened.calibrated.adapted 40.brier, paper.grid.scratch 40.auc, "
+        "boosting.refitted 40.auc, paper.grid.adapted 40.pools_won",
     ),
     f"readings {FRESH} --only none --sizes 60": (
         "readings",

@@ -52,7 +52,7 @@ EVALUATION = SeedBlock(
 """Thresholds are chosen on other episodes, throws and pushes than the evaluated ones."""
 CALIBRATION = SeedBlock(2_000_000, ("calibration",))
 PLANNING = SeedBlock(3_000_000, ("planning",))
-ADAPTATION = SeedBlock(4_000_000, ("adaptation", "evaluation of the adaptation", "oracle"))
+ADAPTATION = SeedBlock(4_000_000, ("adaptation", "evaluation of the adaptation"))
 """Nominal twins have the seed of their actual episodes."""
 DEMONSTRATION = SeedBlock(7_000_000, ("demonstration",))
 """For `run`, `play` and `check`."""
