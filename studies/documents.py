@@ -86,8 +86,6 @@ def today(results: Results, command: str) -> str:
     """A stored command by its present name: the studies evaluate beside baselines."""
     is_beside = any(row.method == "gradient_boosting" for row in results.values())
     old = "drake-safety evaluate "
-    # The reachable region is a picture of its own.
-    command = re.sub(r" --plane-step \S+", "", command)
     return command.replace(old, "python -m studies evaluate ") if is_beside else command
 
 
