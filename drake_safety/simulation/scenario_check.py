@@ -89,6 +89,7 @@ def check_scenario(
         return
     if isinstance(loop, LeggedLoop):
         yield from _guarded("contact spheres", _contacts, loop)
+        yield from _guarded("off the ground", _off_the_ground, loop)
         yield from _guarded("shape of the base", _target, loop)
         progress(_STANDS, 0, 1)
         yield from _guarded(_STANDS, _stands, loop)
@@ -357,6 +358,34 @@ def _contacts(loop: LeggedLoop) -> _Check:
         f"{loop.kinematics.num_contacts} in the model file",
         "the model file has no such sphere: " + "; ".join(missing),
         "add a collision sphere to the URDF, or correct contact_points and radius_m [m]",
+    )
+
+
+def _off_the_ground(loop: LeggedLoop) -> _Check:
+    """Checks that nothing but the feet is in the ground in the standing posture."""
+    plant, context = loop.plant, loop.CreateDefaultContext()
+    loop.reset_to(context, None, loop.standing_start())
+    query = plant.get_geometry_query_input_port().Eval(plant.GetMyContextFromRoot(context))
+    feet = [plant.GetBodyByName(one.body, loop.robot_instance) for one in loop.robot.feet.values()]
+    allowed = {body.index() for foot in feet for body in plant.GetBodiesWeldedTo(foot)}
+    depths: dict[str, float] = {}
+    for pair in query.ComputePointPairPenetration():
+        frames = map(query.inspector().GetFrameId, (pair.id_A, pair.id_B))
+        bodies = [plant.GetBodyFromFrameId(frame) for frame in frames]
+        if (
+            plant.world_body().index() in {body.index() for body in bodies}
+            and pair.depth > _MATCH_M
+        ):
+            for body in bodies:
+                if body.model_instance() == loop.robot_instance and body.index() not in allowed:
+                    depths[body.name()] = max(pair.depth, depths.get(body.name(), 0.0))
+    told = ", ".join(f"'{name}' by {100 * depth:.1f} cm" for name, depth in depths.items())
+    yield _judged(
+        "off the ground",
+        not depths,
+        "in the standing posture the feet alone touch it",
+        f"in the standing posture the robot rests on shapes that reach into the ground: {told}",
+        "look at them by `check --picture FILE`; make them smaller in the URDF [m]",
     )
 
 
