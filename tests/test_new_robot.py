@@ -294,6 +294,14 @@ def test_a_shape_of_the_base_is_asked_for_where_there_is_none(tmp_path):
     assert "base 'body' has no collision geometry" in found.message
 
 
+def test_a_robot_that_rests_on_its_trunk_is_not_ready(tmp_path):
+    trunk = "<collision><geometry><box size='0.3 0.2 1'/></geometry></collision></link>"
+    urdf = urdf_of_spider(tmp_path, lambda text: text.replace("</link>", trunk, 1))
+    written = write_robot("spider", urdf, "balancing", tmp_path / "spider")
+    found = problems(written.folder / "balancing.yaml")["off the ground"]
+    assert "shapes that reach into the ground: 'body' by " in found.message
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

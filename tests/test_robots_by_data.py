@@ -9,6 +9,7 @@ from drake_safety.extras import MissingExtraError
 from drake_safety.models import load_robot, robot_names
 from drake_safety.simulation.sampling import calm_start
 from drake_safety.simulation.scenario import load_scenario, scenario_names
+from drake_safety.simulation.scenario_check import check_scenario
 from drake_safety.simulation.throws import Violations
 
 OF_THE_EXTRA = [
@@ -41,6 +42,13 @@ def test_it_stands(name, duration_s):
 def test_six_quadrupeds_besides_the_packages_own_balance_by_data_alone():
     assert len(BALANCING) >= 6
     assert all(len(load_robot(name).feet) == 4 for name in BALANCING)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BALANCING)
+def test_its_scenario_is_ready(name):
+    findings = check_scenario(f"{name}_balancing", num_episodes=0)
+    assert [finding for finding in findings if not finding.is_ok] == []
 
 
 @pytest.mark.parametrize("name", BALANCING)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
+from contextlib import suppress
 from dataclasses import is_dataclass
 from functools import partial
 from pathlib import Path
@@ -280,7 +281,10 @@ def _model_file(kinematics: RobotKinematics) -> _Check:
     endless = {name for name, is_free in zip(kinematics.joint_names, free, strict=True) if is_free}
     legs = [Limb(body=foot.body, joints=foot.joints) for foot in robot.feet.values()]
     legs = [limb for limb in legs if limb.joints and limb.joints[-1] in endless]
-    if legs and (wheels := Survey(path).wheels(legs)):
+    wheels: list[str] = []
+    with suppress(ValueError):  # Meshes that Drake does not read, which `add_robot` replaces.
+        wheels = Survey(path).wheels(legs) if legs else []
+    if wheels:
         yield passed(
             "wheels",
             f"joints {wheels} turn wheels, and position servos hold them",
