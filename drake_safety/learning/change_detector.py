@@ -90,7 +90,8 @@ class ChangeDetector:
 
     def describe(self) -> str:
         """What the limits were learned from, and what they promise."""
-        motion = f"monitor: {self.motion_s / 60.0:.0f} min of motion for its limits"
+        # Rounded down: a little too little is too little.
+        motion = f"monitor: {math.floor(self.motion_s / 60.0)} min of motion for its limits"
         if math.isfinite(self.alarm_level):
             hours = f"{1 / FALSE_ALARMS_PER_HOUR:.0f} h"
             return f"{motion}, extrapolated to one false alarm in {hours}"
