@@ -39,8 +39,9 @@ def test_the_distances_are_those_of_whitened_inputs_with_bounded_variances(name)
     found = novelty.distances(x)
     np.testing.assert_allclose(found[:, :3], expected, rtol=1e-6)
     if known.least is not None:
-        outside = np.abs(x - 0.5 * (known.least + known.largest)) / (known.largest - known.least)
-        expected = np.column_stack([expected, 2.0 * outside.max(axis=1)])
+        half_width = np.maximum(0.5 * (known.largest - known.least), 0.05)  # A constant column's.
+        outside = np.abs(x - 0.5 * (known.least + known.largest)) / half_width
+        expected = np.column_stack([expected, outside.max(axis=1)])
         np.testing.assert_allclose(found[:, 3], expected[:, 3], rtol=1e-6)
     np.testing.assert_allclose(novelty.of(x), (expected / novelty.limits).max(axis=1), rtol=1e-6)
 
