@@ -303,6 +303,10 @@ def test_a_candidate_that_is_none_is_an_error(monkeypatch, capsys, tmp_path, arg
     assert message in " ".join(capsys.readouterr().out.split())
 
 
+def test_a_candidate_is_told_by_the_name_of_its_file():
+    assert gate._short("policy=/a/b/new.onnx variation=weak") == "policy=new.onnx variation=weak"
+
+
 GO2, _ = policy_files(load_scenario("go2_walking"))
 
 

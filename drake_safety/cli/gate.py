@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import html
 import math
+import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -91,7 +92,9 @@ def gate(
     """
     first = changed_loop(scenario, baseline)
     others = {Path(one).stem: changed_loop(one, baseline) for one in candidates or []}
-    others |= {text: changed_loop(scenario, f"{baseline} {text}") for text in candidate or []}
+    for text in candidate or []:
+        name = text if _short(text) in others else _short(text)
+        others[name] = changed_loop(scenario, f"{baseline} {text}")
     if len(others) < max(replay is None, len(candidates or []) + len(candidate or [])):
         raise ValueError("gate: name different candidates: YAML files, or --candidate KEY=VALUE")
     folder = out or Path("runs") / f"{first.scenario.name}-gate"
@@ -188,6 +191,11 @@ def changed_loop(scenario: str, changes: str) -> Loop:
     loaded = load_scenario(scenario, values)
     loaded.variation(variation)  # There is one.
     return Loop(loaded, variation)
+
+
+def _short(changes: str) -> str:
+    """KEY=VALUE pairs with the names of files, without their folders."""
+    return re.sub(r"(?<==)\S*/", "", changes)
 
 
 def _record(first: Loop, others: Mapping[str, Loop], index: int, seed: int, file: Path) -> None:
