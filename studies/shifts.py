@@ -24,7 +24,6 @@ from drake_safety.evaluation.shift_study import (
     MotionSet,
     assessment_judge,
 )
-from drake_safety.learning.adaptive_threshold import AdaptiveThreshold
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import PLAN, Calibration
 from drake_safety.learning.novelty import Novelty
@@ -306,30 +305,10 @@ def baseline_estimates(
         if 0 < label[is_known].sum() < is_known.sum():
             score = 1.0 - np.nan_to_num(probability[is_known])
             found[f"{name}.known_auc"] = auc(score, label[is_known], judged.motion[is_known])
-    if promise is None or not is_unsafe.any():
-        return found
-    gamma = np.nan_to_num(judged.probability["gamma"][first])
-    return found | promised(promise, gamma, is_unsafe)
-
-
-def promised(
-    promise: Calibration, probability: np.ndarray, is_unsafe: np.ndarray
-) -> dict[str, Estimate]:
-    """Verdicts on first rows by the promise's threshold, and by one that follows outcomes."""
-    adaptive = AdaptiveThreshold(promise)
-    is_accepted = np.zeros((2, len(probability)), dtype=bool)
-    for i, (gamma, ends_unsafely) in enumerate(zip(probability, is_unsafe, strict=True)):
-        is_accepted[:, i] = gamma >= promise.threshold, adaptive.is_safe(gamma)
-        adaptive.update(gamma, ends_unsafely)
-    # The outcomes of the first half; the figures are those of the second.
-    is_counted = np.cumsum(is_unsafe) > 0.5 * is_unsafe.sum()
-    found = {"missed": proportion(int((is_accepted[0] & is_unsafe).sum()), int(is_unsafe.sum()))}
-    for name, row in (("fixed", is_accepted[0]), ("adaptive", is_accepted[1])):
-        for what, of in (("missed", is_unsafe), ("accepted", ~is_unsafe)):
-            if (of & is_counted).any():
-                found[f"{name}.{what}"] = proportion(
-                    int((row & of & is_counted).sum()), int((of & is_counted).sum())
-                )
+    if promise is not None and is_unsafe.any():
+        is_accepted = np.nan_to_num(judged.probability["gamma"][first]) >= promise.threshold
+        num_missed = int((is_accepted & is_unsafe).sum())
+        found["missed"] = proportion(num_missed, int(is_unsafe.sum()))
     return found
 
 

@@ -104,20 +104,6 @@ def test_the_ranking_is_that_of_all_rows_and_of_those_that_gamma_knows():
     assert found["other.auc"].value == pytest.approx(0.5)
 
 
-def test_a_threshold_that_follows_outcomes_misses_less_and_accepts_less():
-    rng = np.random.default_rng(0)
-    is_unsafe = rng.random(400) < 0.5
-    # Under this shift unsafe plans look as safe as the threshold, and a little more.
-    probability = np.where(is_unsafe, rng.uniform(0.5, 0.9, 400), rng.uniform(0.7, 1.0, 400))
-    motions = [motion(1, p, is_unsafe=bool(u)) for p, u in zip(probability, is_unsafe, strict=True)]
-    found = baseline_estimates(judged(motions), PROMISE)
-    assert found["fixed.missed"].value > 0.6
-    assert found["fixed.accepted"].value == 1.0
-    assert found["adaptive.missed"].value == pytest.approx(0.1, abs=0.05)
-    assert 0.2 < found["adaptive.accepted"].value < 0.6
-    assert found["adaptive.missed"].n == pytest.approx(is_unsafe.sum() / 2, abs=1)
-
-
 @pytest.mark.train
 def test_outside_the_safe_set_gamma_is_not_safe_but_the_grid_alone_may_be(assessment, nominal):
     rows = nominal[0]
