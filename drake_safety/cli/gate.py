@@ -92,7 +92,7 @@ def gate(
     """
     first = changed_loop(scenario, baseline)
     others = {Path(one).stem: changed_loop(one, baseline) for one in candidates or []}
-    for text in candidate or []:
+    for text in dict.fromkeys(candidate or []):
         name = text if _short(text) in others else _short(text)
         others[name] = changed_loop(scenario, f"{baseline} {text}")
     if len(others) < max(replay is None, len(candidates or []) + len(candidate or [])):

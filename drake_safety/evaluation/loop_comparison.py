@@ -227,9 +227,12 @@ def _run_pair(
     starts: list[dict[str, np.ndarray]] = []
     episodes = []
     for loop, is_wanted in zip(loops, is_missing, strict=True):
-        options["at_start"] = partial(lambda loop, root: starts.append(_start_of(loop, root)), loop)
         short: dict[str, Any] = {} if is_wanted else {"until_first_row": True}
-        episodes.append(run_episode(loop, index, **options, **short))
+
+        def at_start(context: Context, loop: ClosedLoop = loop) -> None:
+            starts.append(_start_of(loop, context))
+
+        episodes.append(run_episode(loop, index, at_start=at_start, **options, **short))
     _check_alike(index, loops[0], *starts)
     return [one if is_wanted else None for one, is_wanted in zip(episodes, is_missing, strict=True)]
 
