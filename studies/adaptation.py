@@ -158,12 +158,6 @@ class TestSet:
             episodes=episodes, segments=split(episodes, stride=1, discount=1.0, shortest=shortest)
         )
 
-    def unsafe_score(self, assessment: SafetyAssessment) -> np.ndarray:
-        """1 - the safe share of each segment's belief, (N,)."""
-        segments = self.segments
-        found = assessment.predict(segments.state, segments.desired_preview, segments.features)
-        return 1.0 - safe_share(found.belief)
-
 
 def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, float]]:
     """Metrics of an assessment on the test set, by form of Γ and metric.
