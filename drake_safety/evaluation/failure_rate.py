@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -129,9 +128,10 @@ def strata_of(score: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def in_turns(stratum: np.ndarray) -> list[int]:
     """Starts in the order in which they are simulated, one of each stratum (N,) after the other."""
-    members = [np.flatnonzero(stratum == k).tolist() for k in range(stratum.max() + 1)]
-    turns = itertools.chain(*itertools.zip_longest(*members))
-    return [index for index in turns if index is not None]
+    order = np.argsort(stratum, kind="stable")
+    turn = np.arange(len(order)) - np.searchsorted(stratum[order], stratum[order])
+    found: list[int] = order[np.argsort(turn, kind="stable")].tolist()
+    return found
 
 
 def stratified_rate(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -63,13 +64,22 @@ class FallLogit:
 
     def of(self, margins: np.ndarray, unsafe_logit: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Returns the logit (N,) of margins (N, n_c), unsafe logit (N,) and inputs (N, n_x)."""
-        terms = self.inputs(margins, unsafe_logit, x, self.columns) * self.weights
+        columns, weights = self._arrays
+        terms = self.inputs(margins, unsafe_logit, x, columns) * weights
         logit = np.add.reduce(terms, axis=1) + self.offset
         return np.minimum(np.maximum(logit, -_LIMIT), _LIMIT)
 
+    @cached_property
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.array(self.columns, dtype=np.intp), np.array(self.weights)
+
     @staticmethod
     def inputs(
-        margins: np.ndarray, unsafe_logit: np.ndarray, x: np.ndarray, columns: Sequence[int]
+        margins: np.ndarray,
+        unsafe_logit: np.ndarray,
+        x: np.ndarray,
+        columns: Sequence[int] | np.ndarray,
     ) -> np.ndarray:
         """Returns what the weights multiply, (N, n_c + 1 + num_columns)."""
-        return np.concatenate([margins, unsafe_logit[:, None], x[:, columns]], axis=1)
+        read = x.take(np.asarray(columns, dtype=np.intp), axis=1)
+        return np.concatenate([margins, unsafe_logit[:, None], read], axis=1)

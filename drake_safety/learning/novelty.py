@@ -280,9 +280,8 @@ class Novelty:
             squared *= self.inverse_limits[:NUM_QUADRATIC]
             found = np.maximum.reduce(squared, axis=1)
             if len(self.limits) > NUM_QUADRATIC:
-                found = np.maximum(
-                    found, self.offsets(x).max(axis=1) ** 2 * self.inverse_limits[-1]
-                )
+                offset = np.maximum.reduce(self.offsets(x), axis=1)
+                found = np.maximum(found, offset * offset * self.inverse_limits[-1])
             distance: np.ndarray = np.fmin(np.sqrt(np.maximum(found, 0.0)), np.inf)
         return distance
 

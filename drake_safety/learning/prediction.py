@@ -188,8 +188,7 @@ def _weighted(heads: np.ndarray, slopes: Sequence[float], offset: float = 0.0) -
 
     Not a product of matrices, which would round a row differently beside other rows.
     """
-    terms = (head * slope for head, slope in zip(heads.T, slopes, strict=True))
-    return sum(terms, np.array(offset))
+    return np.add.reduce(heads * slopes, axis=1) + offset
 
 
 _CORRECTION = tuple(field.name for field in fields(Correction))
@@ -276,14 +275,15 @@ def predict(
     if np.count_nonzero(is_novel):
         masses[is_novel] = belief_masses.empty((), num_columns - 3)
     safe = masses[:, belief_masses.SAFE]
-    # The paper's Γ(x) = b_safe of the cell of Psi(x).
-    probability = safe.copy()
     if output.margins.shape[2]:
         margins = mean_of_maps(output.margins)
     else:
         margins = np.full((len(x), num_columns - 3), np.nan)
     fall_probability = np.full(len(x), np.nan)
-    if base_logit is not None:
+    if base_logit is None:
+        # The paper's Γ(x) = b_safe of the cell of Psi(x).
+        probability = safe.copy()
+    else:
         trees_logit = None if trees is None else trees.evaluate(x)
         heads = base_logit.heads(output, trees_logit, margins)
         logit = base_logit.of_heads(heads)
