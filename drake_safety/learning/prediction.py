@@ -123,8 +123,7 @@ class BaseLogit:
         if output.margins.shape[2]:
             margins = mean_of_maps(output.margins) if margins is None else margins
             smallest = np.minimum.reduce(margins, axis=1)
-            found[:, 1] = _clip(smallest, *self.margin_range)
-            found[:, 1] /= -self.margin_unit
+            found[:, 1] = _clip(smallest, *self.margin_range) / -self.margin_unit
         if trees_logit is not None:
             found[:, 2] = _clip(trees_logit, -LOGIT_LIMIT, LOGIT_LIMIT)
         return found
