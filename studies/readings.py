@@ -103,12 +103,6 @@ def readings_of(scenario: Scenario) -> list[Reading]:
         ),
         Reading(name="x without velocities", assessment={"paper.velocities": False}),
         Reading(name="loss: distance, not squared", assessment={"paper.loss": "norm"}),
-        Reading(
-            name="loss: without neighbours"
-            if base.paper.neighbour_weight
-            else "loss: with neighbours",
-            assessment={"paper.neighbour_weight": 0.0 if base.paper.neighbour_weight else 0.2},
-        ),
         Reading(name="no dropout or weight decay", assessment=bare),
         Reading(name="three layers of 256", assessment={"paper.hidden_sizes": [256] * 3}),
         Reading(name="200 epochs", assessment={"paper.epochs": 200}),

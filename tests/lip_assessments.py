@@ -41,10 +41,10 @@ def quick_assessment(mode):
 def map_data(x, target, **changes):
     """What a map learns of inputs that are all safe and have no margins."""
     n = len(x)
-    values = dict(x=x, target=target, has_target=np.ones(n, dtype=bool), tsne_unit=1.0)
+    values = dict(x=x, target=target, has_target=np.ones(n, dtype=bool))
     values |= dict(is_unsafe=np.zeros(n, dtype=bool), margins=np.zeros((n, 0)))
     values |= dict(sample_weight=np.ones(n), input_scale=np.ones(x.shape[1]))
-    return MapData(**values | {"neighbours": np.full((n, 1), -1)} | changes)
+    return MapData(**values | changes)
 
 
 def inputs(segments, rows=slice(None)):

@@ -62,33 +62,6 @@ def test_without_velocities_gamma_depends_on_configurations_alone(episodes):
 
 
 @pytest.mark.train
-def test_neighbours_under_omega_meet_in_the_plane_where_the_target_does_not_say_so():
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=(200, 6))
-    group = x[:, 0] > 0.0
-    target = rng.normal(size=(200, 2)) * 20.0  # Nothing of x.
-    same = [np.flatnonzero(group == one) for one in group]
-    neighbours = np.array([rng.choice(one, 5) for one in same])
-    gaps = []
-    for weight in (0.0, 0.5):
-        reading = PaperReading(neighbour_weight=weight, epochs=40)
-        (y,) = trained(map_data(x, target, neighbours=neighbours), reading).embed(x)
-        centres = [y[group == one].mean(axis=0) for one in (False, True)]
-        spread = np.mean([y[group == one].std() for one in (False, True)])
-        gaps.append(np.linalg.norm(centres[0] - centres[1]) / spread)
-    assert gaps[1] > 3.0 * gaps[0]
-
-
-def test_taking_inputs_keeps_the_neighbours_that_are_taken():
-    x = np.arange(4.0)[:, None]
-    neighbours = np.array([[1, 2], [3, 0], [-1, 3], [2, 1]])
-    data = map_data(x, np.zeros((4, 2)), neighbours=neighbours).take(
-        np.array([True, False, True, True])
-    )
-    np.testing.assert_array_equal(data.neighbours, [[-1, 1], [-1, 2], [1, -1]])
-
-
-@pytest.mark.train
 def test_the_loss_without_a_square_gives_the_median_and_with_it_the_mean():
     # Of equal inputs, four fifths are at one point and a fifth is at another.
     rng = np.random.default_rng(0)

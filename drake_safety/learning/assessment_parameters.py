@@ -71,9 +71,6 @@ class PaperReading:
             paper does not say; raw columns weigh as their spread in SI units.
         loss: "squared", the mean of ||y - Psi(x)||^2, or "norm", literally "the cost function
             ||y - Psi(x)||_2".
-        neighbour_weight: Share of a second term of the loss, that of parametric t-SNE: neighbours
-            under Omega become neighbours in the plane for inputs on which Psi cannot reproduce y. 0
-            leaves the paper's loss alone.
         hidden_sizes: Widths of the layers of Psi, "a deep neural network".
         dropout: Dropout rate.
         weight_decay: Weight decay of AdamW.
@@ -86,7 +83,6 @@ class PaperReading:
     velocities: bool = True
     standardized: bool = False
     loss: Literal["squared", "norm"] = "squared"
-    neighbour_weight: Share = 0.0
     hidden_sizes: Widths = field(default_factory=lambda: [128, 128])
     dropout: ShareBelowOne = 0.3
     weight_decay: NotNegative = 0.01

@@ -48,14 +48,11 @@ class MapData(Points):
 
     def take(self, rows: np.ndarray) -> MapData:
         """Selects inputs by a mask (N,)."""
-        # The last entry is that of no neighbour.
-        position = np.append(np.where(rows, np.cumsum(rows) - 1, -1), -1)
         names = ("x", "has_target", "is_unsafe", "margins", "sample_weight")
         return replace(
             self,
             **{name: getattr(self, name)[rows] for name in names},
             target=self.target[rows[self.has_target]],
-            neighbours=position[self.neighbours[rows]],
         )
 
 
@@ -241,7 +238,6 @@ def train_map(
         target[has_target] = single(data.target / target_scale)
         weight = single(data.sample_weight)
         target_weight = weight * has_target
-        neighbours = torch.from_numpy(np.asarray(data.neighbours, dtype=np.int64))
         is_unsafe = single(data.is_unsafe)
         low, high = parameters.margin_range
         margins = single(np.clip(data.margins, low, high) / parameters.margin_unit)
@@ -277,14 +273,6 @@ def train_map(
                     * (target_weight[batch] * distance).mean()
                     / mean_target_weight
                 )
-                if settings.neighbour_weight > 0.0:
-                    chosen = torch.randint(neighbours.shape[1], (len(batch),))
-                    neighbour = neighbours[batch, chosen]
-                    other = net["output"](net["trunk"](x[neighbour.clamp(min=0)]))[:, :2]
-                    contrast = _neighbour_loss(y, other, target_scale / data.tsne_unit)
-                    contrast = (contrast * (neighbour >= 0)).mean()
-                    share = settings.neighbour_weight
-                    loss = (1.0 - share) * loss + share * contrast
                 if has_safety:
                     logit = net["safety"](y)[:, 0]
                     entropy = functional.binary_cross_entropy_with_logits(
@@ -311,17 +299,6 @@ def train_map(
         if best:
             net.load_state_dict(best)
     return _folded_weights(net, mean, spread, target_scale, parameters.margin_unit)
-
-
-def _neighbour_loss(y: Any, neighbour: Any, unit: float) -> Any:
-    """The loss of parametric t-SNE for inputs and one neighbour of each, (N,).
-
-    InfoNC-t-SNE (Damrich et al., 2023), the contrastive form of t-SNE's loss: -log(q / (q + sum of
-    those of the other inputs)), q = 1 / (1 + ||y - y'||^2).
-    """
-    near = 1.0 / (1.0 + (unit * (y - neighbour)).square().sum(dim=1))
-    others = 1.0 / (1.0 + (unit * (y[:, None] - y[None])).square().sum(dim=2))
-    return ((others.sum(dim=1) - 1.0) / near).log1p()
 
 
 def _network(num_inputs: int, num_margins: int, has_safety: bool, settings: ModeSettings) -> Any:

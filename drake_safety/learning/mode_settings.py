@@ -43,7 +43,6 @@ class ModeSettings:
     weight_decay: float = 1e-4
     standardized: bool = True
     loss: str = "squared"
-    neighbour_weight: float = 0.0
     target_weight: float = 1.0
     safety_weight: float = 0.0
     margin_weight: float = 0.0
@@ -59,7 +58,7 @@ def mode_settings(parameters: AssessmentParameters) -> ModeSettings:
     source = parameters.paper if is_paper else parameters
     names = ["hidden_sizes", "dropout", "epochs", "held_out"]
     if is_paper:
-        names += ["velocities", "weight_decay", "standardized", "loss", "neighbour_weight"]
+        names += ["velocities", "weight_decay", "standardized", "loss"]
         stride, shortest, target_stride = (parameters.paper.stride or horizon), horizon, 1
         stride *= parameters.preview_stride
     else:

@@ -15,9 +15,6 @@ from drake_safety.learning.grid import Grid
 from drake_safety.learning.mode_settings import mode_settings
 from drake_safety.learning.segments import Segments
 
-_NUM_NEIGHBOURS = 15
-"""Nearest neighbours of a segment in the loss of parametric t-SNE, as in its publication."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Points:
@@ -26,15 +23,10 @@ class Points:
     Attributes:
         has_target: Whether the segment has a point, (N,).
         target: The points of these segments, scaled to the grid, (M, 2).
-        neighbours: Nearest neighbours under Omega of each segment, as rows, (N, k); -1 for a
-            segment without a point or a neighbour that was not selected.
-        tsne_unit: Length of t-SNE's unit in that of the target.
     """
 
     has_target: np.ndarray
     target: np.ndarray
-    neighbours: np.ndarray
-    tsne_unit: float
 
 
 def embedded_points(
@@ -84,16 +76,7 @@ def embedded_points(
         seed=parameters.seed,
         progress=stage_of(progress, "t-SNE"),
     )
-    target = grid.scale(points)
-    nearest = graph.indices[:, :_NUM_NEIGHBOURS]
-    neighbours = np.full((len(segments), nearest.shape[1]), -1)
-    neighbours[has_target] = np.flatnonzero(has_target)[nearest]
-    return Points(
-        has_target=has_target,
-        target=target,
-        neighbours=neighbours,
-        tsne_unit=float(target.std() / points.std()),
-    )
+    return Points(has_target=has_target, target=grid.scale(points))
 
 
 def tsne(
