@@ -186,7 +186,7 @@ def test_another_ball_is_another_disturbance():
         loop.reset(context, episode_rng(0, 0))
         starts.append(loop_comparison._start_of(loop, context))
     with pytest.raises(ValueError, match=r"pair 0 .*: entry 0 of 'ball' is \S+ in the baseline"):
-        loop_comparison._check_alike(0, *starts)
+        loop_comparison._check_alike(0, loop, *starts)
 
 
 @pytest.mark.train
@@ -307,6 +307,12 @@ def test_a_candidate_is_told_by_the_name_of_its_file():
     assert gate._short("policy=/a/b/new.onnx variation=weak") == "policy=new.onnx variation=weak"
 
 
+def test_a_variation_is_a_name_also_where_a_file_has_it(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "actual").touch()
+    assert gate.changed_loop("pendulum", "variation=actual").variation == "actual"
+
+
 GO2, _ = policy_files(load_scenario("go2_walking"))
 
 
@@ -330,13 +336,12 @@ def test_another_policy_takes_over_where_the_baselines_has_walked(tmp_path):
     baseline = load_scenario("go2_walking")
     crouched = go2(tmp_path, **{"_thigh_joint: 0.8": "_thigh_joint: 0.9"})
     there = start_of(baseline.make_loop())
-    joints = [value for entry, value in there.items() if "'state'" in entry][-12:]
-    assert np.abs(joints).max() > 0.1  # In mid-stride.
+    assert np.abs(there["state"][-12:]).max() > 0.1  # In mid-stride.
     alone = start_of(crouched.make_loop())
     with pytest.raises(ValueError, match="pair 5 does not start alike"):
-        loop_comparison._check_alike(5, there, alone)
+        loop_comparison._check_alike(5, baseline.make_loop(), there, alone)
     taking_over = loop_comparison.make_paired((Loop(baseline), Loop(crouched)), 1)
-    loop_comparison._check_alike(5, there, start_of(taking_over))
+    loop_comparison._check_alike(5, taking_over, there, start_of(taking_over))
 
 
 def test_a_policy_that_remembers_other_things_cannot_take_over_in_mid_stride(tmp_path):
@@ -354,7 +359,7 @@ def test_a_network_alone_is_a_policy(tmp_path):
     assert policy_files(changed) == (GO2, str(copy))
     assert copy in changed.task_class().model_files(changed)
     starts = [start_of(load_scenario("go2_walking").make_loop()), start_of(changed.make_loop())]
-    loop_comparison._check_alike(5, *starts)
+    loop_comparison._check_alike(5, changed.make_loop(), *starts)
 
 
 def test_the_study_counts_wrong_verdicts_and_the_pairs_until_a_right_one():

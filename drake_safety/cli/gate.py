@@ -177,15 +177,17 @@ def rate(
 
 def changed_loop(scenario: str, changes: str) -> Loop:
     """A scenario with KEY=VALUE pairs; files are relative to the working directory."""
-    values = {}
+    values, variation = {}, "nominal"
     for text in shlex.split(changes):
         key, is_pair, value = text.partition("=")
         if not (key and is_pair):
             raise ValueError(f"gate: a change is KEY=VALUE, such as variation=actual; got '{text}'")
+        if key == "variation":
+            variation = value
+            continue
         key = "parameters.policy" if key == "policy" else key
         path = Path(value)
         values[key] = str(path.resolve()) if path.is_file() else parse_yaml(value, f"'{text}'")
-    variation = str(values.pop("variation", "nominal"))
     loaded = load_scenario(scenario, values)
     loaded.variation(variation)  # There is one.
     return Loop(loaded, variation)

@@ -8,6 +8,7 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from functools import partial
 from inspect import signature
+from itertools import zip_longest
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -223,7 +224,7 @@ def _run_pair(
 ) -> list[Episode | None]:
     """The episodes of a pair that are missing; the starts of both are compared."""
     index, is_missing = item
-    starts: list[dict[str, float]] = []
+    starts: list[dict[str, np.ndarray]] = []
     episodes = []
     for loop, is_wanted in zip(loops, is_missing, strict=True):
         short: dict[str, Any] = {} if is_wanted else {"until_first_row": True}
@@ -232,34 +233,32 @@ def _run_pair(
             starts.append(_start_of(loop, context))
 
         episodes.append(run_episode(loop, index, at_start=at_start, **options, **short))
-    _check_alike(index, *starts)
+    _check_alike(index, loops[0], *starts)
     return [one if is_wanted else None for one, is_wanted in zip(episodes, is_missing, strict=True)]
 
 
-def _start_of(loop: ClosedLoop, context: Context) -> dict[str, float]:
-    """Entries of state, plan and disturbances at the start of an episode, by name."""
+def _start_of(loop: ClosedLoop, context: Context) -> dict[str, np.ndarray]:
+    """State, plan and disturbances at the start of an episode."""
     ports = {"state": "true_state", "plan": "desired_preview", "margin": "margins"}
-    start = {what: loop.GetOutputPort(port).Eval(context) for what, port in ports.items()}
+    start = {name: np.array(loop.GetOutputPort(port).Eval(context)) for name, port in ports.items()}
     if isinstance(loop, CanStartAnywhere):
         plan, scenario = loop.start_of(context).plan, loop.scenario
         times_s = scenario.step_s * np.arange(scenario.num_steps + 1)
         start["plan"] = np.concatenate([plan.value(time_s).ravel() for time_s in times_s])
-    start |= loop.disturbances(context) if isinstance(loop, HasDisturbances) else {}
-    names = {"state": loop.state_names, "margin": loop.constraint_names}
-    entries = {}
-    for what, values in start.items():
-        for k, value in enumerate(values):
-            name = f" ({names[what][k]})" if what in names else ""
-            entries[f"entry {k}{name} of '{what}'"] = float(value)
-    return entries
+    return start | (loop.disturbances(context) if isinstance(loop, HasDisturbances) else {})
 
 
-def _check_alike(index: int, baseline: dict[str, float], other: dict[str, float]) -> None:
+def _check_alike(
+    index: int, loop: ClosedLoop, baseline: dict[str, np.ndarray], other: dict[str, np.ndarray]
+) -> None:
     """Raises an error that names the first difference of two starts."""
-    for entry in baseline | other:
-        one, two = (start.get(entry, math.nan) for start in (baseline, other))
-        if not abs(one - two) <= _SAME:
-            raise ValueError(
-                f"pair {index} does not start alike in both loops: {entry} is {one:.6g} in the "
-                f"baseline and {two:.6g} in the candidate"
-            )
+    names = {"state": loop.state_names, "margin": loop.constraint_names}
+    for what in dict.fromkeys([*baseline, *other]):
+        arrays: list[Any] = [start.get(what, []) for start in (baseline, other)]
+        for k, (one, two) in enumerate(zip_longest(*arrays, fillvalue=math.nan)):
+            if not abs(one - two) <= _SAME:
+                name = f" ({names[what][k]})" if what in names else ""
+                raise ValueError(
+                    f"pair {index} does not start alike in both loops: entry {k}{name} of '{what}' "
+                    f"is {one:.6g} in the baseline and {two:.6g} in the candidate"
+                )
