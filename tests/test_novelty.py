@@ -20,7 +20,9 @@ def redundant(rng, num_episodes=EPISODES):
 
 
 def fitted(x, episode, is_unsafe=False, plan=NO_PLAN):
-    return Novelty.fit(x, episode, np.zeros(len(x), dtype=bool) | is_unsafe, rate=0.05, plan=plan)
+    return Novelty.fit(
+        x, episode, np.zeros(len(x), dtype=bool) | is_unsafe, rate=0.05, range_limit=1.25, plan=plan
+    )
 
 
 @pytest.fixture(scope="module")

@@ -190,6 +190,7 @@ class SafetyAssessment:
             every.episode,
             every.is_unsafe,
             parameters.novelty_rate,
+            range_limit=parameters.novelty_range,
             plan=columns.plan,
         )
         detector = detector or ChangeDetector.fit(episodes, stage_of(progress, "monitor"))

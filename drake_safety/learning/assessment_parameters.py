@@ -128,6 +128,9 @@ class AssessmentParameters:
             "random".
         novelty_rate: Share of safe episodes, and of first inputs of all, in which an input may
             exceed a limit of novelty, see `novelty.Novelty`.
+        novelty_range: Largest distance of a known input's column from the centre of its range in
+            training, in half widths of it. An actual robot differs: where training holds postures
+            more closely than a loaded robot does, it must be larger.
         seed: Seed of t-SNE and of the maps.
         learning_rate: Peak learning rate of the maps.
         batch_size: Segments per training step.
@@ -172,6 +175,7 @@ class AssessmentParameters:
     exaggeration: Annotated[float, Field(ge=1)] = 4.0
     initialization: Literal["spectral", "random"] = "spectral"
     novelty_rate: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    novelty_range: Annotated[float, Field(ge=1)] = 1.25
     seed: int = 0
     learning_rate: Positive = 2e-3
     batch_size: Count = 512

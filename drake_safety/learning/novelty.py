@@ -19,7 +19,6 @@ _LEAST_VARIANCE = 1e-2  # Lower bound for the range: an actual robot differs tha
 _LEAST_PLAN_VARIANCE = 1e-4  # The same for the plan alone, which no robot's reality changes.
 _LEAST_LIMIT = 3.0  # Of the root mean square distance along the redundancies; against rounding.
 _LEAST_HALF_WIDTH = 5e-2  # Of a column's range [unit of the column].
-_RANGE_LIMIT = 1.25  # Of a column, in half widths of its range: an actual robot differs.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,7 +125,11 @@ class Distances:
             start += part.shape[1]
 
     def squared(self, x: np.ndarray) -> np.ndarray:
-        """Those of inputs (N, n_x): all of it, redundancies, plan, (N, 3).
+        """Those of inputs (N, n_x): all of it, redundancies, plan, (N, 3)."""
+        return self.weighted(x, self.terms)
+
+    def weighted(self, x: np.ndarray, terms: np.ndarray) -> np.ndarray:
+        """The sums with other weights (n_x + m, 3) in place of `terms`, (N, 3).
 
         One product for each row: those of many rows at once would round differently.
         """
@@ -135,7 +138,7 @@ class Distances:
         offset = np.subtract(x, self.mean, out=entries[:, 0, :num_inputs])
         np.matmul(offset[:, None], self.axes, out=entries[:, :, num_inputs:])
         np.multiply(entries, entries, out=entries)
-        found: np.ndarray = (entries @ self.terms)[:, 0]
+        found: np.ndarray = (entries @ terms)[:, 0]
         return found
 
     def precision(self) -> np.ndarray:
@@ -190,13 +193,22 @@ class Novelty:
         # Without other episodes to choose them from, the limits are infinite: nothing is novel that
         # is finite.
         self.inverse_limits = 1.0 / np.square(self.limits)
+        self._shares = self.quadratic.terms * self.inverse_limits[:NUM_QUADRATIC]
+        self._range_share = self.inverse_half_width / self.limits[-1]
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Novelty:
         return self
 
     @classmethod
     def fit(
-        cls, x: np.ndarray, episode: np.ndarray, is_unsafe: np.ndarray, rate: float, *, plan: slice
+        cls,
+        x: np.ndarray,
+        episode: np.ndarray,
+        is_unsafe: np.ndarray,
+        rate: float,
+        *,
+        range_limit: float,
+        plan: slice,
     ) -> Novelty:
         """Computes the moments of training inputs and chooses the limits.
 
@@ -209,6 +221,7 @@ class Novelty:
         Args:
             is_unsafe: Whether it ended unsafely, (N,).
             rate: Share of episodes with a novel input, in (0, 1).
+            range_limit: Largest distance of a column from the centre of its range [half widths].
         """
         fold = np.unique(episode, return_inverse=True)[1] % NUM_FOLDS
         distances = np.full((len(x), NUM_QUADRATIC), np.inf)
@@ -231,7 +244,7 @@ class Novelty:
         training = Moments.of(x).widened(growth)
         num_redundancies = np.sum(training.axes(slice(None))[0] < _REDUNDANT_VARIANCE)
         least = [1.0, max(1.0, _LEAST_LIMIT * np.sqrt(num_redundancies)), 1.0]
-        of_range = _RANGE_LIMIT if fold.any() else np.inf
+        of_range = range_limit if fold.any() else np.inf
         return cls(
             training=training, limits=np.append(np.maximum(limits, least), of_range), plan=plan
         )
@@ -276,12 +289,11 @@ class Novelty:
         An input is novel above 1; that of an input that is not finite is infinite.
         """
         with np.errstate(invalid="ignore", over="ignore"):
-            squared = self.quadratic.squared(x)
-            squared *= self.inverse_limits[:NUM_QUADRATIC]
-            found = np.maximum.reduce(squared, axis=1)
+            found = np.maximum.reduce(self.quadratic.weighted(x, self._shares), axis=1)
             if len(self.limits) > NUM_QUADRATIC:
-                offset = np.maximum.reduce(self.offsets(x), axis=1)
-                found = np.maximum(found, offset * offset * self.inverse_limits[-1])
+                offset = (x - self.centre) * self._range_share
+                offset *= offset
+                found = np.maximum(found, np.maximum.reduce(offset, axis=1))
             distance: np.ndarray = np.fmin(np.sqrt(np.maximum(found, 0.0)), np.inf)
         return distance
 

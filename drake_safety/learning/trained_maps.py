@@ -16,6 +16,11 @@ INPUT_LIMIT = 1e15
 _CHUNK = 8192
 
 
+def are_usable(x: np.ndarray) -> bool:
+    """Whether all entries are far below `INPUT_LIMIT`, by one pass; False for NaN."""
+    return bool(np.vdot(x, x) < INPUT_LIMIT**2)
+
+
 class EmbeddingOutput(NamedTuple):
     """Outputs of a stack of K maps.
 
@@ -154,10 +159,9 @@ class Embedding:
         A row has the same bits whatever the others are.
         """
         self._check(x)
-        is_usable = np.abs(x) < INPUT_LIMIT  # False for NaN.
-        if np.count_nonzero(is_usable) == is_usable.size:
+        if are_usable(x):
             return self._outputs(self._clipped(x))
-        is_usable = is_usable.all(axis=1)
+        is_usable = (np.abs(x) < INPUT_LIMIT).all(axis=1)  # False for NaN.
         output = self._outputs(self._clipped(np.where(is_usable[:, None], x, 0.0)))
         for values in output:
             values[:, ~is_usable] = np.nan

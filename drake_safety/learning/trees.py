@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.learning.trained_maps import INPUT_LIMIT
+from drake_safety.learning.trained_maps import INPUT_LIMIT, are_usable
 
 MOST_TREES = 300
 MOST_LEAVES = 31
@@ -129,11 +129,12 @@ class Trees:
 
         A row has the same bits whatever the others are.
         """
-        is_usable = np.abs(x) < INPUT_LIMIT  # False for NaN.
-        if np.count_nonzero(is_usable) < is_usable.size:
-            is_usable, logit = is_usable.all(axis=1), np.full(len(x), np.nan)
-            logit[is_usable] = self.evaluate(x[is_usable])
-            return logit
+        if not are_usable(x):
+            is_usable = (np.abs(x) < INPUT_LIMIT).all(axis=1)  # False for NaN.
+            if not is_usable.all():
+                logit = np.full(len(x), np.nan)
+                logit[is_usable] = self.evaluate(x[is_usable])
+                return logit
         if len(x) > _CHUNK:
             parts = [self.evaluate(x[i : i + _CHUNK]) for i in range(0, len(x), _CHUNK)]
             return np.concatenate(parts)
