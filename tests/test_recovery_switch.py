@@ -39,7 +39,7 @@ class Standing(Bench):
             np.testing.assert_array_equal(self.get(f"desired_{name}"), expected)
 
     def recovery_duration_s(self):
-        steps = self.parameters.max_steps * self.parameters.step_duration_s
+        steps = 20 * self.parameters.step_duration_s
         return steps + self.parameters.return_duration_s + 0.2
 
 

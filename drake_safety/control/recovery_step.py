@@ -16,8 +16,11 @@ class RecoveryStepParameters:
     """Duration of a swing [s]."""
     lift_m: Positive = 0.06
     """Height of the swing trajectory [m]."""
-    velocity_gain_s: float = 0.07
+    velocity_gain_s: float = 0.05
     """Raibert's gain: distance beyond the neutral point per speed [s]."""
+    velocity_gain_growth: NotNegative = 0.1
+    """Growth of this gain with every swing, as a share of it. A large gain tips a fast robot over,
+    with a small one it walks on."""
     max_reach_m: Positive = 0.18
     """Largest distance of a foothold from its hip's ground projection [m]."""
     min_lateral_m: float = 0.11
@@ -29,8 +32,8 @@ class RecoveryStepParameters:
     """Offset of the desired base yaw from the heading against the yaw rate, per yaw rate [s]."""
     min_steps: Count = 2
     """Least number of swings."""
-    max_steps: int = 20
-    """Largest number of swings."""
+    max_steps: int = 100
+    """Largest number of swings. A robot that stops before it can stand falls."""
     settle_heading_rad: float = 0.35
     """Largest angle between the base's yaw and the heading for stopping [rad]."""
     settle_margin_m: float = 0.08
@@ -103,12 +106,14 @@ def foothold(
     hip_offset: np.ndarray,
     remaining_s: float,
     parameters: RecoveryStepParameters,
+    num_steps: int = 0,
 ) -> np.ndarray:
     """Returns the foothold of a swinging foot, on the ground (2,) [m].
 
     Raibert's neutral point is the hip at touchdown plus half the distance travelled in the next
-    stance, ``p + v (t_rem + T/2)``; the foothold adds ``k v``. It is within reach of the hip at
-    touchdown, and on its own side of the base, so that legs do not cross.
+    stance, ``p + v (t_rem + T/2)``; the foothold adds ``k v``, where k grows with every swing. It
+    is within reach of the hip at touchdown, and on its own side of the base, so that legs do not
+    cross.
 
     Args:
         p_WB: Base position (3,) [m].
@@ -116,11 +121,13 @@ def foothold(
         yaw: Yaw of the heading frame [rad].
         hip_offset: The foot's position in the standing posture, in the heading frame, (2,) [m].
         remaining_s: Time to touchdown [s].
+        num_steps: Number of swings before this one.
     """
     c, s = math.cos(yaw), math.sin(yaw)
     R_WS = np.array([[c, -s], [s, c]])
     v_S = R_WS.T @ v_WB[:2]
-    step = v_S * (0.5 * parameters.step_duration_s + parameters.velocity_gain_s)
+    gain_s = parameters.velocity_gain_s * (1.0 + parameters.velocity_gain_growth * num_steps)
+    step = v_S * (0.5 * parameters.step_duration_s + gain_s)
     reach = float(np.hypot(*step))
     if reach > parameters.max_reach_m:
         step = step * (parameters.max_reach_m / reach)

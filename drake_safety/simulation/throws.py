@@ -30,7 +30,7 @@ VIOLATIONS = ("legs_collide", "joint_position", "joint_velocity", "joint_effort"
 _FLIGHT_S = 0.1  # From the ball's release to its impact.
 _EARLIEST_S, _LATEST_S = 0.4, 1.2  # Impact of a random ball.
 _LOW_S = 0.02  # For which the probability that triggers is low.
-_AFTER_S = 2.5  # From the first impact to the end.
+_AFTER_S = 5.0  # From the first impact to the end.
 _PORTS = ("state", "desired_preview", "features", "margins", "plant_state")
 
 
@@ -113,7 +113,7 @@ def run_throw(
         loop: A closed loop with a ball. If it has an input port ``safety_probability`` (recovery
             without an assessment), recovery is triggered at ``trigger_time_s``; otherwise by Γ.
         index: Number of the throw; it and the seed determine start, plan and ball.
-        duration_s: End time [s]; by default 2.5 s after the first impact, or the latest possible
+        duration_s: End time [s]; by default 5 s after the first impact, or the latest possible
             one where nothing is thrown.
         ports: Ports to log besides the assessor's inputs, ``margins``, ``plant_state``,
             ``recovery_active`` if there is one, and ``violations``, (N, 4), whether the state has

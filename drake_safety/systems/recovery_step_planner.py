@@ -257,11 +257,12 @@ class RecoveryStepPlanner(LeafSystem):
         R_WF = RotationMatrix.MakeZRotation(yaw).matrix()[:2, :2]
         feet = self._contacts(discrete_state)
         group = int(discrete_state.get_value(self._swinging_group)[0])
+        num_steps = int(discrete_state.get_value(self._num_steps)[0])
         swinging = []
         for foot in self._groups[group]:
             rows = kinematics.foot_slices[foot]
             hip = self._nominal_feet[foot] - kinematics.nominal_base_offset
-            centre = foothold(p_WB, v_WB, yaw, hip, remaining_s, parameters)
+            centre = foothold(p_WB, v_WB, yaw, hip, remaining_s, parameters, num_steps)
             shape = kinematics.nominal_contacts[rows] - self._nominal_feet[foot]
             for i, offset in zip(range(rows.start, rows.stop), shape, strict=True):
                 target = np.append(centre + R_WF @ offset, kinematics.foot_radii[i])
