@@ -19,10 +19,9 @@ def redundant(rng, num_episodes=EPISODES):
     return x + 1e-6 * rng.normal(size=x.shape), np.repeat(np.arange(num_episodes), ROWS)
 
 
-def fitted(x, episode, is_unsafe=False, plan=NO_PLAN):
-    return Novelty.fit(
-        x, episode, np.zeros(len(x), dtype=bool) | is_unsafe, rate=0.05, range_limit=1.25, plan=plan
-    )
+def fitted(x, episode, is_unsafe=False, plan=NO_PLAN, range_limit=1.25):
+    is_unsafe = np.zeros(len(x), dtype=bool) | is_unsafe
+    return Novelty.fit(x, episode, is_unsafe, rate=0.05, range_limit=range_limit, plan=plan)
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +64,7 @@ def test_one_entry_far_outside_its_range_is_novel_though_many_others_hide_it():
     lifted = x[:200] + 0.3 * np.eye(61)[0]
     assert (novelty.distances(lifted)[:, :3] < novelty.limits[:3]).all(axis=1).mean() > 0.9
     assert (novelty.of(lifted) > 1.0).all()
+    assert (fitted(x, episode, range_limit=5.0).of(lifted) > 1.0).mean() < 0.1
     assert (novelty.of(x + [0.02, *[0.0] * 60]) > 1.0).mean() < 0.01
 
 

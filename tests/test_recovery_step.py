@@ -68,8 +68,7 @@ def test_a_robot_at_rest_puts_its_feet_where_they_are_when_standing():
 def test_a_slow_robot_steps_beyond_raiberts_neutral_point_more_with_every_step(num_steps, growth):
     v, remaining_s = np.array([0.4, 0.1, 0.0]), 0.05
     place = foothold(np.zeros(3), v, 0.0, FRONT_LEFT, remaining_s, PARAMETERS, num_steps)
-    gain_s = growth * PARAMETERS.velocity_gain_s
-    time = remaining_s + 0.5 * PARAMETERS.step_duration_s + gain_s
+    time = remaining_s + 0.5 * PARAMETERS.step_duration_s + growth * PARAMETERS.velocity_gain_s
     np.testing.assert_allclose(place, FRONT_LEFT + time * v[:2])
 
 

@@ -124,12 +124,8 @@ class Distances:
             self.terms[start : start + part.shape[1], distance] = sign
             start += part.shape[1]
 
-    def squared(self, x: np.ndarray) -> np.ndarray:
-        """Those of inputs (N, n_x): all of it, redundancies, plan, (N, 3)."""
-        return self.weighted(x, self.terms)
-
-    def weighted(self, x: np.ndarray, terms: np.ndarray) -> np.ndarray:
-        """The sums with other weights (n_x + m, 3) in place of `terms`, (N, 3).
+    def squared(self, x: np.ndarray, terms: np.ndarray) -> np.ndarray:
+        """Those of inputs (N, n_x), by `terms` or multiples: all of it, redundancies, plan, (N, 3).
 
         One product for each row: those of many rows at once would round differently.
         """
@@ -272,7 +268,7 @@ class Novelty:
         """
         with np.errstate(invalid="ignore", over="ignore"):
             # Rounding may make a small square negative.
-            quadratic = np.sqrt(np.maximum(self.quadratic.squared(x), 0.0))
+            quadratic = np.sqrt(np.maximum(self.quadratic.squared(x, self.quadratic.terms), 0.0))
             offset = self.offsets(x).max(axis=1)
             found = np.column_stack([quadratic, offset])[:, : len(self.limits)]
             # `fmin` chooses the number beside NaN.
@@ -289,7 +285,7 @@ class Novelty:
         An input is novel above 1; that of an input that is not finite is infinite.
         """
         with np.errstate(invalid="ignore", over="ignore"):
-            found = np.maximum.reduce(self.quadratic.weighted(x, self._shares), axis=1)
+            found = np.maximum.reduce(self.quadratic.squared(x, self._shares), axis=1)
             if len(self.limits) > NUM_QUADRATIC:
                 offset = (x - self.centre) * self._range_share
                 offset *= offset
