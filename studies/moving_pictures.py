@@ -11,11 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
+from pydrake.geometry import Box, GeometryInstance, PerceptionProperties, Rgba
+from pydrake.math import RigidTransform
 
 from drake_safety.assessments import shipped_folder
 from drake_safety.cli.training_folder import MODES, load_assessment
 from drake_safety.evaluation import figure_style as style
-from drake_safety.evaluation.stills import StillCamera, stack_positions
+from drake_safety.evaluation.stills import SUPERSAMPLING, StillCamera, stack_positions
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.plants.balls import Throw
@@ -33,10 +35,48 @@ _BEFORE_S, _AFTER_S = 0.32, 0.6  # Shown before the disturbance and after the la
 _ACTS_S = 0.12  # From the trigger until the recovery is seen.
 _NUM_COLOURS = 127
 _ARROW_M = 0.5
+_GROUND, _LINES = Rgba(0.78, 0.80, 0.83), Rgba(0.55, 0.58, 0.62)
+_LINE_M, _TILE_M, _NUM_LINES = 0.012, 0.5, 33
 _PORTS = ("safety_probability", "belief")
 _OPTIONS: dict[str, Any] = {"seed": DEMONSTRATION.first, "duration_s": 3.0, "after_fall_s": 0.8}
 _TURNS = np.radians([90.0, -90.0, 135.0, 45.0, -135.0, -45.0])  # From the camera's direction.
 _COLOURS = (style.INK, style.UNSAFE_COLOUR, style.RECOVERY_COLOUR, style.SAFE_COLOUR)
+
+
+class SceneCamera(StillCamera):
+    """A camera that also draws the ground, and knows where bodies are in its last still."""
+
+    def draw_ground(self) -> None:
+        """Adds a wide ground, with lines by which motions of the robot are seen."""
+        context = self._scene_graph.GetMyMutableContextFromRoot(self.context)
+        source, length = self._plant.get_source_id(), _NUM_LINES * _TILE_M
+
+        def draw(sides: list[float], place: list[float], colour: Rgba, name: str) -> None:
+            shown = GeometryInstance(RigidTransform(place), Box(*sides), f"shown {name}")
+            properties = PerceptionProperties()
+            properties.AddProperty("phong", "diffuse", colour)
+            shown.set_perception_properties(properties)
+            self._scene_graph.RegisterGeometry(context, source, self._world, shown)
+
+        # Below that of the plant, which is smaller.
+        draw([100.0, 100.0, 0.01], [0.0, 0.0, -0.01], _GROUND, "ground")
+        for i in range(_NUM_LINES):
+            at = (i - _NUM_LINES // 2) * _TILE_M
+            draw([length, _LINE_M, 0.002], [0.0, at, 0.0], _LINES, f"line {i} along x")
+            draw([_LINE_M, length, 0.002], [at, 0.0, 0.0], _LINES, f"line {i} along y")
+
+    def position(self, body: str) -> np.ndarray:
+        """Centre of mass of a body of the robot in the last still, in the world, (3,) [m]."""
+        found = self._plant.GetBodyByName(body, self._instance)
+        p_BoBcm_B = found.CalcCenterOfMassInBodyFrame(self._plant_context)
+        return found.EvalPoseInWorld(self._plant_context) @ p_BoBcm_B
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Column and row of points (N, 3) of the world [m] in the last still, (N, 2)."""
+        intrinsics = self._camera.core().intrinsics().intrinsic_matrix()
+        X_CW = self._X_WC.inverse()
+        seen = intrinsics @ (X_CW.rotation().matrix() @ points.T + X_CW.translation()[:, None])
+        return (seen[:2] / seen[2]).T / SUPERSAMPLING
 
 
 class Take(NamedTuple):
@@ -193,7 +233,7 @@ def _draw_scene(
         states["ball"] = motion["ball_state"]
     positions = stack_positions(loop, states)
     width, height = (round(size * _DOTS_PER_INCH) for size in (_WIDTH / 2, _PICTURE))
-    camera = StillCamera(loop, positions[0], width=width, height=height)
+    camera = SceneCamera(loop, positions[0], width=width, height=height)
     camera.draw_ground()
     axes.set_axis_off()
     render = lru_cache(1)(lambda row: camera.render(positions[row]))  # The last row may stay.

@@ -11,14 +11,11 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 from pydrake.geometry import (
-    Box,
     ClippingRange,
     ColorRenderCamera,
-    GeometryInstance,
     LightParameter,
     MakeRenderEngineVtk,
     Mesh,
-    PerceptionProperties,
     RenderCameraCore,
     RenderEngineVtkParams,
     Rgba,
@@ -30,13 +27,12 @@ from pydrake.systems.sensors import CameraInfo
 
 from drake_safety.simulation.legged_loop import LeggedLoop
 
+SUPERSAMPLING = 2
+"""Rendered pixels for each of a still, in either direction."""
 _RENDERER = "stills"
 _BACKGROUND = [0.80, 0.84, 0.88]
 _FIELD_OF_VIEW_RAD = math.radians(34.0)
-_SUPERSAMPLING = 2
 _PBR_BRIGHTNESS = 2.2  # With a glTF mesh all shading is physically based, which is darker.
-_GROUND, _LINES = Rgba(0.78, 0.80, 0.83), Rgba(0.55, 0.58, 0.62)
-_LINE_M, _TILE_M, _NUM_LINES = 0.012, 0.5, 33
 _LEAST_GAP_S = 0.3  # Between a still at an event and others.
 
 
@@ -69,7 +65,7 @@ class StillCamera:
         self._eye = view.room * radius / math.sin(narrow) * view.direction()
         core = RenderCameraCore(
             _RENDERER,
-            CameraInfo(width * _SUPERSAMPLING, height * _SUPERSAMPLING, _FIELD_OF_VIEW_RAD),
+            CameraInfo(width * SUPERSAMPLING, height * SUPERSAMPLING, _FIELD_OF_VIEW_RAD),
             ClippingRange(0.05, 30.0 * max(radius, 1.0)),
             RigidTransform(),
         )
@@ -84,25 +80,6 @@ class StillCamera:
         )
         self._scene_graph, self._world = scene_graph, scene_graph.world_frame_id()
 
-    def draw_ground(self) -> None:
-        """Adds a wide ground, with lines by which motions of the robot are seen."""
-        context = self._scene_graph.GetMyMutableContextFromRoot(self.context)
-        source, length = self._plant.get_source_id(), _NUM_LINES * _TILE_M
-
-        def draw(sides: list[float], place: list[float], colour: Rgba, name: str) -> None:
-            shown = GeometryInstance(RigidTransform(place), Box(*sides), f"shown {name}")
-            properties = PerceptionProperties()
-            properties.AddProperty("phong", "diffuse", colour)
-            shown.set_perception_properties(properties)
-            self._scene_graph.RegisterGeometry(context, source, self._world, shown)
-
-        # Below that of the plant, which is smaller.
-        draw([100.0, 100.0, 0.01], [0.0, 0.0, -0.01], _GROUND, "ground")
-        for i in range(_NUM_LINES):
-            at = (i - _NUM_LINES // 2) * _TILE_M
-            draw([length, _LINE_M, 0.002], [0.0, at, 0.0], _LINES, f"line {i} along x")
-            draw([_LINE_M, length, 0.002], [at, 0.0, 0.0], _LINES, f"line {i} along y")
-
     def render(self, positions: np.ndarray) -> np.ndarray:
         """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8."""
         self._pose(positions)
@@ -112,22 +89,9 @@ class StillCamera:
         self._X_WC = _look_at(target + self._eye, target)
         image = query.RenderColorImage(self._camera, self._world, self._X_WC)
         pixels = np.asarray(image.data[..., :3], dtype=np.uint16)
-        rows, columns = pixels.shape[0] // _SUPERSAMPLING, pixels.shape[1] // _SUPERSAMPLING
-        blocks = pixels.reshape(rows, _SUPERSAMPLING, columns, _SUPERSAMPLING, 3)
+        rows, columns = pixels.shape[0] // SUPERSAMPLING, pixels.shape[1] // SUPERSAMPLING
+        blocks = pixels.reshape(rows, SUPERSAMPLING, columns, SUPERSAMPLING, 3)
         return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
-
-    def position(self, body: str) -> np.ndarray:
-        """Centre of mass of a body of the robot in the last still, in the world, (3,) [m]."""
-        found = self._plant.GetBodyByName(body, self._instance)
-        p_BoBcm_B = found.CalcCenterOfMassInBodyFrame(self._plant_context)
-        return found.EvalPoseInWorld(self._plant_context) @ p_BoBcm_B
-
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Column and row of points (N, 3) of the world [m] in the last still, (N, 2)."""
-        intrinsics = self._camera.core().intrinsics().intrinsic_matrix()
-        X_CW = self._X_WC.inverse()
-        seen = intrinsics @ (X_CW.rotation().matrix() @ points.T + X_CW.translation()[:, None])
-        return (seen[:2] / seen[2]).T / _SUPERSAMPLING
 
     def _pose(self, positions: np.ndarray) -> None:
         if not np.isfinite(positions).all():
