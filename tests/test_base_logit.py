@@ -105,10 +105,16 @@ def test_the_trees_count_for_what_they_are_worth_beside_the_heads(segments):
     rng = np.random.default_rng(2)
     said, trees = rng.normal(scale=2.0, size=(4, len(segments))).reshape(2, 2, -1)
     output = EmbeddingOutput(np.zeros((*said.shape, 2)), said, np.zeros((*said.shape, 0)))
-    is_unsafe = rng.random(len(segments)) < sigmoid(0.5 * said.mean(axis=0) + 0.7 * trees[0])
+    is_unsafe = rng.random(len(segments)) < sigmoid(0.4 * said.mean(axis=0) + 0.4 * trees[0])
     relabelled = dataclasses.replace(segments, is_unsafe=is_unsafe)
     found = fitted_base_logit(output, relabelled, parameters(), trees[0])
-    assert (found.safety_slope, found.trees_slope) == pytest.approx((0.5, 0.7), abs=0.1)
+    assert (found.safety_slope, found.trees_slope) == pytest.approx((0.4, 0.4), abs=0.1)
+    # Never surer than both, though these are worth twice what they say.
+    less_sure = output._replace(unsafe_logit=0.4 * said)
+    bounded = fitted_base_logit(less_sure, relabelled, parameters(), 0.2 * trees[0])
+    assert bounded.safety_slope + bounded.trees_slope == pytest.approx(1.0)
+    ratio = bounded.trees_slope / bounded.safety_slope
+    assert ratio == pytest.approx(2.0 * found.trees_slope / found.safety_slope, rel=1e-2)
     # What says the opposite counts for nothing.
     assert fitted_base_logit(output, relabelled, parameters(), -trees[0]).trees_slope == 0.0
     heads = found.heads(output, 9.0 * trees[0])

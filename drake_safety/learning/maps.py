@@ -351,6 +351,9 @@ def fitted_base_logit(
 ) -> BaseLogit:
     """Fits the base logit to the ensemble's heads and the trees by logistic regression.
 
+    Beside trees the slopes of both logits are scaled to a sum of at most one: what is surer than
+    either holds for the nominal plant, as on a changed one both err together.
+
     Args:
         output: The maps' outputs for held-out segments; on training segments they are
             overconfident.
@@ -362,12 +365,14 @@ def fitted_base_logit(
     offset, safety_slope, margin_slope, *of_trees = _logistic(
         logit.heads(output, trees_logit), segments.is_unsafe, weight
     )
+    trees_slope = sum(of_trees)
+    total = max(1.0, safety_slope + trees_slope) if of_trees else 1.0
     return replace(
         logit,
         offset=offset,
-        safety_slope=safety_slope,
+        safety_slope=safety_slope / total,
         margin_slope=margin_slope,
-        trees_slope=of_trees[0] if of_trees else 0.0,
+        trees_slope=trees_slope / total,
     )
 
 
