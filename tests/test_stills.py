@@ -4,6 +4,7 @@ import pytest
 from drake_safety.evaluation.stills import StillCamera, render_stills, stack_positions, still_times
 from drake_safety.simulation.legged_loop import View
 from drake_safety.simulation.scenario import load_scenario
+from studies.moving_pictures import SceneCamera
 
 SIZE = {"width": 96, "height": 72}
 
@@ -91,7 +92,8 @@ def test_stills_are_spread_evenly_and_give_way_to_events():
     assert still_times(time_s) == [0.0, 4.0]
 
 
-def test_points_of_the_world_are_found_in_the_still(loop, camera, standing):
+def test_points_of_the_world_are_found_in_the_still(loop, standing):
+    camera = SceneCamera(loop, standing, **SIZE)
     start = loop.plant.GetBodyByName("ball").floating_positions_start() + 4
     found, places = [], np.array([[0.1, -0.5, 0.4], [0.3, -0.4, 0.2]])
     for place in places:
