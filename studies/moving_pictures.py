@@ -60,22 +60,19 @@ class SceneCamera(StillCamera):
 
         # Below that of the plant, which is smaller.
         draw([100.0, 100.0, 0.01], [0.0, 0.0, -0.01], _GROUND, "ground")
-        for i in range(_NUM_LINES):
-            at = (i - _NUM_LINES // 2) * _TILE_M
-            draw([length, _LINE_M, 0.002], [0.0, at, 0.0], _LINES, f"line {i} along x")
-            draw([_LINE_M, length, 0.002], [at, 0.0, 0.0], _LINES, f"line {i} along y")
+        for at in _TILE_M * (np.arange(_NUM_LINES) - _NUM_LINES // 2):
+            draw([length, _LINE_M, 0.002], [0.0, at, 0.0], _LINES, f"line along x at {at}")
+            draw([_LINE_M, length, 0.002], [at, 0.0, 0.0], _LINES, f"line along y at {at}")
 
     def position(self, body: str) -> np.ndarray:
         """Centre of mass of a body of the robot in the last still, in the world, (3,) [m]."""
-        found = self._plant.GetBodyByName(body, self._instance)
-        p_BoBcm_B = found.CalcCenterOfMassInBodyFrame(self._plant_context)
-        return found.EvalPoseInWorld(self._plant_context) @ p_BoBcm_B
+        found, context = self._plant.GetBodyByName(body, self._instance), self._plant_context
+        return found.EvalPoseInWorld(context) @ found.CalcCenterOfMassInBodyFrame(context)
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Column and row of points (N, 3) of the world [m] in the last still, (N, 2)."""
         intrinsics = self._camera.core().intrinsics().intrinsic_matrix()
-        X_CW = self._X_WC.inverse()
-        seen = intrinsics @ (X_CW.rotation().matrix() @ points.T + X_CW.translation()[:, None])
+        seen = intrinsics @ self._X_WC.inverse().multiply(points.T)
         return (seen[:2] / seen[2]).T / SUPERSAMPLING
 
 
