@@ -1,14 +1,16 @@
 import logging
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import ConstantVectorSource, LinearSystem
+from pydrake.systems.framework import DiagramBuilder, EventStatus, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource, LinearSystem, RandomSource
 
 import quadrotor
 from cart_episodes import assert_identical
@@ -324,3 +326,175 @@ def test_nothing_of_python_is_changed_by_the_import():
         "assert before == (set(copyreg.dispatch_table), metaclass in sys.modules)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("begin_s", [0.07, 3.0, 123.4, 1.76e9])
+def test_rows_count_from_the_time_that_reset_sets(begin_s):
+    def reset(diagram, context, rng):
+        context.SetTime(begin_s)
+        return reset_glider(diagram, context, rng)
+
+    for episode, usual in zip(record(6, reset=reset), record(6), strict=True):
+        assert episode.cause == usual.cause
+        x, v = episode.state[0]
+        np.testing.assert_allclose(episode.state[:, 0], x + v * episode.time_s, atol=0.0201)
+        np.testing.assert_array_equal(episode.time_s[:-1], usual.time_s[:-1])
+
+
+@pytest.mark.parametrize("begin_s", [-1.0, np.nan, np.inf])
+def test_a_reset_to_no_time_of_a_simulation_is_an_error(begin_s):
+    with pytest.raises(
+        EpisodeError, match=r"\(seed 0\): ValueError: it starts at (-1.0|nan|inf) s"
+    ):
+        record(1, reset=lambda diagram, context, rng: context.SetTime(begin_s))
+
+
+class Referee(LeafSystem):
+    """Ends the simulation, or fails, from a time on, by an event of a kind."""
+
+    def __init__(self, kind, end_s, status):
+        super().__init__()
+        self.DeclareDiscreteState(1)
+
+        def judge(context, *state):
+            is_over = context.get_time() > end_s - 1e-9
+            return status() if is_over else EventStatus.DidNothing()
+
+        declare = {
+            "step": self.DeclarePerStepPublishEvent,
+            "publish": lambda judge: self.DeclarePeriodicPublishEvent(0.005, 0.0, judge),
+            "update": lambda judge: self.DeclarePeriodicDiscreteUpdateEvent(0.01, 0.0, judge),
+            "start": self.DeclareInitializationPublishEvent,
+        }
+        declare[kind](judge)
+
+
+def make_refereed(kind, end_s, status=lambda: EventStatus.ReachedTermination(None, "over")):
+    builder = DiagramBuilder()
+    glider = builder.AddNamedSystem("glider", make_glider())
+    builder.AddNamedSystem("referee", Referee(kind, end_s, status))
+    for i in range(glider.num_output_ports()):
+        builder.ExportOutput(glider.get_output_port(i), glider.get_output_port(i).get_name())
+    return builder.Build()
+
+
+def reset_refereed(diagram, context, rng):
+    glider = diagram.GetSubsystemByName("glider").GetMyMutableContextFromRoot(context)
+    reset_glider(diagram, glider, rng)
+
+
+@pytest.mark.parametrize(
+    ("kind", "end_s"),
+    [("step", 0.25), ("publish", 0.255), ("update", 0.3), ("start", 0.0), ("step", 0.0)],
+)
+def test_an_episode_ends_where_a_system_ends_the_simulation(caplog, kind, end_s):
+    make, usual = lambda: make_refereed(kind, end_s), record(6)
+    for one, other in zip(record(6, make=make, reset=reset_refereed), usual, strict=True):
+        if other.time_s[-1] < end_s:  # It has left the safe set before.
+            assert (one.cause, one.time_s[-1]) == (other.cause, other.time_s[-1])
+            continue
+        assert one.is_safe and one.time_s[-1] == pytest.approx(end_s, abs=0.0101)
+        assert (np.diff(one.time_s) > 0).all()
+        num_rows = len(one.time_s) - 1
+        np.testing.assert_array_equal(one.state[:num_rows], other.state[:num_rows])
+    assert f"a system of '{make.__name__}' ended" in caplog.text
+
+
+def test_an_event_that_fails_is_an_error_with_its_reason():
+    def make():
+        return make_refereed("step", 0.25, lambda: EventStatus.Failed(None, "the gear broke"))
+
+    with pytest.raises(EpisodeError, match=r"episode 0 .*\(seed 0\): RuntimeError: .*gear broke"):
+        record(1, make=make, reset=reset_refereed)
+
+
+def outside(diagram, context, rng):
+    context.SetDiscreteState([rng.uniform(0.6, 1.4), 0.0])
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"reset": outside}, r"\d\d % of the starts of 'make_glider' violate 'constraint_0' in"),
+        ({"reset": outside}, "none of 10 episodes of 'make_glider' is unsafe after its first row"),
+        ({"parameters": {"wall_m": 9.0}}, "is unsafe after its first row.* draw wider starts"),
+        (
+            {"parameters": {"wall_m": 0.3}, "duration_s": 9.0},
+            "is safe after its first row.* draw calmer starts",
+        ),
+        ({"duration_s": 0.4}, "episodes of 4 steps are shorter than the preview of 5"),
+    ],
+)
+def test_what_teaches_nothing_is_said_once_at_recording(caplog, options, told):
+    episodes = record(**options)
+    assert len(re.findall(told, caplog.text)) == 1
+    caplog.clear()
+    episodes.warn()
+    assert not caplog.records
+
+
+def test_sampled_ports_are_named_before_anything_is_simulated(caplog):
+    from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
+
+    def make():
+        builder, inner = DiagramBuilder(), DiagramBuilder()
+        plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01), inner)
+        plant.Finalize()
+        builder.AddNamedSystem("inside", inner.Build())
+        return builder.Build()
+
+    with pytest.raises(ValueError, match="exports no port"):
+        record(make=make)
+    assert "record_episodes: plant 'plant' steps before what updates" in caplog.text
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_noise_of_drakes_random_sources_depends_on_seed_and_index_alone(num_workers):
+    def make():
+        builder, inner = DiagramBuilder(), DiagramBuilder()
+        for distribution in (RandomDistribution.kGaussian, RandomDistribution.kUniform):
+            source = RandomSource(distribution, 2, 0.05)
+            source = inner.AddNamedSystem(f"noise_{distribution.name}", source)
+            inner.ExportOutput(source.get_output_port(), distribution.name)
+        noise = builder.AddNamedSystem("noise", inner.Build())
+        ones = builder.AddNamedSystem("ones", ConstantVectorSource(np.ones(2)))
+        for name, port in (
+            ("state", noise.GetOutputPort("kGaussian")),
+            ("output", noise.GetOutputPort("kUniform")),
+            ("desired_preview", ones.get_output_port()),
+            ("margins", ones.get_output_port()),
+        ):
+            builder.ExportOutput(port, name)
+        return builder.Build()
+
+    options = {"make": make, "reset": lambda *start: None, "ports": None, "name": "noisy"}
+    episodes = record(8, num_workers=num_workers, **options)
+    assert_identical(episodes, record(8, num_workers=1, **options))
+    drawn = [one.state.tobytes() for one in (*episodes, *record(2, seed=1, **options))]
+    assert len(set(drawn)) == 10
+    assert np.abs(episodes[0].output - episodes[0].state).min() > 0.0
+
+
+def test_a_margin_of_infinity_is_an_error_that_names_its_constraint():
+    def make():
+        builder = DiagramBuilder()
+        glider = builder.AddNamedSystem("glider", Glider(None, 1.0))
+        far = builder.AddNamedSystem("far", LeafSystem())
+        far.DeclareVectorOutputPort(
+            "margins",
+            2,
+            lambda context, output: output.SetFromVector(
+                [1.0, 1.0 if context.get_time() < 0.25 else np.inf]
+            ),
+        )
+        for name in ("position_and_speed", "output", "desired_preview"):
+            builder.ExportOutput(glider.GetOutputPort(name), name)
+        builder.ExportOutput(far.GetOutputPort("margins"), "margins")
+        return builder.Build()
+
+    def reset(diagram, context, rng):
+        return 0
+
+    told = r"constraint 'gap' has a margin of inf at 0\.2[56] s; cap it at a finite distance"
+    with pytest.raises(EpisodeError, match=told):
+        record(1, make=make, reset=reset, constraint_names=["wall", "gap"])

@@ -153,6 +153,7 @@ class SafetyAssessment:
         """
         require_extra("train", "SafetyAssessment.fit")
         self.parameters.check()
+        episodes.warn()
         from threadpoolctl import threadpool_limits
 
         # The order of sums depends on the number of threads, and the last bits with it.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, overload
@@ -31,6 +32,8 @@ LARGEST = 1e12
 """Any quantity in SI units is smaller; a larger one is an error of a log, or a divergence."""
 DIVERGED = "diverged"
 """Cause of an episode whose simulation failed; it has no safety label."""
+_LOGGER = logging.getLogger("drake_safety")
+_FEW = 1.0  # Percentage of starts outside the safe set without a warning.
 
 
 class DivergenceError(RuntimeError):
@@ -182,6 +185,7 @@ class Episodes(Sequence[Episode]):
                 or contradicts `is_safe`.
         """
         self.info = info
+        self._is_warned = False
         self._episodes = list(episodes)
         for episode in self._episodes:
             _check_episode(info, episode)
@@ -253,6 +257,26 @@ class Episodes(Sequence[Episode]):
     def num_unsafe(self) -> int:
         """Number of episodes that left the safe set."""
         return len(self) - self.num_safe - self.num_diverged
+
+    def warn(self) -> None:
+        """Logs, once, why little can be learned from these episodes, if so."""
+        known = [] if self._is_warned else [one for one in self if one.cause != DIVERGED]
+        self._is_warned, who = True, self.info.scenario
+        for k, name in enumerate(self.info.constraint_names if known else ()):
+            first = [e.margins[0, k] < 0.0 or (e.cause == name and not e.num_steps) for e in known]
+            if (share := 100.0 * np.mean(first)) > _FEW:
+                _LOGGER.warning(
+                    "%.0f %% of the starts of '%s' violate '%s' in their first row, of which "
+                    "nothing is learned; draw starts inside the safe set",
+                    *(share, who, name),
+                )
+        for is_safe, what in {True: "safe", False: "unsafe"}.items() if known else ():
+            if not any(one.is_safe == is_safe and one.num_steps > one.first_step for one in known):
+                _LOGGER.warning(
+                    "none of %d episodes of '%s' is %s after its first row, so that Γ learns no "
+                    "difference; draw %s starts",
+                    *(len(known), who, what, "calmer" if is_safe else "wider"),
+                )
 
 
 def _check_episode(info: EpisodesInfo, episode: Episode) -> None:

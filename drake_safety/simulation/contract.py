@@ -10,6 +10,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop, check_ports
+from drake_safety.simulation.motion import advance_to
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,11 +78,13 @@ def _values(diagram: ClosedLoop, seed: int) -> Iterator[Finding]:
     else:
         remedy = "return the first step whose future is undisturbed, mostly 0"
         yield failed("reset", f"returns {first_step!r}", remedy)
-    step_s = diagram.scenario.step_s
+    begin_s, step_s = context.get_time(), diagram.scenario.step_s
     try:
         simulator.Initialize()
         yield _finite(diagram, context, "at the start")
-        simulator.AdvanceTo(step_s)
+        if advance_to(simulator, begin_s + step_s):
+            remedy = "let an episode last: no system may return EventStatus.ReachedTermination yet"
+            yield failed("simulation", f"ends at {context.get_time():g} s", remedy)
         yield _finite(diagram, context, f"after {step_s:g} s")
     except (RuntimeError, TypeError, ValueError) as error:
         yield failed("simulation", str(error), "correct the system named")

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram, PortDataType
 
 from drake_safety.learning.segments import (
@@ -24,6 +24,8 @@ from drake_safety.simulation.capabilities import CanFall
 from drake_safety.simulation.closed_loop import ClosedLoop, require_ports
 from drake_safety.simulation.legged_loop import LeggedLoop
 
+_SAME_TIME = 1e-3  # Largest difference between the times reached and asked for, in steps.
+_ENDED = SimulatorStatus.ReturnReason.kReachedTerminationCondition
 _LOGGER = logging.getLogger("drake_safety")
 
 
@@ -32,7 +34,7 @@ class Motion:
     """Log of a simulated motion.
 
     Attributes:
-        time_s: Times of the rows [s], (N,).
+        time_s: Times of the rows since the start [s], (N,).
         ports: The logged output ports by name, (N, size) each; ``motion[name]`` is one of them.
         leave_time_s: Time at which it left the safe set [s]; infinite if it did not.
         cause: The constraint that was violated then; "" for none.
@@ -155,6 +157,7 @@ def simulate(
     watch_period_s: float = math.inf,
     after_leaving_s: float = math.inf,
     after_fall_s: float = 0.0,
+    until: str = "",
     until_first_row: bool = False,
     events: Iterable[tuple[float, Callable[[Context], object]]] = (),
     each_row: Callable[[Context, float], None] = lambda context, time_s: None,
@@ -167,12 +170,13 @@ def simulate(
 ) -> Motion:
     """Simulates a diagram from a start to an end, and logs output ports.
 
-    A row shows the state at its time, before the updates that are due then. A motion that ends as
-    it leaves the safe set has its last row at that instant, between two others.
+    A row shows the state at its time, before the updates that are due then; times count from that
+    of the Context after the start. A motion that ends as it leaves the safe set, or as a system
+    ends it (``EventStatus.ReachedTermination``), has its last row then, between two others.
 
     Args:
-        start: Sets state and plan of the root Context, which is the default one. It may return the
-            first row whose future is undisturbed, if that is not 0.
+        start: Sets state, plan and perhaps time of the root Context, which is the default one. It
+            may return the first row whose future is undisturbed, if that is not 0.
         ports: Ports to log; a mapping from logged names to those of ports renames them, also
             ``margins`` and ``safe``, which is below 1 outside the safe set; without a port
             ``safe`` that is where a margin is negative.
@@ -182,6 +186,7 @@ def simulate(
             is sampled at rows.
         after_leaving_s: Time for which a motion goes on outside the safe set [s].
         after_fall_s: Time for which it goes on after a fall [s]; only a :class:`CanFall` falls.
+        until: Constraint whose violation ends the motion.
         until_first_row: Whether it ends at the first row whose future is undisturbed.
         events: Times [s] and what is done then with the Context.
         each_row: Called with Context and time [s] after each row.
@@ -213,38 +218,57 @@ def simulate(
     if isinstance(diagram, LeggedLoop):
         diagram.remove_visuals(context)
     first_row = start(context)
+    begin_s = context.get_time()
     is_finite_at_start = np.isfinite(_state(context))
     waiting = sorted(events, key=lambda event: event[0])
     is_last = False
     leave_s = fall_s = math.inf
+    now_s, is_ended = 0.0, False
     cause = failure = ""
 
     def is_over(time_s: float) -> bool:
         nonlocal leave_s, fall_s, cause
         now = margins_port.Eval(context)
         if not np.isfinite(now).all():
-            raise DivergenceError(f"a margin is not finite at {time_s:g} s")
+            k = int(np.argmin(np.isfinite(now)))
+            text = f"constraint '{names[k]}' has a margin of {now[k]} at {time_s:g} s"
+            if now[k] > 0:
+                raise ValueError(f"{text}; cap it at a finite distance, such as a query's range")
+            raise DivergenceError(text)
         is_safe = now.min() >= 0 if safe_port is None else safe_port.Eval(context)[0] >= 1
         if not is_safe and not cause:
             leave_s, cause = time_s, names[int(np.argmin(now))]
         if fall is not None and now[fall] < 0:
             fall_s = min(fall_s, time_s)
-        return time_s >= leave_s + after_leaving_s or time_s >= fall_s + after_fall_s
+        is_until = bool(until) and (cause == until or now[names.index(until)] < 0)
+        return is_until or time_s >= min(leave_s + after_leaving_s, fall_s + after_fall_s)
+
+    def advance(to_s: float) -> None:
+        nonlocal now_s, is_ended
+        is_ended = is_ended or advance_to(simulator, begin_s + to_s)
+        reached_s = context.get_time() - begin_s
+        now_s = reached_s if is_ended else to_s
+        if not abs(reached_s - now_s) < _SAME_TIME * step_s:
+            raise ValueError(f"the simulation is at {reached_s} s, expected at {to_s} s")
 
     try:
-        simulator.Initialize()
+        if not 0.0 <= begin_s < math.inf:
+            raise ValueError(f"it starts at {begin_s} s; Drake's periodic events begin at 0 s")
+        is_ended = simulator.Initialize().reason() == _ENDED
         num_steps = first_row or 0 if until_first_row else round(duration_s / step_s)
         for row in range(num_steps + 1):
             for time_s in _watch_times(row, step_s, watch_period_s):
                 while waiting and waiting[0][0] <= time_s:
                     event_s, act = waiting.pop(0)
-                    advance_to(simulator, event_s)
+                    advance(event_s)
                     act(context)
-                advance_to(simulator, time_s)
-                if is_last := is_over(time_s):
+                advance(time_s)
+                if is_last := is_over(now_s) or is_ended:
                     break
-            recorder.record(context, time_s, is_checked=True)
-            each_row(context, time_s)
+            if is_ended and row:  # Perhaps at the instant of the row before.
+                now_s = max(now_s, math.nextafter((row - 1) * step_s, math.inf))
+            recorder.record(context, now_s, is_checked=True)
+            each_row(context, now_s)
             if is_last:
                 break
     except (Exception, SystemExit) as error:
@@ -267,8 +291,8 @@ def simulate(
     )
 
 
-def advance_to(simulator: Simulator, time_s: float) -> None:
-    """Advances a simulation to a time, before the updates due at that time.
+def advance_to(simulator: Simulator, time_s: float) -> bool:
+    """Advances a simulation to a time, before its updates; returns whether a system has ended it.
 
     The state of a discrete plant is then that of the given time. The update due then already
     computes the next state, so a row recorded after it (``AdvancePendingEvents``, or a time rounded
@@ -276,8 +300,8 @@ def advance_to(simulator: Simulator, time_s: float) -> None:
     """
     # Both this time and Drake's time of an update are products, rounded in the last bit or two.
     before_s = time_s - 4.0 * math.ulp(time_s)
-    if before_s > simulator.get_context().get_time():
-        simulator.AdvanceTo(before_s)
+    is_later = before_s > simulator.get_context().get_time()
+    return is_later and simulator.AdvanceTo(before_s).reason() == _ENDED
 
 
 def _watch_times(row: int, step_s: float, period_s: float) -> list[float]:

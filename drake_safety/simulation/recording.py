@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -21,9 +22,11 @@ from drake_safety.learning.segments import (
 )
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, port_sizes
 from drake_safety.simulation.motion import simulate
-from drake_safety.simulation.rollouts import collect_episodes, episode_rng
+from drake_safety.simulation.rollouts import collect_episodes, episode_rng, seed_random_sources
 from drake_safety.simulation.worker_processes import MadeOnce, Progress, Sent
+from drake_safety.systems.safety_assessor import warn_of_sampled_ports
 
+_LOGGER = logging.getLogger("drake_safety")
 _OPTIONAL_PORTS = ("true_state", "desired_output", "features", "safe")
 
 Reset = Callable[[Diagram, Context, np.random.Generator], int | None]
@@ -79,8 +82,8 @@ def record_episodes(
         make_diagram: Builds the diagram; called with ``parameters``, once in each worker, and once
             more for the repetition of the first episode.
         reset: Called with diagram, root Context and generator; samples a start into the Context,
-            which is the diagram's default one. It may return the first row whose future is
-            undisturbed, if that is not 0.
+            the diagram's default one with seeded random sources of Drake; rows count from its time.
+            It may return the first row whose future is undisturbed, if that is not 0.
         step_s: Time between two rows, the unit of H [s].
         ports: The diagram's port names, by those above.
         state_names: Names of the n_s entries of ``state``; numbered by default.
@@ -114,17 +117,25 @@ def record_episodes(
     # The diagram is built anew for each call: a function does not tell whether its result changed.
     key = uuid.uuid4().hex
     make = MadeOnce(key, Sent(partial(make_diagram, **dict(parameters or {}))))
+    warn_of_sampled_ports("record_episodes", [make()])
     used, sizes = _used_ports(make(), dict(ports or {}))
     # As the hash has always been made of it, so that kept sets stay valid.
     times = f"EpisodeTiming({step_s=}, {num_steps=}, monitor_period_s={period_s!r})"
     identity = f"({name!r}, {times}, {used}, {sorted((parameters or {}).items())})"
+    horizon = sizes["desired_preview"] // sizes["output"]
+    if num_steps < horizon:
+        _LOGGER.warning(
+            "record_episodes: episodes of %d steps are shorter than the preview of %d; fit needs "
+            "longer ones, or a `shortest_segment`",
+            *(num_steps, horizon),
+        )
     info = EpisodesInfo(
         scenario=name,
         scenario_hash=hashlib.sha256(identity.encode()).hexdigest(),
         variation="nominal",
         seed=seed,
         step_s=step_s,
-        horizon=sizes["desired_preview"] // sizes["output"],
+        horizon=horizon,
         state_names=_names("state", state_names, sizes["state"]),
         output_names=_names("output", output_names, sizes["output"]),
         feature_names=_names("feature", feature_names, sizes.get("features", 0)),
@@ -132,7 +143,7 @@ def record_episodes(
         versions=installed_versions("drake", "numpy"),
         num_steps=num_steps,
     )
-    return collect_episodes(
+    episodes = collect_episodes(
         info,
         range(num_episodes),
         make,
@@ -142,6 +153,13 @@ def record_episodes(
         progress=progress,
         is_repeated=True,
     )
+    episodes.warn()
+    if ended := [one.index for one in episodes if one.is_safe and one.num_steps < num_steps]:
+        _LOGGER.warning(
+            "a system of '%s' ended %d of %d episodes early, as episode %d, and they count as safe",
+            *(name, len(ended), len(episodes), ended[0]),
+        )
+    return episodes
 
 
 def _record(
@@ -157,6 +175,7 @@ def _record(
     who = f"episode {index} of '{info.scenario}' (seed {info.seed})"
 
     def start(context: Context) -> int | None:
+        seed_random_sources(diagram, context, info.seed, index)
         try:
             return reset(diagram, context, episode_rng(info.seed, index))
         except Exception as error:

@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import Context
+from pydrake.common import RandomGenerator
+from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.primitives import RandomSource
 
 from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
 from drake_safety.learning.seeds import MOTION
@@ -43,6 +45,7 @@ from drake_safety.simulation.hidden_state import difference
 from drake_safety.simulation.motion import Motion, simulate
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import BATCH_SIZE, MadeOnce, Progress, map_items
+from drake_safety.systems.safety_assessor import leaf_systems
 
 MOTION_PIECE_S = 60.0
 """Duration of one undisturbed motion [s]."""
@@ -64,6 +67,15 @@ def worker_loop(
 def episode_rng(seed: int, index: int) -> np.random.Generator:
     """The random generator of an episode, which depends on the seed and the index alone."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+
+
+def seed_random_sources(diagram: Diagram, context: Context, seed: int, index: int) -> None:
+    """Seeds Drake's random sources by seed and index, apart from the generator of the start."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index, 0)))
+    for one in leaf_systems([diagram]):
+        if isinstance(one, RandomSource):
+            generator = RandomGenerator(int(rng.integers(2**31)))
+            one.SetRandomContext(one.GetMyMutableContextFromRoot(context), generator)
 
 
 def episodes_info(
@@ -140,6 +152,7 @@ def run_episode(
 
     def begin(context: Context) -> int:
         rng, first_step = episode_rng(seed, index), 0
+        seed_random_sources(loop, context, seed, index)
         if start is not None:
             require(loop, CanStartAnywhere).reset_to(context, rng, start)
         elif goal is None:
@@ -294,6 +307,7 @@ def run_motion(
     step_s = scenario.monitor_step_s
 
     def begin(context: Context) -> int | None:
+        seed_random_sources(loop, context, seed, index)
         if start is not None:
             return start(context)
         rng = episode_rng(seed, index)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Iterator
 from typing import Literal, get_args
 
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
@@ -164,18 +165,30 @@ def AddSafetyAssessor(
                 f"AddSafetyAssessor: port '{port.get_name()}' for {name} has size {port.size()}; "
                 f"the assessment was fitted with {size}{_lacking(name, port, assessment)}"
             )
-    for one in builder.GetSystems():
-        if isinstance(one, MultibodyPlant) and one.has_sampled_output_ports():
-            _LOGGER.warning(
-                "AddSafetyAssessor: plant '%s' steps before what updates at the same time, so that "
-                "Γ sees a later state than in its episodes; make it by AddMultibodyPlant with "
-                "MultibodyPlantConfig(use_sampled_output_ports=False)",
-                one.get_name(),
-            )
+    warn_of_sampled_ports("AddSafetyAssessor", builder.GetSystems())
     builder.AddNamedSystem("safety_assessor", assessor)
     for name, port in ports.items():
         builder.Connect(port, assessor.GetInputPort(name))
     return assessor
+
+
+def leaf_systems(systems: Iterable[System]) -> Iterator[System]:
+    """The systems, with those of diagrams in their place."""
+    for one in systems:
+        yield from leaf_systems(one.GetSystems()) if isinstance(one, Diagram) else [one]
+
+
+def warn_of_sampled_ports(who: str, systems: Iterable[System]) -> None:
+    """Logs which plants show the next state to what updates at the same time."""
+    for one in leaf_systems(systems):
+        if isinstance(one, MultibodyPlant) and one.has_sampled_output_ports():
+            _LOGGER.warning(
+                "%s: plant '%s' steps before what updates at the same time, so that "
+                "Γ sees a later state than in its episodes; make it by AddMultibodyPlant with "
+                "MultibodyPlantConfig(use_sampled_output_ports=False)",
+                who,
+                one.get_name(),
+            )
 
 
 def _lacking(name: str, port: OutputPort, assessment: SafetyAssessment) -> str:
