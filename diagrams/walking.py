@@ -146,7 +146,12 @@ class Walking(LeggedLoop):
             outlook=desired.pop("desired_outlook"),
             memory=(controller.GetOutputPort("action_state"), controller.action_names),
         )
-        ports = {**desired, "controller_status": controller.GetOutputPort("status")}
+        ports = {
+            **desired,
+            "controller_status": controller.GetOutputPort("status"),
+            "controller_memory": controller.GetOutputPort("memory"),
+            "num_controller_failures": controller.GetOutputPort("num_failures"),
+        }
         if guard_system is not None:
             ports["guard_active"] = guard_system.GetOutputPort("is_changed")
             for name in ("state", "features"):
@@ -159,6 +164,7 @@ class Walking(LeggedLoop):
             builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
         # What the policy sees: its last actions, its phase and the command.
         self.memory_features = controller.action_names
+        self.memory_period_s = self.policy.parameters.period_s
         self.monitored = {
             "states": [name for name in self.state_names if name != _POSITION],
             "features": [name for name in self.memory_features if name != _UNCOMMANDED],

@@ -378,3 +378,12 @@ def test_the_study_counts_wrong_verdicts_and_the_pairs_until_a_right_one():
     # By the usual formula for two shares.
     assert (study.batch_size(0.01, 0.02), study.batch_size(0.05, 0.1)) == (2529, 474)
     assert study.batch_size(0.1, 0.1) == np.inf
+
+
+def test_an_episode_in_which_a_controller_found_no_command_fails_and_says_so():
+    loop = pendulum().make_loop()
+    episode = next(e for e in (run_episode(loop, i, seed=7) for i in range(9)) if e.is_safe)
+    for metric in ("unsafe", "front", "tracking=9"):
+        read = Outcomes(loop, metric)
+        good, bad = (read.of(replace(episode, num_controller_failures=n)) for n in (0, 3))
+        assert (good.value, good.cause, bad.value, bad.cause) == (0.0, "", 1.0, "held actions")

@@ -2,6 +2,7 @@
 
 import math
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,10 +17,16 @@ from drake_safety.control.policy import (
     WholeHistory,
     network_file,
     observation_term,
+    with_policy,
 )
-from drake_safety.control.policy_network import load_network, network_files, read_metadata
+from drake_safety.control.policy_network import (
+    PolicyNetwork,
+    load_network,
+    network_files,
+    read_metadata,
+)
 from drake_safety.extras import MissingExtraError
-from drake_safety.robots.robot_model import JointGains
+from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern
 from policy_networks import save_network, save_onnx
 
 JOINTS = ["hip", "knee", "tail"]  # The robot's; the policy moves two, in another order.
@@ -307,3 +314,36 @@ def test_what_the_metadata_say_is_used_where_nothing_is_stated(tmp_path):
         policy(tmp_path, network=str(network), **unstated)
     made = policy(tmp_path, network=str(network), **(unstated | {"action_scale": {".*": 0.5}}))
     np.testing.assert_allclose(made.action_scale, [0.5, 0.5])
+
+
+@pytest.mark.parametrize(
+    "names", [["leg.hip", "legxhip"], ["a[0]", "a0"], ["hip+", "hipp"], ["(l)", "l"], ["a|b", "a"]]
+)
+def test_names_of_joints_are_no_patterns(names):
+    made = SimpleNamespace(
+        default_positions=np.array([0.1, 0.2]),
+        gains={name: JointGains(stiffness=k) for k, name in enumerate(names, 1)},
+        parameters=PolicyParameters(),
+    )
+    robot = with_policy(RobotModel(), made, names)
+    assert [by_pattern(robot.posture, name, "posture", "r") for name in names] == [0.1, 0.2]
+    assert [robot.gains_of(name).stiffness for name in names] == [1, 2]
+
+
+def some(value, where):
+    """A network whose actions are not finite for some observations."""
+    return lambda batch, parts: (np.where(where(batch), value, batch[:, :2]), {})
+
+
+@pytest.mark.parametrize(
+    "evaluate",
+    [
+        some(np.nan, lambda batch: True),
+        some(np.inf, lambda batch: [True, False]),
+        some(np.nan, lambda batch: np.abs(batch[:, :1]) > 0.5),
+    ],
+)
+def test_a_network_whose_actions_are_not_finite_is_refused(evaluate):
+    network = PolicyNetwork(None, evaluate, (9, 2))
+    with pytest.raises(ValueError, match=r"p: the network returns [12] of 2 actions that are not"):
+        network.check("p", 9, 2, "terms")

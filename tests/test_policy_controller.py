@@ -41,3 +41,7 @@ def test_what_is_not_finite_leaves_the_last_action_and_a_status(what):
     bench.advance(0.04)
     np.testing.assert_array_equal(bench.get("desired_joint_state"), good)
     assert bench.get("status")[0] == HELD
+    assert bench.get("num_failures")[0] == 2
+    good = bench.get("memory")
+    bench.system.set_state(bench.context, good)
+    assert np.isfinite(good).all() and bench.get("num_failures")[0] == 2  # No part of the memory.

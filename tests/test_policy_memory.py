@@ -1,14 +1,19 @@
 """Recurrent policies: what they remember is in the Context, and nowhere else."""
 
+from dataclasses import replace
+from unittest import mock
+
 import numpy as np
 import pytest
 import yaml
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
 
 from cart_episodes import assert_identical
 from drake_safety import load_scenario, run_episode, run_episodes
 from drake_safety.control.policy_network import load_network
 from drake_safety.learning.segments import Episodes
+from drake_safety.simulation.feedback import AddFeedbackRecorder, pair_windows, window_start
 from policy_networks import TERMS, new, recurrent_module, save_network, save_onnx, save_script
 from system_doubles import Bench, controller
 
@@ -202,3 +207,43 @@ def test_a_reset_resets_the_memory(walking):
     np.testing.assert_array_equal(memory(), first)
     loop.reset_to(context, None, start)  # The memory of a start is taken over.
     np.testing.assert_array_equal(memory(), later)
+
+
+def windows(scenario):
+    """Windows of a robot that walks on, and its recorder."""
+    builder = DiagramBuilder()
+    loop = builder.AddSystem(scenario.make_loop())
+    recorder = AddFeedbackRecorder(builder, loop)
+    simulator = Simulator(builder.Build())
+    root = simulator.get_mutable_context()
+    loop.reset_standing(root, np.array([0.3, 0.0, 0.2]))
+    simulator.Initialize()
+    simulator.AdvanceTo(2.1 * scenario.episode_duration_s)
+    return recorder, recorder.take_windows(recorder.GetMyMutableContextFromRoot(root))
+
+
+def test_a_twin_of_a_window_begins_in_mid_stride_with_the_memory_that_the_policy_has(walking):
+    recorder, found = windows(walking)
+    assert len(found) == 2
+    loop = walking.make_loop()
+    for window in found:
+        twin = run_episode(loop, start=window_start(loop, window))
+        np.testing.assert_allclose(twin.true_state, window.episode.true_state, atol=1e-3)
+    assert len(pair_windows(walking, recorder, found)) == 2
+
+
+@pytest.mark.parametrize("memory", [None, np.zeros(3)])
+def test_a_window_without_the_memory_is_refused_before_its_twin_is_simulated(walking, memory):
+    recorder, found = windows(walking)
+    with mock.patch("drake_safety.simulation.feedback.run_episode", side_effect=AssertionError):
+        with pytest.raises(ValueError, match="entries of the controller's memory, expected"):
+            bad = replace(found[1], controller_memory=memory)
+            pair_windows(walking, recorder, [found[0], bad])
+
+
+def test_rows_that_are_not_when_the_policy_acts_are_refused(walking):
+    builder = DiagramBuilder()
+    loop = builder.AddSystem(walking.make_loop())
+    loop.memory_period_s = 0.03
+    with pytest.raises(ValueError, match=r"a row every 0\.1 s is not when .* every 0\.03 s"):
+        AddFeedbackRecorder(builder, loop)

@@ -50,6 +50,7 @@ _NUM_STILLS = 5  # Of a motion to a goal.
 _HAPPENING = {
     "guard_active": "the guard passes on another command",
     "recovery_active": "recovery triggered",
+    "controller_status": "the policy returns no finite action: the last one is held",
 }
 """Ports that a loop may have, and what it means when they become positive."""
 _COLUMNS = ("time [s]", "event", "probability")  # Of events.

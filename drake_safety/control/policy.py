@@ -15,7 +15,7 @@ from drake_safety.control.observation import quaternion_of
 from drake_safety.control.policy_network import PolicyNetwork, load_network
 from drake_safety.files.schema import Count, Pattern, Positive, Triple, load_typed_file, schema
 from drake_safety.robots.model_files import model_file
-from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern
+from drake_safety.robots.robot_model import JointGains, RobotModel, as_pattern, by_pattern
 
 _DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -399,11 +399,12 @@ def load_policy(path: Path, kinematics: RobotKinematics, network: str = "") -> P
 
 def with_policy(robot: RobotModel, policy: Policy, joint_names: list[str]) -> RobotModel:
     """A robot, whose joints are named, with the gains, rotor inertias and posture of a policy."""
-    posture = dict(zip(joint_names, policy.default_positions.tolist(), strict=True))
+    names = map(as_pattern, joint_names)
+    posture = dict(zip(names, policy.default_positions.tolist(), strict=True))
     inertia = policy.parameters.rotor_inertia
     return replace(
         robot,
         posture=posture,
-        joint_gains={**policy.gains},
+        joint_gains={as_pattern(name): gains for name, gains in policy.gains.items()},
         rotor_inertia=inertia or robot.rotor_inertia,
     )

@@ -222,6 +222,12 @@ class PolicyNetwork:
                 f"{who}: the network returns {action.size} actions, expected one for each of "
                 f"{num_outputs} joints"
             )
+        if not np.isfinite(action).all():
+            raise ValueError(
+                f"{who}: the network returns {np.sum(~np.isfinite(action))} of {num_outputs} "
+                "actions that are not finite, for an observation that is: it is damaged, or its "
+                "training has diverged"
+            )
         if action.tobytes() != again.tobytes():
             raise ValueError(
                 f"{who}: the network answers the same observation differently after another, "

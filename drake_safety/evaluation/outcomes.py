@@ -16,6 +16,8 @@ from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 UNSAFE = "unsafe"
+HELD = "held actions"
+"""Cause of an episode in which a controller found no command, and held the last one."""
 BELIEFS = ("safe", "unsafe", "don't know")
 """Names of the entries of a belief."""
 
@@ -32,7 +34,7 @@ class Outcome:
     Attributes:
         value: How bad it is, in [0, 1].
         time_s: When it failed, or ended [s].
-        cause: The constraint that it violated first; "" for none.
+        cause: The constraint that it violated first, or `HELD`; "" for none.
         commanded: The desired output as far ahead as Γ sees it, (n_z,).
         belief: Γ's belief (safe, unsafe, don't know); None without Γ. This and what is commanded
             are those of the first undisturbed row.
@@ -69,7 +71,8 @@ class Outcomes:
         Raises:
             ValueError: The metric is not in [0, 1].
         """
-        is_bad = self._bad_rows(episode) | _last_row(episode, episode.cause == DIVERGED)
+        is_held = episode.num_controller_failures > 0
+        is_bad = self._bad_rows(episode) | _last_row(episode, is_held or episode.cause == DIVERGED)
         value = float(self._metric(episode) if callable(self._metric) else is_bad.any())
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"metric: episode {episode.index} has {value}, expected 0 to 1")
@@ -80,7 +83,7 @@ class Outcomes:
             episode=episode.index,
             value=value,
             time_s=min([*episode.time_s[is_bad].tolist(), self._duration_s]),
-            cause=episode.cause,
+            cause=HELD if is_held else episode.cause,
             commanded=tuple(inputs[1][-episode.output.shape[1] :].tolist()),
             belief=belief,
         )

@@ -52,6 +52,7 @@ class ClosedLoop(Diagram):
 
     An optional port ``num_controller_failures`` counts the control periods since the start for
     which the controller found no command; episodes store its last value.
+    ``controller_memory`` is what the controller remembers, ``EpisodeStart.controller_state``.
 
     Attributes:
         state_names, output_names, feature_names, constraint_names: Names of the ports' entries.

@@ -33,7 +33,7 @@ class EpisodeStart:
     v: np.ndarray
     plan: PiecewisePolynomial
     foot_positions: np.ndarray | None = None
-    controller_state: list[np.ndarray] | None = None
+    controller_state: np.ndarray | None = None
 
     def feet(self, kinematics: RobotKinematics) -> np.ndarray:
         """Foot positions, (n_c, 3) [m]."""

@@ -19,7 +19,7 @@ from drake_safety.learning.feedback import EpisodePair, pair_episodes
 from drake_safety.learning.seeds import ADAPTATION, NOT_DRAWN
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.capabilities import CanStartAnywhere, require
-from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.closed_loop import ClosedLoop, port_sizes
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import episodes_info, run_episode, run_episodes, worker_loop
 from drake_safety.simulation.scenario import Scenario
@@ -93,7 +93,12 @@ def run_pairs(
 
 
 def AddFeedbackRecorder(builder: DiagramBuilder, loop: ClosedLoop) -> FeedbackRecorder:
-    """Adds a recorder named ``feedback_recorder`` to a diagram, and connects it to a loop."""
+    """Adds a recorder named ``feedback_recorder`` to a diagram, and connects it to a loop.
+
+    Raises:
+        ValueError: The twins of its windows cannot begin as the windows do.
+    """
+    size = _memory_size(loop)
     recorder = builder.AddNamedSystem(
         "feedback_recorder",
         FeedbackRecorder(
@@ -101,6 +106,7 @@ def AddFeedbackRecorder(builder: DiagramBuilder, loop: ClosedLoop) -> FeedbackRe
             num_steps=loop.scenario.num_steps,
             plant_state_size=loop.GetOutputPort("plant_state").size(),
             watch_period_s=loop.scenario.watch_period_s,
+            controller_memory_size=size,
         ),
     )
     for i in range(recorder.num_input_ports()):
@@ -124,7 +130,25 @@ def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
     ahead_s = scenario.preview_step_s * np.arange(scenario.assessment.horizon)
     times = np.append(scenario.step_s * np.arange(num_rows), scenario.step_s * num_rows + ahead_s)
     q, v = np.split(window.plant_state, [require(loop, CanStartAnywhere).plant_state_sizes[0]])
-    return EpisodeStart(q=q, v=v, plan=PiecewisePolynomial.CubicShapePreserving(times, plan.T))
+    return EpisodeStart(
+        q=q,
+        v=v,
+        plan=PiecewisePolynomial.CubicShapePreserving(times, plan.T),
+        controller_state=window.controller_memory,
+    )
+
+
+def _memory_size(loop: ClosedLoop) -> int:
+    """Size of the memory with which a loop's controller begins a twin; 0 without one."""
+    size = port_sizes(loop).get("controller_memory", 0)
+    period_s, step_s = getattr(loop, "memory_period_s", loop.scenario.step_s), loop.scenario.step_s
+    if abs(step_s / period_s - round(step_s / period_s)) > 1e-6:
+        raise ValueError(
+            f"feedback of '{loop.scenario.name}': a row every {step_s:g} s is not when the "
+            f"controller updates, every {period_s:g} s, so that no twin can begin as a window "
+            "does; choose a step_s that is a multiple"
+        )
+    return size
 
 
 def pair_starts(
@@ -154,9 +178,19 @@ def pair_windows(
     """Pairs of recorded windows and their nominal twins, which are simulated in this process.
 
     Raises:
-        ValueError: The task cannot begin with a given start.
+        ValueError: The task cannot begin with a given start, or windows lack its controller's
+            memory.
     """
     loop = worker_loop(scenario, _TWINS)()
+    size = _memory_size(loop)
+    for one in windows:
+        found = 0 if one.controller_memory is None else len(one.controller_memory)
+        if found != size:
+            raise ValueError(
+                f"feedback of '{scenario.name}': a window has {found} entries of the controller's "
+                f"memory, expected {size}: without it its twin begins in mid-stride as if at rest. "
+                "Connect the recorder's 'controller_memory', as AddFeedbackRecorder does"
+            )
     actual = Episodes(recorder.info, [window.episode for window in windows])
     starts = [window_start(loop, window) for window in windows]
     return pair_starts(scenario, actual, starts).feedback()

@@ -83,6 +83,7 @@ class LeggedLoop(PlannedLoop):
         rate_features: Features that depend on velocities.
         memory_features: Features that depend on what the controller did before, which a log of the
             plant lacks.
+        memory_period_s: Time between two updates of a controller with a memory [s].
         tick_s: Time between two systems that update one after the other [s].
     """
 

@@ -458,15 +458,21 @@ def collect_episodes(
                 if writer is not None:
                     writer.append(episode)
     collected = Episodes(info, sorted(episodes, key=lambda episode: episode.index))
-    if collected.num_diverged:
-        which = [episode.index for episode in collected if episode.cause == DIVERGED]
-        _LOGGER.warning(
-            "%d of %d simulations of '%s' diverged and have no safety label: episodes %s",
-            len(which),
-            len(indices),
-            info.scenario,
-            ", ".join(map(str, which[:10])) + (", ..." if len(which) > 10 else ""),
-        )
+    for problem, which in {
+        "diverged and have no safety label": [e.index for e in collected if e.cause == DIVERGED],
+        "held the last action, where the controller found none": [
+            episode.index for episode in collected if episode.num_controller_failures
+        ],
+    }.items():
+        if which:
+            _LOGGER.warning(
+                "%d of %d simulations of '%s' %s: episodes %s",
+                len(which),
+                len(indices),
+                info.scenario,
+                problem,
+                ", ".join(map(str, which[:10])) + (", ..." if len(which) > 10 else ""),
+            )
     return collected
 
 

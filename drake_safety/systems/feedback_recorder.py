@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ class RecordedWindow:
     episode: Episode
     plant_state: np.ndarray
     start_time_s: float
+    controller_memory: np.ndarray | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,7 +31,7 @@ class Recording:
 
     rows: tuple[tuple[np.ndarray, ...], ...] = ()
     times_s: tuple[float, ...] = ()
-    plant_state: np.ndarray | None = None
+    start: Mapping[str, np.ndarray] = field(default_factory=dict)
     windows: tuple[RecordedWindow, ...] = ()
     num_finished: int = 0
 
@@ -38,7 +40,7 @@ class Recording:
 
     def closed(self) -> Recording:
         """The recording without its open window."""
-        return replace(self, rows=(), times_s=(), plant_state=None)
+        return replace(self, rows=(), times_s=(), start={})
 
 
 class FeedbackRecorder(LeafSystem):
@@ -57,6 +59,7 @@ class FeedbackRecorder(LeafSystem):
         - margins: n_c
         - safe: 1
         - plant_state: n_q + n_v
+        - controller_memory: n (optional)
         - recovery_active: 1 (optional)
         output_ports:
         - num_finished: 1
@@ -67,7 +70,8 @@ class FeedbackRecorder(LeafSystem):
     jumps, as at a reset, the open window is dropped. The windows, at most the newest 400, are state
     of the Context; :meth:`take_windows` removes them. ``true_state`` defaults to ``state``, as on a
     robot. A window with a row at which ``recovery_active`` is not zero is dropped: its twin has no
-    recovery.
+    recovery. ``plant_state`` and ``controller_memory`` of its first row are those from which a twin
+    begins.
 
     Args:
         num_steps: Steps of a safe window.
@@ -84,6 +88,7 @@ class FeedbackRecorder(LeafSystem):
         num_steps: int,
         plant_state_size: int,
         watch_period_s: float,
+        controller_memory_size: int = 0,
     ):
         super().__init__()
         if num_steps < info.horizon * info.preview_stride:
@@ -106,6 +111,10 @@ class FeedbackRecorder(LeafSystem):
             "plant_state": plant_state_size,
         }
         self._ports = {name: self.DeclareVectorInputPort(name, n) for name, n in sizes.items()}
+        self._start_ports = [self._ports["plant_state"]]
+        if controller_memory_size:
+            port = self.DeclareVectorInputPort("controller_memory", controller_memory_size)
+            self._start_ports.append(port)
         self._recovery_port = self.DeclareVectorInputPort("recovery_active", 1)
         # A latch: when the safe set was left since the last row, and the margins at that time.
         self._closed_latch = np.append(-np.inf, np.zeros(num_margins))
@@ -172,14 +181,14 @@ class FeedbackRecorder(LeafSystem):
     def _extended(
         self, context: Context, recording: Recording, row: tuple[np.ndarray, ...]
     ) -> Recording:
-        plant_state = recording.plant_state
+        start = recording.start
         if not recording.rows:
-            plant_state = self._ports["plant_state"].Eval(context).copy()
+            start = {port.get_name(): port.Eval(context).copy() for port in self._start_ports}
         return replace(
             recording,
             rows=(*recording.rows, row),
             times_s=(*recording.times_s, context.get_time()),
-            plant_state=plant_state,
+            start=start,
         )
 
     def _finished(self, recording: Recording, *, is_safe: bool) -> Recording:
@@ -195,10 +204,8 @@ class FeedbackRecorder(LeafSystem):
             cause="" if is_safe else self.info.constraint_names[worst],
         )
         Episodes(self.info, [episode])  # Checks the shapes.
-        if recording.plant_state is None:
-            raise ValueError("feedback recorder: a window without its first plant state")
         window = RecordedWindow(
-            episode=episode, plant_state=recording.plant_state, start_time_s=float(times_s[0])
+            episode=episode, start_time_s=float(times_s[0]), **dict(recording.start)
         )
         windows = (*recording.windows, window)[-_MOST_WINDOWS:]
         return replace(recording, windows=windows, num_finished=recording.num_finished + 1)

@@ -25,13 +25,16 @@ class PolicyController(LeafSystem):
         - desired_joint_state: 2 n_j
         - action_state: n_m
         - status: 1
+        - num_failures: 1
+        - memory: n
 
     ``command`` is (v_x, v_y, ω_z) in the base's heading frame [m/s, rad/s]. All outputs and the
     memory of a recurrent network are discrete states: a cloned Context continues from its phase of
-    the gait. ``action_state`` is the last action (n_a,), its largest change in the last period
-    (1,), sine and cosine of the phases (2 n_p,), and the command that the policy followed (3,),
-    which differs from the input while the policy's change of command is limited. An action that is
-    not finite is replaced by the last one, and ``status`` is ``HELD``.
+    the gait, and so does another one that takes over ``memory``. ``action_state`` is the last
+    action (n_a,), its largest change in the last period (1,), sine and cosine of the phases
+    (2 n_p,), and the command that the policy followed (3,), which differs from the input while the
+    policy's change of command is limited. An action that is not finite is replaced by the last one,
+    ``status`` is ``HELD``, and ``num_failures`` counts it.
     """
 
     def __init__(self, kinematics: RobotKinematics, policy: Policy, *, offset_s: float = 0.0):
@@ -50,7 +53,8 @@ class PolicyController(LeafSystem):
         self._applied = self.DeclareDiscreteState(3)
         self._history = self.DeclareDiscreteState(np.full(sum(policy.sizes), np.nan))
         self._memory = self.DeclareDiscreteState(policy.network.initial_memory)
-        self._status = self.DeclareDiscreteState([ACTING])
+        self._status = self.DeclareDiscreteState([ACTING])  # From here on no memory.
+        self._num_failures = self.DeclareDiscreteState(1)
         self.action_names = [
             *(f"action_{name}" for name in policy.joint_names),
             "action_change",
@@ -62,17 +66,25 @@ class PolicyController(LeafSystem):
         self.DeclareStateOutputPort("desired_joint_state", self._set_point)
         self.DeclareStateOutputPort("action_state", self._action)
         self.DeclareStateOutputPort("status", self._status)
+        self.DeclareStateOutputPort("num_failures", self._num_failures)
+        size = len(self.state_of(self.CreateDefaultContext()))
+        self.DeclareVectorOutputPort(
+            "memory",
+            size,
+            lambda context, output: output.SetFromVector(self.state_of(context)),
+            {self.all_state_ticket()},
+        )
 
-    def state_of(self, context: Context) -> list[np.ndarray]:
-        """The controller's memory in a Context, for :meth:`set_state`."""
-        return [
-            context.get_discrete_state(i).get_value().copy()
-            for i in range(context.num_discrete_state_groups())
-        ]
+    def state_of(self, context: Context) -> np.ndarray:
+        """The controller's memory in a Context, (n,), for :meth:`set_state`."""
+        groups = map(context.get_discrete_state, range(int(self._status)))
+        return np.concatenate([group.get_value() for group in groups])
 
-    def set_state(self, context: Context, state: list[np.ndarray]) -> None:
+    def set_state(self, context: Context, state: np.ndarray) -> None:
         """Sets the controller's memory to that of :meth:`state_of`."""
-        for i, value in enumerate(state):
+        groups = map(context.get_discrete_state, range(int(self._status)))
+        ends = np.cumsum([group.size() for group in groups])
+        for i, value in enumerate(np.split(state, ends[:-1])):
             context.SetDiscreteState(i, value)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -106,3 +118,5 @@ class PolicyController(LeafSystem):
             discrete_state.set_value(self._phases, phases)
         discrete_state.set_value(self._applied, applied)
         discrete_state.set_value(self._status, [status])
+        failures = context.get_discrete_state(self._num_failures).get_value()
+        discrete_state.set_value(self._num_failures, failures + (status == HELD))
