@@ -253,8 +253,13 @@ class Balancing(LeggedLoop):
         return self.scenario.parameters.push.sample(rng, time_s)
 
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> None:
-        """Sets the ball in flight, which hits the base at rest after ``lead_s`` [s]."""
+        """Sets the ball in flight, which hits the base at rest after ``lead_s`` [s].
+
+        The monitor waits from now until the impact has settled.
+        """
         if self.ball is None:
             raise ValueError("balancing: built without a ball; pass ball=True to make_loop")
         with self._physics.edited(context) as plant_context:
             self.ball.throw(plant_context, throw, lead_s)
+        now_s = context.get_time()
+        self.expect_disturbance(context, now_s, now_s + lead_s)

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 MODULES = {
     "cluster": ("distributed",),
-    "live": ("nicegui",),
+    "live": ("aiohttp", "nicegui"),
     "logs": ("mcap", "pandas", "pyarrow", "rosbags"),
     "mujoco": ("mujoco",),
     "onnx": ("onnx",),

@@ -76,8 +76,28 @@ def test_it_waits_while_it_is_held():
     rows[PUSHED] = rows[100]  # Frozen.
     levels, alarm, _ = Played(rows, hold=hold).history()
     assert not alarm.any()
-    np.testing.assert_array_equal(levels[100:142], np.tile(levels[99], (42, 1)))
-    assert not np.array_equal(levels[142], levels[99])
+    # And for half a second, ten rows, after it.
+    np.testing.assert_array_equal(levels[100:151], np.tile(levels[99], (51, 1)))
+    assert not np.array_equal(levels[151], levels[99])
+
+
+@pytest.mark.parametrize(
+    ("told", "waits"),
+    [
+        ([(5.0, 6.95)], [(100, 151)]),
+        ([(1.0, 1.5), (2.2, 2.3)], [(20, 58)]),  # Before the first has settled, which is extended.
+        ([(-1.0, 0.0)], [(0, 12)]),  # As a push at the start.
+    ],
+)
+def test_it_waits_during_disturbances_that_it_is_told_of(told, waits):
+    played = Played(motion(10.0, 50))
+    for interval in told:
+        played.monitor.expect_disturbance(played.context, *interval)
+    levels, _, _ = played.history()
+    is_same = (levels[1:] == levels[:-1]).all(axis=1)
+    for begin, end in waits:
+        assert is_same[begin : end - 1].all() and not is_same[end - 1]
+    assert is_same.sum() == sum(end - max(begin, 1) for begin, end in waits) + (waits[0][0] > 0)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
 import urllib.request
 
 import numpy as np
@@ -91,7 +92,7 @@ def test_two_viewers_see_and_control_the_same(panel, recwarn):
     from drake_safety.live.page import build_page
 
     async def view():
-        async with testing.user_simulation(lambda: build_page(panel, 7001)) as first:
+        async with testing.user_simulation(lambda: build_page(panel)) as first:
             second = testing.User(first.http_client)
             for user in (first, second):
                 await user.open("/")
@@ -110,16 +111,68 @@ def test_two_viewers_see_and_control_the_same(panel, recwarn):
     asyncio.run(view())
 
 
+HERE, ALL = "127.0.0.1", "0.0.0.0"
+
+
+@pytest.mark.parametrize(
+    ("host", "asked", "origin", "is_answered"),
+    [
+        (HERE, "127.0.0.1:7000", None, True),
+        (HERE, "127.0.0.1:7000", "http://127.0.0.1:7000", True),
+        (HERE, "LocalHost:8000", "http://localhost:8000", True),  # As through SSH.
+        (HERE, "[::1]:7000", None, True),
+        (HERE, "robot.example:7000", "https://robot.example:7000", True),  # That was allowed.
+        (HERE, "127.0.0.1.evil.example:7000", None, False),
+        (HERE, "evil.example", "http://evil.example", False),
+        (HERE, "192.0.2.1:7000", None, False),
+        (HERE, "", None, False),
+        (HERE, "[", None, False),
+        (HERE, "127.0.0.1:7000", "http://evil.example", False),
+        (HERE, "127.0.0.1:7000", "http://127.0.0.1:9000", False),
+        (HERE, "127.0.0.1:7000", "null", False),
+        (ALL, "192.0.2.1:7000", "http://192.0.2.1:7000", True),
+        (ALL, f"{socket.gethostname()}:7000", None, True),
+        (ALL, "evil.example:7000", None, False),
+        (ALL, "192.0.2.1:7000", "http://evil.example", False),
+    ],
+)
+def test_only_requests_of_its_own_page_are_answered(host, asked, origin, is_answered):
+    pytest.importorskip("nicegui")
+    from drake_safety.live.page import _OwnRequests
+
+    reached, sent = [], []
+
+    async def application(scope, receive, send):
+        reached.append(scope["type"])
+
+    async def send(message):
+        sent.append(message)
+
+    own = _OwnRequests(application, host, ["Robot.example"])
+    headers = {"host": asked} | ({} if origin is None else {"origin": origin})
+    raw = [(name.encode(), value.encode()) for name, value in headers.items()]
+    for kind in ("http", "websocket", "lifespan"):
+        asyncio.run(own({"type": kind, "headers": raw, "extensions": {}}, None, send))
+    assert reached == ["http", "websocket", "lifespan"] if is_answered else ["lifespan"]
+    refused = ["http.response.start", "http.response.body", "websocket.close"]
+    assert [one["type"] for one in sent] == ([] if is_answered else refused)
+    assert is_answered or sent[0]["status"] == 403
+
+
 def free_port():
-    """A port that is free, as is the next one."""
-    for port in range(7400, 7600, 2):
-        try:
-            for one in (port, port + 1):
-                socket.create_server(("127.0.0.1", one)).close()
-        except OSError:
-            continue
-        return port
-    raise OSError("no free port")
+    """A port that is free."""
+    with socket.create_server((HERE, 0)) as one:
+        return one.getsockname()[1]
+
+
+def answer_to(address, **headers):
+    """The status of an answer and its text."""
+    asked = urllib.request.Request(address, headers=headers)
+    try:
+        with urllib.request.urlopen(asked, timeout=WITHIN_S) as answer:
+            return answer.status, answer.read().decode(errors="replace")
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
 
 
 @pytest.fixture
@@ -146,15 +199,34 @@ def playing():
     process.stdout.close()
 
 
+def check_scene(address):
+    """Checks that the scene is served at the page's port alone, and that no message ends it."""
+    client = pytest.importorskip("websockets.sync.client")
+    status, scene = answer_to(address)
+    assert status == 200 and "MeshCat" in scene
+    for path in re.findall(r'src="(\S+)"', scene):
+        assert answer_to(address + path)[0] == 200
+    place = address.replace("http", "ws")
+    with pytest.raises(Exception, match="403"), client.connect(place, origin="http://evil.example"):
+        pass
+    for message in (b"", "", b"\xc1", bytes(1000)):
+        with client.connect(place) as one:
+            assert one.recv(timeout=WITHIN_S)
+            one.send(message)
+            for _ in range(100):  # The robot moves.
+                assert one.recv(timeout=WITHIN_S)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_page_is_served_without_other_hosts_until_a_signal(playing, number):
     process, address = playing
-    with urllib.request.urlopen(address, timeout=WITHIN_S) as answer:
-        page = answer.read().decode()
-    assert "laikago_balancing" in page
+    status, page = answer_to(address)
+    assert status == 200 and "laikago_balancing" in page
     hosts = set(re.findall(r"(?:src|href|url)[=(]\W{0,2}(https?://[^/\"'\\]+)", page))
-    assert hosts <= {address, f"{address[:-4]}{int(address[-4:]) + 1}"}
+    assert hosts <= {address}
+    assert answer_to(address, Host="evil.example")[0] == 403
+    check_scene(f"{address}/scene/")
     process.send_signal(number)
     told, _ = process.communicate(timeout=WITHIN_S)
     assert process.returncode == 0

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shlex
+import socket
 import sys
 from collections.abc import Iterable
 from functools import partial
@@ -99,6 +102,24 @@ def open_viewer(host: str = LOOPBACK, port: int | None = None, *, has_rate: bool
     except RuntimeError as error:
         place = host if port is None else f"{host}:{port}"
         raise ValueError(f"no page can be served at {place}: {error}") from error
+
+
+def open_recorder() -> Meshcat:
+    """Starts a Meshcat that records and serves nobody."""
+    viewer = open_viewer(port=0)
+    for place in Path("/dev/fd").iterdir():
+        number = int(place.name)
+        with contextlib.suppress(OSError):
+            one = socket.socket(fileno=number)
+            try:
+                is_its_own = one.getsockname()[1:] == (viewer.port(),)
+            finally:
+                one.detach()
+            # Drake has no Meshcat without a server: an empty file takes the place of its socket.
+            if is_its_own:
+                with Path(os.devnull).open() as nothing:
+                    os.dup2(nothing.fileno(), number, inheritable=False)
+    return viewer
 
 
 def warn_of_empty_scene(meshcat: Meshcat, task: str) -> None:

@@ -202,7 +202,7 @@ def _record(first: Loop, others: Mapping[str, Loop], index: int, seed: int, file
     """Writes recordings of one episode in all loops, side by side."""
     panels = [_PANELS]
     for side, (name, loop) in enumerate({"baseline": first, **others}.items()):
-        viewer = console.open_viewer()
+        viewer = console.open_recorder()
         viewer.StartRecording()
         diagram = make_paired((first, loop), min(side, 1), meshcat=viewer)
         episode = run_episode(diagram, index, seed=seed, after_leaving_s=math.inf)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import secrets
 import socket
+import sys
 from typing import Annotated
 
 from typer import Option
@@ -28,7 +30,7 @@ def play(
     mode: console.ModeOption = MODES[0],
     port: Annotated[
         int | None,
-        Option(help="Of the page; the scene's is the next one. Free ones from 7000 on by default."),
+        Option(help="Of the page; the first free one from 7000 on by default."),
     ] = None,
     host: Annotated[
         str,
@@ -37,6 +39,13 @@ def play(
             "reaches it can use the controls: there is no password."
         ),
     ] = console.LOOPBACK,
+    allow_host: Annotated[
+        list[str] | None,
+        Option(
+            help="A further name by which browsers may ask for the page, repeatable. Others than "
+            "--host and this machine's are refused."
+        ),
+    ] = None,
 ) -> None:
     """Simulate a task on a page in the browser, in real time, until Stop or Ctrl-C.
 
@@ -59,15 +68,16 @@ def play(
     if told:
         console.say(told)
     page_port = _page_port(host, port)
-    meshcat = console.open_viewer(host, page_port + 1, has_rate=False)
+    # The page forwards the scene, from an address that other pages cannot guess.
+    meshcat = console.open_viewer(_hidden_host(), 0, has_rate=False)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=meshcat, **options)
     session = LiveSession(
         loop, meshcat, threshold=threshold, unsafe_below=rule.unsafe_below, seed=seed
     )
     console.warn_of_empty_scene(meshcat, loaded.task)
-    address = meshcat.web_url().rpartition(":")[0]
-    with serve_page(session.panel, host=host, port=page_port, scene_port=meshcat.port()):
-        console.say(f"live at {address}:{page_port}")
+    served = {"host": host, "port": page_port, "scene_url": meshcat.web_url()}
+    with serve_page(session.panel, **served, names=allow_host or ()):
+        console.say(f"live at http://{host}:{page_port}")
         console.say("Stop, on the page, or Ctrl-C ends")
         with contextlib.suppress(KeyboardInterrupt):
             session.run()
@@ -82,13 +92,17 @@ def play(
 
 
 def _page_port(host: str, port: int | None) -> int:
-    """The port of the page: it and the next one are free."""
-    asked = range(_FIRST_PORT, _FIRST_PORT + 200, 2) if port is None else [port]
+    """The port of the page, which is free."""
+    asked = range(_FIRST_PORT, _FIRST_PORT + 200) if port is None else [port]
     for candidate in asked:
         with contextlib.suppress(OSError, OverflowError):
-            for one in (candidate, candidate + 1):
-                socket.create_server((host, one)).close()
+            socket.create_server((host, candidate)).close()
             return candidate
-    raise ValueError(
-        f"no page can be served at {host}:{asked[0]}: this port or the next one is not free"
-    )
+    raise ValueError(f"no page can be served at {host}:{asked[0]}: this port is not free")
+
+
+def _hidden_host() -> str:
+    """An address that only this machine reaches: on Linux one of millions."""
+    if sys.platform != "linux":
+        return console.LOOPBACK
+    return ".".join(["127", *(str(1 + secrets.randbelow(254)) for _ in range(3))])

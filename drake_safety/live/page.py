@@ -2,35 +2,53 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import math
+import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Collection, Iterator, MutableMapping
 from importlib.resources import files
+from ipaddress import ip_address
 from typing import Any
+from urllib.parse import urlsplit
 
+from aiohttp import ClientSession
 from nicegui import app, ui
 from nicegui.server import Server
 
 from drake_safety.live.panel import COLOURS, HISTORY_S, LivePanel
 
 _PERIOD_S = 0.1  # Between updates of a page.
+_SCENE = "/scene"  # Path of the scene on the page's server.
 _FAREWELL_S = 1.0  # From the end of a session to that of its page, so that the page shows it.
 _WITHIN_S = 20.0  # For the server to start, and to stop.
+_Message = MutableMapping[str, Any]  # Of ASGI, the interface of servers and applications.
+_Application = Callable[[_Message, Any, Any], Awaitable[None]]
 _BELIEF = {"safe": "safe", "unsafe": "unsafe", "unknown": "don't know"}
 _KEYS = {"Escape": "Esc", "ArrowUp": "↑", "ArrowDown": "↓", "ArrowLeft": "←", "ArrowRight": "→"}
 
 
 @contextlib.contextmanager
-def serve_page(panel: LivePanel, *, host: str, port: int, scene_port: int) -> Iterator[None]:
-    """Serves the page in a thread; one page in a process.
+def serve_page(
+    panel: LivePanel, *, host: str, port: int, scene_url: str, names: Collection[str] = ()
+) -> Iterator[None]:
+    """Serves the page, with the scene, in a thread; one page in a process.
+
+    It answers requests for ``host``, this machine and further ``names`` of hosts only, and of other
+    pages none, so that no page elsewhere can read it or use its controls.
+
+    Args:
+        scene_url: Address at which this process reaches Meshcat.
 
     Raises:
         ValueError: The server does not start.
     """
+    app.add_middleware(_OwnRequests, host=host, names=names)
+    app.mount(_SCENE, _forward(scene_url))
     options: dict[str, Any] = {
-        "root": lambda: build_page(panel, scene_port),
+        "root": lambda: build_page(panel),
         "title": panel.title,
         "host": host,
         "port": port,
@@ -58,17 +76,85 @@ def serve_page(panel: LivePanel, *, host: str, port: int, scene_port: int) -> It
         thread.join(_WITHIN_S)
 
 
-def build_page(panel: LivePanel, scene_port: int) -> None:
-    """Builds the page of a viewer; Meshcat is at the same host, at its own port."""
+class _OwnRequests:
+    """Answers requests that name this server, and of pages only those of its own.
+
+    A page elsewhere may reach it by a name that it resolves to this machine (DNS rebinding), and
+    websockets have no rule of the same origin.
+    """
+
+    def __init__(self, application: _Application, host: str, names: Collection[str]) -> None:
+        self._application = application
+        self._names = {host, "localhost", "127.0.0.1", "::1", *(name.lower() for name in names)}
+        # Served at all addresses of this machine, which cannot be forged as names can.
+        self._is_for_all = host in ("0.0.0.0", "::")
+
+    async def __call__(self, scope: _Message, receive: Any, send: Any) -> None:
+        if scope["type"] not in ("http", "websocket") or self._is_own(dict(scope["headers"])):
+            await self._application(scope, receive, send)
+        elif scope["type"] == "http":
+            await _answer(send, 403, b"not served to other hosts or pages")
+        else:
+            await send({"type": "websocket.close"})  # Before it was accepted: 403.
+
+    def _is_own(self, headers: dict[bytes, bytes]) -> bool:
+        host = headers.get(b"host", b"").decode("latin-1").lower()
+        origin = headers.get(b"origin", b"").decode("latin-1").lower() or f"//{host}"
+        with contextlib.suppress(ValueError):
+            name = urlsplit(f"//{host}").hostname or ""
+            own = name in self._names
+            if not own and self._is_for_all:
+                own = name == socket.gethostname().lower() or bool(ip_address(name))
+            return own and urlsplit(origin).netloc == host
+        return False
+
+
+def _forward(url: str) -> _Application:
+    """Serves Meshcat's scene; nothing that a browser sends reaches Meshcat.
+
+    Meshcat itself answers every page, and one message that is not its own ends it.
+    """
+
+    async def forward(scope: _Message, receive: Any, send: Any) -> None:
+        async with ClientSession() as session:
+            if scope["type"] == "http":
+                path = scope["path"].removeprefix(_SCENE)
+                async with session.get(url + path) as found:
+                    kind = found.headers.get("content-type", "")
+                    await _answer(send, found.status, await found.read(), kind)
+                return
+            async with session.ws_connect(f"{url}/", max_msg_size=0) as scene:
+
+                async def wait_until_it_leaves() -> None:
+                    while (await receive())["type"] != "websocket.disconnect":
+                        pass
+                    await scene.close()
+
+                await send({"type": "websocket.accept"})
+                waiting = asyncio.create_task(wait_until_it_leaves())
+                with contextlib.suppress(OSError):  # It has left.
+                    async for message in scene:
+                        await send({"type": "websocket.send", "bytes": message.data})
+                waiting.cancel()
+
+    return forward
+
+
+async def _answer(send: Any, status: int, body: bytes, kind: str = "text/plain") -> None:
+    headers = [(b"content-type", kind.encode())] if kind else []
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})
+
+
+def build_page(panel: LivePanel) -> None:
+    """Builds the page of a viewer."""
     here = files("drake_safety.live")
     tones = " ".join(f"--{name}: {_css(name)};" for name in COLOURS)
     ui.colors(primary=_css("safe"))
     ui.add_css(f":root {{ {tones} }}\n{here.joinpath('page.css').read_text('utf-8')}")
     ui.add_head_html(f"<script>{here.joinpath('page.js').read_text('utf-8')}</script>")
-    page_url = ui.context.client.request.base_url
-    scene_url = page_url.replace(port=scene_port, query="reconnect_ms=-1")
     with ui.element().classes("scene"):
-        ui.element("iframe").props(f'src="{scene_url}" title="scene"')
+        ui.element("iframe").props(f'src="{_SCENE}/?reconnect_ms=-1" title="scene"')
         with ui.element().classes("veil"):
             ui.label("stopped").classes("told")
             ui.label("disconnected").classes("lost")

@@ -211,7 +211,7 @@ class LeggedLoop(PlannedLoop):
         builder.Connect(self._push_source.get_output_port(), self._physics.applied_spatial_force)
 
     def set_push(self, context: Context, push: Push) -> None:
-        """Sets a push, in place of an earlier one.
+        """Sets a push, in place of an earlier one; the monitor waits while it acts.
 
         Raises:
             ValueError: The robot has no such body, or the task adds no source of pushes.
@@ -219,6 +219,7 @@ class LeggedLoop(PlannedLoop):
         if self._push_source is None:
             raise ValueError(f"task '{type(self).__name__}' has no pushes on its robot")
         self._push_source.set_push(self._push_source.GetMyMutableContextFromRoot(context), push)
+        self.expect_disturbance(context, push.time_s, push.time_s + push.duration_s)
 
     def disturbances(self, context: Context) -> dict[str, np.ndarray]:
         """The ball's mass and state, and the push; see `HasDisturbances`."""
@@ -241,7 +242,15 @@ class LeggedLoop(PlannedLoop):
         }
         if self._physics.ball_state is not None:
             of_robot["ball_state"] = self._physics.ball_state
-        return super().export(builder, of_robot | dict(ports), **options)
+        assessor = super().export(builder, of_robot | dict(ports), **options)
+        self._change_monitor = assessor and assessor.monitor
+        return assessor
+
+    def expect_disturbance(self, context: Context, begin_s: float, end_s: float) -> None:
+        """Lets the monitor, if there is one, wait while a disturbance acts; see `ChangeMonitor`."""
+        if self._change_monitor is not None:
+            own_context = self._change_monitor.GetMyMutableContextFromRoot(context)
+            self._change_monitor.expect_disturbance(own_context, begin_s, end_s)
 
     def remove_visuals(self, context: Context) -> None:
         """Removes the visual shapes, unless the diagram has a visualiser."""

@@ -12,6 +12,9 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.blas_threads import one_blas_thread
 from drake_safety.learning.change_detector import TIME_CONSTANTS_S, ChangeDetector
 
+SETTLING_S = 0.5
+"""Time for which the charts wait on after a disturbance that is known [s]."""
+
 
 class ChangeMonitor(LeafSystem):
     """Watches how each measured state follows from the last two inputs.
@@ -33,9 +36,10 @@ class ChangeMonitor(LeafSystem):
     :class:`~drake_safety.learning.change_detector.ChangeDetector`. ``levels`` has the level of each
     watched state in units of its limit. When one exceeds 1, ``alarm`` becomes 1 and
     ``alarm_cause`` says what was seen; it ends when all were below 0.7 for five seconds, or with a
-    reset. Without enough motion for limits there is no alarm. While ``hold`` is above 0.5, as
-    during a recovery step that training does not have, the charts wait. The detector is a
-    parameter of the Context, see :meth:`adopt`.
+    reset. Without enough motion for limits there is no alarm. The charts wait while a disturbance
+    that is known acts, such as a ball, a push or a recovery step, and `SETTLING_S` longer: while
+    ``hold`` is above 0.5, or as told by :meth:`expect_disturbance`. The detector is a parameter of
+    the Context, see :meth:`adopt`.
     """
 
     def __init__(self, assessment: SafetyAssessment):
@@ -59,6 +63,7 @@ class ChangeMonitor(LeafSystem):
         # `seen` are charts and repeats at the alarm.
         parts = {"state": n_w, "x": n_u, "previous": n_u, "charts": n_charts, "repeats": 1}
         parts |= {"levels": n_w, "alarm": 1, "calm_s": 1, "seen": n_charts + 1}
+        parts |= {"expected_s": 2, "held_s": 1}  # Begin and end; last time with `hold`.
         starts = np.cumsum([0, *parts.values()]).tolist()
         self._places = {
             name: slice(start, start + size)
@@ -67,6 +72,8 @@ class ChangeMonitor(LeafSystem):
         self._initial = np.zeros(starts[-1])
         for name in ("x", "previous"):
             self._initial[self._places[name]] = np.nan
+        for name in ("expected_s", "held_s"):
+            self._initial[self._places[name]] = -math.inf
         state = self.DeclareDiscreteState(self._initial)
         self.DeclarePeriodicDiscreteUpdateEvent(detector.step_s, 0.0, self._update)
         ticket = {self.discrete_state_ticket(state)}
@@ -83,6 +90,17 @@ class ChangeMonitor(LeafSystem):
     def reset(self, context: Context) -> None:
         """Ends the alarm and empties the charts."""
         context.get_mutable_discrete_state_vector().SetFromVector(self._initial)
+
+    def expect_disturbance(self, context: Context, begin_s: float, end_s: float) -> None:
+        """Lets the charts wait in an interval of time [s], and until what it does has settled.
+
+        An interval that begins before the last one has settled extends it, else it replaces it.
+        """
+        expected_s = context.get_mutable_discrete_state_vector().get_mutable_value()
+        expected_s = expected_s[self._places["expected_s"]]
+        if context.get_time() < expected_s[1] + SETTLING_S:
+            begin_s, end_s = min(begin_s, expected_s[0]), max(end_s, expected_s[1])
+        expected_s[:] = begin_s, end_s
 
     def row(self, context: Context) -> np.ndarray:
         """(state, desired preview, features) at the ports, (n,); features not read are 0."""
@@ -106,7 +124,13 @@ class ChangeMonitor(LeafSystem):
         part = {name: values[place] for name, place in self._places.items()}  # Views.
         row = self.row(context)
         x, state = row[detector.columns], row[detector.watched]
-        if self.is_held(context) or not x @ x < math.inf:  # As for NaN.
+        now_s, (begin_s, end_s) = context.get_time(), part["expected_s"]
+        if self.is_held(context):
+            part["held_s"][0] = now_s
+        if begin_s <= now_s:
+            part["held_s"][0] = max(part["held_s"][0], min(now_s, end_s))
+        is_settled = now_s - part["held_s"][0] > SETTLING_S - 1e-9
+        if not is_settled or not x @ x < math.inf:  # As for NaN.
             part["x"][:] = part["previous"][:] = np.nan
             part["repeats"][0] = 0.0
         else:

@@ -134,7 +134,8 @@ def AddSafetyAssessor(
         features: Port of the features, in the order of the assessment's ``feature_names``, such as
             that of :class:`~drake_safety.systems.assessor_inputs.AssessorInputs`; not needed if the
             assessment reads none.
-        hold: Port that is 1 while the monitor waits, as during recovery.
+        hold: Port that is 1 while a disturbance acts that is known, such as a recovery step: the
+            monitor waits then.
 
     Raises:
         ValueError: The assessment reads features and there is no port for them, or a port has
