@@ -1,6 +1,7 @@
 """Two closed loops in the same episodes: verdicts, refusals, and the command."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -10,19 +11,22 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from cart_episodes import assert_identical
 from command_line import call
-from drake_safety import compare_loops, load_scenario, run_episode, run_episodes
+from drake_safety import cli, compare_loops, load_scenario, run_episode, run_episodes
 from drake_safety.cli import gate
 from drake_safety.control.policy import network_file, read_policy_file
 from drake_safety.diagrams.walking import policy_files
 from drake_safety.evaluation import loop_comparison
 from drake_safety.evaluation.loop_comparison import Loop
 from drake_safety.evaluation.outcomes import Outcomes
+from drake_safety.evaluation.paired_test import look, pairs_needed
 from drake_safety.evaluation.results import Results
-from drake_safety.learning.segments import DIVERGED
+from drake_safety.learning.segments import DIVERGED, RECORDED
 from drake_safety.simulation.dataset import load_episodes
+from drake_safety.simulation.motion import simulate
 from drake_safety.simulation.rollouts import episode_rng
 from studies import gate as study
 
@@ -90,6 +94,23 @@ def test_at_the_limit_nothing_is_known():
     found = COMPARED(pendulum(), pendulum(damping=0.0501), max_pairs=18, worse_by=0.01)
     assert found.verdict == "undecided"
     assert [look.n for look in found.difference] == [16, 18]
+    # No pair differs: a multiple of them excludes a difference of 0.01.
+    more = [0.0] * found.pairs_needed
+    assert look(more, [], 0.05).high < 0.01 <= look(more[: len(more) * 9 // 10], [], 0.05).high
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "end"),
+    [([1.0] * 3 + [0.0] * 60, "low"), ([-1.0] * 3 + [0.0] * 60, "high"), ([1.0, -1.0] * 9, "")],
+)
+def test_the_pairs_that_a_verdict_takes_are_those_that_give_one(outcomes, end):
+    number = pairs_needed(outcomes, 0.01, 0.05)
+    if not end:
+        assert number is None or number > 10_000
+        return
+    times = number // len(outcomes)
+    one = look(outcomes * (times + 1), [], 0.05)
+    assert one.low > 0.0 if end == "low" else one.high < 0.01
 
 
 def test_metrics_are_a_constraint_the_tracking_error_or_a_function():
@@ -129,6 +150,68 @@ def test_a_fall_and_a_diverged_simulation_are_failures():
     diverged = replace(one, margins=np.ones((num_rows, 2)), cause=DIVERGED, is_safe=False)
     found = Outcomes(pendulum().make_loop(), "front").of(diverged)
     assert (found.value, found.time_s) == (1.0, one.time_s[-1])
+
+
+class Dip(LeafSystem):
+    """Margins that are negative for a moment between two rows."""
+
+    def __init__(self, dips, safe):
+        super().__init__()
+        names = ("state", "true_state", "output", "desired_output", "desired_preview", "features")
+        for name in names:
+            self.DeclareVectorOutputPort(name, 1, lambda context, out: out.SetFromVector([0.0]))
+
+        def margins(context, output):
+            time_s = context.get_time()
+            output.SetFromVector([1.0 - 2.0 * (abs(time_s - dip) < 0.006) for dip in dips])
+
+        self.DeclareVectorOutputPort("margins", 2, margins)
+        self.DeclareVectorOutputPort("safe", 1, lambda c, out: out.SetFromVector([safe(c)]))
+
+
+@pytest.mark.parametrize(
+    ("dips", "metric", "expected"),
+    [
+        ((0.05, 9.0), "tilt", (1.0, 0.05, "tilt")),
+        ((0.05, 9.0), "height", (0.0, 0.2, "tilt")),
+        ((0.05, 0.15), "height", (1.0, 0.15, "tilt")),
+        ((0.15, 0.05), "fall", (1.0, 0.05, "fall")),
+        ((9.0, 9.0), "tilt", (1.0, 0.13, "tilt")),  # By the port ``safe`` alone.
+    ],
+)
+def test_a_violation_between_two_rows_is_a_failure_at_its_instant(dips, metric, expected):
+    second = "fall" if metric == "fall" else "height"
+    has_own = dips[0] == dips[1]
+    dip = Dip(
+        dips,
+        lambda c: float(
+            c.get_time() < 0.125 if has_own else min(dip.GetOutputPort("margins").Eval(c)) >= 0
+        ),
+    )
+    builder = DiagramBuilder()
+    builder.AddSystem(dip)
+    for i in range(dip.num_output_ports()):
+        builder.ExportOutput(dip.get_output_port(i), dip.get_output_port(i).get_name())
+    loop = builder.Build()
+    words = SimpleNamespace(
+        constraint_names=["tilt", second],
+        scenario=SimpleNamespace(episode_duration_s=0.2, num_steps=5),
+        fall_name="fall",
+        watched_features={},
+    )
+    outcomes = Outcomes(words, metric)
+    motion = simulate(
+        loop,
+        lambda context: 0,
+        (*RECORDED,),
+        duration_s=0.2,
+        step_s=0.04,
+        watch_period_s=0.01,
+        constraint_names=words.constraint_names,
+        **outcomes.simulated,
+    )
+    found = outcomes.of(motion.episode())
+    assert (found.value, pytest.approx(found.time_s), found.cause) == expected
 
 
 def test_gamma_says_of_each_change_whether_it_was_to_be_expected(worse):
@@ -241,6 +324,7 @@ def test_the_command_says_which_candidate_is_worse_and_replays_an_episode(
     assert failure.get("message").startswith(f"worse after {first['pairs']} pairs: ")
     index = first["newly_failing"][0]["episode"]
     told = " ".join(printed.split())
+    assert "bob x [m], bob y [m], bob z [m]" in told
     assert "by cause" in told and "by what was commanded" in told
     for output in {part[0] for part in first["by_command"]}:
         counts = [part[3:] for part in first["by_command"] if part[0] == output]
@@ -299,8 +383,139 @@ def test_ctrl_c_tells_what_is_known_so_far(monkeypatch, capsys, tmp_path):
     ],
 )
 def test_a_candidate_that_is_none_is_an_error(monkeypatch, capsys, tmp_path, arguments, message):
-    assert call(monkeypatch, *GATE, *arguments, "--out", tmp_path) == 2
+    assert call(monkeypatch, *GATE, *arguments, "--out", tmp_path) == 3
     assert message in " ".join(capsys.readouterr().out.split())
+
+
+BROKEN = """
+from drake_safety.diagrams.pendulum import Pendulum
+
+
+class Stuck(Pendulum):
+    def reset(self, context, rng):
+        raise KeyError("no such part")
+
+
+class Nameless(Pendulum):
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        self.output_names = self.output_names[:2]
+
+
+class Aborted(Pendulum):
+    def __init__(self, *arguments, **options):
+        raise SystemExit("Failure at plant.cc: condition failed")
+
+
+class Late(Pendulum):
+    count = 0
+
+    def reset(self, context, rng):
+        Late.count += 1
+        if Late.count > 12:
+            raise TypeError("worn out")
+        return super().reset(context, rng)
+"""
+
+
+@pytest.fixture
+def broken(tmp_path):
+    """Makes a scenario of a broken task."""
+    module = tmp_path.name  # Of its own in each test.
+    (tmp_path / f"{module}.py").write_text(BROKEN)
+    text = (Path(__file__).resolve().parents[1] / "diagrams/pendulum.yaml").read_text()
+
+    def make(name):
+        file = tmp_path / f"{name}.yaml"
+        file.write_text(re.sub(r"(?m)^task:.*$", f"task: {module}:{name}", text))
+        return file
+
+    return make
+
+
+def cases(junit):
+    """Kind and message of each test case by name, "" for one that passed."""
+    suite = ElementTree.parse(junit).getroot()
+    found = {one.get("name"): next(iter(one), None) for one in suite.iter("testcase")}
+    ended = [one for one in found.values() if one is not None]
+    assert int(suite.get("tests")) == len(found)
+    assert int(suite.get("errors")) + int(suite.get("failures")) == len(ended)
+    kinds = {
+        name: ("", "") if one is None else (one.get("type"), one.get("message"))
+        for name, one in found.items()
+    }
+    return kinds
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("Stuck", "no such part"),
+        ("Nameless", "task 'Nameless' has ports whose sizes do not fit their names"),
+        ("Aborted", "condition failed"),
+        ("Missing", "Missing"),
+    ],
+)
+def test_every_candidate_is_tried_before_anything_is_simulated(
+    monkeypatch, capsys, tmp_path, broken, name, told
+):
+    def simulated(*loops, **options):
+        raise AssertionError("something was simulated")
+
+    monkeypatch.setattr(gate, "compare_loops", simulated)
+    junit = tmp_path / "out/junit.xml"
+    sound = ("--candidate", "parameters.damping=0.0501")
+    command = ("gate", "pendulum", broken(name), *sound, "--out", tmp_path, "--junit", junit)
+    assert call(monkeypatch, *command) == 3
+    assert f"{name}: " in capsys.readouterr().out
+    found = cases(junit)
+    assert found[name][0] == "error" and told in found[name][1]
+    assert found["parameters.damping=0.0501"][0] == "not reached"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("gate",),
+        ("gate", "pendulum", "--no-such-option"),
+        ("gate", "pendulum", "--alpha", "much"),
+        ("gate", "no_such_scenario", "--candidate", "variation=actual"),
+        ("gate", "pendulum", "--candidate", "variation=actual", "--metric", "frnt"),
+        ("--debug", "gate", "pendulum", "--candidate", "variation=actul"),
+    ],
+)
+def test_an_error_has_an_exit_code_of_its_own(monkeypatch, tmp_path, arguments):
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, *arguments) == 3
+
+
+def test_what_nobody_expects_is_an_error_too_with_its_traceback(monkeypatch, capsys):
+    def fail(*arguments, **options):
+        raise ZeroDivisionError("of the package")
+
+    for name in ("changed_loop", "make_app"):
+        monkeypatch.setattr(gate if name == "changed_loop" else cli, name, fail)
+        assert call(monkeypatch, *GATE, "--candidate", "variation=actual") == 3
+        assert "ZeroDivisionError: of the package" in capsys.readouterr().err
+
+
+@pytest.mark.train
+def test_a_run_that_ends_early_says_in_junit_what_is_known(monkeypatch, tmp_path, broken):
+    junit = tmp_path / "out/junit.xml"
+    command = (*GATE, broken("Late"), "--candidate", "parameters.damping=0.0501")
+    command = (*command, "--out", tmp_path / "out", "--junit", junit)
+    assert call(monkeypatch, *command) == 3
+    found = cases(junit)
+    assert found["Late"][0] == "error" and "TypeError: worn out" in found["Late"][1]
+    assert found["parameters.damping=0.0501"][0] == "not reached"
+
+    def stopped(*loops, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(gate, "compare_loops", stopped)
+    command = (*GATE, "--candidate", "variation=actual", "--out", tmp_path, "--junit", junit)
+    assert call(monkeypatch, *command) == 130
+    assert cases(junit)["variation=actual"][0] == "not reached"
 
 
 def test_a_candidate_is_told_by_the_name_of_its_file():

@@ -4,9 +4,10 @@ import math
 import numpy as np
 import pytest
 
+from drake_safety.evaluation.figure_style import spoken
 from drake_safety.evaluation.interval_figure import interval_figure
 from drake_safety.evaluation.metrics import Estimate, proportion
-from drake_safety.evaluation.results import Result, Results
+from drake_safety.evaluation.results import Result, Results, key_part
 from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
 from report_runs import make_figures
 from studies.documents import markdown, narrow
@@ -26,6 +27,12 @@ def test_a_key_names_set_method_and_metric(key, parts):
     row = Result.of(key, proportion(1, 2))
     assert (row.set, row.method, row.metric) == parts
     assert (row.value, row.n) == (0.5, 2)
+
+
+@pytest.mark.parametrize("name", ["collision (arm)", "a.b", "50 %", "left/right", "fall"])
+def test_a_constraint_may_have_any_name(name):
+    row = Result.of(f"plans.outcomes.{key_part(name)}", proportion(1, 2))
+    assert (row.set, row.method, spoken(row.metric)) == ("plans", "outcomes", name)
 
 
 def test_rows_are_selected_by_set_method_and_metric():

@@ -5,14 +5,20 @@ import numpy as np
 import pytest
 
 from drake_safety import AssessmentParameters, SafetyAssessment, load_assessment, load_scenario
+from drake_safety.evaluation.figure_style import save
+from drake_safety.evaluation.metrics import proportion
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.shift_study import (
     CONFIDENT,
     JudgedShift,
     assessment_judge,
     motions_of,
     shift_estimates,
+    shifts_figure,
+    shifts_tables,
 )
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
+from drake_safety.robots.robot_model import as_pattern
 from lip_assessments import QUICK, calibration
 from lip_episodes import make_episodes
 from studies.shifts import (
@@ -165,6 +171,60 @@ def test_the_catalogue_is_scaled_to_the_robot():
     shifts = plant_shifts(own, own.make_loop())
     assert list(shifts) == [f"variation {n}" for n in own.variations if n != "nominal"]
     assert run_changed_starts(own, 2, seed=1) == {}
+
+
+NAMES = ["friction+10%", "collision (arm)", "v1.heavy", "../up", "größe $a_1$ $", "0.5", "a%2Eb"]
+
+
+def test_a_variation_may_have_any_name(tmp_path):
+    scenario = load_scenario("pendulum")
+    nominal = scenario.variation("nominal")
+    scenario.variations = {"nominal": nominal} | dict.fromkeys(NAMES, nominal)
+    shifts = plant_shifts(scenario, scenario.make_loop())
+    found = {}
+    for name in shifts:
+        found[f"shifts.{name}.unsafe"] = proportion(1, 2)
+        found[f"shifts.{name}.gamma.unknown"] = proportion(1, 4)
+    Results(found).write(tmp_path / "shifts.json")
+    read = Results.read(tmp_path / "shifts.json")
+    (table,) = shifts_tables(read)
+    assert [row.label for row in table.rows] == [f"variation {n}".replace("_", " ") for n in NAMES]
+    assert all(None not in row.estimates for row in table.rows)
+    unknown = [row.set for row in read.select(method="gamma", metric="unknown")]
+    assert unknown == [f"shifts.{name}" for name in shifts]
+    save(shifts_figure(found), tmp_path / "shifts")
+
+
+@pytest.mark.parametrize("limit", [None, math.inf, 0.0])
+def test_the_loaded_joint_may_have_no_motor_or_no_limit(monkeypatch, limit):
+    scenario = load_scenario("laikago_balancing")
+    loop = scenario.make_loop()
+    usual = plant_shifts(scenario, loop)
+    (pattern,) = usual["weak_joint"].variation.shift.joints
+    plant = loop.kinematics.plant
+    motors = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
+    others = [one for one in motors if as_pattern(one.joint().name()) != pattern]
+    (own,) = set(motors) - set(others)
+    if limit is not None:
+        joint = own.joint()
+        others.append(SimpleNamespace(joint=lambda: joint, effort_limit=lambda: limit))
+
+    class Changed:
+        get_joint_actuator = others.__getitem__
+
+        def GetJointActuatorIndices(self):
+            return range(len(others))
+
+        def __getattr__(self, name):
+            return getattr(plant, name)
+
+    monkeypatch.setattr(loop.kinematics, "plant", Changed())
+    found = plant_shifts(scenario, loop)
+    if limit == math.inf:
+        assert usual.keys() - found.keys() == {"weak_joint"}
+    else:
+        (other,) = found["weak_joint"].variation.shift.joints
+        assert other != pattern
 
 
 def test_postures_and_falls_are_never_called_safe():

@@ -13,7 +13,8 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Container, Sequence
+import traceback
+from collections.abc import Callable, Container, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -50,6 +51,7 @@ _RESUMED = {"train": "--resume"} | dict.fromkeys(_KEEPING, "")
 """Commands that the same line continues after Ctrl-C, and the option that does so."""
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.
+_ERRORS = {"gate": 3}  # Exit codes of errors of commands for which 1 and 2 are results.
 
 
 class _Command(TyperCommand):
@@ -155,10 +157,11 @@ def _common(
 
 def main() -> None:
     """Runs the command."""
-    run_app(make_app(_called()), "drake-safety")
+    # An import that fails is an error of the command.
+    run_app(lambda *given, **options: make_app(_called())(*given, **options), "drake-safety")
 
 
-def run_app(commands: typer.Typer, program: str) -> None:
+def run_app(commands: Callable[..., Any], program: str) -> None:
     """Runs a command; user errors are printed as one line, with --debug as a traceback.
 
     SIGTERM stops it as Ctrl-C does.
@@ -168,24 +171,26 @@ def run_app(commands: typer.Typer, program: str) -> None:
     logging.getLogger("drake").setLevel(logging.WARNING)  # Whoever serves a page that stays tells.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     arguments = [argument for argument in sys.argv[1:] if argument != _DEBUG]
+    name = next(iter(arguments), "")
     try:
         code = commands(arguments, prog_name=program, standalone_mode=False)
         if code == _STOPPED:  # Typer's own answer to Ctrl-C.
             raise KeyboardInterrupt
-        sys.exit(code)
     except (typer.Abort, KeyboardInterrupt):
         console.say("stopped; finished episodes are kept")
-        if (name := next(iter(arguments), "")) in _RESUMED:
+        if name in _RESUMED:
             console.say("continue with:", console.command_line(program, _RESUMED[name]))
         sys.exit(_STOPPED)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if isinstance(error, (ValueError, OSError, EpisodeError)) and _DEBUG not in sys.argv:
             console.say("error", error, style="red")
             if isinstance(error, EpisodeError):
                 console.say(f"{_DEBUG} in the command line shows where")
-            sys.exit(2)
-        # Typer's own errors (unknown options, wrong types) have `show`.
-        if not hasattr(error, "exit_code") or not hasattr(error, "show"):
+        elif hasattr(error, "show"):  # Typer's own errors: unknown options, wrong types.
+            error.show()
+        elif name in _ERRORS:
+            traceback.print_exception(error)
+        else:
             raise
-        error.show()
-        sys.exit(error.exit_code)
+        sys.exit(_ERRORS.get(name, 2))
+    sys.exit(code)

@@ -266,11 +266,11 @@ def add_shifts(
     judges = judges or {name: shift_study.assessment_judge(one) for name, one in names.items()}
     scenario, seed, stages = evaluation.scenario, evaluation.seeds["shifts"], evaluation.stages
     folder, workers = evaluation.run_folder, evaluation.workers
+    shifts = plant_shifts(scenario, scenario.make_loop())
     nominal = shift_study.motions_of(evaluation.fresh("nominal motions", num_nominal, "shifts"))
     promise = gamma.calibrations_.get(MOTION)
     found: dict[str, Estimate] = {}
     sets: dict[str, MotionSet] = {"nominal": ("nominal", nominal[:_MOST_JUDGED])}
-    shifts = plant_shifts(scenario, scenario.make_loop())
     for i, (name, shift) in enumerate(shifts.items()):
         stages("shifted motions", i, len(shifts))
         shifted = shifted_scenario(scenario, name, shift)

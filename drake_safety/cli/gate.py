@@ -28,6 +28,7 @@ from drake_safety.evaluation.loop_comparison import (
     WORSE,
     Loop,
     Verdict,
+    check_pair,
     compare_loops,
     make_paired,
 )
@@ -49,6 +50,7 @@ _COLUMNS = (
 _OF_RATE = ("failure rate", "episodes", "failures", "random episodes of the same variance")
 _OF_COMMANDS = ("commanded", "from", "to", "pairs", "newly fail", "fail no longer")
 _OF_EPISODES = ("episode", "cause", "at [s]", "commanded", "Γ at its start: safe, unsafe, unknown")
+_NOT_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _POINTS = Column("", "", "points", digits=1)
 _PANELS = """<!doctype html><meta charset="utf-8">
 <style>body { display: flex; height: 95vh } iframe { flex: 1 }</style>"""
@@ -87,28 +89,38 @@ def gate(
     """Decide whether a candidate fails more often than the baseline, in the same episodes.
 
     It stops when it knows, and says worse, better, not worse by --worse-by, or undecided. Exit
-    code: 1 if a candidate is worse, 2 if one is undecided, else 0. Episodes are kept in OUT: the
-    same command continues.
+    code: 3 after an error, 1 if a candidate is worse, 2 if one is undecided, else 0; 130 after
+    Ctrl-C. Episodes are kept in OUT: the same command continues.
     """
-    first = changed_loop(scenario, baseline)
-    others = {Path(one).stem: changed_loop(one, baseline) for one in candidates or []}
+    given = {Path(one).stem: (one, baseline) for one in candidates or []}
     for text in dict.fromkeys(candidate or []):
-        name = text if _short(text) in others else _short(text)
-        others[name] = changed_loop(scenario, f"{baseline} {text}")
-    if len(others) < max(replay is None, len(candidates or []) + len(candidate or [])):
+        name = text if _short(text) in given else _short(text)
+        given[name] = (scenario, f"{baseline} {text}")
+    if len(given) < max(replay is None, len(candidates or []) + len(candidate or [])):
         raise ValueError("gate: name different candidates: YAML files, or --candidate KEY=VALUE")
-    folder = out or Path("runs") / f"{first.scenario.name}-gate"
-    folders.check_writable(folder, *([] if junit is None else [junit.parent]))
-    if replay is not None:
-        return _record(first, others, replay, seed, folder / f"episode-{replay}.html")
-    gamma = None
-    with contextlib.suppress(ValueError):  # That of this very scenario, if one is shipped.
-        shipped = folders.assessment_folder(first.scenario, None)
-        gamma = folders.load_assessment(shipped.path, MODES[0])
     found: dict[str, Verdict] = {}
+    wrong: dict[str, str] = {}
+    under_way, gamma, first_error = "", None, None
     try:
+        first = changed_loop(scenario, baseline)
+        folder = out or Path("runs") / f"{first.scenario.name}-gate"
+        folders.check_writable(folder, *([] if junit is None else [junit.parent]))
+        others: dict[str, Loop] = {}
+        for name, changed in given.items():
+            try:
+                others[name] = changed_loop(*changed)
+                check_pair((first, others[name]), metric=metric, seed=seed)
+            except (Exception, SystemExit) as error:  # Drake's failed assertions are SystemExit.
+                wrong[name], first_error = _told(error), first_error or error
+        if wrong:
+            raise ValueError("; ".join(map(": ".join, wrong.items()))) from first_error
+        if replay is not None:
+            return _record(first, others, replay, seed, folder / f"episode-{replay}.html")
+        with contextlib.suppress(ValueError):  # That of this very scenario, if one is shipped.
+            shipped = folders.assessment_folder(first.scenario, None)
+            gamma = folders.load_assessment(shipped.path, MODES[0])
         with console.open_stages() as stages:
-            for name, other in others.items():
+            for under_way, other in others.items():
                 compare_loops(
                     first,
                     other,
@@ -119,16 +131,20 @@ def gate(
                     seed=seed,
                     num_workers=workers,
                     path=folder / "episodes",
-                    progress=partial(stages, f"pairs, {name}"),
+                    progress=partial(stages, f"pairs, {under_way}"),
                     assessment=gamma,
-                    each_look=partial(found.__setitem__, name),
+                    each_look=partial(found.__setitem__, under_way),
                 )
-                stages(f"pairs, {name}", found[name].pairs, found[name].pairs)
+                pairs = found[under_way].pairs
+                stages(f"pairs, {under_way}", pairs, pairs)
+    except (Exception, SystemExit) as error:
+        wrong = wrong or dict.fromkeys([under_way] if under_way else given, _told(error))
+        raise
     finally:  # After Ctrl-C too.
+        if junit is not None and replay is None:
+            _write_junit(junit, Path(scenario).stem, given, found, wrong)
         if found:
             _report(first, found, metric, folder, seed, alpha / len(others))
-            if junit is not None:
-                _write_junit(junit, first.scenario.name, found)
     verdicts = {one.verdict for one in found.values()}
     raise Exit(1 if WORSE in verdicts else 2 if UNDECIDED in verdicts else 0)
 
@@ -170,7 +186,7 @@ def rate(
     rate = Column("", "", "%", digits=2).text(found.rate)
     row = (rate, found.rate.n, len(found.failures), round(found.plain_rollouts))
     _show(f"{loaded.name}, {variation}: {metric}", _OF_RATE, [row])
-    _show_episodes("Failures", found.failures, metric)
+    _show_episodes("Failures", found.failures, metric, found.output_names)
     entries = {"seed": seed, "metric": metric} | asdict(found)
     _write(folder / "rate.json", Loop(loaded, variation), entries, failure_rate=found.rate)
 
@@ -191,6 +207,10 @@ def changed_loop(scenario: str, changes: str) -> Loop:
     loaded = load_scenario(scenario, values)
     loaded.variation(variation)  # There is one.
     return Loop(loaded, variation)
+
+
+def _told(error: BaseException) -> str:
+    return f"{error}" if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
 
 
 def _short(changes: str) -> str:
@@ -229,6 +249,8 @@ def _report(
     _show(f"{first.scenario.name}, {first.variation}: {metric}", _COLUMNS, rows)
     for name, one in found.items():
         _show_changes(name, metric, one)
+        if one.pairs_needed:
+            console.say(f"{name}: a verdict would take about {one.pairs_needed} pairs like these")
     console.say(
         "a verdict, or an end of an interval, is wrong with a probability of at most "
         f"{100 * alpha:.3g} % a candidate, whenever one looks; 'not worse': by "
@@ -245,8 +267,9 @@ def _show_changes(name: str, metric: str, one: Verdict) -> None:
     new, old = one.newly_failing, one.no_longer_failing
     if not (new or old):
         return console.say(f"{name}: no episode ends differently")
-    _show_episodes(f"{name}: episodes that newly fail", new, metric)
-    _show_episodes(f"{name}: episodes that fail no longer", old, metric)
+    names = list(dict.fromkeys(row[0] for row in one.by_command))
+    _show_episodes(f"{name}: episodes that newly fail", new, metric, names)
+    _show_episodes(f"{name}: episodes that fail no longer", old, metric, names)
     rows, sides = [], BELIEFS if any(one.belief for one in new) else ()
     for cause in dict.fromkeys(each.cause for each in (*new, *old)):
         here = [each for each in new if each.cause == cause]
@@ -255,12 +278,21 @@ def _show_changes(name: str, metric: str, one: Verdict) -> None:
         rows.append((spoken(cause or metric), len(here), *map(believed.count, sides), lost))
     columns = ("cause", "newly fail", *(f"Γ: {what}" for what in sides), "fail no longer")
     _show(f"{name}: by cause", columns, rows)
-    _show(f"{name}: by what was commanded", _OF_COMMANDS, one.by_command)
+    by_command = [(_with_unit(entry), *row) for entry, *row in one.by_command]
+    _show(f"{name}: by what was commanded", _OF_COMMANDS, by_command)
     index = [*new, *old][0].episode
     return console.say("to see one:", console.command_line(option=f"--replay={index}"))
 
 
-def _show_episodes(title: str, episodes: Sequence[Outcome], metric: str) -> None:
+def _with_unit(entry: str) -> str:
+    """The name of an entry of the desired output, with its unit."""
+    units = {"velocity": "m/s", "rate": "rad/s"}
+    return f"{spoken(entry)} [{units.get(entry.rpartition('_')[2], 'm')}]"
+
+
+def _show_episodes(
+    title: str, episodes: Sequence[Outcome], metric: str, names: Iterable[str]
+) -> None:
     """Prints episodes that failed, the first ones in full."""
     if len(episodes) > _MOST_SHOWN:
         title += f": the first {_MOST_SHOWN} of {len(episodes)}"
@@ -272,7 +304,9 @@ def _show_episodes(title: str, episodes: Sequence[Outcome], metric: str) -> None
         )
         for one in episodes[:_MOST_SHOWN]
     ]
-    _show(title, _OF_EPISODES, rows)
+    columns = [*_OF_EPISODES]
+    columns[3] = ", ".join(map(_with_unit, names))
+    _show(title, columns, rows)
 
 
 def _show(title: str, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
@@ -289,18 +323,31 @@ def _write(file: Path, loop: Loop, entries: dict[str, Any], **figures: Estimate)
     console.say("figures", file)
 
 
-def _write_junit(file: Path, suite: str, found: Mapping[str, Verdict]) -> None:
-    """Writes JUnit XML, a test case a candidate: worse is a failure, undecided an error."""
-    kinds = {WORSE: "failure", UNDECIDED: "error"}
-    root = ElementTree.Element("testsuite", name=f"gate {suite}", tests=f"{len(found)}")
-    for name, one in found.items():
-        case = ElementTree.SubElement(root, "testcase", classname=suite, name=name)
-        told = f"{one.verdict} after {one.pairs} pairs: {_POINTS.text(one.difference[-1])} points"
-        if one.verdict in kinds:
-            ElementTree.SubElement(case, kinds[one.verdict], message=told)
-    for kind in kinds.values():
-        root.set(f"{kind}s", f"{len(list(root.iter(kind)))}")
+def _write_junit(
+    file: Path,
+    suite: str,
+    names: Iterable[str],
+    found: Mapping[str, Verdict],
+    wrong: Mapping[str, str],
+) -> None:
+    """Writes JUnit XML, a test case a candidate: worse is a failure, what is not known an error."""
+    root = ElementTree.Element("testsuite", name=f"gate {suite}")
+    for name in names:
+        case, kind = ElementTree.SubElement(root, "testcase", classname=suite, name=name), "error"
+        if name in wrong:
+            what, told = "error", wrong[name]
+        elif name in found:
+            one = found[name]
+            what, kind = one.verdict, {WORSE: "failure", UNDECIDED: "error"}.get(one.verdict, "")
+            told = f"{what} after {one.pairs} pairs: {_POINTS.text(one.difference[-1])} points"
+        else:
+            what, told = "not reached", "not reached: the command ended before"
+        if kind:
+            ElementTree.SubElement(case, kind, type=what, message=told)
+    counts = {"tests": "testcase", "failures": "failure", "errors": "error"}
+    root.attrib |= {key: f"{len([*root.iter(kind)])}" for key, kind in counts.items()}
     file.parent.mkdir(parents=True, exist_ok=True)
+    text = ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
     with replacing(file) as temporary:
-        ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
+        temporary.write_text(_NOT_XML.sub("?", text), encoding="utf-8")
     console.say("JUnit  ", file)

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, proportion, segment_estimates, threshold_at
+from drake_safety.evaluation.results import key_part
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.learning.calibration import episodes_needed, least_miss_rate, score_threshold
 from drake_safety.learning.seeds import check_unused
@@ -83,7 +84,7 @@ def evaluate_plans(
     causes = [episode.cause for episode in test]
     for name in ("", *test.info.constraint_names, DIVERGED):
         share = proportion(causes.count(name), len(causes))
-        estimates[f"plans.outcomes.{name or 'safe'}"] = share
+        estimates[f"plans.outcomes.{key_part(name) or 'safe'}"] = share
     return estimates, scores, first
 
 

@@ -10,6 +10,7 @@ import os
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -56,6 +57,7 @@ _STYLE: dict[Any, Any] = {
     "figure.constrained_layout.w_pad": 0.08,
     "savefig.facecolor": "white",
     "svg.hashsalt": "drake_safety",
+    "text.parse_math": False,  # Names may have a dollar.
 }
 
 _LABELS = {
@@ -118,8 +120,8 @@ def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:
 
 
 def spoken(name: str) -> str:
-    """A name as readable text: `support_polygon` → support polygon."""
-    return name.replace("_", " ")
+    """A name, or part of a key, as readable text: `support_polygon` → support polygon."""
+    return unquote(name).replace("_", " ")
 
 
 def label_of(key: str) -> str:

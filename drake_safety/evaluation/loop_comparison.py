@@ -18,14 +18,15 @@ from pydrake.systems.framework import Context
 
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, Outcomes
-from drake_safety.evaluation.paired_test import look
+from drake_safety.evaluation.paired_test import look, pairs_needed
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import GATE
 from drake_safety.learning.segments import Episode
 from drake_safety.simulation.capabilities import CanStartAnywhere, HasDisturbances
 from drake_safety.simulation.closed_loop import ClosedLoop
+from drake_safety.simulation.contract import check_contract
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
-from drake_safety.simulation.rollouts import check_kept, episodes_info, run_episode
+from drake_safety.simulation.rollouts import check_kept, episode_rng, episodes_info, run_episode
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import MadeOnce, Progress, map_items
 
@@ -58,6 +59,8 @@ class Verdict:
         no_longer_failing: The baseline's that do worse.
         by_command: Rows of an entry of the desired output, a range, a third of all pairs, their
             number, and how many of them newly fail and fail no longer.
+        pairs_needed: Number of pairs that a verdict takes, if all are like those so far; None if
+            there is one, or it takes over a thousand times as many.
     """
 
     verdict: str
@@ -69,6 +72,7 @@ class Verdict:
     no_longer_failing: list[Outcome]
     by_command: list[tuple[str, float, float, int, int, int]]
     worse_by: float
+    pairs_needed: int | None = None
 
 
 def compare_loops(
@@ -110,10 +114,7 @@ def compare_loops(
         got = f"{worse_by}, {alpha} and {max_pairs}"
         raise ValueError(f"worse_by and alpha must be in (0, 1), max_pairs at least 1; got {got}")
     one, two = (Loop(x) if isinstance(x, Scenario) else x for x in (baseline, candidate))
-    hashes = [scenario.simulation_hash(variation) for scenario, variation in (one, two)]
-    if hashes[0] == hashes[1]:
-        who = f"scenario '{one.scenario.name}', variation '{one.variation}'"
-        raise ValueError(f"the candidate is the baseline: {who}, with hash {hashes[0][:12]}")
+    hashes = _hashes((one, two))
     # The texts say what the hashes leave out.
     texts = (scenario.to_yaml() for scenario, _ in (one, two))
     make = MadeOnce((*hashes, *texts), lambda: [make_paired((one, two), side) for side in (0, 1)])
@@ -159,10 +160,42 @@ def compare_loops(
             looks[0].append(look(apart, looks[0], alpha))
             looks[1].append(look(later_s, looks[1], alpha, one.scenario.episode_duration_s))
             verdict = _verdict(pairs, looks, worse_by, loops[0].output_names)
+            if verdict.verdict == UNDECIDED:
+                needed = pairs_needed(apart, worse_by, alpha)
+                verdict = replace(verdict, pairs_needed=needed)
             each_look(verdict)
             if verdict.verdict != UNDECIDED:
                 break
     return verdict
+
+
+def check_pair(pair: tuple[Loop, Loop], *, metric: Metric = UNSAFE, seed: int = GATE.first) -> None:
+    """Builds two loops and begins their first episode, before hours of simulations.
+
+    Raises:
+        ValueError: They are the same or do not start alike, one of them breaks the contract of
+            :class:`ClosedLoop`, or there is no such metric.
+    """
+    _hashes(pair)
+    starts = []
+    for side, who in enumerate(("baseline", "candidate")):
+        loop = make_paired(pair, side)
+        Outcomes(loop, metric)
+        for one in check_contract(loop, seed=seed):
+            if not one.is_ok:
+                raise ValueError(f"the {who}'s {one.item}: {one.message}; {one.remedy}")
+        context = loop.CreateDefaultContext()
+        loop.reset(context, episode_rng(seed, 0))
+        starts.append(_start_of(loop, context))
+    _check_alike(0, loop, *starts)
+
+
+def _hashes(pair: tuple[Loop, Loop]) -> list[str]:
+    hashes = [scenario.simulation_hash(variation) for scenario, variation in pair]
+    if hashes[0] == hashes[1]:
+        who = f"scenario '{pair[0].scenario.name}', variation '{pair[0].variation}'"
+        raise ValueError(f"the candidate is the baseline: {who}, with hash {hashes[0][:12]}")
+    return hashes
 
 
 def _verdict(

@@ -23,8 +23,8 @@ BELIEFS = ("safe", "unsafe", "don't know")
 
 Metric = str | Callable[[Episode], float]
 """How bad an episode is, in [0, 1]: ``unsafe``, ``fall``, a constraint, ``tracking=BOUND``, or a
-function of an episode. Episodes of the first and the last end where they leave the safe set; others
-go on until a fall."""
+function of an episode. Episodes of the first and the last end where they leave the safe set, those
+of a constraint where it is violated; others go on until a fall."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +64,8 @@ class Outcomes:
         self._bad_rows = _bad_rows(loop, UNSAFE if callable(metric) else metric)
         goes_on = not callable(metric) and metric != UNSAFE
         self.simulated: dict[str, Any] = {"after_leaving_s": math.inf} if goes_on else {}
+        if (name := _constraint(loop, metric)) in loop.constraint_names:
+            self.simulated["until"] = name
 
     def of(self, episode: Episode) -> Outcome:
         """What is kept of an episode.
@@ -101,14 +103,20 @@ def _bad_rows(loop: ClosedLoop, metric: str) -> Callable[[Episode], np.ndarray]:
             (np.linalg.norm(one.output - one.desired_output, axis=1) > float(bound))
             | _last_row(one, one.num_steps < num_steps)
         )
-    name = require(loop, CanFall, "metric 'fall'").fall_name if metric == "fall" else metric
+    name = _constraint(loop, metric)
     if name not in names:
         known = [UNSAFE, "fall", "tracking=BOUND", *names]
         raise ValueError(
             f"metric '{metric}'{did_you_mean(metric, known)}: expected one of {known}, or in "
             "Python a function of an episode"
         )
-    return lambda one: one.margins[:, names.index(name)] < 0.0
+    # The cause may be a constraint without a negative margin, by a task's own port ``safe``.
+    return lambda one: (one.margins[:, names.index(name)] < 0.0) | _last_row(one, one.cause == name)
+
+
+def _constraint(loop: ClosedLoop, metric: Metric) -> Metric:
+    """The metric, or the constraint of a fall."""
+    return require(loop, CanFall, "metric 'fall'").fall_name if metric == "fall" else metric
 
 
 def _last_row(episode: Episode, is_bad: bool) -> np.ndarray:

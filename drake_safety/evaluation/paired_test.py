@@ -17,6 +17,7 @@ from drake_safety.evaluation.metrics import Estimate
 _SHARES = 0.95 * 0.5 ** np.arange(8)
 """Shares u of the capital that are bet. Large ones have larger weights: failures are rare."""
 _WEIGHTS = np.sqrt(_SHARES) / np.sqrt(_SHARES).sum()
+_MOST_TIMES = 1000.0  # As many pairs as so far.
 _EDGE = 1e-9  # Of the range of means, where a bet would be infinite.
 
 
@@ -63,6 +64,19 @@ def look(
     low = max([low, *(one.low for one in before[-1:])])
     high = min([high, *(one.high for one in before[-1:])])
     return Estimate(float(np.mean(outcomes)), low, high, len(outcomes))
+
+
+def pairs_needed(outcomes: Sequence[float], bound: float, alpha: float) -> int | None:
+    """Number of pairs that decide, if all are like the outcomes so far, (N,); None if too many.
+
+    Then an interval excludes 0, or what is above ``bound``.
+    """
+    values, counts = np.unique(outcomes, return_counts=True)
+    times = np.geomspace(1.0, _MOST_TIMES, 400)[:, None]
+    bets = ((1.0, 0.0), (-1.0, 0.0), (-1.0, -bound))
+    log_e = [betting_log_e(sign * values, times * counts, mean) for sign, mean in bets]
+    is_known = np.max(log_e, axis=0) >= -math.log(alpha)
+    return math.ceil(len(outcomes) * times[np.argmax(is_known), 0]) if is_known.any() else None
 
 
 def _low(values: np.ndarray, counts: np.ndarray, alpha: float) -> float:

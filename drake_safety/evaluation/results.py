@@ -19,7 +19,13 @@ SCHEMA_VERSION = 1
 _NUM_DIGITS = 6  # Significant digits in a file, more than any table shows.
 _DOT = re.compile(r"(?<!\d)\.|\.(?!\d)")  # A dot between digits belongs to a number.
 _DAMAGES = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError)
-_KEY = re.compile(r"[\w -]+(\.[\w -]+)*")
+_KEY = re.compile(r"[\w% -]+(\.[\w% -]+)*")
+_OTHER = re.compile(rf"[^\w .-]|{_DOT.pattern}")  # Characters that a part of a key does not have.
+
+
+def key_part(name: str) -> str:
+    """Any name as one part of a key, as in an address: ``friction+10%`` → ``friction%2B10%25``."""
+    return _OTHER.sub(lambda one: "".join(f"%{byte:02X}" for byte in one[0].encode()), name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +47,8 @@ class Result(Estimate):
         """The row with a key "set.method.metric", "set.metric" or "metric"; a set may have dots."""
         if not _KEY.fullmatch(key):
             raise ValueError(
-                f"a result has the key '{key[:80]}', expected letters, digits, spaces, '_' and "
-                "'-' between dots"
+                f"a result has the key '{key[:80]}', expected letters, digits, spaces, '_', '%' "
+                "and '-' between dots"
             )
         *rest, metric = _DOT.split(key)
         method = rest.pop() if len(rest) > 1 else ""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS
+from drake_safety.evaluation.results import key_part
 from drake_safety.robots.robot import ObservationNoise, Payload, PlantVariation
 from drake_safety.robots.robot_model import as_pattern
 from drake_safety.robots.robot_size import GRAVITY_M_S2
@@ -34,12 +35,12 @@ class PlantShift:
 
 
 def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
-    """Shifts of plant and sensors from the nominal plant, and the scenario's variations, by name.
+    """Shifts of plant and sensors from the nominal plant, and the scenario's variations.
 
-    Robots with legs have more.
+    They are by name, as a part of a key. Robots with legs have more.
     """
     own = {
-        f"variation {name}": PlantShift(
+        f"variation {key_part(name)}": PlantShift(
             kind="plant", variation=variation, options=scenario.options_for("pairs", name)
         )
         for name, variation in scenario.variations.items()
@@ -52,23 +53,23 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     q = kinematics.standing_positions()
     is_stance = np.ones(kinematics.num_contacts, dtype=bool)
     torques = np.abs(kinematics.gravity_torques(q, is_stance))
-    loaded = int(np.argmax(torques))
-    joint = kinematics.joint_names[loaded]
+    plant = kinematics.plant
+    motors = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
+    limits = {one.joint().name(): one.effort_limit() for one in motors if one.effort_limit() > 0.0}
+    loads = dict(zip(kinematics.joint_names, torques.tolist(), strict=True))
+    joint = max((name for name in loads if name in limits), key=loads.__getitem__)
     key = as_pattern(joint)
     foot = kinematics.foot_names[0]
-    plant = kinematics.plant
-    motors = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
-    limit = next(motor.effort_limit() for motor in motors if motor.joint().name() == joint)
-    weak_scale = 0.9 * torques[loaded] / limit  # Too weak to stand.
     late_s = _whole(5 * scenario.control_period_s, scenario.time_step_s)
     lasting = {
         "slope": Shift(slope_rad=math.radians(10.0)),
         "side_force": Shift(base_force_n=[0.0, 0.1 * mass_kg * GRAVITY_M_S2, 0.0]),
-        "weak_joint": Shift(joints={key: JointShift(effort_scale=weak_scale)}),
         "locked_joint": Shift(joints={key: JointShift(is_locked=True)}),
         "late_command": Shift(command_delay_s=late_s),
         "hole": Shift(holes_m={foot: 0.07 * kinematics.standing_height}),
     }
+    if 0.0 < (weak_scale := 0.9 * loads[joint] / limits[joint]):  # Too weak to stand.
+        lasting["weak_joint"] = Shift(joints={key: JointShift(effort_scale=weak_scale)})
     if robot.gains_of(joint) is not None:
         lasting["soft_joint"] = Shift(joints={key: JointShift(stiffness_scale=0.5)})
     names = [as_pattern(name) for name in plant.GetStateNames(add_model_instance_prefix=False)]

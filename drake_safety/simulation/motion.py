@@ -261,7 +261,8 @@ def simulate(
                 while waiting and waiting[0][0] <= time_s:
                     event_s, act = waiting.pop(0)
                     advance(event_s)
-                    act(context)
+                    if not is_ended:
+                        act(context)
                 advance(time_s)
                 if is_last := is_over(now_s) or is_ended:
                     break
