@@ -157,6 +157,8 @@ class Walking(LeggedLoop):
             for name in ("state", "features"):
                 builder.Connect(self._seen[name], guard_system.GetInputPort(name))
         assessor = self.export(builder, ports, period_s=parameters.assessment_period_s)
+        if guard_system is not None and assessor is not None:
+            builder.Connect(assessor.GetOutputPort("learned"), guard_system.GetInputPort("learned"))
         if trigger is not None and assessor is not None:
             for name in ("safety_probability", "belief"):
                 builder.Connect(assessor.GetOutputPort(name), trigger.GetInputPort(name))

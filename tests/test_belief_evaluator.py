@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from drake_safety import load_assessment
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
 from system_doubles import NOVELTY, AssessmentDouble, Bench, correction
 
@@ -118,3 +119,68 @@ def test_outside_the_safe_set_nothing_is_safe_until_it_has_been_entered_again(ma
     bench.fix(margins=[0.1, 0.2])
     bench.advance(PERIOD_S)
     np.testing.assert_allclose(bench.get("belief"), [0.25, 0.65, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("margins", "cause"),
+    [
+        ([0.1, np.nan], 1),
+        ([np.nan, -1.0], 0),
+        ([-1.0, np.nan], 1),
+        ([np.inf, 0.1], 0),
+        ([0.1, -np.inf], 1),
+        ([-1.0, np.inf], 1),
+        ([np.nan, np.nan], 0),
+    ],
+)
+def test_a_margin_that_is_not_finite_is_outside_the_safe_set_and_the_cause(margins, cause):
+    _, bench = running()
+    bench.fix(margins=margins)
+    bench.begin()
+    np.testing.assert_allclose(bench.get("belief"), [0.0, 0.9, 0.1])
+    assert bench.get("safety_probability") == 0.0
+    np.testing.assert_allclose(bench.get("cause_probability") - [0.2, 0.3], 0.25 * np.eye(2)[cause])
+
+
+@pytest.mark.parametrize("alarm", [1.0, np.nan, np.inf, -np.inf])
+def test_an_alarm_that_is_not_finite_is_one(alarm):
+    _, bench = running()
+    bench.fix(alarm=alarm)
+    np.testing.assert_array_equal(bench.begin().get("belief"), [0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("entry", ["state", "desired_preview", "features", "beliefs"])
+def test_what_is_not_finite_is_not_known_and_may_fall(entry):
+    assessment = load_assessment("go2_walking" if entry == "features" else "laikago_balancing")
+    info = assessment.info_
+    widths = {"state": len(info.state_names), "features": len(info.feature_names)}
+    widths["desired_preview"] = info.horizon * len(info.output_names)
+    given = {name: np.zeros(width) for name, width in widths.items()}
+    evaluator = BeliefEvaluator(assessment, period_s=0.02, checks_margins=False, heeds_alarm=False)
+    if entry in given:
+        given[entry][-1] = np.nan
+    bench = Bench(evaluator, **given)
+    if entry == "beliefs":
+        beliefs = np.full_like(assessment.beliefs_, np.nan)
+        with pytest.raises(ValueError, match="beliefs must be finite"):
+            evaluator.set_beliefs(bench.context, beliefs)
+        bench.context.get_mutable_numeric_parameter(0).SetFromVector(beliefs.ravel())
+    bench.begin()
+    np.testing.assert_array_equal(bench.get("belief"), [0.0, 0.0, 1.0])
+    assert bench.get("safety_probability") == 0.0
+    is_learned = assessment.fall_logit_ is not None and entry != "beliefs"
+    assert bench.get("fall_probability") == 1.0 if is_learned else True
+
+
+@pytest.mark.parametrize("mode", ["paper", "sharpened"])
+def test_where_no_falls_were_learned_their_probability_is_not_a_number(mode):
+    assessment = load_assessment("laikago_balancing", mode)
+    assessment.fall_logit_ = None
+    info = assessment.info_
+    rows = [np.zeros(info.widths[name]) for name in ("state", "desired_preview", "features")]
+    expected = assessment.predict_one(*rows).fall_probability
+    names = ("state", "desired_preview", "features")
+    system = BeliefEvaluator(assessment, period_s=0.02, checks_margins=False, heeds_alarm=False)
+    bench = Bench(system, **dict(zip(names, rows, strict=True)))
+    for found in (expected, bench.get("fall_probability"), bench.begin().get("fall_probability")):
+        assert np.isnan(found)

@@ -1,6 +1,11 @@
+import copy
+
 import numpy as np
 import pytest
+from pydrake.systems.analysis import Simulator
 
+from drake_safety import load_assessment, load_scenario
+from drake_safety.learning.beliefs import empty
 from system_doubles import HORIZON, LIMITS, OUTLOOK, Bench, SlowIsSafe, guard
 
 
@@ -56,3 +61,37 @@ def test_a_guard_that_does_not_act_passes_on_everything():
     out = passed_on(SlowIsSafe(fastest=1.5), [2.5, 0.4, 0.0], is_acting=False)
     np.testing.assert_array_equal(out["desired_output"], [2.5, 0.4, 0.0])
     assert out["safety_probability"][0] == 0.0
+
+
+@pytest.mark.parametrize("state", [0.0, np.nan])
+def test_a_guard_that_does_not_act_passes_on_what_it_cannot_judge(state):
+    out = passed_on(SlowIsSafe(), [2.5, 0.4, 0.0], state, is_acting=False)
+    np.testing.assert_array_equal(out["desired_output"], [2.5, 0.4, 0.0])
+
+
+@pytest.mark.parametrize("what", ["beliefs", "an alarm"])
+def test_a_guard_judges_by_what_the_evaluator_has_adopted_and_during_an_alarm_by_nothing(what):
+    assessment = load_assessment("go2_walking")
+    loop = load_scenario("go2_walking").make_loop(assessment=assessment, guard=True)
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset_standing(context, np.array([0.3, 0.0, 0.0]))
+    guard_system = loop.GetSubsystemByName("command_guard")
+    assessor = loop.GetSubsystemByName("safety_assessor")
+
+    def probability():
+        port = guard_system.GetOutputPort("safety_probability")
+        return port.Eval(guard_system.GetMyContextFromRoot(context))[0]
+
+    simulator.AdvanceTo(0.01)
+    assert probability() > 0.5
+    if what == "beliefs":
+        adapted = copy.copy(assessment)
+        adapted.beliefs_ = empty(assessment.beliefs_.shape[:-1], assessment.beliefs_.shape[-1] - 3)
+        assessor.adopt(assessor.GetMyMutableContextFromRoot(context), adapted)
+    else:
+        port = assessor.evaluator.GetInputPort("alarm")
+        port.FixValue(assessor.evaluator.GetMyMutableContextFromRoot(context), [1.0])
+    simulator.AdvanceTo(0.12)
+    assert loop.GetOutputPort("safety_probability").Eval(context) == 0.0
+    assert probability() == 0.0

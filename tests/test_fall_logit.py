@@ -49,13 +49,13 @@ def test_it_tells_falls_from_other_ends_where_the_probability_of_staying_safe_ca
     assert of_falls > 0.7
 
 
-def test_it_is_of_one_row_what_it_is_of_many_and_unknown_where_nothing_is(fitted, tmp_path):
+def test_it_is_of_one_row_what_it_is_of_many_and_certain_where_nothing_is_known(fitted, tmp_path):
     rows = rows_of(until_falls(13, num=5)[0])
     rows[0][3, 1] = np.nan
     many = fitted.predict(*rows).fall_probability
     one = [fitted.predict_one(*row).fall_probability for row in zip(*rows, strict=True)]
     np.testing.assert_array_equal(many, one)
-    assert np.isnan(many[3]) and np.isfinite(np.delete(many, 3)).all()
+    assert many[3] == 1.0 and (np.delete(many, 3) < 1.0).all()
     fitted.save(tmp_path / "file")
     read = SafetyAssessment.load(tmp_path / "file")
     np.testing.assert_array_equal(read.predict(*rows).fall_probability, many)

@@ -351,8 +351,14 @@ def test_the_command_writes_the_file_and_prints_what_is_promised(monkeypatch, ca
     assert Runtime(file).contract["scenario"] == "laikago_balancing"
 
 
-def test_the_python_of_the_page_runs_and_prints_a_verdict(monkeypatch, capsys, tmp_path):
-    load_assessment("laikago_balancing").to_onnx(tmp_path / "gamma.onnx")
+@pytest.mark.parametrize("is_calibrated", [True, False])
+def test_the_python_of_the_page_runs_and_prints_a_verdict(
+    is_calibrated, monkeypatch, capsys, tmp_path
+):
+    assessment = load_assessment("laikago_balancing")
+    if not is_calibrated:
+        assessment.calibrations_ = {}
+    assessment.to_onnx(tmp_path / "gamma.onnx")
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"^```python\n(.*?)^```$", DOCUMENTED.read_text(), re.DOTALL | re.M)
     exec(code, {})

@@ -37,6 +37,7 @@ class Triggered(Bench):
         (math.nan, 0.6, True),
         (0.0, 0.0, False),
         (math.nan, 0.0, True),
+        (math.inf, 0.6, True),
     ],
 )
 def test_it_fires_below_the_threshold_and_when_nothing_is_known(probability, threshold, fires):

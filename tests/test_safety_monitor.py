@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.safety_monitor import SafetyMonitor
@@ -33,10 +34,11 @@ def test_it_is_safe_exactly_while_no_margin_of_the_present_state_is_negative():
         np.testing.assert_allclose(bench.get("margins"), margins)
 
 
-def test_a_margin_that_is_no_number_is_not_safe():
+@pytest.mark.parametrize("margin", [np.nan, np.inf, -np.inf])
+def test_a_margin_that_is_not_finite_is_not_safe(margin):
     class Broken(BoxSafeSet):
         def margins(self, q, v):
-            return np.array([np.nan, 1.0])
+            return np.array([margin, 1.0])
 
     assert Bench(SafetyMonitor(Broken(), 1, 1), plant_state=[0.0, 0.0]).get("safe") == 0
 

@@ -12,7 +12,9 @@ import system_block
 from drake_safety import load_assessment
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
+from drake_safety.control.walking_safe_set import WalkingLimits, WalkingSafeSet
 from drake_safety.diagrams.pendulum import PendulumController, PendulumObserver, PendulumParameters
+from drake_safety.robots.robot import ObservationNoise
 from drake_safety.robots.shift import Fault
 from drake_safety.systems.assessor_inputs import AssessorInputs
 from drake_safety.systems.belief_evaluator import BeliefEvaluator
@@ -36,6 +38,7 @@ PERIOD = {"period_s": 0.01}
 LATE = PERIOD | {"offset_s": 0.002}
 ROWS = PERIOD | {"horizon": 4, "num_outlook": 3}
 FAULTS = [Fault(kind="delay", value=0.2), Fault(kind="half_rate")]
+LIMITS = BalanceLimits()
 STEPS = RecoveryStepParameters(min_steps=1, max_steps=1)
 LEARNED = load_assessment("laikago_balancing")
 N_S, N_F = len(LEARNED.info_.state_names), len(LEARNED.info_.feature_names)
@@ -44,7 +47,7 @@ SEEN = f"state {N_S}, desired_preview {N_P}, features {N_F}"
 PLAN = "desired_output 3, desired_preview 12, desired_outlook 9"
 ALARM = f"alarm 1, levels {N_S}, alarm_cause -"
 BELIEF = "safety_probability 1, belief 3, embedding 2, novelty 1, fall_probability 1, "
-BELIEF += "cause_probability {0}, predicted_margins {0}"
+BELIEF += "cause_probability {0}, predicted_margins {0}, learned -"
 # Ports with their sizes; `?`: may be left open; `<`: of these inputs, or of all of them, at once.
 CASES = {
     "SensorFaults": (
@@ -64,7 +67,7 @@ CASES = {
     ),
     "BeliefEvaluator": (
         lambda: BeliefEvaluator(AssessmentDouble(), **PERIOD),
-        f"state 2, desired_preview 6, features 3, margins 2, alarm 1 -> {BELIEF.format(2)}",
+        f"state 2, desired_preview 6, features 3, margins 2, alarm 1 -> {BELIEF.format(2)} < alarm",
     ),
     "ChangeMonitor": (lambda: ChangeMonitor(LEARNED), f"{SEEN}, hold? 1 -> {ALARM}"),
     "SafetyAssessor": (
@@ -73,7 +76,7 @@ CASES = {
     ),
     "CommandGuard": (
         lambda: guard(SlowIsSafe()),
-        f"command 3, state 1, features 3 -> {PLAN}, is_changed 1, safety_probability 1",
+        f"command 3, state 1, features 3, learned? - -> {PLAN}, is_changed 1, safety_probability 1",
     ),
     "FeedbackRecorder": (
         lambda: FeedbackRecorder(INFO, num_steps=5, plant_state_size=2, watch_period_s=0.01),
@@ -162,15 +165,20 @@ class Given(Bench):
         make, text = CASES[key]
         inputs, outputs = (side.split(", ") for side in text.split(" -> "))
         pairs = [one.split() for one in inputs]
-        self.inputs = {name.strip("?"): int(size) for name, size in pairs}
+        # An abstract port, `-`, has the size 0.
+        self.inputs = {name.strip("?"): int(size.replace("-", "0")) for name, size in pairs}
         self.optional = {name.strip("?") for name, _ in pairs if "?" in name}
         self.promised, self.through = {}, set()
         for output in outputs:
             name, size, *sources = output.replace(" < ", " ").split()
             self.promised[name] = size
             self.through |= {(one, name) for one in self.inputs if one in sources or "*" in sources}
-        given = {port: self.value(key, port) for port in self.inputs.keys() - set(without)}
+        given = {port: self.value(key, port) for port in self.vectors - set(without)}
         super().__init__(make(), **given | values)
+
+    @property
+    def vectors(self):
+        return {port for port, size in self.inputs.items() if size}
 
     def value(self, key, port):
         if port == "plant_state" and len(key.split()) > 1:
@@ -252,7 +260,7 @@ def test_the_docstring_says_the_size_of_every_port_and_which_may_be_left_open(ke
         product = re.sub(r"(?<=\w) (?=\w)", " * ", port.size)
         return None if product == "abstract" else eval(product, symbols(key))
 
-    assert {one.name: size(one) for one in block.inputs} == given.inputs
+    assert {one.name: size(one) or 0 for one in block.inputs} == given.inputs
     promised = {name: None if n == "-" else int(n) for name, n in given.promised.items()}
     assert {one.name: size(one) for one in block.outputs} == promised
     assert {one.name for one in block.inputs if one.remark == "optional"} == given.optional
@@ -280,14 +288,15 @@ def test_all_memory_is_in_the_context_so_a_clone_goes_on_as_if_alone(key):
     clone = Bench(given.system)
     clone.simulator.reset_context(given.context.Clone())
     clone.context = clone.simulator.get_mutable_context()
-    given.fix(**{port: given.value(key, port) + np.full(1, 0.1) for port in given.inputs})
+    given.fix(**{port: given.value(key, port) + np.full(1, 0.1) for port in given.vectors})
     given.at(0.3)
     for time_s in (0.06, 0.1, 0.3):
         for bench in (clone, alone):
             bench.simulator.AdvanceTo(time_s)
         expected = alone.outputs()
         for name, found in clone.outputs().items():
-            np.testing.assert_array_equal(found, expected[name])
+            if given.promised[name] != "-":
+                np.testing.assert_array_equal(found, expected[name])
 
 
 NOT_FINITE = {
@@ -313,6 +322,34 @@ def test_an_entry_that_is_not_finite_has_the_promised_answer(key, port, value):
         found = Given(key, **{port: values}).at(0.01)
         for name, expected in promised.items():
             np.testing.assert_array_equal(found[name], np.broadcast_to(expected, found[name].shape))
+
+
+@pytest.mark.parametrize("norm", [0.0, 1e-160, 1e-12, np.nan])
+@pytest.mark.parametrize("has_noise", [False, True])
+@pytest.mark.parametrize("is_walking", [False, True])
+def test_a_base_without_orientation_is_unknown_and_outside_the_safe_set(
+    is_walking, has_noise, norm
+):
+    k = robot_kinematics("laikago")
+    x = np.append(k.standing_positions(), np.zeros(k.num_velocities))
+    x[:4] *= norm
+    safe_set = WalkingSafeSet(k, WalkingLimits()) if is_walking else BalanceSafeSet(k, LIMITS)
+    options = {"num_outlook": 2, "gravity": [0.0, 0.0, -9.81], "is_walking": is_walking}
+    given = {"plant_state": x, "desired_outlook": np.zeros(6)}
+    inputs = Bench(AssessorInputs(k, safe_set, **options), **given).outputs()
+    monitor = SafetyMonitor(safe_set, k.num_positions, k.num_velocities)
+    monitored = Bench(monitor, plant_state=x).outputs()
+    noise = ObservationNoise(position=0.01, velocity=0.01) if has_noise else None
+    observer = StateObserver(k, noise, is_walking=is_walking)
+    given = {"plant_state": x} | ({"noise": np.ones(2 * k.num_velocities)} if has_noise else {})
+    observed = Bench(observer, **given).outputs()
+    for found in (inputs["state"], inputs["features"][:-2], observed["state"]):
+        assert np.isnan(found).all()
+    assert monitored["safe"] == 0.0
+    for found in (inputs["margins"], monitored["margins"]):
+        assert (found == -np.inf).all()
+    # The position is as measured; a velocity in the heading frame needs an orientation.
+    assert np.isnan(observed["output"]).all() if is_walking else observed["output"][2] > 0.3
 
 
 @pytest.mark.parametrize(

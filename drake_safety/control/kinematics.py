@@ -32,6 +32,13 @@ except ImportError:  # Online environments do not need scipy: see docs/online.md
 
 NUM_BASE_POSITIONS = 7
 NUM_BASE_VELOCITIES = 6
+_LEAST_QUATERNION = 1e-3  # Norm of a quaternion that is an orientation.
+
+
+def is_state(q: np.ndarray, *others: np.ndarray) -> bool:
+    """Whether all entries are finite, and the base has an orientation: a dead sensor has none."""
+    size = math.hypot(*(one for part in (q, *others) for one in part.ravel().tolist()))
+    return size * size < math.inf and math.hypot(*q[:4].tolist()) > _LEAST_QUATERNION
 
 
 @dataclass(eq=False)
@@ -134,8 +141,8 @@ class RobotKinematics:
 
     def set_positions(self, q: np.ndarray) -> None:
         """Sets the positions (n_q,) of the scratch Context."""
-        # Drake's plant aborts the process for positions that are not finite.
-        if not q.dot(q) < math.inf:
+        # Drake's plant aborts the process for positions that are not finite, or without a rotation.
+        if not is_state(q):
             raise ValueError(f"robot '{self.robot.name}': positions must be finite; got {q}")
         self.plant.SetPositions(self.context, q)
 

@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 
-from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.kinematics import RobotKinematics, is_state
 from drake_safety.robots.robot import ObservationNoise
 
 _LEAST_FOOT_SPREAD_M = 0.005  # Root mean square extent of the feet that defines a plane.
@@ -47,9 +47,9 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
 
     Returns:
         (12 + 2 n_j,) [m, rad, m/s, rad/s], in the order of :func:`state_names`; all NaN if a
-        position or velocity is not finite.
+        position or velocity is not finite, or the quaternion zero.
     """
-    if not q.dot(q) + v.dot(v) < math.inf:
+    if not is_state(q, v):
         return np.full(12 + 2 * kinematics.num_joints, np.nan)
     x, y, yaw = kinematics.stance_pose(q)
     R_SW = RotationMatrix.MakeZRotation(-yaw)
@@ -78,16 +78,21 @@ def walking_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> 
 
     Returns:
         (10 + 2 n_j,) [m, rad/s, m/s, rad], in the order of :func:`walking_state_names`; all NaN if
-        a position or velocity is not finite.
+        a position or velocity is not finite, or the quaternion zero.
     """
-    if not q.dot(q) + v.dot(v) < math.inf:
+    if not is_state(q, v):
         return np.full(10 + 2 * kinematics.num_joints, np.nan)
     R_BW = RotationMatrix(quaternion_of(q)).matrix().T
     return np.concatenate([q[6:7], -R_BW[:, 2], R_BW @ v[:3], R_BW @ v[3:6], q[7:], v[6:]])
 
 
 def heading_velocity(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """(v_x, v_y, ω_z) [m/s, rad/s] of the base in its heading frame: a walking robot's output."""
+    """(v_x, v_y, ω_z) [m/s, rad/s] of the base in its heading frame: a walking robot's output.
+
+    NaN if a position or velocity is not finite, or the quaternion zero.
+    """
+    if not is_state(q, v):
+        return np.full(3, np.nan)
     x_axis = RotationMatrix(quaternion_of(q)).matrix()[:2, 0]
     length = math.hypot(*x_axis)
     c, s = x_axis / length if length > 0 else (1.0, 0.0)
@@ -101,9 +106,9 @@ def gravity_in_foot_plane(
 
     On level ground they are zero; on a slope, the sine of its inclination downhill. The plane is
     fitted to the contact points; along a direction in which these do not extend it is level. NaN if
-    ``q`` or gravity (3,) [m/s²] is not finite.
+    ``q`` or gravity (3,) [m/s²] is not finite, or the quaternion zero.
     """
-    if not q.dot(q) + gravity @ gravity < math.inf:
+    if not is_state(q, gravity):
         return np.full(2, np.nan)
     p_WC = kinematics.contact_positions(q) - kinematics.foot_radii[:, None] * (0.0, 0.0, 1.0)
     p = p_WC - p_WC.sum(axis=0) / len(p_WC)

@@ -9,7 +9,12 @@ import numpy as np
 from pydantic import Field
 
 from drake_safety.control.kinematic_preview import KinematicPreview, chain_joints
-from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, planar_pose
+from drake_safety.control.kinematics import (
+    NUM_BASE_POSITIONS,
+    NUM_BASE_VELOCITIES,
+    is_state,
+    planar_pose,
+)
 from drake_safety.control.safe_sets import (
     DIRECTION_NAMES,
     DIRECTIONS,
@@ -141,8 +146,9 @@ class ReachingSafeSet:
         return plant.CalcCenterOfMassTranslationalVelocityInWorld(context), v_WH
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Returns the signed margins (4,) of a state, always finite."""
-        del v
+        """Returns the signed margins (4,) of a state; minus infinity without one."""
+        if not is_state(q, v):
+            return np.full(len(self.names), -np.inf)
         return np.array(
             [
                 support_margin(self.kinematics, q, self.limits.support_clearance_m),
@@ -156,9 +162,9 @@ class ReachingSafeSet:
         """Margins (n_f,) [m, rad] now, along the plan, and along a preview of the whole body.
 
         The preview has the desired positions of the hand from now to the goal, in the stance frame,
-        (M, 3) [m]. All are NaN if an argument is not finite.
+        (M, 3) [m]. All are NaN if an argument is not finite, or the quaternion zero.
         """
-        if not q.dot(q) + v.dot(v) + np.vdot(preview, preview) < math.inf:
+        if not is_state(q, v, preview):
             return np.full(len(self.feature_names), np.nan)
         kinematics, model = self.kinematics, self.model
         p_WC = kinematics.contact_positions(q)

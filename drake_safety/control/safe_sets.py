@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.kinematics import RobotKinematics, is_state
 from drake_safety.files.schema import Interval, schema
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 
@@ -152,8 +152,9 @@ class BalanceSafeSet:
         self.rate_features = [n for n in self.feature_names if n.startswith("capture_point_")]
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Returns the signed margins (3,) [m] of a state, always finite."""
-        del v
+        """Returns the signed margins (3,) [m] of a state; minus infinity without one."""
+        if not is_state(q, v):
+            return np.full(len(self.names), -np.inf)
         kinematics, limits = self.kinematics, self.limits
         height, (lowest, highest) = float(q[6]), limits.height_m
         return np.array(
@@ -172,9 +173,9 @@ class BalanceSafeSet:
         number of feet.
 
         ``preview`` has the desired base positions from now to the goal, in the stance frame, (M, 3)
-        [m]. All are NaN if an argument is not finite.
+        [m]. All are NaN if an argument is not finite, or the quaternion zero.
         """
-        if not q.dot(q) + v.dot(v) + np.vdot(preview, preview) < math.inf:
+        if not is_state(q, v, preview):
             return np.full(len(self.feature_names), np.nan)
         kinematics, limits = self.kinematics, self.limits
         p_WC = kinematics.contact_positions(q)

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, is_state
 from drake_safety.control.observation import heading_velocity
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
 from drake_safety.files.schema import schema
@@ -122,8 +122,9 @@ class WalkingSafeSet:
         )
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Returns the signed margins (5,) of a state, always finite."""
-        del v
+        """Returns the signed margins (5,) of a state; minus infinity without one."""
+        if not is_state(q, v):
+            return np.full(len(self.names), -np.inf)
         tilt, height = _tilt(q), float(q[6])
         fallen = min(
             height - self._fallen_m,
@@ -143,9 +144,9 @@ class WalkingSafeSet:
         """The margins now, the coming commands, the tracking error and the capture point, (n_f,).
 
         The preview has the commands from now on, (M, 3) [m/s, rad/s]. All are NaN if an argument is
-        not finite.
+        not finite, or the quaternion zero.
         """
-        if not q.dot(q) + v.dot(v) + np.vdot(preview, preview) < math.inf:
+        if not is_state(q, v, preview):
             return np.full(len(self.feature_names), np.nan)
         kinematics = self.kinematics
         p_WC = kinematics.contact_positions(q)

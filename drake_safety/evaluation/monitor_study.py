@@ -16,6 +16,7 @@ import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, mean, proportion, quantile, rate_per_hour
 from drake_safety.evaluation.shift_study import BOOTSTRAP, CONFIDENT, Judge
+from drake_safety.learning import causes
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector, rows_of, usual_rows
@@ -106,7 +107,7 @@ def _sure_and_wrong(
     if motion.is_safe:
         return rows[:0], np.nan
     rows = rows[len(motion.time_s) - 1 - rows <= horizon]
-    is_outside = np.any(motion.margins[rows] < 0.0, axis=1)
+    is_outside = causes.is_outside(motion.margins[rows])
     seen = motion.state[rows], motion.desired_preview[rows], motion.features[rows]
     probability = np.nan_to_num(judge(*seen, is_outside))
     return rows[probability >= CONFIDENT], float(min(probability[~is_outside], default=0.0))

@@ -11,6 +11,7 @@ import numpy as np
 
 from drake_safety.files.reading import did_you_mean, is_number
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.causes import is_outside
 from drake_safety.learning.segments import DIVERGED, Episode
 from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -100,7 +101,7 @@ def _bad_rows(loop: ClosedLoop, metric: str) -> Callable[[Episode], np.ndarray]:
     if kind == "tracking" and is_number(bound) and float(bound) > 0:
         # A motion that ends early has fallen.
         return lambda one: (
-            (np.linalg.norm(one.output - one.desired_output, axis=1) > float(bound))
+            ~(np.linalg.norm(one.output - one.desired_output, axis=1) <= float(bound))
             | _last_row(one, one.num_steps < num_steps)
         )
     name = _constraint(loop, metric)
@@ -111,7 +112,8 @@ def _bad_rows(loop: ClosedLoop, metric: str) -> Callable[[Episode], np.ndarray]:
             "Python a function of an episode"
         )
     # The cause may be a constraint without a negative margin, by a task's own port ``safe``.
-    return lambda one: (one.margins[:, names.index(name)] < 0.0) | _last_row(one, one.cause == name)
+    k = names.index(name)
+    return lambda one: is_outside(one.margins[:, [k]]) | _last_row(one, one.cause == name)
 
 
 def _constraint(loop: ClosedLoop, metric: Metric) -> Metric:

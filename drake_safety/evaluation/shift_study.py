@@ -22,6 +22,7 @@ from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.evaluation.tables import Column, Table, rows_of
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.causes import is_outside
 from drake_safety.learning.segments import DIVERGED, RECORDED, Episode, Episodes
 
 SEEN = ("state", "desired_preview", "features")
@@ -90,7 +91,7 @@ class JudgedShift:
 
     def __init__(self, judges: Mapping[str, Judge], motions: Sequence[Episode]):
         rows = [np.concatenate([getattr(one, name) for one in motions]) for name in SEEN]
-        rows.append(np.concatenate([np.any(one.margins < 0.0, axis=1) for one in motions]))
+        rows.append(np.concatenate([is_outside(one.margins) for one in motions]))
         self.probability = {name: judge(*rows) for name, judge in judges.items()}
         self.motion = np.repeat(np.arange(len(motions)), [len(one.state) for one in motions])
         self.is_unsafe = np.array([not one.is_safe for one in motions])

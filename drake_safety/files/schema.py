@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import re
+from collections.abc import Collection
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from enum import Enum
+from numbers import Real
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
@@ -60,6 +63,15 @@ Bounds = Annotated[Pair[_Value], AfterValidator(_ascending)]
 """Lowest and highest, which may be the same."""
 Interval = Annotated[Pair[FiniteFloat], AfterValidator(_increasing)]
 Pattern = Annotated[str, AfterValidator(_pattern)]
+
+
+def check_times(who: str, *, or_zero: Collection[str] = (), **times: Any) -> None:
+    """Refuses times [s] that are not finite and positive or, if named, not negative."""
+    for name, value in times.items():
+        is_real = isinstance(value, Real) and not isinstance(value, bool)
+        if not (is_real and (0 < value < math.inf or (value == 0 and name in or_zero))):
+            wanted = "not be negative or infinite" if name in or_zero else "be positive and finite"
+            raise ValueError(f"{who}: {name} must {wanted} [s]; got {value}")
 
 
 def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:

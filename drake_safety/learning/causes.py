@@ -11,6 +11,22 @@ NO_CAUSE = -1
 """Where nothing speaks for any constraint."""
 
 
+def is_on(flag: float) -> bool:
+    """Whether an alarm is on: it is above 0.5, or not finite."""
+    return not -math.inf < flag <= 0.5
+
+
+def is_outside(margins: np.ndarray) -> np.ndarray:
+    """Where one of a state's margins (..., n_c) is negative or not finite, (...)."""
+    return ~np.all((margins >= 0.0) & (margins < math.inf), axis=-1)
+
+
+def violated(margins: np.ndarray) -> int:
+    """The constraint that violates margins (n_c,) most; the first that is not finite, if any is."""
+    is_finite = np.isfinite(margins)
+    return int(np.argmin(margins if is_finite.all() else is_finite))
+
+
 def likely_causes(
     cause_probability: np.ndarray,
     predicted_margins: np.ndarray,

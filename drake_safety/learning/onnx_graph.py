@@ -46,7 +46,7 @@ _DESCRIPTIONS = {
     "predicted_margins": "Smallest margin of each constraint until the motion's end; negative is "
     "violated; NaN for maps that predict none.",
     "novelty": "Distance from the training inputs; novel above 1.",
-    "fall_probability": "Probability of a fall; NaN for inputs that are not finite, or if it was "
+    "fall_probability": "Probability of a fall; 1 for inputs that are not finite, NaN if it was "
     "not learned.",
     "embedding": "Place of the input in the first map.",
 }
@@ -116,10 +116,8 @@ def write(path: Path, assessment: Any) -> None:
     is_known = nodes("LessOrEqual", uncertainty, unknown_above(parameters.initial_uncertainty))
     probability = nodes("Where", is_known, probability, 0.0)
     nodes("Squeeze", probability, [1], output="safety_probability")
-    if fall is None:
-        # NaN of N rows.
-        fall = nodes("Mul", safe, np.nan)
-    fall = nodes("Where", is_usable, fall, np.nan)
+    # Without it, NaN of N rows.
+    fall = nodes("Where", is_usable, fall, 1.0) if fall else nodes("Mul", safe, np.nan)
     nodes("Squeeze", fall, [1], output="fall_probability")
     outputs: dict[str, int | None] = {
         "belief": 3,

@@ -38,7 +38,7 @@ class Prediction:
         novelty: Distance of x from the training inputs in units of the largest known one, (N,);
             novel above 1, infinite for inputs that are not finite.
         fall_probability: Probability of a fall until the episode's end or soon after it left the
-            safe set, (N,), extrapolated for novel inputs; NaN for inputs that are not finite or
+            safe set, (N,), extrapolated for novel inputs; 1 for inputs that are not finite, NaN
             without a `FallLogit`.
     """
 
@@ -270,9 +270,10 @@ def predict(
         masses[:, belief_masses.UNCERTAINTY] += 1.0 - share_inside
     # Departure: beyond the training inputs the maps place x in cells of others.
     distance = novelty.of(x)
-    is_novel = distance > 1.0
-    if np.count_nonzero(is_novel):
-        masses[is_novel] = belief_masses.empty((), num_columns - 3)
+    # Nothing is known either where a cell's belief is not finite.
+    is_empty = ~((distance <= 1.0) & np.isfinite(np.add.reduce(masses, axis=1)))
+    if np.count_nonzero(is_empty):
+        masses[is_empty] = belief_masses.empty((), num_columns - 3)
     safe = masses[:, belief_masses.SAFE]
     if output.margins.shape[2]:
         margins = mean_of_maps(output.margins)
@@ -293,8 +294,9 @@ def predict(
             residual[is_usable] = correction.residual(embedding, x[is_usable])
             logit += correction.shift(heads, residual, guard)
         probability = 1.0 / (1.0 + np.exp(logit))
-        if fall_logit is not None:
+        if fall_logit is not None and output.margins.shape[2]:
             fall_probability = sigmoid(fall_logit.of(margins, logit, x))
+            fall_probability[np.isnan(output.embedding[0, :, 0])] = 1.0
     probability[is_unknown(masses, initial_uncertainty)] = 0.0
     return Prediction(
         belief=masses[:, :3],

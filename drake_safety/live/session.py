@@ -17,7 +17,7 @@ from pydrake.geometry import Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from drake_safety.learning.causes import cause_words, likely_cause
+from drake_safety.learning.causes import cause_words, is_on, is_outside, likely_cause, violated
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import DivergenceError
 from drake_safety.live.following_camera import WORLD, FollowingCamera
@@ -160,7 +160,7 @@ class LiveSession:
     def has_fallen(self) -> bool:
         """Whether the robot has fallen; False where nothing can fall."""
         names, margins = self.loop.constraint_names, self._eval("margins")
-        return isinstance(self.loop, CanFall) and margins[names.index(self.loop.fall_name)] < 0
+        return isinstance(self.loop, CanFall) and not margins[names.index(self.loop.fall_name)] >= 0
 
     def tick(self) -> bool:
         """Reacts to the controls, advances by one tick, and shows belief and verdict.
@@ -274,7 +274,7 @@ class LiveSession:
         loop, now_s, margins = self.loop, self.context.get_time(), self._eval("margins")
         if not np.isfinite(margins).all():
             raise DivergenceError(f"a margin is not finite at {now_s:.2f} s")
-        left = loop.constraint_names[int(np.argmin(margins))] if margins.min() < 0 else ""
+        left = loop.constraint_names[violated(margins)] if is_outside(margins) else ""
         if self._use == "episodes" and left and not self.cause:
             self._end_s = now_s + _SHOWN_S
         self.cause = self.cause or left
@@ -340,7 +340,7 @@ class LiveSession:
         return self.loop.GetOutputPort(port).Eval(self.context)
 
     def _is_on(self, port: str) -> bool:
-        return self.loop.HasOutputPort(port) and self._eval(port)[0] > 0
+        return self.loop.HasOutputPort(port) and is_on(self._eval(port)[0])
 
     def _push(self) -> None:
         """Begins a random push."""

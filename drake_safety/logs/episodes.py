@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import planar_pose
+from drake_safety.learning.causes import is_outside, violated
 from drake_safety.learning.mode_settings import mode_settings
 from drake_safety.learning.seeds import NOT_DRAWN
 from drake_safety.learning.segments import Episode, Episodes
@@ -229,7 +230,7 @@ class _Cutter:
         is_safe = True
         for tick_s, state in zip(ticks, log.states_at(begin_s + ticks), strict=True):
             self._set_state(context, tick_s, state)
-            if (margins.Eval(context) < 0).any():
+            if is_outside(margins.Eval(context)):
                 is_safe, times = False, np.append(times[times < tick_s - _ROUNDING_S], tick_s)
                 break
         recorder = Recorder(loop)
@@ -240,7 +241,7 @@ class _Cutter:
             self._set_state(context, time_s, state)
             recorder.record(context)
         arrays: dict[str, Any] = recorder.arrays()
-        cause = "" if is_safe else loop.constraint_names[int(np.argmin(arrays["margins"][-1]))]
+        cause = "" if is_safe else loop.constraint_names[violated(arrays["margins"][-1])]
         return Episode(index=0, **arrays, is_safe=is_safe, cause=cause)
 
     def _set_state(self, context: Context, time_s: float, state: np.ndarray) -> None:

@@ -18,7 +18,7 @@ from pydrake.systems.analysis import Simulator
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
 from drake_safety.files.progress import StageProgress, ignore
-from drake_safety.learning.causes import describe_margin
+from drake_safety.learning.causes import describe_margin, is_outside
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.models import load_robot, robot_files
 from drake_safety.robots.model_files import model_file
@@ -427,10 +427,11 @@ def _stands(loop: LeggedLoop) -> _Check:
 def _stands_safely(loop: LeggedLoop, margins: np.ndarray) -> _Check:
     """Judges the margins of the standing posture."""
     kinematics, height = loop.kinematics, loop.kinematics.standing_height
-    names = [loop.constraint_names[i] for i in np.flatnonzero(margins < 0)]
+    is_wrong = is_outside(margins[:, None])
+    names = [loop.constraint_names[i] for i in np.flatnonzero(is_wrong)]
     wrong = [
         describe_margin(name, margin, loop.angular_constraints)
-        for name, margin in zip(names, margins[margins < 0], strict=True)
+        for name, margin in zip(names, margins[is_wrong], strict=True)
     ]
     stops = zip(kinematics.joint_names, kinematics.posture, kinematics.position_limits, strict=True)
     wrong += [

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.beliefs import EMPTY
+from drake_safety.learning.beliefs import EMPTY, empty
+from drake_safety.learning.causes import is_on, is_outside, violated
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Correction
+from drake_safety.systems.periodic_update import declare_update
 
 _LARGEST_NOVELTY = 1e6
 
@@ -34,20 +38,24 @@ class BeliefEvaluator(LeafSystem):
         - predicted_margins: n_c
         - novelty: 1
         - fall_probability: 1
+        - learned: abstract
 
-    Γ is evaluated every ``period_s`` and held, so no output has direct feedthrough.
+    Γ is evaluated every ``period_s`` and held, so no output but ``learned`` has direct feedthrough.
     ``belief`` is (safe, unsafe, don't know), and its first entry the paper's Γ.
     ``safety_probability`` is the probability of staying safe, by the maps' heads with the
     correction from feedback; the paper's mode has no heads, and it is the belief's first entry. It
     is 0 where the belief is "don't know". ``novelty`` is the distance of the inputs from those of
-    training, novel above 1. ``fall_probability`` is 1 for inputs that are not finite, and 0 for
+    training, novel above 1. ``fall_probability`` is 1 for inputs that are not finite, and NaN for
     an assessment that has learned no falls. The belief of inputs that are novel or not finite is
     (0, 0, 1), and so is the belief before the first evaluation, and every belief while ``alarm`` is
-    above 0.5, as that of a :class:`~drake_safety.systems.change_monitor.ChangeMonitor`. While one
-    of ``margins``, those of the measured state, is negative, no belief is safe: its mass for "safe"
-    counts as unsafe by the most violated constraint. The beliefs of the grid, the correction and
-    the novelty are parameters of the Context: :meth:`adopt` replaces them by those of an adapted
-    assessment, between simulations and during them. The embedding is immutable.
+    above 0.5, as that of a :class:`~drake_safety.systems.change_monitor.ChangeMonitor`, or not
+    finite. While one of ``margins``, those of the measured state, is negative or not finite, no
+    belief is safe: its mass for "safe" counts as unsafe by the first constraint that is not finite,
+    else the most violated one. The beliefs of the grid, the correction and the novelty are
+    parameters of the Context: :meth:`adopt` replaces them by those of an adapted assessment,
+    between simulations and during them. ``learned`` has all three, with empty beliefs during an
+    alarm, for a :class:`~drake_safety.systems.command_guard.CommandGuard`. The embedding is
+    immutable.
 
     Args:
         period_s: Time between two evaluations [s].
@@ -96,9 +104,9 @@ class BeliefEvaluator(LeafSystem):
         first = np.concatenate(
             [EMPTY if name == "belief" else np.zeros(size) for name, size in sizes.items()]
         )
-        state = self.DeclareDiscreteState(first)
-        self.DeclareInitializationDiscreteUpdateEvent(self._update)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)
+        first[-1] = np.nan  # The probability of a fall.
+        state = self._state = self.DeclareDiscreteState(first)
+        declare_update(self, self._update, self._update, period_s, 0.0)
         start = 0
         for name, size in sizes.items():
             rows = slice(start, start + size)
@@ -107,10 +115,17 @@ class BeliefEvaluator(LeafSystem):
                 name,
                 BasicVector(size),
                 lambda context, output, rows=rows: output.SetFromVector(
-                    context.get_discrete_state_vector().get_value()[rows]
+                    context.get_discrete_state(self._state).get_value()[rows]
                 ),
                 {self.discrete_state_ticket(state)},
             )
+        ports = filter(None, [self._alarm_port])
+        self.DeclareAbstractOutputPort(
+            "learned",
+            lambda: Value[object]({}),
+            lambda context, output: output.set_value(self._present(context)),
+            {self.all_parameters_ticket(), *(self.input_port_ticket(p.get_index()) for p in ports)},
+        )
 
     def get_beliefs(self, context: Context) -> np.ndarray:
         """Returns the beliefs in a Context, shaped as the assessment's ``beliefs_``."""
@@ -123,6 +138,8 @@ class BeliefEvaluator(LeafSystem):
             raise ValueError(
                 f"belief evaluator: beliefs must have shape {self._shape}; got {beliefs.shape}"
             )
+        if not np.isfinite(beliefs).all():
+            raise ValueError("belief evaluator: beliefs must be finite numbers; got NaN or inf")
         context.get_mutable_numeric_parameter(self._belief_index).SetFromVector(beliefs.ravel())
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
@@ -136,27 +153,33 @@ class BeliefEvaluator(LeafSystem):
         self.set_beliefs(context, adapted.beliefs_)
         context.get_mutable_abstract_parameter(self._learned).set_value(_learned(adapted))
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _is_alarmed(self, context: Context) -> bool:
+        return self._alarm_port is not None and is_on(self._alarm_port.Eval(context)[0])
+
+    def _present(self, context: Context) -> dict[str, Any]:
+        """Arguments of a prediction; during an alarm all beliefs are empty."""
         correction, novelty = context.get_abstract_parameter(self._learned).get_value()
+        beliefs = self.get_beliefs(context)
+        if self._is_alarmed(context):
+            beliefs = empty(self._shape[:-1], self._shape[-1] - 3)
+        return {"beliefs": beliefs, "correction": correction, "novelty": novelty}
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         prediction = self._assessment.predict_one(
             self._state_port.Eval(context),
             self._preview_port.Eval(context),
             self._features_port.Eval(context) if self.reads_features else None,
-            beliefs=self.get_beliefs(context),
-            correction=correction,
-            novelty=novelty,
+            **self._present(context),
         )
-        if self._alarm_port is not None and self._alarm_port.Eval(context)[0] > 0.5:
+        if self._is_alarmed(context):
             prediction = prediction.unknown()
         elif self._margins_port is not None:
             margins = self._margins_port.Eval(context)
-            if margins.min(initial=0.0) < 0.0:
-                prediction = prediction.outside(int(np.argmin(margins)))
-        fall_probability = prediction.fall_probability
-        if np.isnan(fall_probability):
-            fall_probability = float(self._assessment.fall_logit_ is not None)
+            if is_outside(margins):
+                prediction = prediction.outside(violated(margins))
         # In the order of the ports.
         discrete_state.set_value(
+            self._state,
             np.concatenate(
                 [
                     (prediction.probability,),
@@ -165,9 +188,9 @@ class BeliefEvaluator(LeafSystem):
                     prediction.embedding,
                     prediction.predicted_margins,
                     (min(prediction.novelty, _LARGEST_NOVELTY),),
-                    (fall_probability,),
+                    (prediction.fall_probability,),
                 ]
-            )
+            ),
         )
 
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
+from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_safety.control.policy import CommandLimits
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.systems.periodic_update import declare_update
 
 _SHARES = np.linspace(0.0, 1.0, 6)  # Of each entry of the asked command.
 
@@ -23,6 +27,7 @@ class CommandGuard(LeafSystem):
         - command: 3
         - state: n_s
         - features: n_f
+        - learned: abstract (optional)
         output_ports:
         - desired_output: n_z
         - desired_preview: H n_z
@@ -35,8 +40,10 @@ class CommandGuard(LeafSystem):
     measured in the policy's ranges, among commands whose entries are shares of the asked ones; if
     none is accepted, the one with the largest probability. A command is accepted if its probability
     reaches the threshold. ``safety_probability`` is that of the asked command. All outputs are
-    discrete states, and preview and outlook hold the command. Whether the guard acts is a parameter
-    of the Context; one that does not passes on everything.
+    discrete states, and preview and outlook hold the command. ``learned``, that of a
+    :class:`~drake_safety.systems.belief_evaluator.BeliefEvaluator`, replaces the beliefs of the
+    assessment. Whether the guard acts is a parameter of the Context; one that does not passes on
+    everything.
 
     Args:
         with_commands: Maps features (n_f,) and commands (C, 3) to the features (C, n_f) of these
@@ -70,11 +77,11 @@ class CommandGuard(LeafSystem):
         self._command_port = self.DeclareVectorInputPort("command", 3)
         self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
         self._features_port = self.DeclareVectorInputPort("features", len(info.feature_names))
+        self._learned_port = self.DeclareAbstractInputPort("learned", Value[object]({}))
         self._is_acting = self.DeclareNumericParameter(BasicVector([1.0]))
         command = self._command = self.DeclareDiscreteState(3)
         self._is_changed, self._probability = map(self.DeclareDiscreteState, (1, 1))
-        self.DeclareInitializationDiscreteUpdateEvent(self._update)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
+        declare_update(self, self._update, self._update, period_s, offset_s)
         self.DeclareStateOutputPort("desired_output", command)
         for name, count in (("desired_preview", info.horizon), ("desired_outlook", num_outlook)):
             self.DeclareVectorOutputPort(
@@ -93,13 +100,14 @@ class CommandGuard(LeafSystem):
         context.get_mutable_numeric_parameter(self._is_acting).SetAtIndex(0, float(is_acting))
 
     def probabilities(
-        self, state: np.ndarray, features: np.ndarray, commands: np.ndarray
+        self, state: np.ndarray, features: np.ndarray, commands: np.ndarray, **learned: Any
     ) -> np.ndarray:
         """Probability of constant commands (C, 3) from now on, (C,); 0 where it is "don't know"."""
         return self._assessment.predict(
             np.tile(state, (len(commands), 1)),
             np.tile(commands, self._horizon),
             self._with_commands(features, commands),
+            **learned,
         ).probability
 
     def candidates(self, asked: np.ndarray) -> np.ndarray:
@@ -111,14 +119,14 @@ class CommandGuard(LeafSystem):
         return commands[np.argsort(distance, kind="stable")]
 
     def decide(
-        self, asked: np.ndarray, state: np.ndarray, features: np.ndarray, *, is_acting: bool = True
+        self, asked: np.ndarray, probabilities: Callable[[np.ndarray], np.ndarray]
     ) -> tuple[np.ndarray, float]:
         """Returns the command to pass on, (3,), and the probability of the asked one."""
-        asked_probability = float(self.probabilities(state, features, asked[None])[0])
-        if asked_probability >= self._threshold or not is_acting:
+        asked_probability = float(probabilities(asked[None])[0])
+        if asked_probability >= self._threshold:
             return asked, asked_probability
         commands = self.candidates(asked)
-        probability = self.probabilities(state, features, commands)
+        probability = probabilities(commands)
         is_accepted = probability >= self._threshold
         chosen = int(np.argmax(is_accepted)) if is_accepted.any() else int(np.argmax(probability))
         if not probability[chosen] > 0:  # Nothing is known: as asked, within the ranges.
@@ -128,13 +136,16 @@ class CommandGuard(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         asked = self._command_port.Eval(context)
         state, features = self._state_port.Eval(context), self._features_port.Eval(context)
+        learned = self._learned_port.Eval(context) if self._learned_port.HasValue(context) else {}
         if not np.isfinite(asked).all():
             command, probability = np.zeros(3), 0.0
         elif np.isfinite(state).all() and np.isfinite(features).all():
-            is_acting = bool(context.get_numeric_parameter(self._is_acting).GetAtIndex(0) > 0)
-            command, probability = self.decide(asked, state, features, is_acting=is_acting)
+            judge = partial(self.probabilities, state, features, **learned)
+            command, probability = self.decide(asked, judge)
         else:
             command, probability = np.clip(asked, self._lowest, self._highest), 0.0
+        if np.isfinite(asked).all() and not context.get_numeric_parameter(self._is_acting)[0] > 0:
+            command = asked
         discrete_state.set_value(self._command, command)
         discrete_state.set_value(self._is_changed, [float(np.any(command != asked))])
         discrete_state.set_value(self._probability, [probability])

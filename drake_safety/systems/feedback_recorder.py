@@ -10,6 +10,8 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
 
+from drake_safety.files.schema import check_times
+from drake_safety.learning.causes import violated
 from drake_safety.learning.segments import RECORDED, Episode, Episodes, EpisodesInfo
 
 _MOST_WINDOWS = 400
@@ -78,7 +80,7 @@ class FeedbackRecorder(LeafSystem):
         watch_period_s: Sampling period of ``safe`` [s].
 
     Raises:
-        ValueError: A window is shorter than the horizon.
+        ValueError: A window is shorter than the horizon, or a time out of range.
     """
 
     def __init__(
@@ -91,6 +93,7 @@ class FeedbackRecorder(LeafSystem):
         controller_memory_size: int = 0,
     ):
         super().__init__()
+        check_times("feedback recorder", watch_period_s=watch_period_s, step_s=info.step_s)
         if num_steps < info.horizon * info.preview_stride:
             raise ValueError(
                 f"feedback recorder: num_steps is {num_steps}, expected at least the horizon of "
@@ -139,7 +142,7 @@ class FeedbackRecorder(LeafSystem):
 
     def _watch(self, context: Context, discrete_state: DiscreteValues) -> None:
         latch = context.get_discrete_state_vector().get_value()
-        if latch[0] == -np.inf and self._ports["safe"].Eval(context)[0] < 1.0:
+        if latch[0] == -np.inf and not self._ports["safe"].Eval(context)[0] >= 1.0:
             margins = self._ports["margins"].Eval(context)
             discrete_state.set_value(np.append(context.get_time(), margins))
 
@@ -155,7 +158,7 @@ class FeedbackRecorder(LeafSystem):
         latch = context.get_discrete_state_vector().get_value()
         # A latch of before a jump in time says nothing.
         was_left = 0.0 <= time_s - latch[0] <= 1.01 * self.info.step_s
-        has_left = was_left or self._ports["safe"].Eval(context)[0] < 1.0
+        has_left = was_left or not self._ports["safe"].Eval(context)[0] >= 1.0
         if recording.times_s:
             lapse_s = time_s - recording.times_s[-1]
             if abs(lapse_s - self.info.step_s) > 0.01 * self.info.step_s:
@@ -194,14 +197,13 @@ class FeedbackRecorder(LeafSystem):
     def _finished(self, recording: Recording, *, is_safe: bool) -> Recording:
         columns = [np.array(column) for column in zip(*recording.rows, strict=True)]
         arrays: dict[str, Any] = dict(zip(RECORDED, columns, strict=True))
-        worst = int(np.argmin(arrays["margins"][-1]))
         times_s = np.array(recording.times_s)
         episode = Episode(
             index=recording.num_finished,
             time_s=times_s - times_s[0],
             **arrays,
             is_safe=is_safe,
-            cause="" if is_safe else self.info.constraint_names[worst],
+            cause="" if is_safe else self.info.constraint_names[violated(arrays["margins"][-1])],
         )
         Episodes(self.info, [episode])  # Checks the shapes.
         window = RecordedWindow(

@@ -9,6 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_safety.control.inverse_kinematics import solve_from
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
+from drake_safety.systems.periodic_update import declare_update
 
 _RATE_SHARE = 0.7  # Of a joint's speed limit; the rest is left for the servo's overshoot.
 _LIFTED_M = 0.005  # Height of a foot's set point above which the foot carries no weight.
@@ -81,8 +82,7 @@ class InverseKinematicsController(LeafSystem):
         self._feet = self.DeclareDiscreteState(np.full(3 * kinematics.num_contacts, np.nan))
         self._set_point = self.DeclareDiscreteState(n_j)  # Of the joints, without the offset.
         self._command = self.DeclareDiscreteState(2 * n_j)  # Positions with it, and rates.
-        self.DeclareInitializationDiscreteUpdateEvent(self._initialize)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
+        declare_update(self, self._update, self._initialize, period_s, offset_s)
         self.DeclareStateOutputPort("desired_joint_state", self._command)
 
     def set_foot_positions(self, context: Context, p_WC: np.ndarray) -> None:

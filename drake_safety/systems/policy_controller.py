@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.kinematics import RobotKinematics, is_state
 from drake_safety.control.policy import Policy
+from drake_safety.systems.periodic_update import declare_update
 
 ACTING, HELD = 0.0, 1.0
 """Values of ``status``: the network's action, or the last finite one."""
@@ -62,7 +63,7 @@ class PolicyController(LeafSystem):
             *(f"applied_command_{axis}" for axis in ("forward", "left", "yaw")),
         ]
         self._num_actions, self._num_phases = n_a, n_p
-        self.DeclarePeriodicDiscreteUpdateEvent(policy.parameters.period_s, offset_s, self._update)
+        declare_update(self, self._update, None, policy.parameters.period_s, offset_s)
         self.DeclareStateOutputPort("desired_joint_state", self._set_point)
         self.DeclareStateOutputPort("action_state", self._action)
         self.DeclareStateOutputPort("status", self._status)
@@ -95,9 +96,9 @@ class PolicyController(LeafSystem):
         wanted = self._command_port.Eval(context)
         plant_state = self._state_port.Eval(context)
         new, status = action, HELD
-        if np.isfinite(wanted).all() and np.isfinite(plant_state).all():
+        q, v = plant_state[: self._n_q], plant_state[self._n_q :]
+        if is_state(q, v, wanted):
             applied = policy.next_command(applied, wanted)
-            q, v = plant_state[: self._n_q], plant_state[self._n_q :]
             seen = policy.see(q, v, applied, action, phases)
             history = context.get_discrete_state(self._history).get_value()
             observation = policy.observe(seen, history)

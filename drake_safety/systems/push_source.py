@@ -10,6 +10,7 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_safety.plants.pushes import Push
+from drake_safety.systems.periodic_update import declare_update
 
 _BODY, _FORCE, _START, _DURATION = 0, slice(1, 4), 4, 5
 _SIZE = 6
@@ -36,7 +37,7 @@ class PushSource(LeafSystem):
         self._bodies = {body.name(): body for body in bodies}
         self._parameter = self.DeclareNumericParameter(BasicVector(np.zeros(_SIZE)))
         state = self.DeclareDiscreteState(1)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._update)
+        declare_update(self, self._update, None, period_s, 0.0)
         self.DeclareAbstractOutputPort(
             "applied_spatial_force",
             lambda: Value[list[ExternallyAppliedSpatialForce]](),

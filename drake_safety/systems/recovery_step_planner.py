@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
 
-from drake_safety.control.kinematics import RobotKinematics, fit_stance, yaw_of
+from drake_safety.control.kinematics import RobotKinematics, fit_stance, is_state, yaw_of
 from drake_safety.control.observation import quaternion_of
 from drake_safety.control.recovery_step import (
     RecoveryStepParameters,
@@ -21,6 +21,7 @@ from drake_safety.control.recovery_step import (
     swing_position,
 )
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
+from drake_safety.systems.periodic_update import declare_update
 
 _IDLE, _STEPPING, _RETURNING, _DONE = 0.0, 1.0, 2.0, 3.0
 
@@ -102,7 +103,7 @@ class RecoveryStepPlanner(LeafSystem):
         self._stance = self.DeclareDiscreteState(3)  # x, y, yaw
         # Before the discrete updates, such as that of a controller of these feet.
         self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
+        declare_update(self, self._update, None, period_s, offset_s)
         self.DeclareStateOutputPort("desired_output", self._set_point)
         self.DeclareStateOutputPort("desired_foot_positions", self._feet)
         self.DeclareStateOutputPort("desired_yaw", self._yaw)
@@ -155,6 +156,8 @@ class RecoveryStepPlanner(LeafSystem):
             return
         time, swing_s = context.get_time(), self._parameters.step_duration_s - 1e-9
         q, v = np.split(self._state_port.Eval(context), [self._kinematics.num_positions])
+        if not is_state(q, v):  # The set points are held.
+            return
         if mode == _RETURNING:
             if self._stays_standing(discrete_state, q, v):
                 self._return(discrete_state, self._nominal_port.Eval(context), time)

@@ -7,7 +7,9 @@ import math
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, InputPortIndex, LeafSystem
 
+from drake_safety.files.schema import check_times
 from drake_safety.learning.prediction import is_unknown
+from drake_safety.systems.periodic_update import declare_update
 
 
 class RecoveryTrigger(LeafSystem):
@@ -25,7 +27,8 @@ class RecoveryTrigger(LeafSystem):
         - recovery_active: 1
 
     The trigger latches: once active it stays active until ``recovery_done`` is 1. A probability
-    that is NaN activates it. ``belief`` (3,) tells a low probability from one that is 0 because the
+    that is not finite activates it, such as 1 minus ``fall_probability`` where no falls were
+    learned. ``belief`` (3,) tells a low probability from one that is 0 because the
     belief is "don't know": meanwhile it must have been below Γ_thre for ``persistence_s``. An
     impact makes a single input unlike those of training. ``port_selector`` drives a PortSwitch
     whose ports were declared ``nominal`` first, ``recovery`` second.
@@ -38,7 +41,7 @@ class RecoveryTrigger(LeafSystem):
             :func:`~drake_safety.learning.prediction.is_unknown`.
 
     Raises:
-        ValueError: The threshold is outside [0, 1], or the persistence negative.
+        ValueError: Threshold or initial uncertainty is outside [0, 1], or a time out of range.
     """
 
     def __init__(
@@ -51,12 +54,12 @@ class RecoveryTrigger(LeafSystem):
         offset_s: float = 0.0,
     ):
         super().__init__()
-        if not 0 <= threshold <= 1:
-            raise ValueError(f"recovery trigger: threshold must be in [0, 1]; got {threshold}")
-        if not persistence_s >= 0:
-            raise ValueError(
-                f"recovery trigger: persistence_s must not be negative; got {persistence_s}"
-            )
+        who = "recovery trigger"
+        shares = {"threshold": threshold, "initial_uncertainty": initial_uncertainty}
+        for name, value in shares.items():
+            if not 0 <= value <= 1:
+                raise ValueError(f"{who}: {name} must be in [0, 1]; got {value}")
+        check_times(who, or_zero=["persistence_s"], period_s=period_s, persistence_s=persistence_s)
         self.threshold = threshold
         self._initial_uncertainty = initial_uncertainty
         self._num_waited = math.ceil(persistence_s / period_s - 1e-6)
@@ -65,7 +68,7 @@ class RecoveryTrigger(LeafSystem):
         self._done_port = self.DeclareVectorInputPort("recovery_done", 1)
         self._active = self.DeclareDiscreteState(1)
         self._num_below = self.DeclareDiscreteState(1)  # Updates below Γ_thre, up to now.
-        self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
+        declare_update(self, self._update, None, period_s, offset_s)
         self.DeclareAbstractOutputPort(
             "port_selector",
             lambda: Value(InputPortIndex(1)),
@@ -80,10 +83,10 @@ class RecoveryTrigger(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._is_active(context):
             done = self._done_port
-            active = not (done.HasValue(context) and done.Eval(context)[0] > 0)
+            active = not (done.HasValue(context) and 0 < done.Eval(context)[0] < math.inf)
             num_below = 0.0
         else:
-            is_below = not self._probability_port.Eval(context)[0] >= self.threshold
+            is_below = not self.threshold <= self._probability_port.Eval(context)[0] < math.inf
             num_below = context.get_discrete_state(self._num_below).GetAtIndex(0)
             num_below = num_below + 1.0 if is_below else 0.0
             belief = self._belief_port

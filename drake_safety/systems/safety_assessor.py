@@ -39,6 +39,7 @@ class SafetyAssessor(Diagram):
         - predicted_margins: n_c
         - novelty: 1
         - fall_probability: 1
+        - learned: abstract
         - alarm: 1
         - levels: n_w
         - alarm_cause: abstract

@@ -8,6 +8,8 @@ from typing import Protocol
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_safety.learning.causes import is_outside
+
 
 class SafeSet(Protocol):
     """A safe set: named constraints with signed margins."""
@@ -49,8 +51,8 @@ class SafetyMonitor(LeafSystem):
         - safe: 1
 
     Both outputs are direct functions of the state: margins that were sampled and held would lag a
-    recorded row by one period. ``safe`` is 1 while no margin is negative. The margins of a state
-    that is not finite are minus infinity.
+    recorded row by one period. ``safe`` is 1 while every margin is finite and not negative. The
+    margins of a state that is not finite, or without an orientation, are minus infinity.
     """
 
     def __init__(self, safe_set: SafeSet, num_positions: int, num_velocities: int):
@@ -72,5 +74,4 @@ class SafetyMonitor(LeafSystem):
         output.SetFromVector(finite_margins(self._safe_set, q, v))
 
     def _calc_safe(self, context: Context, output: BasicVector) -> None:
-        margins = self._margins_port.Eval(context)
-        output.SetAtIndex(0, float(margins.min() >= 0))
+        output.SetAtIndex(0, float(not is_outside(self._margins_port.Eval(context))))

@@ -9,6 +9,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_safety.files.reading import did_you_mean
+from drake_safety.files.schema import check_times
 from drake_safety.robots.shift import Fault
 
 _TOLERANCE_S = 1e-9
@@ -48,6 +49,7 @@ class SensorFaults(LeafSystem):
         offset_s: float = 0.0,
     ):
         super().__init__()
+        check_times("sensor faults", or_zero=["offset_s"], period_s=period_s, offset_s=offset_s)
         self._period_s, self._offset_s = period_s, offset_s
         self._input = self.DeclareVectorInputPort("input", len(names))
         self._faults = [(fault, _indices(fault, list(names))) for fault in faults]

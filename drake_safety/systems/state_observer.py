@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.kinematics import RobotKinematics, is_state
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import (
     add_noise,
@@ -33,7 +33,8 @@ class StateObserver(LeafSystem):
         - output: n_z
 
     Every output is a direct function of the inputs. Without the ``noise`` input, or with zero
-    standard deviations, the measurement is exact.
+    standard deviations, the measurement is exact. State and output of a measurement that is not
+    finite, or without an orientation, are NaN; the base's position is as measured.
 
     Args:
         noise: Standard deviations that scale the standard normal ``noise`` input, which has
@@ -78,8 +79,8 @@ class StateObserver(LeafSystem):
     def _calc_measured(self, context: Context, output: BasicVector) -> None:
         state = self._state_port.Eval(context)
         is_noisy = not self._is_exact and self._noise_port.HasValue(context)
-        if is_noisy and np.isfinite(state).all():
-            q, v = np.split(state, [self._n_q])
+        q, v = np.split(state, [self._n_q])
+        if is_noisy and is_state(q, v):
             state = np.concatenate(add_noise(q, v, self._noise_port.Eval(context), self._noise))
         output.SetFromVector(state)
 
@@ -89,13 +90,12 @@ class StateObserver(LeafSystem):
         output.SetFromVector(state if self._mirror is None else self._mirror.stance_state(state))
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
-        measured = self._measured_port.Eval(context)
-        q, v = np.split(measured, [self._n_q])
-        if self._is_walking and np.isfinite(measured).all():
+        q, v = np.split(self._measured_port.Eval(context), [self._n_q])
+        if self._is_walking:
             output.SetFromVector(heading_velocity(q, v))
         elif self._hand is None:
             output.SetFromVector(q[4:7])
-        elif np.isfinite(measured).all():
+        elif is_state(q, v):
             output.SetFromVector(self._kinematics.reaching_position(q, self._hand))
         else:
             output.SetFromVector(np.full(3, np.nan))

@@ -11,6 +11,8 @@ from pydrake.polynomial import Polynomial
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
 
+from drake_safety.files.schema import check_times
+
 
 def interpolate(
     start: np.ndarray,
@@ -25,8 +27,7 @@ def interpolate(
     With s the minimum-jerk progress from 0 to 1, ``z*(s) = start + s (goal - start) + 4 s (1 - s)
     detour``: at s = 0.5 the motion is offset from the straight line by the detour, (n_z,) [m].
     """
-    if not duration_s > 0:
-        raise ValueError(f"plan: duration_s must be positive; got {duration_s}")
+    check_times("plan", duration_s=duration_s)
     progress = np.array([0, 0, 0, 10 / duration_s**3, -15 / duration_s**4, 6 / duration_s**5])
     coefficients = np.outer(np.subtract(goal, start), progress)
     if detour is not None:
@@ -121,6 +122,7 @@ class TrajectoryPlanner(LeafSystem):
         if num_outlook < 2:
             raise ValueError(f"planner: num_outlook must be at least 2; got {num_outlook}")
         outlook_s = step_s * (horizon - 1) if outlook_s is None else outlook_s
+        check_times("planner", or_zero=["outlook_s"], step_s=step_s, outlook_s=outlook_s)
         no_plan = None, None
         self._plan_index = self.DeclareAbstractParameter(
             Value(no_plan if plan is None else self._with_rate(plan))

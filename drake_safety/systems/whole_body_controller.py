@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.whole_body_model import PointReference, WholeBodyModel, WholeBodyReference
 from drake_safety.control.whole_body_qp import SOLVED, NotFiniteError, build_qp, solve_qp
+from drake_safety.systems.periodic_update import declare_update
 
 NOT_FINITE = 1
 """Solver status of an update with a non-finite state or set point."""
@@ -82,8 +83,7 @@ class WholeBodyController(LeafSystem):
         self._actuation = self.DeclareDiscreteState(len(matrix))  # Torques of the actuators.
         self._status = self.DeclareDiscreteState(1)
         self._num_failures = self.DeclareDiscreteState(1)  # Since the initialisation.
-        self.DeclareInitializationDiscreteUpdateEvent(self._initialize)
-        self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
+        declare_update(self, self._update, self._initialize, period_s, offset_s)
         self.DeclareStateOutputPort("actuation", self._actuation)
         self.DeclareStateOutputPort("solver_status", self._status)
         self.DeclareStateOutputPort("num_failures", self._num_failures)
