@@ -85,7 +85,8 @@ CASES = {
     ),
     "PolicyController": (
         controller,
-        "plant_state 17, command 3 -> desired_joint_state 4, action_state 10, status 1",
+        "plant_state 17, command 3 -> desired_joint_state 4, action_state 10, status 1, "
+        "num_failures 1, memory 28",
     ),
     "PendulumObserver": (
         lambda: PendulumObserver(0.5),
@@ -229,7 +230,7 @@ SYMBOLS = {
     "BeliefEvaluator": {"n_s": 2, "n_z": 3, "H": 2, "n_f": 3, "n_c": 2},
     "CommandGuard": {"n_s": 1, "n_z": 3, "H": 4, "M": 3, "n_f": 3},
     "FeedbackRecorder": {"n_s": 1, "n_z": 3, "H": 3, "n_f": 1, "n_c": 2, "n_q": 1, "n_v": 1},
-    "PolicyController": {"n_q": 9, "n_v": 8, "n_j": 2, "n_m": 10},
+    "PolicyController": {"n_q": 9, "n_v": 8, "n_j": 2, "n_m": 10, "n": 28},
     "PlanFeatures": {"M": 2},
     "AssessorInputs": {"M": 2, "n_m": 1},
 }
