@@ -79,9 +79,12 @@ CASES = {
         f"command 3, state 1, features 3, learned? - -> {PLAN}, is_changed 1, safety_probability 1",
     ),
     "FeedbackRecorder": (
-        lambda: FeedbackRecorder(INFO, num_steps=5, plant_state_size=2, watch_period_s=0.01),
+        lambda: FeedbackRecorder(
+            INFO, num_steps=5, plant_state_size=2, watch_period_s=0.01, controller_memory_size=4
+        ),
         "state 1, true_state? 1, output 3, desired_output 3, desired_preview 9, features 1, "
-        "margins 2, safe 1, plant_state 2, recovery_active? 1 -> num_finished 1 < *",
+        "margins 2, safe 1, plant_state 2, controller_memory? 4, recovery_active? 1 -> "
+        "num_finished 1 < *",
     ),
     "PolicyController": (
         controller,
@@ -229,7 +232,16 @@ SYMBOLS = {
     "TrajectoryPlanner": {"n_z": 3, "H": 7, "M": 5},
     "BeliefEvaluator": {"n_s": 2, "n_z": 3, "H": 2, "n_f": 3, "n_c": 2},
     "CommandGuard": {"n_s": 1, "n_z": 3, "H": 4, "M": 3, "n_f": 3},
-    "FeedbackRecorder": {"n_s": 1, "n_z": 3, "H": 3, "n_f": 1, "n_c": 2, "n_q": 1, "n_v": 1},
+    "FeedbackRecorder": {
+        "n_s": 1,
+        "n_z": 3,
+        "H": 3,
+        "n_f": 1,
+        "n_c": 2,
+        "n_q": 1,
+        "n_v": 1,
+        "n": 4,
+    },
     "PolicyController": {"n_q": 9, "n_v": 8, "n_j": 2, "n_m": 10, "n": 28},
     "PlanFeatures": {"M": 2},
     "AssessorInputs": {"M": 2, "n_m": 1},
