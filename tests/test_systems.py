@@ -83,7 +83,7 @@ CASES = {
             INFO, num_steps=5, plant_state_size=2, watch_period_s=0.01, controller_memory_size=4
         ),
         "state 1, true_state? 1, output 3, desired_output 3, desired_preview 9, features 1, "
-        "margins 2, safe 1, plant_state 2, controller_memory? 4, recovery_active? 1 -> "
+        "margins 2, safe 1, plant_state 2, controller_memory 4, recovery_active? 1 -> "
         "num_finished 1 < *",
     ),
     "PolicyController": (

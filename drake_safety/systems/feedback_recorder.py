@@ -61,7 +61,7 @@ class FeedbackRecorder(LeafSystem):
         - margins: n_c
         - safe: 1
         - plant_state: n_q + n_v
-        - controller_memory: n (optional)
+        - controller_memory: n (with ``controller_memory_size``)
         - recovery_active: 1 (optional)
         output_ports:
         - num_finished: 1
