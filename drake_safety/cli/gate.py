@@ -49,7 +49,7 @@ _COLUMNS = (
 )
 _OF_RATE = ("failure rate", "episodes", "failures", "random episodes of the same variance")
 _OF_COMMANDS = ("commanded", "from", "to", "pairs", "newly fail", "fail no longer")
-_OF_EPISODES = ("episode", "cause", "at [s]", "commanded", "Γ at its start: safe, unsafe, unknown")
+_OF_EPISODES = ("episode", "cause", "at [s]", "Γ at its start: safe, unsafe, unknown")
 _NOT_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _POINTS = Column("", "", "points", digits=1)
 _PANELS = """<!doctype html><meta charset="utf-8">
@@ -186,7 +186,7 @@ def rate(
     rate = Column("", "", "%", digits=2).text(found.rate)
     row = (rate, found.rate.n, len(found.failures), round(found.plain_rollouts))
     _show(f"{loaded.name}, {variation}: {metric}", _OF_RATE, [row])
-    _show_episodes("Failures", found.failures, metric, found.output_names)
+    _show_episodes("Failures", found.failures, metric, loaded.make_loop(variation).output_names)
     entries = {"seed": seed, "metric": metric} | asdict(found)
     _write(folder / "rate.json", Loop(loaded, variation), entries, failure_rate=found.rate)
 
@@ -304,9 +304,8 @@ def _show_episodes(
         )
         for one in episodes[:_MOST_SHOWN]
     ]
-    columns = [*_OF_EPISODES]
-    columns[3] = ", ".join(map(_with_unit, names))
-    _show(title, columns, rows)
+    commanded = "commanded: " + ", ".join(map(_with_unit, names))
+    _show(title, (*_OF_EPISODES[:3], commanded, _OF_EPISODES[3]), rows)
 
 
 def _show(title: str, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
@@ -341,7 +340,7 @@ def _write_junit(
             what, kind = one.verdict, {WORSE: "failure", UNDECIDED: "error"}.get(one.verdict, "")
             told = f"{what} after {one.pairs} pairs: {_POINTS.text(one.difference[-1])} points"
         else:
-            what, told = "not reached", "not reached: the command ended before"
+            what = told = "not reached"
         if kind:
             ElementTree.SubElement(case, kind, type=what, message=told)
     counts = {"tests": "testcase", "failures": "failure", "errors": "error"}

@@ -37,13 +37,11 @@ class FailureRate:
         rate: With its 95 % interval, of n rollouts.
         plain_rollouts: Number of random episodes whose share of failures has the same variance.
         failures: The episodes that failed, by time.
-        output_names: Names of what was commanded.
     """
 
     rate: Estimate
     plain_rollouts: float
     failures: list[Outcome]
-    output_names: list[str]
 
 
 def estimate_failure_rate(
@@ -108,10 +106,7 @@ def estimate_failure_rate(
     failures = np.bincount(chosen, [one.value for one in found])
     rate, plain_rollouts = stratified_rate(np.bincount(stratum), np.bincount(chosen), failures)
     failed = sorted((one for one in found if one.value), key=lambda one: one.time_s)
-    names = list(make().output_names)
-    return FailureRate(
-        rate=rate, plain_rollouts=plain_rollouts, failures=failed, output_names=names
-    )
+    return FailureRate(rate=rate, plain_rollouts=plain_rollouts, failures=failed)
 
 
 def strata_of(score: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -59,8 +59,8 @@ class Verdict:
         no_longer_failing: The baseline's that do worse.
         by_command: Rows of an entry of the desired output, a range, a third of all pairs, their
             number, and how many of them newly fail and fail no longer.
-        pairs_needed: Number of pairs that a verdict takes, if all are like those so far; None if
-            there is one, or it takes over a thousand times as many.
+        pairs_needed: That a verdict takes, if all are like those so far; None if there is one, or
+            too many.
     """
 
     verdict: str
@@ -114,7 +114,8 @@ def compare_loops(
         got = f"{worse_by}, {alpha} and {max_pairs}"
         raise ValueError(f"worse_by and alpha must be in (0, 1), max_pairs at least 1; got {got}")
     one, two = (Loop(x) if isinstance(x, Scenario) else x for x in (baseline, candidate))
-    hashes = _hashes((one, two))
+    check_pair((one, two), metric=metric, seed=seed)
+    hashes = [scenario.simulation_hash(variation) for scenario, variation in (one, two)]
     # The texts say what the hashes leave out.
     texts = (scenario.to_yaml() for scenario, _ in (one, two))
     make = MadeOnce((*hashes, *texts), lambda: [make_paired((one, two), side) for side in (0, 1)])
@@ -161,8 +162,7 @@ def compare_loops(
             looks[1].append(look(later_s, looks[1], alpha, one.scenario.episode_duration_s))
             verdict = _verdict(pairs, looks, worse_by, loops[0].output_names)
             if verdict.verdict == UNDECIDED:
-                needed = pairs_needed(apart, worse_by, alpha)
-                verdict = replace(verdict, pairs_needed=needed)
+                verdict = replace(verdict, pairs_needed=pairs_needed(apart, worse_by, alpha))
             each_look(verdict)
             if verdict.verdict != UNDECIDED:
                 break
@@ -173,29 +173,23 @@ def check_pair(pair: tuple[Loop, Loop], *, metric: Metric = UNSAFE, seed: int = 
     """Builds two loops and begins their first episode, before hours of simulations.
 
     Raises:
-        ValueError: They are the same or do not start alike, one of them breaks the contract of
+        ValueError: They are the same or do not start alike, one breaks the contract of a
             :class:`ClosedLoop`, or there is no such metric.
     """
-    _hashes(pair)
+    (one, variation), (two, other) = pair
+    if (hash_ := one.simulation_hash(variation)) == two.simulation_hash(other):
+        who = f"scenario '{one.name}', variation '{variation}'"
+        raise ValueError(f"the candidate is the baseline: {who}, with hash {hash_[:12]}")
     starts = []
     for side, who in enumerate(("baseline", "candidate")):
         loop = make_paired(pair, side)
         Outcomes(loop, metric)
-        for one in check_contract(loop, seed=seed):
-            if not one.is_ok:
-                raise ValueError(f"the {who}'s {one.item}: {one.message}; {one.remedy}")
+        if wrong := [each for each in check_contract(loop, seed=seed) if not each.is_ok]:
+            raise ValueError(f"the {who}'s {wrong[0].item}: {wrong[0].message}; {wrong[0].remedy}")
         context = loop.CreateDefaultContext()
         loop.reset(context, episode_rng(seed, 0))
         starts.append(_start_of(loop, context))
     _check_alike(0, loop, *starts)
-
-
-def _hashes(pair: tuple[Loop, Loop]) -> list[str]:
-    hashes = [scenario.simulation_hash(variation) for scenario, variation in pair]
-    if hashes[0] == hashes[1]:
-        who = f"scenario '{pair[0].scenario.name}', variation '{pair[0].variation}'"
-        raise ValueError(f"the candidate is the baseline: {who}, with hash {hashes[0][:12]}")
-    return hashes
 
 
 def _verdict(

@@ -94,15 +94,15 @@ class Outcomes:
 
 def _bad_rows(loop: ClosedLoop, metric: str) -> Callable[[Episode], np.ndarray]:
     """The rows of an episode in which it fails, (N,), by a metric."""
-    names, num_steps = loop.constraint_names, loop.scenario.num_steps
+    names = loop.constraint_names
     kind, _, bound = metric.partition("=")
     if metric == UNSAFE:
         return lambda one: _last_row(one, not one.is_safe)
     if kind == "tracking" and is_number(bound) and float(bound) > 0:
-        # A motion that ends early has fallen.
+        fall = names.index(loop.fall_name) if isinstance(loop, CanFall) else None
         return lambda one: (
             ~(np.linalg.norm(one.output - one.desired_output, axis=1) <= float(bound))
-            | _last_row(one, one.num_steps < num_steps)
+            | (False if fall is None else one.margins[:, fall] < 0.0)
         )
     name = _constraint(loop, metric)
     if name not in names:

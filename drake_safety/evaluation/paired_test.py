@@ -67,14 +67,11 @@ def look(
 
 
 def pairs_needed(outcomes: Sequence[float], bound: float, alpha: float) -> int | None:
-    """Number of pairs that decide, if all are like the outcomes so far, (N,); None if too many.
-
-    Then an interval excludes 0, or what is above ``bound``.
-    """
+    """Pairs that exclude 0, or more than a bound, if all are like the outcomes so far, (N,)."""
     values, counts = np.unique(outcomes, return_counts=True)
     times = np.geomspace(1.0, _MOST_TIMES, 400)[:, None]
-    bets = ((1.0, 0.0), (-1.0, 0.0), (-1.0, -bound))
-    log_e = [betting_log_e(sign * values, times * counts, mean) for sign, mean in bets]
+    bets = ((values, 0.0), (-values, 0.0), (-values, -bound))
+    log_e = [betting_log_e(of, times * counts, mean) for of, mean in bets]
     is_known = np.max(log_e, axis=0) >= -math.log(alpha)
     return math.ceil(len(outcomes) * times[np.argmax(is_known), 0]) if is_known.any() else None
 

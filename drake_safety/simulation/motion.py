@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.systems.analysis import Simulator, SimulatorStatus
-from pydrake.systems.framework import Context, Diagram, PortDataType
+from pydrake.systems.framework import Context, Diagram, EventStatus, PortDataType, System
 
 from drake_safety.learning.segments import (
     DIVERGED,
@@ -26,6 +26,7 @@ from drake_safety.simulation.legged_loop import LeggedLoop
 
 _SAME_TIME = 1e-3  # Largest difference between the times reached and asked for, in steps.
 _ENDED = SimulatorStatus.ReturnReason.kReachedTerminationCondition
+_FAILED = EventStatus.Failed
 _LOGGER = logging.getLogger("drake_safety")
 
 
@@ -219,7 +220,7 @@ def simulate(
         diagram.remove_visuals(context)
     first_row = start(context)
     begin_s = context.get_time()
-    is_finite_at_start = np.isfinite(_state(context))
+    is_finite_at_start = np.abs(_state(context)) < LARGEST
     waiting = sorted(events, key=lambda event: event[0])
     is_last = False
     leave_s = fall_s = math.inf
@@ -229,8 +230,8 @@ def simulate(
     def is_over(time_s: float) -> bool:
         nonlocal leave_s, fall_s, cause
         now = margins_port.Eval(context)
-        if not np.isfinite(now).all():
-            k = int(np.argmin(np.isfinite(now)))
+        if len(wrong := np.flatnonzero(~(np.abs(now) < LARGEST))):
+            k = max(wrong, key=lambda i: not now[i] > 0.0)  # One that shows a divergence, if any.
             text = f"constraint '{names[k]}' has a margin of {now[k]} at {time_s:g} s"
             if now[k] > 0:
                 raise ValueError(f"{text}; cap it at a finite distance, such as a query's range")
@@ -252,6 +253,7 @@ def simulate(
             raise ValueError(f"the simulation is at {reached_s} s, expected at {to_s} s")
 
     try:
+        EventStatus.Failed = _failed
         if not 0.0 <= begin_s < math.inf:
             raise ValueError(f"it starts at {begin_s} s; Drake's periodic events begin at 0 s")
         is_ended = simulator.Initialize().reason() == _ENDED
@@ -279,6 +281,8 @@ def simulate(
             raise EpisodeError(f"{who}: the simulation failed: {error}") from error
         failure = str(error)
         _LOGGER.info("%s diverged: %s", who, error)
+    finally:
+        EventStatus.Failed = _FAILED
     arrays = recorder.arrays()
     return Motion(
         time_s=arrays.pop("time_s"),
@@ -290,6 +294,11 @@ def simulate(
         first_row=int(first_row or 0),  # It may be one of NumPy's.
         index=index,
     )
+
+
+def _failed(system: System | None, message: str) -> None:
+    """Raises what a system says of its failure: pydrake's message of one in Python would crash."""
+    raise RuntimeError(f"system '{system and system.get_name()}' failed: {message}")
 
 
 def advance_to(simulator: Simulator, time_s: float) -> bool:
@@ -328,9 +337,9 @@ def _is_divergence(error: BaseException, context: Context, is_finite_at_start: n
         return True
     if type(error) in (RuntimeError, SystemExit) and _NUMERICAL_FAILURE.search(str(error)):
         return True
-    # Any error that follows a state that became non-finite.
+    # Any error that follows a state that became non-finite, or huge.
     state = _state(context)
-    return bool((is_finite_at_start & ~np.isfinite(state)).any())
+    return bool((is_finite_at_start & ~(np.abs(state) < LARGEST)).any())
 
 
 def _state(context: Context) -> np.ndarray:

@@ -55,23 +55,11 @@ def record_episodes(
 ) -> Episodes:
     """Simulates a set of episodes of any diagram, in worker processes.
 
-    The diagram exports these ports, under these names or those of ``ports``:
-
-    =================== ======= ===============================================================
-    output port         size    meaning
-    =================== ======= ===============================================================
-    ``state``           n_s     the assessor's input
-    ``output``          n_z     the output that follows the plan
-    ``desired_preview`` H n_z   the plan at the next H steps, the present included, row-major in
-                                time; its size determines H
-    ``margins``         n_c     signed distance to each constraint, negative where violated
-    ``true_state``      n_s     optional: ``state`` without noise; ``state`` by default
-    ``desired_output``  n_z     optional: the plan now, in the frame of ``output``; the first
-                                sample of ``desired_preview`` by default
-    ``features``        n_f     optional: further inputs of the assessor; none by default
-    ``safe``            1       optional: below 1 once the state is unsafe; by default when a
-                                margin is negative
-    =================== ======= ===============================================================
+    The diagram exports, under these names or those of ``ports``, the ports ``state`` (n_s),
+    ``output`` (n_z), ``desired_preview`` (H n_z; its size determines H) and ``margins`` (n_c), as a
+    :class:`ClosedLoop` does. Optional are ``true_state``, by default ``state``, ``desired_output``,
+    by default the first sample of the preview, ``features`` of the assessor, by default none, and
+    ``safe``, below 1 once the state is unsafe, by default where a margin is negative.
 
     A row has the values of the ports at its time; a port that is sampled and held has its last
     sample. Episode i depends on the diagram, the seed and i alone: its arrays are identical for
