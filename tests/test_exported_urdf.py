@@ -6,6 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial import ConvexHull
 
 import legged_robots
@@ -33,10 +34,10 @@ def problems(written):
     return [f for f in check_scenario(written.files[-1], num_episodes=0) if not f.is_ok]
 
 
-def warned(written):
-    """Items of which a check that imports nothing warns, and remedies."""
+def findings_of(written):
+    """What a check that imports nothing warns of or refuses."""
     findings = check_scenario(written.files[-1], num_episodes=0, is_imported=False)
-    return {f.item: f.remedy for f in findings if f.is_warning}
+    return {f.item: f for f in findings if f.remedy}
 
 
 def obj(path, points):
@@ -170,7 +171,7 @@ MASSES, THIGH_MASS = "mass value|ixx|iyy|izz", '<mass value="0.24"/>'
         (with_moments(lambda moment: 1e-6), "at 4.8 kg, a radius of gyration of 0.00046 m"),
         (with_moments(lambda mass: 1e3 * mass, MASSES), "has 8.16e+03 kg (grams or tonnes?)"),
         (
-            with_moments(lambda mass: 1e-3 * mass, MASSES),
+            with_moments(lambda value: 1e-3 * value, f"{MASSES}|effort"),
             "has 0.00816 kg (grams or tonnes?)",
         ),
         (
@@ -178,6 +179,7 @@ MASSES, THIGH_MASS = "mass value|ixx|iyy|izz", '<mass value="0.24"/>'
             "the centre of mass of link 'FL_thigh' is 100 m from it; the centre of mass",
         ),
         (quadruped({STOPS: 'lower="-45" upper="45"'}), "limits in degrees instead of radians?"),
+        (quadruped({'velocity="30"': 'velocity="1000"'}), "(1000 rad/s, at most 97.3 expected)"),
         (
             quadruped({TURN: TURN.replace('rpy="0 0 0', 'rpy="0 0 180')}),
             "rpy of ['FL_foot_jo",
@@ -203,10 +205,74 @@ MASSES, THIGH_MASS = "mass value|ixx|iyy|izz", '<mass value="0.24"/>'
 def test_what_is_changed_or_odd_is_told_at_once_and_nothing_else(text, note, tmp_path):
     obj(tmp_path / "part.obj", BOX)
     written = robot_of(text, tmp_path)
-    warnings, remedy = written.copy.warnings, warned(written).get("inertias", "")
+    warnings, found = written.copy.warnings, findings_of(written)
+    remedy = found["inertias"].remedy if "inertias" in found else ""
     assert len(warnings) == bool(note) and all(note in one for one in warnings)
     of_masses = re.search("inertias|centre of mass|grams", "".join(warnings))
     assert ("correct <inertia>" in remedy) == bool(of_masses)
+
+
+SLIDING = quadruped({'"0 1 0"/>' + CALF: f'"0 0 1"/>{LIMIT.format(-0.12, 0.1)}'})
+for name in KNEES:
+    SLIDING = SLIDING.replace(f'"{name}" type="revolute"', f'"{name}" type="prismatic"')
+
+
+def limited(text, effort):
+    return text.replace('effort="23.7"', effort)
+
+
+@pytest.mark.parametrize(
+    ("text", "effort", "asked"),
+    [
+        (quadruped(), 'effort="1000"', "'FL_calf_joint' (q.urdf says 1000) [N·m]"),
+        (quadruped(above=each(ROS1, DRIVEN + KNEES)), 'effort="50000"', "says 50000) [N·m]"),
+        (quadruped(), 'effort="100"', "(q.urdf says 100) [N·m]"),
+        (quadruped(), 'effort="1e12"', "(q.urdf says 1e+12) [N·m]"),
+        (
+            SLIDING,
+            'effort="1000"',
+            "the largest force of joint 'FL_calf_joint' (q.urdf says 1000) [N]",
+        ),
+        (SLIDING, "", "the largest force of joint 'FL_calf_joint' [N]"),
+    ],
+)
+def test_efforts_that_no_motor_has_are_estimated_asked_for_and_warned_of(
+    text, effort, asked, tmp_path
+):
+    written = robot_of(limited(text, effort), tmp_path)
+    (note,) = written.copy.warnings or [""]
+    assert ("12 joints have limits that no motor of a robot of 8" in note) == bool(effort)
+    assert asked in " ".join(written.asked)
+    assert "those of 12 joints are estimates" in findings_of(written)["effort limits"].message
+    assert "motor limits" not in findings_of(written)
+    # robot.yaml replaces the limits of the file, which come back without it.
+    file = written.folder / "robot.yaml"
+    stated = yaml.safe_load(file.read_text())
+    plant = RobotKinematics(load_robot_file(file)).plant
+    motors = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
+    assert {m.joint().name(): m.effort_limit() for m in motors} == stated["effort_limits"]
+    limits = {name: 1e3 for name in stated["effort_limits"]}
+    file.write_text(yaml.safe_dump(stated | {"effort_limits": limits}))
+    unit = "N" if "prismatic" in text and not effort else "N·m"
+    assert f"(1000 {unit}, at most" in findings_of(written)["motor limits"].message
+
+
+@pytest.mark.parametrize("text", [quadruped(), SLIDING, limited(SLIDING, 'effort="60"')])
+def test_efforts_that_a_motor_may_have_are_neither_noted_nor_asked_for(text, tmp_path):
+    written = robot_of(text, tmp_path)
+    assert not written.copy.warnings and "largest" not in " ".join(written.asked)
+    assert {"motor limits", "effort limits"}.isdisjoint(findings_of(written))
+
+
+def test_a_slider_is_as_stiff_at_the_foot_as_a_hinge(tmp_path):
+    gains = load_robot_file(robot_of(SLIDING, tmp_path).folder / "robot.yaml").joint_gains
+    slider, hinge = (gains[f"FL_{part}_joint"].stiffness for part in ("calf", "hip"))
+    assert slider == pytest.approx(hinge / 0.36**2, rel=0.1)
+
+
+def test_efforts_too_small_to_stand_are_a_problem(tmp_path):
+    found = findings_of(robot_of(limited(quadruped(), 'effort="0.5"'), tmp_path))
+    assert "of 0.5 N·m" in found["effort against gravity"].message
 
 
 def test_a_speed_limit_of_zero_is_none(tmp_path):
@@ -338,7 +404,7 @@ def test_wheels_are_told_in_the_terminal_and_in_the_files(text, radius_m, tmp_pa
         any(told in note for note in written.copy.warnings),
         "turns a wheel, which its servo holds" in written.files[1].read_text(),
         "turn wheels" in written.files[2].read_text(),
-        "wheels" in warned(written),
+        "wheels" in findings_of(written),
     ] == 4 * [radius_m is not None]
 
 

@@ -5,6 +5,7 @@ import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -258,6 +259,14 @@ def test_such_a_task_can_be_played_and_run_and_an_empty_scene_is_warned_of(
     assert "end" in rows[-1][1] or "left" in rows[-1][1]
     assert "meshcat" in (run / "recording.html").read_text()[:200_000].lower()
     assert "the episode starts" in told
+    for file in run.iterdir():
+        file.unlink()
+    broken = {"side_effect": RuntimeError("no picture")}
+    with mock.patch("drake_safety.cli.run.timeline_figure", **broken), pytest.raises(RuntimeError):
+        call(monkeypatch, "run", *arguments)
+    # Its pictures come last.
+    assert {path.name for path in run.iterdir()} == {"recording.html", "run.json"}
+    capsys.readouterr()
     for options, message in (
         (["--push", "ball"], f"run: --push: task '{task.split(':')[1]}' has no ball to throw"),
         (["--target", "1 2 3"], "has no plans with a goal"),

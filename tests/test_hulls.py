@@ -10,6 +10,7 @@ import yaml
 
 import urdf_files
 from command_line import invoked
+from drake_safety.evaluation.stills import StillCamera
 from drake_safety.robots.robot_template import write_robot
 from drake_safety.robots.urdf_survey import Survey
 from drake_safety.simulation.rollouts import run_episode
@@ -131,6 +132,34 @@ def test_check_draws_the_standing_robot_beside_its_shapes(spider, tmp_path):
     assert "--picture draws a legged robot" in str(result.exception) and not picture.exists()
     assert invoked("check", spider.folder / "balancing.yaml", *words).exit_code == 0
     assert picture.is_file() and "convex hulls" in picture.with_suffix(".svg").read_text()
+
+
+def test_a_picture_is_without_a_mesh_that_has_no_normals(spider, tmp_path, caplog):
+    own = shutil.copytree(spider.folder, tmp_path / "own")
+    (own / "bare.obj").write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\n")
+    urdf, bare = own / "spider.urdf", urdf_files.mesh("visual", "bare.obj")
+    urdf.write_text(urdf_files.with_shape(urdf.read_text(), "femur_3", bare))
+    loop = load_scenario(own / "balancing.yaml").make_loop()
+    context = loop.plant.CreateDefaultContext()
+    camera = StillCamera(loop, loop.plant.GetPositions(context), width=96, height=72)
+    (note,) = [record.getMessage() for record in caplog.records]
+    assert note.startswith("the picture is without a mesh: OBJ has no normals:")
+    assert "bare.obj" in note
+    assert np.ptp(camera.render(loop.plant.GetPositions(context))) > 100
+
+
+def test_new_gives_normals_to_meshes_of_visuals_and_of_links_without_one(tmp_path, caplog):
+    urdf = shaped(tmp_path)
+    text = urdf.read_text()
+    for link, kind in (("femur_0", "visual"), ("femur_1", "collision")):
+        bar(length=0.1).export(tmp_path / f"{link}.obj", include_normals=False)
+        text = urdf_files.with_shape(text, link, urdf_files.mesh(kind, f"{link}.obj"))
+    urdf.write_text(text)
+    folder = write_robot("spider", urdf, "balancing", tmp_path / "new").folder
+    loop = load_scenario(folder / "balancing.yaml").make_loop()
+    StillCamera(loop, loop.plant.GetPositions(loop.plant.CreateDefaultContext()))
+    assert not caplog.records
+    assert {one.name for one in (folder / "meshes").iterdir()} >= {"femur_0.gltf", "femur_1.gltf"}
 
 
 def test_mujoco_takes_the_hulls_too(spider, tmp_path):

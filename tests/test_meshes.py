@@ -91,7 +91,7 @@ def test_a_collada_mesh_is_upright_and_in_metres(tmp_path, asset, extents):
 )
 def test_an_obj_whose_materials_are_all_transparent_is_converted(cache, tmp_path, materials, shown):
     path = tmp_path / "hip.obj"
-    trimesh.creation.box(extents=[1.0, 2.0, 4.0]).export(path)
+    trimesh.creation.box(extents=[1.0, 2.0, 4.0]).export(path, include_normals=True)
     if materials is not None:
         path.with_suffix(".mtl").write_text(materials)
     assert is_shown(path) == shown
@@ -99,6 +99,44 @@ def test_an_obj_whose_materials_are_all_transparent_is_converted(cache, tmp_path
     assert (found == path) == shown == (not cache.exists())
     if not shown:
         assert_colour(found, [0.2, 0.4, 0.6, 1.0])
+
+
+POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+NORMAL, PLACE = "vn 0 0 1\n", "vt 0 0\n"
+
+
+@pytest.mark.parametrize(
+    ("faces", "shown"),
+    [
+        (NORMAL + "f 1//1 2//1 3//1\nf 1//1 2//1 4//1\n", True),
+        (NORMAL + PLACE + "f 1/1/1 2/1/1 3/1/1\n", True),
+        (NORMAL + "f -4//-1 -3//-1 -2//-1\n", True),
+        ("f 1 2 3\nf 1 2 4\n", False),
+        (NORMAL + "f 1//1 2//1 3//1\nf 1 2 4\n", False),
+        (PLACE + "f 1/1 2/1 3/1\n", False),
+        ("  f\t1 2 3 4 \r\n", False),
+    ],
+)
+def test_an_obj_without_normals_is_converted_if_it_can_be(
+    cache, tmp_path, monkeypatch, faces, shown
+):
+    path = tmp_path / "hull.obj"
+    path.write_text(POINTS + faces)
+    path.with_suffix(".mtl").write_text("newmtl a\nKd 1 0 0\n")
+    found = shown_mesh(path)
+    assert (found == path) == shown
+    monkeypatch.setattr("drake_safety.robots.meshes.find_spec", lambda name: None)
+    assert shown_mesh(path) == path
+
+
+def test_an_obj_that_gets_normals_keeps_the_colours_of_its_materials(cache, tmp_path):
+    path = tmp_path / "hull.obj"
+    path.write_text(f"mtllib hull.mtl\n{POINTS}usemtl a\nf 1 2 3\n")
+    path.with_suffix(".mtl").write_text("newmtl a\nKd 1 0 0\n")
+    assert_colour(shown_mesh(path, "0 0 1 1"), [1, 0, 0, 1])
+    path.with_suffix(".mtl").unlink()
+    path.write_text(f"{POINTS}f 1 2 4\n")
+    assert_colour(shown_mesh(path, "0 0 1 1"), [0, 0, 1, 1])
 
 
 def test_up_stays_up_and_the_colour_is_the_models(cache, tower):

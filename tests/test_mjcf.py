@@ -141,6 +141,8 @@ def test_a_urdf_moves_as_the_mjcf_does(tmp_path, bodies):
     assert plant.CalcTotalMass(context) == pytest.approx(model.body_subtreemass[1])
 
 
+IN_CLASSES = """<motor joint="j" class="geared"/></actuator><default><default class="geared">
+  <motor ctrlrange="-2 2" gear="25"/><joint armature="0.1"/></default></default><actuator>"""
 GEARED = '<position joint="j" kp="9" kv="2" forcerange="-4 4" gear="3"/>'
 
 
@@ -158,6 +160,8 @@ GEARED = '<position joint="j" kp="9" kv="2" forcerange="-4 4" gear="3"/>'
         ('<motor joint="j" ctrlrange="-3 6" gear="10"/>', "", None, 60),
         ('<motor joint="j"/>', "", None, None),
         ("", 'actuatorfrcrange="-8 8"', None, None),
+        (IN_CLASSES, 'class="geared"', None, 50),
+        (IN_CLASSES, 'class="geared" actuatorfrcrange="-9 9"', None, 9),
     ],
 )
 def test_gains_and_effort_limits_are_the_actuators(tmp_path, actuators, joint, gains, effort):
@@ -209,6 +213,27 @@ def test_what_a_urdf_cannot_hold_is_noted(tmp_path, text, note):
     assert converted(text, tmp_path)[0].left_out == [note]
 
 
+SLIDES = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+TURNS = SLIDES.replace("slide", "hinge")
+
+
+@pytest.mark.parametrize(
+    ("free", "names"),
+    [
+        (SLIDES + '<joint type="ball"/>', "joint_0, joint_1, joint_2, joint_3"),
+        (SLIDES + TURNS, ", ".join(f"joint_{k}" for k in range(6))),
+        ('<joint type="ball" name="b"/>' + SLIDES, "b, joint_1, joint_2, joint_3"),
+    ],
+)
+def test_a_base_that_moves_as_by_a_free_joint_floats(tmp_path, free, names):
+    key = '<keyframe><key qpos="0 0 0 {} 0.5"/></keyframe>'
+    key = key.format("0 0 0" if "hinge" in free else "1 0 0 0")
+    facts, root = converted(robot(arm(), key, free), tmp_path)
+    assert facts.left_out == [f"joints of the base are read as a free joint: {names}"]
+    assert [joint.get("name") for joint in root.findall("joint")] == ["j"]
+    assert facts.postures == {"0": {"j": 0.5}}
+
+
 LOOP = '<equality><connect body1="arm_j" body2="base" anchor="0 0 0"/></equality>'
 GONE = '<asset><mesh name="gone" file="gone.stl"/></asset>'
 SLIDE = "<joint name='slide_x' type='slide'/>"
@@ -217,11 +242,15 @@ SLIDE = "<joint name='slide_x' type='slide'/>"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (robot(arm('type="ball"')), "joint 'j' is a ball joint or moves the base"),
+        (robot(arm('type="ball"')), "body 'arm_j' has a ball joint; replace it by three hinges"),
+        (
+            robot(arm(), free=SLIDE),
+            "the base 'base' moves in 1 of 6 directions; replace its joints",
+        ),
+        (robot(arm(), free='<joint type="ball"/>'), "moves in 3 of 6 .* by <freejoint/>"),
         (robot(arm(), LOOP), "connects bodies 'arm_j' and 'base' to a loop"),
         (robot(arm('stiff="5"')), "unrecognized attribute: 'stiff'"),
         (robot(arm("", '<geom type="mesh" mesh="gone"/>'), GONE), "gone.stl"),
-        (robot(arm(), free=SLIDE), "'slide_x' .* moves the base"),
         (robot(free=""), "has no joint"),
     ],
 )

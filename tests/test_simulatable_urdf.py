@@ -97,6 +97,24 @@ def test_visuals_that_are_missing_or_broken_are_left_out_by_name_and_reason(tmp_
     assert copy.notes == copy.left_out
 
 
+@pytest.mark.parametrize(
+    ("url", "there"),
+    [
+        ("package://my_bot/meshes/hull.obj", "my-bot/meshes/hull.obj"),
+        ("../meshes/HULL.obj", "my-bot/meshes/hull.obj"),
+        ("package://My_Bot/Meshes/hull.OBJ", "my-bot/meshes/hull.obj"),
+        ("../meshes/other.obj", ""),
+    ],
+)
+def test_a_file_that_differs_by_case_or_hyphens_is_named(url, there, tmp_path):
+    source = tmp_path / "my-bot" / "urdf"
+    for folder in (source, source.parent / "meshes"):
+        folder.mkdir(parents=True)
+    (source.parent / "meshes" / "hull.obj").write_text("v 0 0 0\n")
+    (note,) = copy_of(source, mesh("visual", url))[0].left_out
+    assert url in note and (f"{there}' is there)" in note if there else "is there" not in note)
+
+
 def test_two_meshes_of_one_name_are_two_in_the_copy(tmp_path):
     for name in ("left", "right"):
         (tmp_path / name).mkdir()

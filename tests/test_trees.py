@@ -3,8 +3,10 @@ import copy
 import numpy as np
 import pytest
 
+from drake_safety.learning.maps import learned_trees
 from drake_safety.learning.trained_maps import INPUT_LIMIT
 from drake_safety.learning.trees import MOST_LEAVES, Trees
+from lip_assessments import map_data
 
 NUM_INPUTS = 5
 
@@ -63,6 +65,22 @@ def test_the_logit_is_that_of_scikit_learn(monkeypatch):
     between = np.nextafter(single, single[::-1])  # Beside the thresholds.
     np.testing.assert_allclose(trees.evaluate(between), model.decision_function(between), atol=1e-6)
     assert np.ptp(trees.evaluate(x)) > 4.0
+
+
+@pytest.mark.train
+@pytest.mark.parametrize("is_rare", [True, False])
+@pytest.mark.parametrize("num_rare", [0, 1, 2, 3])
+def test_where_the_rest_to_learn_from_has_one_label_there_are_no_trees(num_rare, is_rare):
+    episode = np.repeat(np.arange(40), 20)
+    is_held_out = episode < 10
+    # Episodes 10, 20 and 30 choose the number of trees.
+    label = np.isin(episode, [10, 20, 30][:num_rare]) | (is_held_out & (episode % 2 == 0))
+    x = drawn(len(episode))[0]
+    data = map_data(x, x[:, :2], is_unsafe=label == is_rare)
+    assert learned_trees(data, episode, is_held_out, 0) is None
+    data.is_unsafe[episode == 33] = is_rare
+    tried, trees = learned_trees(data, episode, is_held_out, 0)
+    assert 0 < len(tried) == len(trees)
 
 
 @pytest.mark.train

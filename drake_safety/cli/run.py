@@ -336,11 +336,7 @@ def event_rows(
 
 def _save(folder: Path, viewer: Meshcat, loop: Any, shown: _Shown) -> None:
     """Writes recording, figures and events, and prints the events and the paths."""
-    motion, figures = shown.motion, {"timeline": _timeline(loop, shown)}
-    if shown.marked is not None:
-        unknown = is_unknown(motion["belief"], loop.assessment.parameters.initial_uncertainty)
-        curve = motion.time_s, motion["embedding"], ~unknown, motion["safety_probability"][:, 0]
-        figures["path"] = path_figure(loop.assessment, *curve, shown.threshold, shown.marked)
+    motion = shown.motion
     viewer.StopRecording()
     viewer.PublishRecording()
     folder.mkdir(parents=True, exist_ok=True)
@@ -353,6 +349,11 @@ def _save(folder: Path, viewer: Meshcat, loop: Any, shown: _Shown) -> None:
     console.show(console.new_table(*_COLUMNS, rows=rows))
     console.say("threshold", shown.told)
     console.say("recording", recording)
+    figures = {"timeline": _timeline(loop, shown)}
+    if shown.marked is not None:
+        unknown = is_unknown(motion["belief"], loop.assessment.parameters.initial_uncertainty)
+        curve = motion.time_s, motion["embedding"], ~unknown, motion["safety_probability"][:, 0]
+        figures["path"] = path_figure(loop.assessment, *curve, shown.threshold, shown.marked)
     for name, figure in figures.items():
         for path in save(figure, folder / name):
             console.say("picture  ", path)

@@ -6,6 +6,7 @@ its plant. The diagram is not changed: the renderer belongs to a separate Contex
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterable, Mapping
 
@@ -13,6 +14,7 @@ import numpy as np
 from pydrake.geometry import (
     ClippingRange,
     ColorRenderCamera,
+    GeometryId,
     LightParameter,
     MakeRenderEngineVtk,
     Mesh,
@@ -27,6 +29,7 @@ from pydrake.systems.sensors import CameraInfo
 
 from drake_safety.simulation.legged_loop import LeggedLoop
 
+_LOGGER = logging.getLogger("drake_safety")
 SUPERSAMPLING = 2
 """Rendered pixels for each of a still, in either direction."""
 _RENDERER = "stills"
@@ -71,14 +74,9 @@ class StillCamera:
         )
         self._camera = ColorRenderCamera(core)
         scene_graph = loop.GetSubsystemByName("scene_graph")
-        scene_graph.AddRenderer(
-            scene_graph.GetMyMutableContextFromRoot(self.context),
-            _RENDERER,
-            MakeRenderEngineVtk(
-                _lighting(centre, radius, brightness=_PBR_BRIGHTNESS if self._has_gltf() else 1.0)
-            ),
-        )
         self._scene_graph, self._world = scene_graph, scene_graph.world_frame_id()
+        brightness = _PBR_BRIGHTNESS if self._meshes(".gltf") else 1.0
+        self._add_renderer(_lighting(centre, radius, brightness=brightness))
 
     def render(self, positions: np.ndarray) -> np.ndarray:
         """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8."""
@@ -98,12 +96,29 @@ class StillCamera:
             raise ValueError("stills: the positions are not finite")
         self._plant.SetPositions(self._plant_context, positions)
 
-    def _has_gltf(self) -> bool:
-        """Whether the scene has a glTF mesh."""
+    def _add_renderer(self, lighting: RenderEngineVtkParams) -> None:
+        """Leaves out meshes that the renderer refuses, such as an OBJ without normals."""
+        context = self._scene_graph.GetMyMutableContextFromRoot(self.context)
+        try:
+            self._scene_graph.AddRenderer(context, _RENDERER, MakeRenderEngineVtk(lighting))
+        except RuntimeError as error:
+            refused = [one for one, path in self._meshes().items() if path in str(error)]
+            if not refused:
+                raise
+            _LOGGER.warning("the picture is without a mesh: %s", error)
+            for one in refused:
+                source = self._plant.get_source_id()
+                self._scene_graph.RemoveRole(context, source, one, Role.kPerception)
+            self._scene_graph.RemoveRenderer(context, _RENDERER)
+            self._add_renderer(lighting)
+
+    def _meshes(self, suffix: str = "") -> dict[GeometryId, str]:
+        """The files of the scene's meshes."""
         query = self._plant.get_geometry_query_input_port().Eval(self._plant_context)
         inspector = query.inspector()
-        shapes = map(inspector.GetShape, inspector.GetAllGeometryIds(Role.kPerception))
-        return any(isinstance(one, Mesh) and one.extension() == ".gltf" for one in shapes)
+        shapes = ((i, inspector.GetShape(i)) for i in inspector.GetAllGeometryIds(Role.kPerception))
+        found = {i: one.source() for i, one in shapes if isinstance(one, Mesh)}
+        return {i: str(one.path()) for i, one in found.items() if one.extension().endswith(suffix)}
 
     def _extent(self) -> tuple[np.ndarray, float]:
         """Centre of the visible geometry of the robot in the world (3,) and its radius [m]."""

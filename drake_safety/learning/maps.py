@@ -71,7 +71,7 @@ def learned_maps(
 
     Returns:
         The maps, the base logit of their heads and of the trees, and the trees. Without heads, both
-        are None; without held-out episodes of both labels, to weigh them on, trees are.
+        are None; trees are None without episodes of both labels to weigh them on and to learn from.
     """
     settings, x = mode_settings(parameters), columns.of_rows(segments)
     is_raw = np.arange(x.shape[1]) < columns.plan.stop
@@ -98,8 +98,9 @@ def learned_maps(
         # on the held-out episodes, and the final one is trained on all episodes.
         tried = _train(data.take(~is_held_out), parameters, lambda done: progress(0.5 * done))
         embedding = _train(data, parameters, lambda done: progress(0.5 * (1 + done)))
-        if settings.trees and embedding.has_heads:
-            tried_trees, trees = _trees(data, segments.episode, is_held_out, parameters.seed)
+        of = data, segments.episode, is_held_out, parameters.seed
+        if settings.trees and embedding.has_heads and (found := learned_trees(*of)):
+            tried_trees, trees = found
             trees_logit = tried_trees.evaluate(x[is_held_out])
     base_logit = None
     if embedding.has_heads:
@@ -110,12 +111,15 @@ def learned_maps(
     return embedding.clipping(known), base_logit, trees
 
 
-def _trees(
+def learned_trees(
     data: MapData, episode: np.ndarray, is_held_out: np.ndarray, seed: int
-) -> tuple[Trees, Trees]:
-    """Trees without the held-out inputs, and as many of all inputs."""
+) -> tuple[Trees, Trees] | None:
+    """Trees without the held-out inputs, and as many of all; None if the others have one label."""
     # A tenth of the other episodes, on which their number is chosen.
     is_stopping = np.isin(episode, np.unique(episode[~is_held_out])[::10])
+    label = data.is_unsafe[~is_held_out & ~is_stopping]
+    if label.all() or not label.any():
+        return None
 
     def fit(rows: np.ndarray, **options: Any) -> Trees:
         of = data.x[rows], data.is_unsafe[rows], data.sample_weight[rows]

@@ -7,6 +7,7 @@ import os
 import re
 import warnings
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,8 @@ SHOWN_FORMATS = (".gltf", ".obj", ".vtk")
 CACHE_VARIABLE = "DRAKE_SAFETY_CACHE"
 """Environment variable with the cache's folder."""
 _TRANSPARENCY = re.compile(r"^\s*Tr\s+(\d+\.?\d*)\s*$", re.MULTILINE)  # In an MTL file.
+_BARE_FACE = re.compile(r"^\s*f\s(?:.*\s)?-?\d+(?:/-?\d*)?(?=\s|$)", re.MULTILINE)
+"""A corner without a normal in an OBJ file, which Drake's renderer refuses."""
 _GREY = [0.6, 0.6, 0.6, 1.0]
 _UP_AXIS = re.compile(r"<up_axis>\s*(\w+)")  # In a COLLADA file.
 _X_ZY = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # From y up to z up.
@@ -53,9 +56,11 @@ def is_shown(path: Path) -> bool:
 def shown_mesh(path: Path, rgba: str = "") -> Path:
     """The file itself if Drake renders it, or else a glTF file in the cache.
 
-    ``rgba`` ("r g b a") colours a mesh without materials.
+    An OBJ without normals gets them, if trimesh is installed. ``rgba`` ("r g b a") colours a mesh
+    without materials.
     """
-    if is_shown(path):
+    is_bare = path.suffix.lower() == ".obj" and find_spec("trimesh") is not None
+    if is_shown(path) and not (is_bare and _BARE_FACE.search(path.read_text("utf-8", "replace"))):
         return path
     if not path.is_file():
         raise ValueError(f"mesh '{path}' does not exist")
@@ -134,7 +139,8 @@ def _to_gltf(path: Path, rgba: str) -> bytes:
     scene = _scene(path)
     import trimesh
 
-    if path.suffix.lower() in (".stl", ".obj"):
+    is_coloured = is_shown(path) and path.with_suffix(".mtl").is_file()
+    if path.suffix.lower() in (".stl", ".obj") and not is_coloured:
         colour = [float(value) for value in rgba.split()] or _GREY
         for mesh in scene.geometry.values():
             mesh.visual = trimesh.visual.TextureVisuals(

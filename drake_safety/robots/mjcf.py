@@ -93,15 +93,21 @@ class _Robot:
         (base, _), *others = Counter(roots.tolist()).most_common()
         self.bodies = self._names("body", np.flatnonzero(model.body_rootid == base).tolist())
         ids, kinds = np.flatnonzero(roots == base), mujoco.mjtJoint
-        is_free = model.jnt_type[ids] == kinds.mjJNT_FREE
-        self.joints = self._names("joint", ids[~is_free].tolist())
-        for j, name in self.joints.items():
-            if model.jnt_type[j] == kinds.mjJNT_BALL or model.jnt_bodyid[j] == base:
-                raise ValueError(
-                    f"joint '{name}' is a ball joint or moves the base '{self.bodies[base]}'; "
-                    "expected a base with a free joint, and joints that turn or slide"
-                )
-        fixed = [] if is_free.any() else [base]
+        is_base, num_ways = model.jnt_bodyid[ids] == base, int(model.body_dofnum[base])
+        # A free joint, or as free by three slides and a ball or three hinges.
+        if num_ways not in (0, 6):
+            raise ValueError(
+                f"the base '{self.bodies[base]}' moves in {num_ways} of 6 directions; replace its "
+                "joints by <freejoint/>"
+            )
+        self.joints = self._names("joint", ids[~is_base].tolist())
+        for j in self.joints:
+            if model.jnt_type[j] == kinds.mjJNT_BALL:
+                child = self.bodies[int(model.jnt_bodyid[j])]
+                raise ValueError(f"body '{child}' has a ball joint; replace it by three hinges")
+        likewise = ids[is_base & (model.jnt_type[ids] != kinds.mjJNT_FREE)].tolist()
+        fixed = [] if num_ways else [base]
+        self._note("joints of the base are read as a free joint", "joint", likewise)
         self._note("moving bodies beside the robot are left out", "body", [i for i, _ in others])
         self._note("the base is fixed to the world there, and floats here", "body", fixed)
         self._note("tendons are left out", "tendon", range(model.ntendon))

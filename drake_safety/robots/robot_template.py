@@ -21,15 +21,17 @@ from drake_safety.robots.robot_model import as_pattern, load_robot_file
 from drake_safety.robots.scenario_template import TASKS, Sizes, scenario_yaml
 from drake_safety.robots.simulatable_urdf import simulatable_copy
 from drake_safety.robots.standing_posture import standing_posture
-from drake_safety.robots.urdf_copy import UrdfCopy
+from drake_safety.robots.urdf_copy import UrdfCopy, joint_elements
 from drake_safety.robots.urdf_survey import (
     WITHOUT_STOPS_RAD,
     Limb,
     Survey,
+    effort_unit,
     extent,
     listed,
     mirrored,
     odd_inertias,
+    odd_limits,
     require_masses,
     require_motors,
     require_shapes,
@@ -39,6 +41,8 @@ from drake_safety.robots.urdf_survey import (
 # Servo gains in proportion to mass times height, from `BALANCING_REFERENCE`.
 _STIFFNESS = 28.0  # [1/s² · N·m/(rad kg m)]
 _DAMPING_S = 0.027
+# Efforts that the file lacks, in proportion to mass times height, and of sliders to mass.
+_TORQUE, _FORCE = 4.0, 20.0  # [m/s²]
 _LEAST_HEIGHT_M, _GREATEST_HEIGHT_M = 0.02, 20.0
 _LEAST_STANCE = 0.02  # Half the stance's width, by the height.
 
@@ -52,6 +56,7 @@ class NewRobot:
         posture_source: Where they come from.
         wheels: Joints that turn wheels at the ends of legs.
         fixed: Joints that move neither a foot nor a hand.
+        odd: Joints with efforts that no such motor has; robot.yaml estimates them.
         asked: Values that the file lacks and the user must supply.
     """
 
@@ -67,6 +72,7 @@ class NewRobot:
     posture_source: str = ""
     wheels: list[str] = field(default_factory=list)
     fixed: list[str] = field(default_factory=list)
+    odd: set[str] = field(default_factory=set)
     asked: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -310,7 +316,12 @@ def _stand(found: NewRobot) -> None:
     found.renew_survey()
     survey = found.survey
     survey.set_joints(found.posture)
-    if odd := odd_inertias(survey.plant, survey.context, survey.instance):
+    model = survey.plant, survey.context, survey.instance
+    found.odd, limits = odd_limits(*model, copy.drives.efforts)
+    for joint in (one for one in joint_elements(copy.root) if one.get("name") in found.odd):
+        for limit in joint.findall("limit"):
+            limit.attrib.pop("effort", None)  # Of which robot.yaml has an estimate.
+    for odd in filter(None, (odd_inertias(*model), limits)):
         copy.warn(odd)
     copy.ignore_collisions(survey.overlaps() | found.facts.apart)
     sizes = found.sizes
@@ -374,6 +385,8 @@ def _robot_yaml(found: NewRobot) -> str:
     legs = {name for limb in found.legs for name in limb.joints}
     for name, key in keys.items():
         stiffness = _STIFFNESS * sizes.load * (1.0 if name in legs else 0.5)
+        if effort_unit(found.survey.plant.GetJointByName(name, found.survey.instance)) == "N":
+            stiffness /= sizes.height_m**2  # [N/m]
         stiffness, damping = facts.gains.get(name, (stiffness, _DAMPING_S * stiffness))
         origin = f"  # of {source}" if name in facts.gains else ""
         gains.append(f"{key}: {{stiffness: {stiffness:.4g}, damping: {damping:.4g}}}{origin}")
@@ -391,14 +404,17 @@ def _robot_yaml(found: NewRobot) -> str:
     indices = plant.GetJointActuatorIndices(found.survey.instance)
     motors = [*map(plant.get_joint_actuator, indices)]
     driven = {one.joint().name() for one in motors if math.isfinite(one.effort_limit())}
-    for name in (name for name in names if name not in driven):
-        limit, note = found.copy.drives.efforts[name], ""
-        if not 0 < limit < math.inf:
-            limit = float(f"{4 * sizes.load:.3g}")
-            note = "  # ASK the motor's largest torque [N·m]"
-            found.asked.append(f"the largest torque of joint '{name}' [N·m]")
+    for name in (name for name in names if name not in driven - found.odd):
+        stated = limit = found.copy.drives.efforts[name]
+        unit, note = effort_unit(plant.GetJointByName(name, found.survey.instance)), ""
+        if name in found.odd or not 0 < limit < math.inf:
+            limit = float(f"{_FORCE * sizes.mass_kg if unit == 'N' else _TORQUE * sizes.load:.3g}")
+            what = "largest force" if unit == "N" else "largest torque"
+            said = f" ({source} says {stated:g})" * (name in found.odd)
+            note = f"  # ASK the motor's {what}{said} [{unit}]"
+            found.asked.append(f"the {what} of joint '{name}'{said} [{unit}]")
         efforts.append(f"{keys[name]}: {limit:g}{note}")
-    ask("effort_limits:  # where the file has no motor, or none with a limit [N·m]", efforts)
+    ask("effort_limits:  # where the file has no motor, or no plausible limit [N·m, N]", efforts)
     mu = found.foot_friction or 0.6
     origin = f"that of {source}" if found.foot_friction else "assumed"
     lines.append(f"foot_friction: {mu:g}  # ASK Coulomb's coefficient of feet on your ground [1]")

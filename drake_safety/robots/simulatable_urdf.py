@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import math
+import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from copy import deepcopy
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
@@ -39,6 +42,7 @@ _IGNORED = (  # By Drake, with a warning, or rejected: places and tags.
     ("joint", "safety_controller"),
     ("transmission/actuator", "mechanicalReduction"),
 )
+_PLACED = "origin", "geometry"  # Parts that a collision shape and a visual share.
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ROWS, _COLUMNS = np.triu_indices(3)
 _ROUNDING = 1e-6  # Of the digits of moments of inertia.
@@ -187,11 +191,14 @@ def _gather_meshes(copy: UrdfCopy) -> None:
 
     def converted(kind: str, url: str, convert: Callable[[Path], str]) -> str:
         """What a mesh becomes; "", with the reason in ``lost``, if it is left out."""
-        file = _mesh_file(url, copy.source)
+        candidates = _mesh_files(url, copy.source)
+        file = next((one for one in candidates if one.is_file()), None)
         name, why, until = url if file is None else file.name, "are not where the URDF says", ""
         try:
             if file is not None:
                 return convert(file)
+            for other in (other for one in candidates for other in _alike(one)):
+                name = f"{url} (but '{Path(*other.parts[-len(Path(url).parts) :])}' is there)"
         except MissingExtraError as error:
             why = "Drake does not read"
             until = f", until you `pip install '{error.needs}'` and write the folder again"
@@ -236,13 +243,23 @@ def _gather_meshes(copy: UrdfCopy) -> None:
             # Links without visuals show their collision shapes.
             for shape in link.findall("collision"):
                 visual = ET.SubElement(link, "visual")
-                visual.extend(part for part in shape if part.tag in ("origin", "geometry"))
+                visual.extend(deepcopy([part for part in shape if part.tag in _PLACED]))
+                for mesh in visual.iter("mesh"):
+                    mesh.set("filename", shown("", copy.meshes[mesh.get("filename", "")]))
     for name, of_link in hulls.items():
         copy.set_hulls(name, of_link)
 
 
-def _mesh_file(url: str, source: Path) -> Path | None:
-    """The file of a mesh's URL: in a ROS package around the URDF, or in an installed package."""
+def _alike(path: Path) -> Iterator[Path]:
+    """Paths that differ from one by case, or by - and _, alone."""
+    path = path.resolve()
+    letters = (f"[{c.lower()}{c.upper()}]" if c.isalpha() else glob.escape(c) for c in str(path))
+    pattern = re.sub("[-_]", "[-_]", "".join(letters))
+    return Path(path.anchor).glob(pattern.lstrip("/"))
+
+
+def _mesh_files(url: str, source: Path) -> list[Path]:
+    """Where a mesh's URL may be: in a ROS package around the URDF, or in an installed package."""
     scheme, _, rest = url.rpartition("://")
     candidates: list[Path] = []
     for name in (rest, unquote(rest.replace("\\", "/"))):  # As written, or as of Windows.
@@ -254,4 +271,4 @@ def _mesh_file(url: str, source: Path) -> Path | None:
     if scheme == "package":
         with contextlib.suppress(ValueError):
             candidates.append(model_file(url))
-    return next((file for file in candidates if file.is_file()), None)
+    return candidates

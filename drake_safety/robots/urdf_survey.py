@@ -12,10 +12,17 @@ import numpy as np
 from pydrake.geometry import Box, Capsule, Cylinder, Shape, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.multibody.tree import Joint, ModelInstanceIndex, RevoluteJoint, ScrewJoint
+from pydrake.multibody.tree import (
+    Joint,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    RevoluteJoint,
+    ScrewJoint,
+)
 from pydrake.systems.framework import Context, DiagramBuilder
 
 from drake_safety.robots.model_files import package_parser
+from drake_safety.robots.robot_size import GRAVITY_M_S2
 from drake_safety.robots.urdf_copy import JointDrives, UrdfCopy
 
 WITHOUT_STOPS_RAD = 4 * math.pi
@@ -26,6 +33,8 @@ _STOP_RAD = 0.05  # Distance from a stop of a joint that cannot be at zero.
 _ROUND = 0.15  # Of a wheel's radius, by which it may be out of round.
 _MATTERS = 1e-4  # Moment of inertia that matters, by the robot's mass times extent squared.
 _POINT = 0.005  # Least radius of gyration, by the robot's extent.
+_MOST_TORQUE, _MOST_FORCE = 1.5, 8.0  # Of motors, by weight times extent (known: 0.4); by weight.
+_MOST_SPEED = 25.0  # Of joints, by √(g / extent); known robots have 5 to 20.
 _AIR_KG_M3, _LEAD_KG_M3 = 1.2, 11_300.0  # Density of the cube that is as large as the robot.
 _FLAT_M = 1e-3  # Height over a sole's lowest part within which other parts touch as well.
 _LEVEL_M = 0.005  # Height over the lowest sphere within which others count as contacts.
@@ -411,6 +420,43 @@ def odd_inertias(plant: MultibodyPlant, context: Context, instance: ModelInstanc
     if not _AIR_KG_M3 < total / size**3 < _LEAD_KG_M3:
         told.append(f"no robot of {size:.2g} m has {total:.3g} kg (grams or tonnes?)")
     return "; ".join(told)
+
+
+def effort_unit(joint: Joint) -> str:
+    """Returns the unit of a joint's effort."""
+    return "N" if isinstance(joint, PrismaticJoint) else "N·m"
+
+
+def odd_limits(
+    plant: MultibodyPlant,
+    context: Context,
+    instance: ModelInstanceIndex,
+    efforts: Mapping[str, float],
+) -> tuple[set[str], str]:
+    """Returns joints with efforts that no motor of a robot of this size has, and words; "" if none.
+
+    A torque is beyond 1.5 times weight times extent, a force beyond 8 times the weight. Words also
+    name speeds beyond 25 √(g / extent) of hinges and 25 √(g · extent) of sliders.
+    """
+    size, mass = extent(plant, context, instance), plant.CalcTotalMass(context, [instance])
+    found, told = set[str](), dict[str, str]()
+    for joint in map(plant.get_joint, plant.GetJointIndices(instance)):
+        if joint.num_velocities() != 1:
+            continue
+        name, unit = joint.name(), effort_unit(joint)
+        most, fastest = _MOST_TORQUE * size, _MOST_SPEED * math.sqrt(GRAVITY_M_S2 / size)
+        if unit == "N":
+            most, fastest = _MOST_FORCE, fastest * size
+        for value, limit, of in (
+            (efforts.get(name, math.inf), most * GRAVITY_M_S2 * mass, unit),
+            (joint.velocity_upper_limits()[0], fastest, "m/s" if unit == "N" else "rad/s"),
+        ):
+            if limit < value < math.inf:
+                told.setdefault(name, f"{value:g} {of}, at most {limit:.3g} expected")
+                found |= {name} if of == unit else set()
+    few = listed(dict([*told.items()][:4])) + " ..." * (len(told) > 4)
+    what = f"limits that no motor of a robot of {mass:.3g} kg and {size:.2g} m has (placeholders?)"
+    return found, f"{len(told)} joints have {what}: {few}" if told else ""
 
 
 def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]:

@@ -24,7 +24,14 @@ from drake_safety.models import load_robot, robot_files
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.robots.urdf_copy import read_urdf
-from drake_safety.robots.urdf_survey import WITHOUT_STOPS_RAD, Limb, Survey, odd_inertias
+from drake_safety.robots.urdf_survey import (
+    WITHOUT_STOPS_RAD,
+    Limb,
+    Survey,
+    effort_unit,
+    odd_inertias,
+    odd_limits,
+)
 from drake_safety.simulation.capabilities import HasBall
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed
@@ -151,6 +158,10 @@ def _robot(scenario: Scenario) -> Generator[Finding, None, RobotModel | None]:
         yield failed("files", f"not found: {missing}", "set 'urdf' to a path beside robot.yaml")
         return None
     yield passed("files", "found")
+    text = robot_files(scenario.robot)[0].read_text(encoding="utf-8")
+    if asked := [line.strip() for line in text.splitlines() if "# ASK the motor's" in line]:
+        told = f"those of {len(asked)} joints are estimates, such as {asked[0]}"
+        yield passed("effort limits", told, f"{_EFFORT_REMEDY}, and delete the remark")
     return robot
 
 
@@ -248,11 +259,19 @@ def _motors(kinematics: RobotKinematics) -> _Check:
                 "servo gains", f"joints {loose} have none", "add them under 'joint_gains' [N·m/rad]"
             )
     q = kinematics.standing_positions()
+    kinematics.set_positions(q)
+    instance = plant.GetModelInstanceByName(robot.name)
+    if odd := odd_limits(plant, kinematics.context, instance, limits)[1]:
+        remedy = (
+            "correct <limit> in the model file, or 'effort_limits' [N·m] and 'velocity_limits' "
+        )
+        yield passed("motor limits", odd, f"{remedy}[rad/s] in robot.yaml")
     torques = kinematics.gravity_torques(q, np.ones(kinematics.num_contacts, dtype=bool))
     needs = dict(zip(kinematics.joint_names, np.abs(torques), strict=True))
     shares = {name: need / limits[name] for name, need in needs.items() if name in limits}
     weak = [
-        f"{name} needs {needs[name]:.1f} of {limits[name]:.1f} N·m"
+        f"{name} needs {needs[name]:.1f} of {limits[name]:.1f} "
+        f"{effort_unit(plant.GetJointByName(name, instance))}"
         for name, share in shares.items()
         if share > 1
     ]
