@@ -9,7 +9,7 @@ import numpy as np
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits
-from drake_safety.files.schema import schema
+from drake_safety.files.schema import NotNegative, Positive, schema
 from drake_safety.models import load_robot
 from drake_safety.plants.balls import Throw
 from drake_safety.robots.robot_size import (
@@ -28,10 +28,10 @@ class RecoveryParameters:
 
     threshold: float = 0.6
     """Γ_thre, of the probability. The default is the paper's value, which it has for b_safe."""
-    persistence_s: float = 0.02
+    persistence_s: NotNegative = 0.02
     """Time for which "don't know" must have lasted to trigger [s]: two assessments. A known
     probability triggers at once. The paper has neither."""
-    assessment_period_s: float = 0.02
+    assessment_period_s: Positive = 0.02
     """Time between two assessments [s]."""
     step: RecoveryStepParameters = field(default_factory=RecoveryStepParameters)
 

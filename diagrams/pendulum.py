@@ -17,6 +17,7 @@ from drake_safety.robots.robot_size import GRAVITY_M_S2
 from drake_safety.simulation.episode_start import EpisodeStart, StatePlane
 from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.simulation.scenario import Scenario
+from drake_safety.systems.periodic_update import declare_update
 from drake_safety.systems.trajectory_planner import interpolate
 
 _NUM_OUTLOOK = 41  # Samples of the plan from now to its end, for the features.
@@ -166,7 +167,7 @@ class PendulumController(LeafSystem):
             state.set_value([min(max(torque, -limit), limit)])
 
         self.DeclareStateOutputPort("torque", self.DeclareDiscreteState(1))
-        self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, update)
+        declare_update(self, update, None, period_s, 0.0)
 
 
 class Pendulum(PlannedLoop):

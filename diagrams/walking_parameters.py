@@ -114,7 +114,7 @@ class GuardParameters:
 
     threshold: float = 0.9
     """Lowest probability of a command that is passed on; set after a look at figures."""
-    period_s: float = 0.1
+    period_s: Positive = 0.1
     """Time between two decisions [s]."""
 
 
@@ -126,7 +126,7 @@ class WalkingRecovery:
     """``stop``: a command of zero; ``slower``: a share of the command."""
     threshold: float = 0.5
     """Γ_thre, of the probability; not tuned."""
-    persistence_s: float = 0.04
+    persistence_s: NotNegative = 0.04
     """Time for which Γ must have been below it while nothing is known [s]: when the robot begins to
     move, a single row can be unlike those of training."""
     slower_share: float = 0.3
@@ -163,5 +163,5 @@ class WalkingParameters:
     """The camera's pose."""
     guard: GuardParameters = field(default_factory=GuardParameters)
     recovery: WalkingRecovery = field(default_factory=WalkingRecovery)
-    assessment_period_s: float = 0.02
+    assessment_period_s: Positive = 0.02
     """Time between two evaluations of Γ [s]."""

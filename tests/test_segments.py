@@ -204,3 +204,12 @@ def changed(episodes, **changes):
 def test_what_gives_no_segments_is_refused(episodes, ask, message):
     with pytest.raises(ValueError, match=message):
         ask(episodes)
+
+
+def test_masked_entries_of_an_episode_are_not_numbers():
+    (episode,) = make_episodes(1)
+    masked = np.ma.array(episode.margins)
+    masked[-1, 0] = np.ma.masked
+    found = dataclasses.replace(episode, margins=masked)
+    assert type(found.margins) is np.ndarray and np.isnan(found.margins[-1, 0])
+    np.testing.assert_array_equal(found.margins[:-1], episode.margins[:-1])

@@ -235,3 +235,34 @@ def test_where_none_is_shipped_or_the_scenario_is_another_one_train_is_named(
             assert message in line
             assert "`drake-safety train` learns one, in a folder to be passed as --asse" in line
     assert list((tmp_path / "work").iterdir()) == []
+
+
+@pytest.mark.parametrize("entry", ["state", "desired_preview", "features"])
+@pytest.mark.parametrize("form", ["masked", "rows of masked", "integers"])
+def test_what_is_masked_is_not_known(entry, form):
+    assessment = load_assessment("laikago_balancing")
+    widths = assessment.info_.widths
+    names = ("state", "desired_preview", "features")
+    rows = {name: np.zeros((2, widths[name])) for name in names}
+    values = np.ma.array(rows[entry], dtype=int if form == "integers" else float)
+    values[1, 0] = np.ma.masked
+    if form == "rows of masked":
+        values = list(values)
+    rows[entry] = values
+    found = assessment.predict(**rows)
+    assert np.isinf(found.novelty[1]) and np.isfinite(found.novelty[0])
+    np.testing.assert_array_equal(found.belief[1], [0.0, 0.0, 1.0])
+    one = assessment.predict_one(**{name: part[1] for name, part in rows.items()})
+    assert np.isinf(one.novelty)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, int])
+def test_numbers_of_another_type_are_judged_as_floats(dtype):
+    assessment = load_assessment("laikago_balancing")
+    names = ("state", "desired_preview", "features")
+    rows = [np.ones((2, assessment.info_.widths[name])) for name in names]
+    expected, found = (
+        assessment.predict(*(part.astype(kind) for part in rows)) for kind in (float, dtype)
+    )
+    np.testing.assert_array_equal(found.novelty, expected.novelty)
+    np.testing.assert_array_equal(found.belief, expected.belief)

@@ -384,3 +384,24 @@ def test_outputs_are_held_until_the_next_tick(key, port, value, tick_s):
         np.testing.assert_array_equal(later, held[name])
     changed, expected = given.at(tick_s + 1e-4), same.at(tick_s + 1e-4)
     assert any(not np.array_equal(changed[name], expected[name]) for name in held)
+
+
+def test_a_masked_margin_or_feature_is_not_a_number():
+    class Masked(BalanceSafeSet):
+        def margins(self, q, v):
+            return np.ma.masked_less(super().margins(q, v), 10.0)
+
+        def features(self, q, v, preview):
+            return np.ma.masked_less(super().features(q, v, preview), 100.0)
+
+    k = robot_kinematics("laikago")
+    x = np.append(k.standing_positions(), np.zeros(k.num_velocities))
+    safe_set = Masked(k, LIMITS)
+    monitored = Bench(SafetyMonitor(safe_set, 19, 18), plant_state=x).outputs()
+    assert np.isnan(monitored["margins"]).all() and monitored["safe"] == 0.0
+    inputs = AssessorInputs(k, safe_set, num_outlook=2)
+    given = {"plant_state": x, "desired_outlook": np.zeros(6)}
+    assert np.isnan(Bench(inputs, **given).get("features")).all()
+    features = PlanFeatures(safe_set, 19, 18, horizon=2)
+    given = {"plant_state": x, "desired_preview": np.zeros(6)}
+    assert np.isnan(Bench(features, **given).get("features")).all()

@@ -13,7 +13,15 @@ from pydrake.math import RotationMatrix
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.observation import quaternion_of
 from drake_safety.control.policy_network import PolicyNetwork, load_network
-from drake_safety.files.schema import Count, Pattern, Positive, Triple, load_typed_file, schema
+from drake_safety.files.schema import (
+    Count,
+    NotNegative,
+    Pattern,
+    Positive,
+    Triple,
+    load_typed_file,
+    schema,
+)
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import JointGains, RobotModel, as_pattern, by_pattern
 
@@ -101,7 +109,7 @@ class ObservationTerm:
 class GaitClock:
     """A clock whose phases are part of the observation."""
 
-    period_s: float = 0.0
+    period_s: NotNegative = 0.0
     """Of a cycle [s]; 0 for policies without a clock."""
     offsets: list[float] = field(default_factory=lambda: [0.0, 0.5])
     """Phase of each foot at the start, as a share of the period."""

@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import Field
 
 from drake_safety.files.schema import Share, schema
-from drake_safety.learning.segments import Segments
+from drake_safety.learning.segments import Segments, floats
 
 SAFE, UNSAFE, UNKNOWN = "safe", "unsafe", "don't know"
 """The verdicts."""
@@ -93,7 +93,7 @@ class Calibration:
 
     def verdicts(self, safety_probability: np.ndarray) -> np.ndarray:
         """Returns the verdicts for probabilities (N,) as strings; "don't know" for NaN."""
-        probability = np.asarray(safety_probability, dtype=float)
+        probability = floats(safety_probability)
         verdicts = np.full(probability.shape, UNKNOWN, dtype=object)
         verdicts[probability >= self.threshold] = SAFE
         verdicts[probability < self.unsafe_below] = UNSAFE

@@ -6,7 +6,7 @@ import numpy as np
 
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.mode_settings import mode_settings
-from drake_safety.learning.segments import Episode, EpisodesInfo, Segments
+from drake_safety.learning.segments import Episode, EpisodesInfo, Segments, floats
 
 
 def is_rate(name: str) -> bool:
@@ -69,7 +69,7 @@ class InputColumns:
         parts: list[np.ndarray] = []
         for name, values, width in given:
             try:
-                part = np.asarray(values, dtype=float)
+                part = floats(values)
             except (TypeError, ValueError) as error:
                 raise ValueError(
                     f"{self._who}: {name} must be an array of numbers: {error}"

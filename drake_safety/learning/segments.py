@@ -7,7 +7,7 @@ import importlib.metadata
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -127,6 +127,13 @@ class EpisodesInfo:
         return {name: len(names) for name, names in self.columns.items()}
 
 
+def floats(values: Any) -> np.ndarray:
+    """Numbers as an array of floats, NaN where they are masked."""
+    if type(values) is not np.ndarray:
+        values = np.ma.asarray(values, dtype=float).filled(np.nan)
+    return np.asarray(values, dtype=float)
+
+
 @dataclass(kw_only=True, eq=False)
 class Episode:
     """One closed-loop rollout, sampled at rows 0..K; row r is at time r * step_s.
@@ -161,6 +168,11 @@ class Episode:
     cause: str
     first_step: int = 0
     num_controller_failures: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, np.ma.MaskedArray):
+                setattr(self, name, floats(value))
 
     @property
     def num_steps(self) -> int:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.extras import require_extra
-from drake_safety.files.schema import load_typed
+from drake_safety.files.schema import check_times, load_typed
 from drake_safety.logs.channel import Wanted
 from drake_safety.logs.checks import check
 from drake_safety.logs.conversion import Source, common_span, rotations_at, values_at
@@ -118,8 +118,8 @@ def read_pieces(
         log_map = load_typed(LogMap, asdict(log_map), "map")
     else:
         log_map = load_log_map(Path(log_map))
-    if step_s is not None and not step_s > 0:
-        raise ValueError(f"read_log: step_s must be positive; got {step_s}")
+    if step_s is not None:
+        check_times("read_log", step_s=step_s)
     kinematics = RobotKinematics(robot)
     joints = kinematics.joint_names
     require_extra("logs", f"log '{path}'", "pandas")

@@ -15,6 +15,7 @@ from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import cause_words, likely_cause
 from drake_safety.learning.prediction import is_unknown
+from drake_safety.learning.segments import floats
 from drake_safety.simulation.capabilities import HasGoals, goal_words, is_in_box, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
@@ -211,7 +212,7 @@ def inputs_of_each(
 
 def checked_goal(goal: np.ndarray) -> np.ndarray:
     """Returns a goal as an array, (3,) [m]; it need not be finite."""
-    goal = np.asarray(goal, dtype=float)
+    goal = floats(goal)
     if goal.shape != (3,):
         raise ValueError(f"a goal is three numbers; got {goal.tolist()}")
     return goal

@@ -10,7 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia
 from pydrake.systems.framework import Context
 
-from drake_safety.files.schema import Positive, schema
+from drake_safety.files.schema import NotNegative, Positive, schema
 from drake_safety.plants.obstacles import collision_geometries
 from drake_safety.robots.model_files import package_parser
 from drake_safety.robots.robot_size import GRAVITY_M_S2
@@ -26,7 +26,7 @@ _PARKED = np.array([50.0, 50.0, 0.0])  # Far from the robot [m].
 class Throw:
     """A thrown ball."""
 
-    time_s: float = 0.0
+    time_s: NotNegative = 0.0
     """Time of impact [s]."""
     mass_kg: Positive = 2.0
     speed_m_s: Positive = 6.0

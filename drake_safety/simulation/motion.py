@@ -12,6 +12,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram, EventStatus, PortDataType, System
 
+from drake_safety.files.schema import check_times
 from drake_safety.learning.segments import (
     DIVERGED,
     LARGEST,
@@ -199,10 +200,14 @@ def simulate(
         who: What is simulated, for messages.
 
     Raises:
-        ValueError: The diagram has no such port.
+        ValueError: The diagram has no such port, or a time is out of range.
         EpisodeError: A system raised an error, which is its cause, or the simulation failed, before
             the first row or where it may not.
     """
+    check_times(who, step_s=step_s, watch_period_s=min(watch_period_s, step_s))
+    ends = {"after_leaving_s": after_leaving_s, "after_fall_s": after_fall_s}
+    finite = {name: min(value, duration_s) for name, value in ends.items()}
+    check_times(who, or_zero=["duration_s", *ends], duration_s=duration_s, **finite)
     if isinstance(diagram, ClosedLoop):
         constraint_names = constraint_names or diagram.constraint_names
     names = list(constraint_names or ())

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, Diagram
 
+from drake_safety.files.schema import check_times
 from drake_safety.learning.segments import (
     Episode,
     EpisodeError,
@@ -93,14 +94,14 @@ def record_episodes(
         EpisodeError: A system of the diagram or ``reset`` raised an error, which is its cause.
     """
     name = str(name or getattr(make_diagram, "__name__", type(make_diagram).__name__))
-    if not (step_s > 0 and round(duration_s / step_s) >= 1):
+    period_s = step_s / 10 if monitor_period_s is None else monitor_period_s
+    who = "record_episodes"
+    check_times(who, duration_s=duration_s, step_s=step_s, monitor_period_s=period_s)
+    if round(duration_s / step_s) < 1:
         raise ValueError(
             f"record_episodes: an episode has at least one step; got duration_s {duration_s} and "
             f"step_s {step_s}"
         )
-    period_s = step_s / 10 if monitor_period_s is None else monitor_period_s
-    if not period_s > 0:
-        raise ValueError(f"record_episodes: monitor_period_s must be positive; got {period_s}")
     num_steps = round(duration_s / step_s)
     # The diagram is built anew for each call: a function does not tell whether its result changed.
     key = uuid.uuid4().hex
@@ -108,8 +109,8 @@ def record_episodes(
     warn_of_sampled_ports("record_episodes", [make()])
     used, sizes = _used_ports(make(), dict(ports or {}))
     # As the hash has always been made of it, so that kept sets stay valid.
-    times = f"EpisodeTiming({step_s=}, {num_steps=}, monitor_period_s={period_s!r})"
-    identity = f"({name!r}, {times}, {used}, {sorted((parameters or {}).items())})"
+    timing = f"EpisodeTiming({step_s=}, {num_steps=}, monitor_period_s={period_s!r})"
+    identity = f"({name!r}, {timing}, {used}, {sorted((parameters or {}).items())})"
     horizon = sizes["desired_preview"] // sizes["output"]
     if num_steps < horizon:
         _LOGGER.warning(

@@ -18,6 +18,7 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.framework import Context, Diagram
 from pydrake.systems.primitives import RandomSource
 
+from drake_safety.files.schema import check_times
 from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
 from drake_safety.learning.seeds import MOTION
 from drake_safety.learning.segments import (
@@ -26,6 +27,7 @@ from drake_safety.learning.segments import (
     Episode,
     Episodes,
     EpisodesInfo,
+    floats,
     installed_versions,
 )
 from drake_safety.plants.pushes import Push
@@ -264,6 +266,7 @@ def run_motions(
         ValueError: The folder holds another set or one that is not the same any more.
         EpisodeError: A system of the loop raised an error, which is its cause.
     """
+    check_times("run_motions", duration_s=duration_s)
     make = worker_loop(scenario, variation, **loop_options)
     loop = make()
     piece_s = min(_piece_s(loop), until_s)
@@ -496,7 +499,7 @@ def check_kept(path: Path, kept: Sequence[Episode], run: Callable[[int], Episode
 
 def _checked_goals(loop: ClosedLoop, goals: np.ndarray, num_episodes: int) -> np.ndarray:
     require(loop, HasGoals)
-    goals = np.asarray(goals, dtype=float)
+    goals = floats(goals)
     if goals.ndim != 2 or len(goals) != num_episodes:
         raise ValueError(
             f"run_episodes: goals must have one row per episode, {num_episodes} in all; got shape "

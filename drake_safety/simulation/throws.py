@@ -29,7 +29,6 @@ VIOLATIONS = ("legs_collide", "joint_position", "joint_velocity", "joint_effort"
 """Physically implausible states; see :class:`Violations`."""
 _FLIGHT_S = 0.1  # From the ball's release to its impact.
 _EARLIEST_S, _LATEST_S = 0.4, 1.2  # Impact of a random ball.
-_LOW_S = 0.02  # For which the probability that triggers is low.
 _AFTER_S = 5.0  # From the first impact to the end.
 _PORTS = ("state", "desired_preview", "features", "margins", "plant_state")
 
@@ -152,8 +151,9 @@ def run_throw(
     events = [release(throw) for throw in throws]
     if not math.isnan(trigger_time_s):
         # One low value suffices: the trigger latches.
+        low_s = 2.0 * loop.scenario.control_period_s
         events.append((trigger_time_s, partial(set_probability, value=0.0)))
-        events.append((trigger_time_s + _LOW_S, partial(set_probability, value=1.0)))
+        events.append((trigger_time_s + low_s, partial(set_probability, value=1.0)))
     motion = simulate(
         loop,
         start,

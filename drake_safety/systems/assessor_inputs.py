@@ -16,6 +16,7 @@ from drake_safety.control.observation import (
     walking_state,
     walking_state_names,
 )
+from drake_safety.learning.segments import floats
 from drake_safety.systems.safety_monitor import FeaturedSafeSet, finite_margins
 
 
@@ -103,7 +104,7 @@ class AssessorInputs(LeafSystem):
     def _calc_features(self, context: Context, output: BasicVector) -> None:
         q, v = self._measured(context)
         outlook = self._outlook_port.Eval(context).reshape(-1, 3)
-        parts = [self._safe_set.features(q, v, outlook)]
+        parts = [floats(self._safe_set.features(q, v, outlook))]
         if self._gravity is not None:
             gravity = gravity_in_foot_plane(self._kinematics, q, self._gravity)
             parts.append(gravity if self._mirror is None else gravity * (1.0, -1.0))

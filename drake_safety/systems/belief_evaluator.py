@@ -13,6 +13,7 @@ from drake_safety.learning.beliefs import EMPTY, empty
 from drake_safety.learning.causes import is_on, is_outside, violated
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Correction
+from drake_safety.learning.segments import floats
 from drake_safety.systems.periodic_update import declare_update
 
 _LARGEST_NOVELTY = 1e6
@@ -133,7 +134,7 @@ class BeliefEvaluator(LeafSystem):
 
     def set_beliefs(self, context: Context, beliefs: np.ndarray) -> None:
         """Replaces the beliefs of every cell."""
-        beliefs = np.asarray(beliefs, dtype=float)
+        beliefs = floats(beliefs)
         if beliefs.shape != self._shape:
             raise ValueError(
                 f"belief evaluator: beliefs must have shape {self._shape}; got {beliefs.shape}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_safety.learning.segments import floats
 from drake_safety.systems.safety_monitor import FeaturedSafeSet
 
 
@@ -44,4 +45,4 @@ class PlanFeatures(LeafSystem):
     def _calc_features(self, context: Context, output: BasicVector) -> None:
         q, v = np.split(self._state_port.Eval(context), [self._n_q])
         preview = self._preview_port.Eval(context).reshape(-1, 3)
-        output.SetFromVector(self._safe_set.features(q, v, preview))
+        output.SetFromVector(floats(self._safe_set.features(q, v, preview)))

@@ -9,6 +9,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_safety.learning.causes import is_outside
+from drake_safety.learning.segments import floats
 
 
 class SafeSet(Protocol):
@@ -34,7 +35,7 @@ class FeaturedSafeSet(SafeSet, Protocol):
 def finite_margins(safe_set: SafeSet, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Margins (n_c,) of a state; minus infinity for one that is not finite."""
     if q.dot(q) + v.dot(v) < math.inf:
-        return safe_set.margins(q, v)
+        return floats(safe_set.margins(q, v))
     return np.full(len(safe_set.names), -np.inf)
 
 

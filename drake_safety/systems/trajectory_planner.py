@@ -48,6 +48,7 @@ def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndar
         step_s: Time between them [s].
         duration_s: Duration of the whole plan [s].
     """
+    check_times("plan", step_s=step_s)
     seen_s = step_s * np.arange(len(preview))
     motion = interpolate(np.zeros(1), np.ones(1), duration_s)
     progress = motion.vector_values(seen_s.tolist()).ravel()
