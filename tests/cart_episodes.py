@@ -40,7 +40,9 @@ def make_episode(index, info=None, num_rows=5, **changes):
         desired_output=rng.normal(size=(num_rows, num_outputs)),
         desired_preview=rng.normal(size=(num_rows, info.horizon * num_outputs)),
         features=rng.normal(size=(num_rows, len(info.feature_names))),
-        margins=rng.normal(size=(num_rows, len(info.constraint_names))),
+        margins=(np.abs, np.positive)[index % 2](
+            rng.normal(size=(num_rows, len(info.constraint_names)))
+        ),
         is_safe=index % 2 == 0,
         cause="" if index % 2 == 0 else info.constraint_names[0],
         first_step=index % 3,

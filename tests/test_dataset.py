@@ -16,6 +16,7 @@ from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episo
 
 pytestmark = pytest.mark.train
 pd = pytest.importorskip("pandas")
+pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
 
@@ -352,3 +353,68 @@ def test_a_shard_from_before_failures_were_counted_has_none(tmp_path):
     table = pq.read_table(shard)
     pq.write_table(table.drop_columns(["num_controller_failures"]), shard)
     assert [episode.num_controller_failures for episode in load_episodes(tmp_path)] == [0, 0]
+
+
+def forged(path, name, row, value, type_=None):
+    """A folder with a shard of a safe and an unsafe episode, with another value or type."""
+    write(path, [0, 1])
+    shard = path / "episodes-00000.parquet"
+    table = pq.read_table(shard)
+    place = table.column_names.index(name)
+    values = table.column(name).to_pylist()
+    values[row] = value if type_ is None else values[row]
+    column = pa.array(values, table.schema.field(name).type)
+    if type_ is not None:
+        column = column.cast(type_)
+    pq.write_table(table.set_column(place, name, column), shard)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("margins", 2, [0.1, -0.1]), "episode 0: it is safe, and a margin is negative"),
+        (("is_safe", 3, False), r"episode 0: its rows differ in \['is_safe', 'cause', 'first_s"),
+        (("cause", 7, ""), "episode 1: its rows differ"),
+        (("state", 1, [0.0, np.nan, 0.0]), r"episode 0: \['state'\] hold values that are not fin"),
+        (("features", 1, [1e13]), r"episode 0: \['features'\] hold values that are not finite"),
+        (("step", 4, 0), "episode 0: its steps are not 0, 1, 2"),
+        (("time_s", 4, 0.0), "episode 0: its time does not increase"),
+        (("is_safe", 0, 0, pa.string()), "is_safe is string; expected another type"),
+        (("first_step", 0, 0, pa.float64()), "first_step is double; expected another type"),
+    ],
+)
+def test_a_shard_with_forged_content_is_refused_where_it_is_read(tmp_path, change, message):
+    forged(tmp_path, *change)
+    with pytest.raises(ValueError, match=rf"episodes-00000\.parquet: {message}"):
+        load_episodes(tmp_path)
+
+
+def test_a_shard_with_more_steps_than_its_set_is_refused(tmp_path):
+    write(tmp_path, [0], make_info(num_steps=3))
+    with pytest.raises(ValueError, match="episode 0: it has more than 3 steps"):
+        load_episodes(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("horizon", 10**12, r"horizon is 1000000000000, expected 1\.\.10000"),
+        ("step_s", float("nan"), "step_s is nan, expected > 0"),
+        ("seed", "seven", "'seed' must be a valid integer; got 'seven'"),
+        ("state_names", 3, "'state_names' must be a valid array; got 3"),
+    ],
+)
+def test_an_info_with_forged_values_is_refused(tmp_path, name, value, message):
+    write(tmp_path, [0])
+    info = json.loads((tmp_path / "info.json").read_text())
+    info["info"][name] = value
+    (tmp_path / "info.json").write_text(json.dumps(info))
+    with pytest.raises(ValueError, match=rf"info\.json does not describe episodes: .*{message}"):
+        load_episodes(tmp_path)
+
+
+def test_a_shard_that_takes_too_much_memory_is_refused_by_its_header(tmp_path, monkeypatch):
+    write(tmp_path, [0])
+    monkeypatch.setattr("drake_safety.files.reading._MOST_BYTES", 600)
+    with pytest.raises(ValueError, match=r"00000\.parquet would take \S* GB; expected at most"):
+        load_episodes(tmp_path)

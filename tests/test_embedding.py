@@ -167,7 +167,6 @@ def without_bias(embedding):
         (lambda e: e.evaluate(np.zeros((2, 3))), r"inputs have shape \(2, 3\), expected \(N, 4\)"),
         (lambda e: e.clipping(np.zeros((2, 3))), r"range of .* shape \(2, 3\), expected \(2, 4\)"),
         (lambda e: Embedding(without_bias(e), num_margins=1), r"output\.bias"),
-        (lambda e: Embedding(e.weights, num_margins=3), "output layer has 3 columns, expected 5"),
     ],
 )
 def test_what_does_not_fit_the_maps_is_refused(embedding, ask, message):

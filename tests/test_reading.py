@@ -23,6 +23,28 @@ def test_yaml_that_is_a_trap_is_refused(text, message):
         parse_yaml(text, "the text")
 
 
+@pytest.mark.parametrize(
+    ("text", "key", "lines"),
+    [
+        ("a: 1\nb: 2\na: 3", "a", "1 and 3"),
+        ("{a: 1, 'a': 1}", "a", "1 and 1"),
+        ("x:\n- b: {c: 1}\n  b: {c: 2}", "b", "2 and 3"),
+        ('"1": a\n1: b', "1", "1 and 2"),
+        ("yes: a\ntrue: b", "True", "1 and 2"),
+        ("z: &z {a: 1}\ny: &y {a: 2}\nx:\n  <<: *z\n  <<: *y", "<<", "4 and 5"),
+    ],
+)
+def test_a_key_that_stands_twice_is_refused_with_its_lines(text, key, lines):
+    with pytest.raises(ValueError, match=f"^the text: key '{key}' stands twice, in lines {lines}$"):
+        parse_yaml(text, "the text")
+
+
+def test_a_key_beside_a_merged_one_replaces_it():
+    text = "z: &z {a: 1, b: 1}\nx: {y: &y {<<: *z, a: 2}}\nw: {<<: *y, b: 3}"
+    read = parse_yaml(text, "the text")
+    assert (read["x"]["y"], read["w"]) == ({"a": 2, "b": 1}, {"a": 2, "b": 3})
+
+
 def test_an_alias_that_saves_typing_is_read():
     text = "a: &a {x: 1}\nb: *a\nc: [*a, *a]"
     assert parse_yaml(text, "the text") == {"a": {"x": 1}, "b": {"x": 1}, "c": [{"x": 1}] * 2}

@@ -2,14 +2,16 @@ import importlib
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import drake_safety
 import gliding_task
 from drake_safety import load_scenario
+from drake_safety.cli.training_folder import check_fresh
 from drake_safety.models import load_robot
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -271,6 +273,32 @@ def test_a_copy_is_the_scenario_that_was_learned_from_only_if_it_simulates_the_s
     assert copy.name == "copied"
 
 
+@pytest.mark.parametrize(
+    ("theirs", "mine", "message"),
+    [
+        ("ours", "ours", "its robot or its task has changed: train again"),
+        (
+            "ours",
+            "theirs",
+            "of robot 'ours' with hash .* and is one of robot 'theirs': name the fol",
+        ),
+        ("", "theirs", "its robot or its task has changed: train again"),  # Of an earlier version.
+    ],
+)
+def test_an_assessment_of_another_robot_is_told_from_one_of_a_changed_scenario(
+    tmp_path, theirs, mine, message
+):
+    write_hexapod(tmp_path)
+    path = tmp_path / "robot.yaml"
+    path.write_text(path.read_text().replace("name: hexapod", f"name: {mine}"))
+    scenario = parsed(SCENARIO.replace("robot: none", "robot: robot.yaml"), folder=tmp_path)
+    learned = replace(episodes_info(scenario.make_loop(), seed=0), robot=theirs)
+    assert scenario.robot_name == mine
+    scenario.step_s = 0.08
+    with pytest.raises(ValueError, match=message):
+        check_fresh(SimpleNamespace(info_=learned), scenario)
+
+
 def test_a_default_that_changes_is_another_simulation(monkeypatch):
     before = parsed(SCENARIO).simulation_hash()
 
@@ -303,6 +331,44 @@ def test_a_robots_files_change_the_hash_and_their_folder_does_not(tmp_path):
     urdf = tmp_path / "there" / "hexapod.urdf"
     urdf.write_text(urdf.read_text().replace('mass value="6.0"', 'mass value="7.0"'))
     assert parsed(text, folder=tmp_path / "there").simulation_hash() != hashes[0]
+
+
+def test_the_hash_has_no_absolute_path_of_robot_obstacles_or_policy(tmp_path):
+    hashes = set()
+    for folder in (tmp_path / "here", tmp_path / "there" / "my robots"):
+        write_hexapod(folder)
+        urdf, robot = folder / "hexapod.urdf", folder / "robot.yaml"
+        urdf.write_text(f"{urdf.read_text()}<!-- from /here/hexapod.xacro -->")
+        text = robot.read_text().replace("urdf: hexapod.urdf", f"urdf: {urdf}")
+        assert str(urdf) in text
+        robot.write_text(text)
+        (folder / "shelf.urdf").write_text(
+            f'<robot><mesh filename="file://{folder}/a.obj"/></robot>'
+        )
+        reaching = load_scenario(
+            "atlas_reaching",
+            {"robot": str(robot), "parameters.obstacles": [{"model": f"{folder}/shelf.urdf"}]},
+        )
+        walking = load_scenario("go2_walking", {"parameters.policy": f"{folder}/policy.yaml"})
+        network = Path(drake_safety.__file__).parents[1] / "tests" / "gliding_task.py"
+        (folder / "policy.yaml").write_text(f"network: {folder}/policy.onnx\njoints: [a]\n")
+        (folder / "policy.onnx").write_bytes(network.read_bytes())
+        hashes.add((reaching.simulation_hash(), walking.simulation_hash()))
+    assert len(hashes) == 1
+    (folder / "shelf.urdf").write_text("<robot/>")
+    (folder / "policy.onnx").write_bytes(b"another one")
+    for scenario, before in zip((reaching, walking), hashes.pop(), strict=True):
+        assert scenario.simulation_hash() != before
+
+
+def test_a_copy_with_another_duration_keeps_what_the_loader_set(beside):
+    scenario = load_scenario(beside)
+    copy = replace(scenario, episode_duration_s=0.4)
+    assert copy.parameters == scenario.parameters
+    assert copy.make_loop().scenario.num_steps == 10
+    assert replace(scenario).simulation_hash() == scenario.simulation_hash()
+    with pytest.raises(ValueError, match=r"unknown keys \['folder'\]"):
+        parsed(SCENARIO + "folder: /there")
 
 
 def test_a_relative_robot_path_starts_at_the_scenarios_folder(tmp_path, monkeypatch):

@@ -154,11 +154,15 @@ def check_fresh(
     """
     trained = assessment.info_
     if not scenario.adopt(trained):
-        own = scenario.simulation_hash()
+        own, robot = scenario.simulation_hash(), scenario.robot_name
+        whose = f" of robot '{trained.robot}'" if trained.robot else ""
+        why = "as its file, its robot or its task has changed: train again"
+        if (trained.scenario, trained.robot or robot) != (scenario.name, robot):
+            why = f"and is one of robot '{robot}': " if robot else "and is another scenario: "
+            why += "name the folder that `drake-safety train` wrote for it, or train it"
         raise ValueError(
-            f"the assessment was trained on scenario '{trained.scenario}' with hash "
-            f"{trained.scenario_hash[:12]}; '{scenario.name}' now has hash {own[:12]}, as its "
-            "file, its robot or its task has changed: train again"
+            f"the assessment was trained on scenario '{trained.scenario}'{whose} with hash "
+            f"{trained.scenario_hash[:12]}; '{scenario.name}' now has hash {own[:12]}, {why}"
         )
     assessment.check_unused(*seeds)
 

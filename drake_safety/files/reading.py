@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 _LONGEST_MESSAGE = 500  # Characters, without the name of the file.
+_MOST_BYTES = 2**33
 _MOST_VALUES = 200_000  # Of a YAML document, with every alias written out.
 
 
@@ -47,6 +48,13 @@ def shortened(text: str) -> str:
     return text if len(text) <= _LONGEST_MESSAGE else f"{text[: _LONGEST_MESSAGE - 4]} ..."
 
 
+def check_memory(num_bytes: int, who: str) -> None:
+    """Raises ValueError if the content of a file, by its header, takes too much memory."""
+    if num_bytes > _MOST_BYTES:
+        gigabytes = f"{num_bytes / 1e9:.3g} GB; expected at most {_MOST_BYTES / 1e9:.3g} GB"
+        raise ValueError(f"{who} would take {gigabytes}")
+
+
 def is_number(value: Any) -> bool:
     """Whether a value or its text is a number."""
     try:
@@ -63,7 +71,24 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 class YamlLoader(yaml.SafeLoader):
-    """Reads ``1e-3`` as a number, as YAML 1.2 does."""
+    """Reads ``1e-3`` as a number, as YAML 1.2 does, and refuses keys that stand twice."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        """Composes a mapping; keys differ as texts, as in JSON, by which :func:`load_typed` reads.
+
+        Raises:
+            ValueError: A key stands twice.
+        """
+        node: yaml.MappingNode = super().compose_mapping_node(anchor)
+        lines: dict[str, int] = {}
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            name, line = key.value, key.start_mark.line + 1
+            if key.tag != "tag:yaml.org,2002:merge":
+                name = str(self.construct_object(key))
+            if name in lines:
+                raise ValueError(f"key '{name}' stands twice, in lines {lines[name]} and {line}")
+            lines[name] = line
+        return node
 
 
 YamlLoader.add_implicit_resolver(
@@ -81,13 +106,15 @@ def yaml_text(text: str) -> str:
 
 
 def parse_yaml(text: str, who: str, loader: type[yaml.SafeLoader] = YamlLoader) -> Any:
-    """Parses a YAML document of plain values; deep nesting and many aliases are refused."""
+    """Parses YAML of plain values; double keys, deep nesting and many aliases are refused."""
     try:
         value = yaml.load(text, Loader=loader)
     except yaml.YAMLError as error:
         raise ValueError(f"{who} is not YAML: {shortened(str(error))}") from error
     except RecursionError:
         raise ValueError(f"{who} is not YAML that can be read: it is nested too deeply") from None
+    except ValueError as error:
+        raise ValueError(f"{who}: {error}") from error
     pending, num_values = [value], 0
     while pending:
         one = pending.pop()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 
 from drake_safety.files.atomic import replacing
+from drake_safety.files.schema import load_typed
 from drake_safety.learning.adaptation import Adaptation
 from drake_safety.learning.assessment_parameters import (
     AdaptationParameters,
@@ -24,7 +27,7 @@ from drake_safety.learning.fall_logit import FallLogit
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.novelty import Moments, Novelty
-from drake_safety.learning.prediction import BaseLogit, Correction
+from drake_safety.learning.prediction import BaseLogit, Correction, predict
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
@@ -47,6 +50,26 @@ _TRAINING: dict[str, tuple[type, type]] = {
 }
 """Arrays of `TrainingScores`: the type on disk and in memory."""
 _T = TypeVar("_T")
+_ROUNDING = 1e-6  # Of a sum of masses.
+_SIZES = dict(
+    entry.split(":")
+    for entry in """beliefs:krb input_range:2x correction.change:g correction.guard:kr
+    correction.hidden_range:2 embedding.trunk.0.weight:kx* embedding.output.weight:k*m
+    training_points:kn2 training_score:n training_cause:n training_nearest:n training_heads:nh
+    training_multiplicity:n training_count:kr novelty.mean:x novelty.least:x novelty.largest:x
+    novelty.covariance:xx feedback_novelty.mean:x feedback_novelty.least:x
+    feedback_novelty.largest:x feedback_novelty.covariance:xx trees.feature:ot trees.threshold:ot
+    trees.left:ot trees.value:tl detector.columns:u detector.watched:w detector.limits:6w
+    detector.deviation:w detector.predictor.mean:u detector.predictor.low:u
+    detector.predictor.high:u detector.predictor.scale:u detector.predictor.unit:w""".split()
+)
+"""Sizes of arrays by letter; an asterisk stands for any."""
+_INDICES = {"training_cause": "c", "training_nearest": "c", "trees.feature": "x"}
+_INDICES |= {"detector.columns": "y", "detector.watched": "s"}
+"""Arrays of indices, and the sizes below which they are."""
+_SHARES = ("beliefs", "training_score", "correction.guard")
+_POSITIVE = re.compile("limits|deviation|scale|unit|multiplicity")
+_MAYBE_INFINITE = ("trees.threshold", "detector.settings")
 
 
 def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, Any]) -> None:
@@ -127,7 +150,14 @@ def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
             return _learned(entries, tensors)
     except KeyError as error:
         raise ValueError(f"'{path}' is a damaged safety assessment: it has no {error}") from error
-    except (AttributeError, RecursionError, TypeError, ValueError) as error:
+    except (
+        ArithmeticError,
+        AttributeError,
+        IndexError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
         raise ValueError(f"'{path}' is a damaged safety assessment: {error}") from error
     raise ValueError(
         f"'{path}' has the schema version {version}, this version reads {SCHEMA_VERSION}: train "
@@ -151,8 +181,40 @@ def _digest(entries: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> st
 
 def _made(made: type[_T], entries: Mapping[str, Any]) -> _T:
     """Makes a dataclass of JSON values, without those of fields that it does not have any more."""
-    hints = get_type_hints(made)
-    return made(**{name: value for name, value in entries.items() if name in hints})
+    return load_typed(made, _known(made, entries), made.__name__)
+
+
+def _known(made: type, entries: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in entries.items() if name in get_type_hints(made)}
+
+
+def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: dict[str, int]) -> None:
+    """Raises ValueError if an array does not fit the sizes by letter, or has impossible values."""
+    for name, values in sorted(arrays.items()):
+        letters = _SIZES.get(name, "*" * values.ndim)
+        if len(letters) != values.ndim or not all(
+            one == "*" or sizes.setdefault(one, size) == size
+            for one, size in zip(letters, values.shape, strict=True)
+        ):
+            expected = tuple(sizes.get(one, one) for one in letters)
+            raise ValueError(f"'{name}' has the shape {values.shape}, expected {expected}")
+        if name.endswith(".bias"):  # Else it may be broadcast.
+            of_weight = arrays[f"{name.removesuffix('bias')}weight"].shape
+            if values.shape != of_weight[:-2] + of_weight[-1:]:
+                raise ValueError(f"'{name}' has the shape {values.shape}, its weight {of_weight}")
+        most = math.inf if name in _MAYBE_INFINITE else float(np.finfo(float).max)
+        least = float(np.finfo(float).tiny) if _POSITIVE.search(name) else -most
+        if name in _SHARES:
+            least, most = 0.0, 1.0 + _ROUNDING
+        elif name in _INDICES:
+            least, most = -float(name == "training_cause"), sizes[_INDICES[name]] - 1.0
+        numbers = values.astype(float)
+        if (wrong := numbers[~((numbers >= least) & (numbers <= most))]).size:
+            raise ValueError(f"'{name}' has {wrong[0]}, expected {least:g} to {most:g}")
+    masses, variances = arrays["beliefs"], np.diag(arrays["novelty.covariance"])
+    sums = masses[..., :3].sum(axis=-1) - 1.0, masses[..., 3:].sum(axis=-1) - masses[..., 1]
+    if np.abs(sums).max() > _ROUNDING or variances.min() < 0.0:
+        raise ValueError("'beliefs' do not sum to 1, or variances of 'novelty' are negative")
 
 
 def _learned(
@@ -163,8 +225,8 @@ def _learned(
         raise ValueError("its contents do not have the SHA-256 that it was written with")
     # Files from before these parameters are of exact neighbours, and without trees.
     own: dict[str, Any] = {"candidates_per_neighbour": 0, "trees": False} | entries["parameters"]
-    own["paper"] = _made(PaperReading, own["paper"])
-    own["adaptation"] = _made(AdaptationParameters, own["adaptation"])
+    own["paper"] = _known(PaperReading, own["paper"])
+    own["adaptation"] = _known(AdaptationParameters, own["adaptation"])
     parameters, info = _made(AssessmentParameters, own), _made(EpisodesInfo, entries["info"])
 
     def group(prefix: str) -> dict[str, Any]:
@@ -172,16 +234,23 @@ def _learned(
 
     numbers, columns = entries["numbers"], InputColumns(info, parameters)
     base_logit, adaptation = numbers["base_logit"], entries["adaptation"]
-    if base_logit is not None:
-        base_logit["margin_range"] = tuple(base_logit["margin_range"])
+    num_causes, widths = len(info.constraint_names), info.widths
+    trees, nodes = group("trees."), len(tensors.get("trees.left", ()))
+    sizes = {"2": 2, "6": 6, "r": parameters.resolution**2, "b": 3 + num_causes, "c": num_causes}
+    sizes |= {"g": 4 if trees else 3, "h": 3 if trees else 2, "l": nodes + 1, "s": widths["state"]}
+    sizes |= {"x": len(columns.names), "m": 2 + numbers["num_margins"]}
+    sizes["y"] = sum(widths[name] for name in ("state", "desired_preview", "features"))
+    _check_arrays(tensors, sizes)
     correction = Correction(**group("correction."))
     correction.guard = correction.guard.astype(float)
     # Files from before have none.
     fall_logit = numbers.get("fall_logit")
-    training, trees = group("training_"), group("trees.")
-    counts = numbers["novelty_counts"]
+    training, counts = group("training_"), numbers["novelty_counts"]
+    limits = np.array(numbers["novelty_limits"], dtype=float)
+    if not (min(counts) >= 0 < counts[0] and (limits > 0.0).all() and len(limits) in (3, 4)):
+        raise ValueError(f"its novelty has the counts {counts} and limits {limits.tolist()}")
     feedback = Moments(count=counts[1], **group("feedback_novelty.")) if counts[1] else None
-    return parameters, {
+    learned: dict[str, Any] = {
         "info_": info,
         "grid_": Grid.of(parameters),
         "columns_": columns,
@@ -200,7 +269,7 @@ def _learned(
         "novelty_": Novelty(
             training=Moments(count=counts[0], **group("novelty.")),
             feedback=feedback,
-            limits=np.array(numbers["novelty_limits"], dtype=float),
+            limits=limits,
             plan=columns.plan,
         ),
         "detector_": ChangeDetector.from_arrays(group("detector.")),
@@ -208,6 +277,14 @@ def _learned(
         "used_": [_made(UsedEpisodes, one) for one in numbers["used"]],
         "adaptation_": None if adaptation is None else _made(Adaptation, adaptation),
     }
+    # Layers that do not fit together raise an error.
+    names = "embedding grid beliefs correction base_logit novelty trees fall_logit"
+    parts = {name: learned[f"{name}_"] for name in names.split()}
+    with np.errstate(all="ignore"):
+        x = learned["novelty_"].training.mean[None]
+        predict(x, **parts, initial_uncertainty=parameters.initial_uncertainty)
+        learned["detector_"].predictor.errors(*(np.zeros((3, sizes[one])) for one in "uw"))
+    return parameters, learned
 
 
 def file_hash(path: Path) -> str:

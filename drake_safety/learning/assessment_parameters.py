@@ -17,7 +17,9 @@ from drake_safety.files.schema import (
 )
 from drake_safety.learning.distance import Backend, WarpingCost
 
-Widths = Annotated[list[Count], Field(min_length=1)]
+Widths = Annotated[list[Annotated[int, Field(ge=1, le=10_000)]], Field(min_length=1)]
+MOST_SAMPLES = 10_000
+"""Largest horizon, for which names and previews are made."""
 
 
 @schema(kw_only=True)
@@ -161,12 +163,12 @@ class AssessmentParameters:
 
     mode: Literal["sharpened", "paper"] = "sharpened"
     discount: Share = 0.99
-    horizon: Count = 10
+    horizon: Annotated[int, Field(ge=1, le=MOST_SAMPLES)] = 10
     preview_stride: Count = 1
     score_weight: NotNegative = 0.01
     initial_uncertainty: Share = 0.3
     min_count: Count = 5
-    resolution: Count = 14
+    resolution: Annotated[int, Field(ge=1, le=1000)] = 14
     cell_length: Positive = 10.0
     warping_cost: WarpingCost = "squared"
     distance_backend: Backend = "dtaidistance"
@@ -180,7 +182,7 @@ class AssessmentParameters:
     learning_rate: Positive = 2e-3
     batch_size: Count = 512
     epochs: Count = 18
-    ensemble_size: Count = 3
+    ensemble_size: Annotated[int, Field(ge=1, le=100)] = 3
     held_out: ShareBelowOne = 0.3
     hidden_sizes: Widths = field(default_factory=lambda: [128, 128])
     dropout: ShareBelowOne = 0.2

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from pydantic import FiniteFloat, NonNegativeInt
 
 _LIMIT = 20.0  # Of the logit, which keeps exp from overflowing.
 _INVERSE_PENALTY = 0.01  # Of inputs with unit variance.
@@ -25,9 +26,9 @@ class FallLogit:
             columns.
     """
 
-    columns: tuple[int, ...]
-    weights: tuple[float, ...]
-    offset: float
+    columns: tuple[NonNegativeInt, ...]
+    weights: tuple[FiniteFloat, ...]
+    offset: FiniteFloat
 
     @classmethod
     def fit(

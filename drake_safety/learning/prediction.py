@@ -7,7 +7,9 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+from pydantic import FiniteFloat
 
+from drake_safety.files.schema import Positive
 from drake_safety.learning import beliefs as belief_masses
 from drake_safety.learning.fall_logit import FallLogit
 from drake_safety.learning.grid import Grid
@@ -93,12 +95,12 @@ class BaseLogit:
         margin_range: Range that margins are clipped to [unit of the margins].
     """
 
-    margin_unit: float
-    margin_range: tuple[float, float]
-    offset: float = 0.0
-    safety_slope: float = 1.0
-    margin_slope: float = 1.0
-    trees_slope: float = 0.0
+    margin_unit: Positive
+    margin_range: tuple[FiniteFloat, FiniteFloat]
+    offset: FiniteFloat = 0.0
+    safety_slope: FiniteFloat = 1.0
+    margin_slope: FiniteFloat = 1.0
+    trees_slope: FiniteFloat = 0.0
 
     @property
     def slopes(self) -> tuple[float, float, float]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from drake_safety.extras import require_extra
-from drake_safety.learning.assessment_parameters import AssessmentParameters
+from drake_safety.learning.assessment_parameters import MOST_SAMPLES, AssessmentParameters
 from drake_safety.learning.mode_settings import mode_settings
 
 if TYPE_CHECKING:
@@ -72,6 +72,7 @@ class EpisodesInfo:
         preview_stride: Rows between two of the H samples of a preview or a segment.
         monitored_states: States that a `ChangeDetector` predicts; None for all of them.
         monitored_features: Features by which it predicts them; None for all of them.
+        robot: Name of the robot; empty if it is unknown, or there is none.
     """
 
     scenario: str
@@ -89,10 +90,11 @@ class EpisodesInfo:
     preview_stride: int = 1
     monitored_states: list[str] | None = None
     monitored_features: list[str] | None = None
+    robot: str = ""
 
     def __post_init__(self) -> None:
         for name, is_valid, expected in (
-            ("horizon", self.horizon >= 1, ">= 1"),
+            ("horizon", 1 <= self.horizon <= MOST_SAMPLES, f"1..{MOST_SAMPLES}"),
             ("step_s", self.step_s > 0.0, "> 0"),
             ("preview_stride", self.preview_stride >= 1, ">= 1"),
         ):

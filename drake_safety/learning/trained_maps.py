@@ -83,11 +83,6 @@ class Embedding:
         self._layers = [self._layer(name) for name in names]
         self.num_members, self.num_inputs, _ = self._layers[0][0].shape
         self.num_activations = self._layers[-1][0].shape[1]
-        if self._layers[-1][0].shape[2] != 2 + num_margins:
-            raise ValueError(
-                f"Embedding: the output layer has {self._layers[-1][0].shape[2]} columns, expected "
-                f"{2 + num_margins} for {num_margins} margins"
-            )
         self.input_range = np.full((2, self.num_inputs), np.inf, dtype=np.float32)
         self.input_range[0] = -np.inf
         if input_range is not None:

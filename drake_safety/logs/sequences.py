@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_safety.files.reading import did_you_mean, reading
+from drake_safety.files.reading import check_memory, did_you_mean, reading
 from drake_safety.files.schema import NotNegative, schema
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.inputs import preview_names
@@ -81,6 +81,7 @@ def _arrays(path: Path, sequence_map: SequenceMap) -> tuple[np.ndarray, list[str
         for name in (sequence_map.data, sequence_map.names):
             if name not in file.files:
                 raise ValueError(f"'{path}' has no array '{name}'; it has {file.files}")
+        check_memory(sum(one.file_size for one in file.zip.infolist()), f"'{path}'")
         data = file[sequence_map.data]
         names = file[sequence_map.names].astype(str).ravel().tolist()
     if data.ndim not in (2, 3) or data.shape[-1] != len(names) or data.dtype.kind not in "fiu":

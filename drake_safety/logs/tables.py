@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_safety.extras import require_extra
-from drake_safety.files.reading import is_number, reading
+from drake_safety.files.reading import check_memory, is_number, reading
 from drake_safety.logs.channel import Channel, Wanted, listed
 from drake_safety.logs.log_map import LogTime
 
@@ -80,6 +80,7 @@ def read_parquet(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, C
         existing = file.schema_arrow.names
         places = _places(path, wanted, time, existing)
         names = [existing[place] for place in places.values()]
+        check_memory(8 * file.metadata.num_rows * len(names), f"'{path}'")
         table = file.read(columns=names).select(names).rename_columns([*places])
         frame = table.to_pandas(timestamp_as_object=False, ignore_metadata=True)
         return {"": _channel(path, frame, time, "row")}, []

@@ -22,7 +22,8 @@ import numpy as np
 
 from drake_safety.extras import require_extra
 from drake_safety.files.atomic import lock_folder, replacing
-from drake_safety.files.reading import reading, shortened
+from drake_safety.files.reading import reading
+from drake_safety.files.schema import load_typed
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
 from drake_safety.simulation.episode_shards import (
     from_table,
@@ -148,14 +149,12 @@ def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any
             f"{file} has schema version {schema_version!r}; expected {_SCHEMA_VERSION}"
         )
     fields, extra = content.get("info"), content.get("extra")
-    try:
-        if not isinstance(extra, dict):
-            raise TypeError("it has no extra")
-        # Fields that older folders lack have defaults that mean "unknown"; others mean nothing now.
-        known = {field.name for field in dataclasses.fields(EpisodesInfo)}
-        return EpisodesInfo(**{name: fields[name] for name in known & fields.keys()}), extra
-    except (AttributeError, TypeError, ValueError) as error:
-        raise ValueError(f"{file} does not describe episodes: {shortened(str(error))}") from error
+    if not (isinstance(fields, dict) and isinstance(extra, dict)):
+        raise ValueError(f"{file} does not describe episodes: it has no info, or no extra")
+    # Fields that older folders lack have defaults that mean "unknown"; others mean nothing now.
+    known = {field.name for field in dataclasses.fields(EpisodesInfo)} & fields.keys()
+    who = f"{file} does not describe episodes"
+    return load_typed(EpisodesInfo, {name: fields[name] for name in known}, who), extra
 
 
 def completed(path: str | os.PathLike[str]) -> set[int]:
@@ -227,7 +226,7 @@ def _check_same_set(path: Path, stored: EpisodesInfo, given: EpisodesInfo) -> No
     differences = {
         name: f"{name}: there {there[name]!r}, here {here[name]!r}"
         for name in there
-        if there[name] != here[name]
+        if there[name] != here[name] and (name != "robot" or there[name])
     }
     versions = differences.pop("versions", None)
     if differences:

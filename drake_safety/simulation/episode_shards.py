@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drake_safety.extras import require_extra
+from drake_safety.files.reading import check_memory
 from drake_safety.learning.segments import DIVERGED, LARGEST, Episode, EpisodesInfo
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 _FAILURES = "num_controller_failures"
 _OF_EPISODES = {"is_safe": bool, "cause": str, "first_step": int, _FAILURES: int}
+_KINDS = {"time_s": "f", "is_safe": "b", "cause": "O"}
 _SHARD_NAME = re.compile(r"episodes-\d{5,}\.parquet")
 
 
@@ -68,22 +70,33 @@ def from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode
         if width:
             column = column.combine_chunks().flatten()
         arrays[name] = column.to_numpy().reshape((num_rows, width) if width else num_rows)
-    episode = arrays["episode"]
+        if arrays[name].dtype.kind != ("f" if width else _KINDS.get(name, "i")):
+            raise ValueError(f"{shard}: {name} is {column.type}; expected another type")
+    episode, margins = arrays["episode"], arrays["margins"]
     bounds = [0, *(np.flatnonzero(np.diff(episode)) + 1), num_rows]
     result = []
     for first, last in itertools.pairwise(bounds):
-        rows = slice(first, last)
-        if not np.array_equal(arrays["step"][rows], np.arange(last - first)):
-            raise ValueError(f"{shard}: the steps of episode {episode[first]} are not 0, 1, 2, ...")
-        if not (np.diff(arrays["time_s"][rows]) > 0.0).all():
-            raise ValueError(f"{shard}: the time of episode {episode[first]} does not increase")
-        if arrays["cause"][first] != DIVERGED:
-            for name in ("time_s", *widths):
-                if not (np.abs(arrays[name][rows]) < LARGEST).all():
-                    raise ValueError(
-                        f"{shard}: {name} of episode {episode[first]} holds values that are not "
-                        f"finite numbers below {LARGEST:g}"
-                    )
+        rows, longest = slice(first, last), info.num_steps or num_rows
+        large = [n for n in ("time_s", *widths) if not (np.abs(arrays[n][rows]) < LARGEST).all()]
+        faults = {
+            "its steps are not 0, 1, 2, ...": (
+                arrays["step"][rows] != np.arange(last - first)
+            ).any(),
+            "its time does not increase": not (np.diff(arrays["time_s"][rows]) > 0.0).all(),
+            f"it has more than {longest} steps": last - first > longest + 1,
+            f"its rows differ in {[*_OF_EPISODES]}": any(
+                (arrays[name][rows] != arrays[name][first]).any() for name in _OF_EPISODES
+            ),
+            "it is safe, and a margin is negative": (
+                arrays["is_safe"][first] and (margins[rows] < 0.0).any()
+            ),
+            f"{large} hold values that are not finite numbers below {LARGEST:g}": (
+                large and arrays["cause"][first] != DIVERGED
+            ),
+        }
+        for what, is_wrong in faults.items():
+            if is_wrong:
+                raise ValueError(f"{shard}: episode {episode[first]}: {what}")
         one: dict[str, Any] = {name: arrays[name][rows].copy() for name in ("time_s", *widths)}
         for name, kind in _OF_EPISODES.items():
             one[name] = kind(arrays[name][first])
@@ -114,6 +127,8 @@ def read_shard(shard: Path, columns: list[str] | None = None) -> pa.Table:
     try:
         # ParquetFile and not read_table, which adds columns for folders named like `seed=1`.
         with pq.ParquetFile(shard, page_checksum_verification=True) as file:
+            sizes = (getattr(one.type, "list_size", 1) for one in file.schema_arrow)
+            check_memory(8 * file.metadata.num_rows * sum(sizes), f"{shard}")
             table = file.read(columns=columns)
     except (pa.ArrowException, OSError) as error:
         raise ValueError(

@@ -105,6 +105,7 @@ def episodes_info(
         preview_stride=scenario.assessment.preview_stride,
         monitored_states=loop.monitored.get("states"),
         monitored_features=loop.monitored.get("features"),
+        robot=scenario.robot_name,
     )
 
 

@@ -4,22 +4,25 @@ import hashlib
 import importlib
 import inspect
 import math
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import field
 from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import pydantic
 import yaml
+from pydantic import Field
 
 from drake_safety.files.reading import did_you_mean, parse_yaml, reading
 from drake_safety.files.schema import Positive, load_typed, schema
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.robots.robot import PlantVariation
+from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.robots.robot_size import overlaid
 from drake_safety.simulation.closed_loop import ClosedLoop, Purpose, check_ports
 from drake_safety.systems.safety_assessor import OnAlarm
@@ -30,6 +33,9 @@ if TYPE_CHECKING:
 
 _LEAST_MONITOR_STEP_S = 0.02
 _MOST_STEPS = 10_000_000  # Of an episode, of any kind.
+# A folder in a text file: the value of an XML attribute, or of a key or an item in YAML.
+_FOLDER_IN_TEXT = re.compile(rb"""(["']|[:,{\[-]\s+|\[)(?:file://)?/[^"'<>\n,}\]]*/""")
+_TEXT_FORMATS = (".yaml", ".yml", ".urdf", ".sdf", ".xml")
 
 
 @schema(kw_only=True)
@@ -60,9 +66,12 @@ class Scenario:
     assessment: AssessmentParameters = field(default_factory=AssessmentParameters)
     """Parameters of the assessment."""
 
-    parameters = cast(Any, None)  # Set by the loader: an instance of the task's Parameters.
-    folder = ""  # Set by the loader: the scenario file's folder, where its task may stand.
-    identity = ""  # Set by `adopt`: the name under which it was learned; its own by default.
+    parameters: Annotated[Any, Field(exclude=True)] = field(default=None, repr=False)
+    """An instance of the task's Parameters."""
+    folder: Annotated[str, Field(exclude=True)] = field(default="", repr=False, compare=False)
+    """The scenario file's folder, where its task may stand; filled in by the loader."""
+    identity: Annotated[str, Field(exclude=True)] = field(default="", repr=False, compare=False)
+    """The name under which it was learned, its own by default; filled in by `adopt`."""
 
     def __post_init__(self) -> None:
         for name in ("step_s", "time_step_s", "control_period_s"):
@@ -110,6 +119,12 @@ class Scenario:
                 f"{did_you_mean(name, self.variations)}; it has {list(self.variations)}"
             )
         return self.variations[name]
+
+    @property
+    def robot_name(self) -> str:
+        """The name of the robot, which may be that in its YAML file."""
+        is_file = Path(self.robot).suffix in (".yaml", ".yml")
+        return load_robot_file(self.robot).name if is_file else self.robot
 
     def task_class(self) -> type[ClosedLoop]:
         """The task, imported.
@@ -209,15 +224,33 @@ class Scenario:
             if name in self.variations
         }
         text["name"] = name or self.identity or self.name
-        # The robot's files are hashed; their folder is irrelevant.
+        # Files are hashed; their folders are irrelevant.
         text["robot"] = Path(self.robot).name
+        text["parameters"] = _without_folders(text["parameters"])
         task = self.task_class()
         for name in getattr(task.Parameters, "online", ()):
             text["parameters"].pop(name, None)
         digest = hashlib.sha256(yaml.safe_dump(text, sort_keys=True).encode())
         for path in task.model_files(self):
-            digest.update(Path(path).read_bytes())
+            digest.update(_content(Path(path)))
         return digest.hexdigest()
+
+
+def _content(path: Path) -> bytes:
+    """The bytes of a file, without the folders of the absolute paths in a text."""
+    content = path.read_bytes()
+    return _FOLDER_IN_TEXT.sub(rb"\1", content) if path.suffix in _TEXT_FORMATS else content
+
+
+def _without_folders(value: Any) -> Any:
+    """Plain values with the SHA-256 of the files in place of their absolute paths."""
+    if isinstance(value, dict):
+        return {key: _without_folders(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [*map(_without_folders, value)]
+    if isinstance(value, str) and value.startswith("/") and (path := Path(value)).is_file():
+        return hashlib.sha256(_content(path)).hexdigest()
+    return value
 
 
 def _accepted(
@@ -401,6 +434,8 @@ def _parsed(text: str, name: str, folder: Path) -> Scenario:
             f"scenario '{name}' must be a mapping with the key 'task', and 'robot' if the task has "
             "one"
         )
+    if own := sorted(raw.keys() & {"folder", "identity"}):
+        raise ValueError(f"scenario '{name}': unknown keys {own}, which no file states")
     parameters = raw.pop("parameters", None) or {}
     scenario = load_typed(Scenario, raw | {"name": name}, f"scenario '{name}'")
     if Path(scenario.robot).suffix in (".yaml", ".yml"):
