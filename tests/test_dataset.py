@@ -372,7 +372,7 @@ def forged(path, name, row, value, type_=None):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("margins", 2, [0.1, -0.1]), "episode 0: it is safe, and a margin is negative"),
+        (("margins", 2, [0.1, -0.1]), ".*is_safe is True but the margin speed is -0.1 in row 2"),
         (("is_safe", 3, False), r"episode 0: its rows differ in \['is_safe', 'cause', 'first_s"),
         (("cause", 7, ""), "episode 1: its rows differ"),
         (("state", 1, [0.0, np.nan, 0.0]), r"episode 0: \['state'\] hold values that are not fin"),

@@ -54,14 +54,18 @@ _ROUNDING = 1e-6  # Of a sum of masses.
 _SIZES = dict(
     entry.split(":")
     for entry in """beliefs:krb input_range:2x correction.change:g correction.guard:kr
-    correction.hidden_range:2 embedding.trunk.0.weight:kx* embedding.output.weight:k*m
+    correction.hidden_range:2 embedding.trunk.0.weight:kxA embedding.trunk.1.weight:kAB
+    embedding.trunk.2.weight:kBC embedding.trunk.3.weight:kCD embedding.output.weight:k*m
+    embedding.safety.0.weight:k2S embedding.safety.1.weight:kS1
     training_points:kn2 training_score:n training_cause:n training_nearest:n training_heads:nh
     training_multiplicity:n training_count:kr novelty.mean:x novelty.least:x novelty.largest:x
     novelty.covariance:xx feedback_novelty.mean:x feedback_novelty.least:x
     feedback_novelty.largest:x feedback_novelty.covariance:xx trees.feature:ot trees.threshold:ot
     trees.left:ot trees.value:tl detector.columns:u detector.watched:w detector.limits:6w
     detector.deviation:w detector.predictor.mean:u detector.predictor.low:u
-    detector.predictor.high:u detector.predictor.scale:u detector.predictor.unit:w""".split()
+    detector.predictor.high:u detector.predictor.scale:u detector.predictor.unit:w
+    detector.predictor.hidden.0.weight:vE detector.predictor.hidden.1.weight:EF
+    detector.predictor.output.weight:Fw detector.predictor.linear.weight:vw""".split()
 )
 """Sizes of arrays by letter; an asterisk stands for any."""
 _INDICES = {"training_cause": "c", "training_nearest": "c", "trees.feature": "x"}
@@ -207,10 +211,10 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: dict[str, int]) -> No
         if name in _SHARES:
             least, most = 0.0, 1.0 + _ROUNDING
         elif name in _INDICES:
-            least, most = -float(name == "training_cause"), sizes[_INDICES[name]] - 1.0
+            least, most = -1.0 * (name == "training_cause"), sizes[_INDICES[name]] - 1.0
         numbers = values.astype(float)
         if (wrong := numbers[~((numbers >= least) & (numbers <= most))]).size:
-            raise ValueError(f"'{name}' has {wrong[0]}, expected {least:g} to {most:g}")
+            raise ValueError(f"'{name}' has {wrong[0]}, expected {least + 0.0:g} to {most:g}")
     masses, variances = arrays["beliefs"], np.diag(arrays["novelty.covariance"])
     sums = masses[..., :3].sum(axis=-1) - 1.0, masses[..., 3:].sum(axis=-1) - masses[..., 1]
     if np.abs(sums).max() > _ROUNDING or variances.min() < 0.0:
@@ -236,9 +240,17 @@ def _learned(
     base_logit, adaptation = numbers["base_logit"], entries["adaptation"]
     num_causes, widths = len(info.constraint_names), info.widths
     trees, nodes = group("trees."), len(tensors.get("trees.left", ()))
-    sizes = {"2": 2, "6": 6, "r": parameters.resolution**2, "b": 3 + num_causes, "c": num_causes}
+    sizes = {
+        "1": 1,
+        "2": 2,
+        "6": 6,
+        "r": parameters.resolution**2,
+        "b": 3 + num_causes,
+        "c": num_causes,
+    }
     sizes |= {"g": 4 if trees else 3, "h": 3 if trees else 2, "l": nodes + 1, "s": widths["state"]}
     sizes |= {"x": len(columns.names), "m": 2 + numbers["num_margins"]}
+    sizes["v"] = 2 * len(tensors["detector.columns"])
     sizes["y"] = sum(widths[name] for name in ("state", "desired_preview", "features"))
     _check_arrays(tensors, sizes)
     correction = Correction(**group("correction."))

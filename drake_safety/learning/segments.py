@@ -306,6 +306,10 @@ def _check_episode(info: EpisodesInfo, episode: Episode) -> None:
         raise ValueError(f"{who}: first_step is {episode.first_step}, expected 0..{num_rows - 1}")
     if episode.is_safe != (episode.cause == ""):
         raise ValueError(f"{who}: is_safe is {episode.is_safe} but the cause is '{episode.cause}'")
+    if episode.is_safe and (episode.margins < 0.0).any():
+        row, column = np.argwhere(episode.margins < 0.0)[0]
+        margin = f"{info.constraint_names[column]} is {episode.margins[row, column]:g} in row {row}"
+        raise ValueError(f"{who}: is_safe is True but the margin {margin}")
     if episode.cause not in ("", DIVERGED, *info.constraint_names):
         raise ValueError(
             f"{who}: unknown cause '{episode.cause}'; the constraints are {info.constraint_names}"

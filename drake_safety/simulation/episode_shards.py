@@ -72,7 +72,7 @@ def from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode
         arrays[name] = column.to_numpy().reshape((num_rows, width) if width else num_rows)
         if arrays[name].dtype.kind != ("f" if width else _KINDS.get(name, "i")):
             raise ValueError(f"{shard}: {name} is {column.type}; expected another type")
-    episode, margins = arrays["episode"], arrays["margins"]
+    episode = arrays["episode"]
     bounds = [0, *(np.flatnonzero(np.diff(episode)) + 1), num_rows]
     result = []
     for first, last in itertools.pairwise(bounds):
@@ -86,9 +86,6 @@ def from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode
             f"it has more than {longest} steps": last - first > longest + 1,
             f"its rows differ in {[*_OF_EPISODES]}": any(
                 (arrays[name][rows] != arrays[name][first]).any() for name in _OF_EPISODES
-            ),
-            "it is safe, and a margin is negative": (
-                arrays["is_safe"][first] and (margins[rows] < 0.0).any()
             ),
             f"{large} hold values that are not finite numbers below {LARGEST:g}": (
                 large and arrays["cause"][first] != DIVERGED
