@@ -1,5 +1,6 @@
 """The command line: every command is listed, and what a user did wrong is one line."""
 
+import errno
 import math
 import os
 import subprocess
@@ -149,6 +150,7 @@ def test_a_shell_completes_commands_and_scenarios_without_drake():
         (["train", "pendulum", "--out"], "file"),
         (["train", "pendulum", "--out"], "file/inside"),
         (["evaluate", "pendulum", "--assessment", ".", "--out"], "file"),
+        (["run", SCENE, "--push", "ball", "--out"], "file/inside"),
     ],
 )
 def test_a_folder_that_cannot_be_written_is_found_before_anything_is_simulated(
@@ -157,7 +159,37 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_simulated(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     assert call(monkeypatch, *arguments, what) == 2
-    assert f"error folder '{what}' cannot be written" in capsys.readouterr().out
+    assert f"error folder '{what}" in (printed := capsys.readouterr().out)
+    assert "cannot be written" in printed
+
+
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [
+        (errno.ENOSPC, "error 'there' cannot be written: the disk is full; make room and run the"),
+        (errno.ENOENT, "error 'there' does not exist"),
+        (errno.EISDIR, "error 'there' cannot be used: Is a directory"),
+    ],
+)
+def test_an_error_of_the_operating_system_is_a_sentence(monkeypatch, capsys, number, message):
+    def fails(*arguments, **options):
+        raise OSError(number, os.strerror(number), "there")
+
+    monkeypatch.setattr("drake_safety.cli.ask.folders.open_assessment", fails)
+    assert call(monkeypatch, "ask", "atlas_reaching", "--target", "1", "0", "1") == 2
+    assert capsys.readouterr().out.startswith(message)
+
+
+@pytest.mark.train
+def test_motion_for_one_piece_is_refused_before_anything_is_simulated(
+    monkeypatch, capsys, stopped, tmp_path
+):
+    train = ("train", "laikago_balancing", "--out", tmp_path / "run", "--motion")
+    for minutes in (1, 0.5):
+        assert call(monkeypatch, *train, minutes) == 2
+        told = f"error train: --motion {minutes} gives one motion, and the monitor needs one for"
+        assert told in capsys.readouterr().out
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.train

@@ -7,6 +7,7 @@ imported.
 
 from __future__ import annotations
 
+import errno
 import itertools
 import logging
 import os
@@ -161,6 +162,18 @@ def main() -> None:
     run_app(lambda *given, **options: make_app(_called())(*given, **options), "drake-safety")
 
 
+def _sentence(error: Exception) -> str:
+    """An error in words, also one of the operating system."""
+    if not isinstance(error, OSError) or not error.strerror:
+        return str(error)
+    why = {
+        errno.ENOENT: "does not exist",
+        errno.ENOSPC: "cannot be written: the disk is full; make room and run the command again",
+    }
+    place = f"'{error.filename}'" if error.filename else "a file"
+    return f"{place} {why.get(error.errno or 0, f'cannot be used: {error.strerror}')}"
+
+
 def run_app(commands: Callable[..., Any], program: str) -> None:
     """Runs a command; user errors are printed as one line, with --debug as a traceback.
 
@@ -183,7 +196,7 @@ def run_app(commands: Callable[..., Any], program: str) -> None:
         sys.exit(_STOPPED)
     except (Exception, SystemExit) as error:
         if isinstance(error, (ValueError, OSError, EpisodeError)) and _DEBUG not in sys.argv:
-            console.say("error", error, style="red")
+            console.say("error", _sentence(error), style="red")
             if isinstance(error, EpisodeError):
                 console.say(f"{_DEBUG} in the command line shows where")
         elif hasattr(error, "show"):  # Typer's own errors: unknown options, wrong types.

@@ -160,7 +160,12 @@ def evaluating(
 
     Seeds are those of `block`, from `seed` or its default on.
     """
+    files = {mode: folders.assessment_file(run_folder, mode) for mode in MODES}
+    before = {mode: file_hash(file) for mode, file in files.items() if file.is_file()}
     assessments = folders.load_assessments(run_folder)
+    hashes = {mode: file_hash(files[mode]) for mode in assessments}
+    if hashes != before:
+        raise ValueError(f"an assessment in {run_folder} was written meanwhile: start again")
     seeds = block.seeds(seed)
     for gamma in assessments.values():
         folders.check_fresh(gamma, scenario, seeds.values())
@@ -169,7 +174,6 @@ def evaluating(
         yield evaluation
     sharpened = assessments[MODES[0]]
     trained = next(one for one in sharpened.used_ if one.purpose == "training")
-    hashes = {mode: file_hash(folders.assessment_file(run_folder, mode)) for mode in assessments}
     made = console.made_by(scenario.name, program) | {
         "scenario_hash": sharpened.info_.scenario_hash,
         "seed": next(iter(seeds.values())),

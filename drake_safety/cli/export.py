@@ -25,7 +25,6 @@ def export(
     """
     *_, gamma = folders.open_assessment(scenario, assessment, mode)
     folders.check_writable(out.parent)
-    out.parent.mkdir(parents=True, exist_ok=True)
     gamma.to_onnx(out)
     for one in gamma.calibrations_.values():
         told = f"safe from {one.threshold:.4f}, unsafe below {one.unsafe_below:.4f}: {one.promise}"

@@ -36,7 +36,7 @@ from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.outcomes import BELIEFS, UNSAFE, Outcome
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.tables import Column
-from drake_safety.files.atomic import replacing
+from drake_safety.files.atomic import write_file
 from drake_safety.files.reading import parse_yaml
 from drake_safety.learning.seeds import GATE, RATE
 from drake_safety.simulation.rollouts import run_episode
@@ -232,8 +232,7 @@ def _record(first: Loop, others: Mapping[str, Loop], index: int, seed: int, file
         how = "stays in the safe set" if episode.is_safe else f"leaves the safe set: {cause}"
         console.say(f"{name}: {how}")
         panels.append(f'<iframe srcdoc="{html.escape(viewer.StaticHtml())}"></iframe>')
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text("\n".join(panels), encoding="utf-8")
+    write_file(file, "\n".join(panels))
     console.say("recording, in this order:", file)
 
 
@@ -345,8 +344,6 @@ def _write_junit(
             ElementTree.SubElement(case, kind, type=what, message=told)
     counts = {"tests": "testcase", "failures": "failure", "errors": "error"}
     root.attrib |= {key: f"{len([*root.iter(kind)])}" for key, kind in counts.items()}
-    file.parent.mkdir(parents=True, exist_ok=True)
     text = ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
-    with replacing(file) as temporary:
-        temporary.write_text(_NOT_XML.sub("?", text), encoding="utf-8")
+    write_file(file, _NOT_XML.sub("?", text))
     console.say("JUnit  ", file)

@@ -23,6 +23,7 @@ from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.path_figure import path_figure
 from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
 from drake_safety.evaluation.timeline_figure import timeline_figure
+from drake_safety.files.atomic import write_file
 from drake_safety.files.reading import did_you_mean, parse_yaml
 from drake_safety.files.schema import load_typed
 from drake_safety.learning.assessment import SafetyAssessment
@@ -99,6 +100,8 @@ def run(
     if force and target is None:
         raise ValueError("run: --force goes to a target that Γ refuses: pass that too")
     loaded, learned, gamma = folders.open_assessment(scenario, assessment, mode)
+    folder = (out or learned.out) / "run"
+    folders.check_writable(folder)
     rule = folders.goal_threshold(learned.path, gamma)
     options = console.given(hand=hand, recovery=recovery)
     # Check the capabilities of the task before a browser is opened. The verdict is on what is
@@ -137,7 +140,7 @@ def run(
     rate = 1.0 if meshcat else 0.0
     shown = simulated(loop, duration_s=duration or duration_s, seed=seed, realtime_rate=rate)
     console.warn_of_empty_scene(viewer, loaded.task)
-    _save((out or learned.out) / "run", viewer, loop, shown)
+    _save(folder, viewer, loop, shown)
 
 
 _Events = list[tuple[float, str]]  # Times [s] and words.
@@ -339,13 +342,11 @@ def _save(folder: Path, viewer: Meshcat, loop: Any, shown: _Shown) -> None:
     motion = shown.motion
     viewer.StopRecording()
     viewer.PublishRecording()
-    folder.mkdir(parents=True, exist_ok=True)
     recording = folder / "recording.html"
-    recording.write_text(viewer.StaticHtml(), encoding="utf-8")
+    write_file(recording, viewer.StaticHtml())
     rows = event_rows(shown.events, motion, loop.assessment)
     content = console.made_by(loop.scenario.name) | {"columns": _COLUMNS, "rows": rows}
-    text = json.dumps(content, indent=2, ensure_ascii=False) + "\n"
-    (folder / "run.json").write_text(text, encoding="utf-8")
+    write_file(folder / "run.json", json.dumps(content, indent=2, ensure_ascii=False) + "\n")
     console.show(console.new_table(*_COLUMNS, rows=rows))
     console.say("threshold", shown.told)
     console.say("recording", recording)

@@ -21,7 +21,7 @@ from drake_safety.learning.seeds import FALLS, TRAINING
 from drake_safety.learning.segments import Episodes, training_segments
 from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.dataset import completed, load_episodes
-from drake_safety.simulation.rollouts import run_episodes, run_motions
+from drake_safety.simulation.rollouts import motion_piece_s, run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
 
@@ -69,6 +69,12 @@ def train(
                 "continue with them, or choose another --out"
             )
     folders.check_writable(out)
+    loop = loaded.make_loop()
+    if 0.0 < 60.0 * motion <= motion_piece_s(loop):
+        raise ValueError(
+            f"train: --motion {motion:g} gives one motion, and the monitor needs one for its "
+            "prediction and one for its limits: give 2 or more, or 0 to learn it from the episodes"
+        )
     with console.open_stages() as stages:
         for folder, options in sets.items():
             run_episodes(
@@ -93,7 +99,7 @@ def train(
             detector = ChangeDetector.fit(motions, stage_of(stages, "monitor"))
         num_falls = episodes // 4 if falls is None else falls
         fallen = None
-        if num_falls and MODES[0] in modes and isinstance(loaded.make_loop(), CanFall):
+        if num_falls and MODES[0] in modes and isinstance(loop, CanFall):
             fallen = run_episodes(
                 loaded,
                 num_falls,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from drake_safety.control.policy_network import (
     load_network,
     network_files,
 )
+from drake_safety.files.atomic import write_file
 from drake_safety.files.reading import yaml_text
 from drake_safety.robots.robot_model import as_pattern
 
@@ -48,10 +48,9 @@ class PolicyTemplate:
         written = []
         for source in network_files(self.network.path):
             written.append(folder / source.relative_to(self.network.path.parent))
-            written[-1].parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, written[-1])
+            write_file(written[-1], source.read_bytes())
         path = folder / "policy.yaml"
-        path.write_text(text, encoding="utf-8")
+        write_file(path, text)
         return [*written, path], asked
 
     def yaml(self, robot_joints: list[str], posture: dict[str, float]) -> tuple[str, list[str]]:

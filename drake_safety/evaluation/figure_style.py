@@ -6,6 +6,7 @@ matplotlib are not changed.
 
 from __future__ import annotations
 
+import io
 import os
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -15,6 +16,8 @@ from urllib.parse import unquote
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from drake_safety.files.atomic import write_file
 
 SAFE_COLOUR = "#2b6cb0"
 UNSAFE_COLOUR = "#d1541b"
@@ -109,13 +112,13 @@ def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:
 
     The suffix of the path is replaced.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with drawing_style():
-        paths = [path.with_suffix(".png"), path.with_suffix(".svg")]
-        fig.savefig(paths[0], dpi=_DPI)
+    paths = [Path(path).with_suffix(suffix) for suffix in (".png", ".svg")]
+    for one in paths:
         # Without the date, equal figures are equal files.
-        fig.savefig(paths[1], dpi=_DPI, metadata={"Date": None})
+        metadata: dict[str, Any] | None = {"Date": None} if one.suffix == ".svg" else None
+        with drawing_style(), io.BytesIO() as content:
+            fig.savefig(content, format=one.suffix[1:], dpi=_DPI, metadata=metadata)
+            write_file(one, content.getvalue())
     return paths
 
 

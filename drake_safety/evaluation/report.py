@@ -15,6 +15,7 @@ from drake_safety.evaluation.shift_study import shifts_tables
 from drake_safety.evaluation.tables import Column
 from drake_safety.evaluation.verdict_tables import MEANINGS, set_title, verdict_tables
 from drake_safety.extras import require_extra
+from drake_safety.files.atomic import write_file
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.dataset import read_info
 
@@ -68,7 +69,7 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
         versions=versions,
     )
     file = folder / REPORT_FILE
-    file.write_text(page, encoding="utf-8")
+    write_file(file, page)
     return file
 
 

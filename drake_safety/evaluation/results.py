@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.files.atomic import replacing
+from drake_safety.files.atomic import write_file
 
 SCHEMA = "drake_safety.results"
 SCHEMA_VERSION = 1
@@ -100,8 +100,7 @@ class Results(dict[str, Result]):
         entries = json.dumps(self.entries, indent=2, ensure_ascii=False).replace("\n", "\n  ")
         head = f'  "schema": "{SCHEMA}",\n  "schema_version": {SCHEMA_VERSION},\n'
         text = f'{{\n{head}  "entries": {entries},\n  "figures": {{\n{figures}\n  }}\n}}\n'
-        with replacing(Path(path)) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_file(Path(path), text)
 
 
 def _rounded(number: float) -> float | None:

@@ -34,6 +34,13 @@ def replacing(final: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_file(path: Path, content: str | bytes) -> None:
+    """Writes a file whole, in UTF-8, by :func:`replacing`; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
 def lock_folder(path: Path) -> BaseFileLock:
     """Makes a folder if it does not exist, and locks it until this process ends or releases it.
 

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
-from drake_safety.files.atomic import replacing
+from drake_safety.files.atomic import write_file
 from drake_safety.files.schema import load_typed
 from drake_safety.learning.adaptation import Adaptation
 from drake_safety.learning.assessment_parameters import (
@@ -131,9 +131,7 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
     }
     # safetensors stores several entries of metadata in any order.
     text = _to_json(entries | {"sha256": _digest(entries, arrays)})
-    content = save(arrays, {SCHEMA: text})
-    with replacing(path) as temporary:
-        temporary.write_bytes(content)
+    write_file(path, save(arrays, {SCHEMA: text}))
 
 
 def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drake_safety.extras import require_extra
-from drake_safety.files.atomic import replacing
+from drake_safety.files.atomic import write_file
 from drake_safety.learning import beliefs as belief_masses
 from drake_safety.learning.fall_logit import FallLogit
 from drake_safety.learning.grid import Grid
@@ -145,8 +145,7 @@ def write(path: Path, assessment: Any) -> None:
     )
     onnx.helper.set_model_props(model, {name: json.dumps(one) for name, one in contract.items()})
     onnx.checker.check_model(model, full_check=True)
-    with replacing(path) as temporary:
-        temporary.write_bytes(model.SerializeToString(deterministic=True))
+    write_file(path, model.SerializeToString(deterministic=True))
 
 
 def _contract(assessment: Any, ports: Iterable[str]) -> dict[str, Any]:

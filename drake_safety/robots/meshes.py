@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_safety.extras import require_extra
-from drake_safety.files.atomic import replacing
+from drake_safety.files.atomic import write_file
 
 if TYPE_CHECKING:
     import trimesh
@@ -67,10 +67,7 @@ def shown_mesh(path: Path, rgba: str = "") -> Path:
     digest = _digest(path, path.stat().st_mtime_ns, rgba)
     target = cache_folder() / "meshes" / f"{path.stem}-{digest[:16]}.gltf"
     if not target.is_file():
-        content = _to_gltf(path, rgba)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(target) as part:  # Other processes may read the cache.
-            part.write_bytes(content)
+        write_file(target, _to_gltf(path, rgba))  # Other processes may read the cache.
     return target
 
 

@@ -21,7 +21,7 @@ from typing import Any, Self
 import numpy as np
 
 from drake_safety.extras import require_extra
-from drake_safety.files.atomic import lock_folder, replacing
+from drake_safety.files.atomic import lock_folder, replacing, write_file
 from drake_safety.files.reading import reading
 from drake_safety.files.schema import load_typed
 from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
@@ -214,8 +214,7 @@ def _open_folder(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> No
         text = json.dumps(content, indent=2, ensure_ascii=False)
     except TypeError as error:
         raise ValueError(f"{path}: info and extra must be made of JSON types: {error}") from error
-    with replacing(path / _INFO_NAME) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_file(path / _INFO_NAME, text + "\n")
 
 
 def _check_same_set(path: Path, stored: EpisodesInfo, given: EpisodesInfo) -> None:

@@ -270,7 +270,7 @@ def run_motions(
     check_times("run_motions", duration_s=duration_s)
     make = worker_loop(scenario, variation, **loop_options)
     loop = make()
-    piece_s = min(_piece_s(loop), until_s)
+    piece_s = min(motion_piece_s(loop), until_s)
     info = episodes_info(loop, seed, {**loop_options, "undisturbed_s": piece_s})
     step_s = scenario.monitor_step_s
     return collect_episodes(
@@ -286,7 +286,8 @@ def run_motions(
     )
 
 
-def _piece_s(loop: ClosedLoop) -> float:
+def motion_piece_s(loop: ClosedLoop) -> float:
+    """Duration of one undisturbed motion of a loop [s]."""
     is_long = isinstance(loop, MovesUndisturbed)
     return MOTION_PIECE_S if is_long else loop.scenario.episode_duration_s
 
@@ -307,7 +308,7 @@ def run_motion(
         until_s: Time at which it ends, if not sooner [s].
         with_features: Whether to record features that the monitor does not read, too.
     """
-    scenario, piece_s = loop.scenario, _piece_s(loop)
+    scenario, piece_s = loop.scenario, motion_piece_s(loop)
     step_s = scenario.monitor_step_s
 
     def begin(context: Context) -> int | None:
