@@ -1,19 +1,35 @@
 """A URDF made fit for Drake: what can be seen stays, and what cannot is told with its reason."""
 
+import json
+import re
 import sys
 import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.robots.meshes import mesh_points
+from drake_safety.plants.obstacles import Obstacle, add_obstacles
+from drake_safety.robots.meshes import check_meshes, mesh_points
+from drake_safety.robots.robot import add_robot
+from drake_safety.robots.robot_model import RobotModel
 from drake_safety.robots.simulatable_urdf import simulatable_copy
 from drake_safety.robots.urdf_copy import read_drives
-from urdf_files import GOOD, LINK, mesh, stl, written
+from urdf_files import GOOD, LINK, TETRAHEDRON, mesh, stl, written
 
+VTK = (
+    "# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 4 double\n"
+    "0 0 0 1 0 0 0 1 0 0 0 1\nCELLS 1 5\n4 0 1 2 3\nCELL_TYPES 1\n10\n"
+)
+GLTF = json.dumps(
+    {
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"byteLength": 36}],
+    }
+)
 TRIANGLE = [[0, 0, 0], [2, 0, 0], [0, 1, 4]]
 
 
@@ -56,10 +72,10 @@ def loaded_quietly(copy, folder, caplog):
 def test_a_mesh_that_drake_shows_goes_along_as_it_is(name, url, tmp_path):
     source = tmp_path / "bot_description" / "urdf"
     source.mkdir(parents=True)
-    (source.parent / f"{name}.obj").write_text("v 0 0 0\n")
+    (source.parent / f"{name}.obj").write_text(TETRAHEDRON)
     copy, folder = copy_of(source, mesh("visual", url))
     assert meshes_of(folder) == [f"meshes/{name}.obj"]
-    assert (folder / "meshes" / f"{name}.obj").read_text() == "v 0 0 0\n"
+    assert (folder / "meshes" / f"{name}.obj").read_text() == TETRAHEDRON
     assert copy.notes == []
 
 
@@ -118,10 +134,11 @@ def test_a_file_that_differs_by_case_or_hyphens_is_named(url, there, tmp_path):
 def test_two_meshes_of_one_name_are_two_in_the_copy(tmp_path):
     for name in ("left", "right"):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "hull.obj").write_text(name)
+        (tmp_path / name / "hull.obj").write_text(f"{TETRAHEDRON}# {name}")
     shapes = mesh("visual", "left/hull.obj") + mesh("visual", "right/hull.obj")
     _, folder = copy_of(tmp_path, shapes)
-    assert [(folder / name).read_text() for name in meshes_of(folder)] == ["left", "right"]
+    texts = [(folder / name).read_text() for name in meshes_of(folder)]
+    assert [text.partition("# ")[2] for text in texts] == ["left", "right"]
 
 
 def test_a_mesh_of_an_installed_package_is_found(tmp_path):
@@ -238,3 +255,79 @@ def test_a_material_without_a_colour_takes_a_later_one_or_is_left_out(tmp_path, 
     copy, folder = copy_of(tmp_path, shapes + box.format(grey))
     assert [one.get("name") for one in copy.root.iter("material")] == ["grey", "grey"]
     loaded_quietly(copy, folder, caplog)
+
+
+@pytest.mark.parametrize(
+    ("url", "is_copied"),
+    [
+        ("a.obj", True),
+        ("../meshes/a.obj", True),
+        ("package://bot/meshes/a.obj", True),
+        ("package://other/meshes/a.obj", True),  # Beside it in the workspace.
+        ("file://{inside}/meshes/a.obj", True),
+        ("../../a.obj", False),
+        ("../../../outside/a.obj", False),
+        ("package://bot/../../outside/a.obj", False),
+        ("{outside}/a.obj", False),
+        ("file://{outside}/a.obj", False),
+        ("linked.obj", False),
+    ],
+)
+def test_no_mesh_from_outside_the_description_is_copied(tmp_path, url, is_copied):
+    inside, outside = tmp_path / "ws" / "bot", tmp_path / "outside"
+    places = [inside / "urdf", inside / "meshes", inside.parent / "other" / "meshes", outside]
+    for place in (*places, inside.parent):
+        place.mkdir(parents=True, exist_ok=True)
+        (place / "a.obj").write_text(TETRAHEDRON)
+    (inside / "urdf" / "linked.obj").symlink_to(outside / "a.obj")
+    copy, folder = copy_of(
+        inside / "urdf", mesh("visual", url.format(inside=inside, outside=outside))
+    )
+    assert [path.name for path in folder.glob("meshes/*")] == ["a.obj"] * is_copied
+    if not is_copied:
+        (note,) = copy.left_out
+        assert "it lies outside the folders of the URDF and of its package" in note
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.obj", TETRAHEDRON.replace("1 2 3", "1 2 99"), "4 vertices and a face of vertex 99"),
+        ("a.obj", TETRAHEDRON.replace("1 2 3", "0 2 3"), "4 vertices and a face of vertex 0"),
+        ("a.obj", TETRAHEDRON.replace("1 2 3", "-1 -2 -5"), "4 vertices and a face of vertex -5"),
+        ("a.obj", TETRAHEDRON.replace("v 1", "v nan"), "a vertex that is not three finite numbers"),
+        ("a.obj", TETRAHEDRON.replace("f 1", "f a"), "is damaged"),
+        ("a.obj", "v 0 0 0", "has no faces"),
+        ("a.vtk", VTK.replace("0 1 2 3", "0 1 2 9"), "has 4 points and a cell of point 9"),
+        ("a.gltf", GLTF.replace('"bufferView": 0', '"bufferView": 7'), "is damaged"),
+        (
+            "a.gltf",
+            GLTF.replace('[{"byteLength": 36', '[{"byteLength": 9'),
+            "a view beyond its buf",
+        ),
+    ],
+)
+def test_a_damaged_mesh_is_refused_by_name_before_drake_sees_it(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    urdf = written(tmp_path, LINK.format("a", GOOD, mesh("visual", name)))
+    told = rf"mesh '{tmp_path / name}' .*{message}"
+    for kind in ("visual", "collision"):
+        (tmp_path / kind).mkdir()
+        copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, mesh(kind, name))))
+        assert re.search(told, copy.left_out[0])
+    with pytest.raises(ValueError, match=told):
+        add_robot(MultibodyPlant(0.001), RobotModel(name="r", urdf=str(urdf), base="a"))
+    with pytest.raises(ValueError, match=told):
+        add_obstacles(MultibodyPlant(0.001), [Obstacle(model=str(urdf))])
+    with pytest.raises(ValueError, match=told):
+        add_obstacles(MultibodyPlant(0.001), [Obstacle(model=str(tmp_path / name))])
+
+
+def test_meshes_that_are_whole_are_not_refused(tmp_path):
+    for name, text in (
+        ("a.obj", TETRAHEDRON.replace("1 2 3", "-2/7/1 2//3 3/1")),
+        ("a.vtk", VTK),
+        ("a.gltf", GLTF),
+    ):
+        (tmp_path / name).write_text(text)
+        check_meshes(tmp_path / name)

@@ -19,6 +19,7 @@ from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder
 
 from drake_safety.files.schema import Triple, schema
+from drake_safety.robots.meshes import check_meshes
 from drake_safety.robots.model_files import model_file, package_parser
 from drake_safety.robots.robot import Scratch, add_robot
 from drake_safety.robots.robot_model import RobotModel
@@ -46,6 +47,7 @@ def add_obstacles(plant: MultibodyPlant, obstacles: list[Obstacle]) -> list[Mode
             raise ValueError(
                 f"{who}: model must be a package:// URL or the absolute path of an existing file"
             )
+        check_meshes(path)
         try:
             found = parser.AddModels(str(path))
         except RuntimeError as error:

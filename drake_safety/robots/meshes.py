@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
 import warnings
@@ -13,8 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_safety.extras import require_extra
+from drake_safety.extras import MissingExtraError, require_extra
 from drake_safety.files.atomic import write_file
+from drake_safety.robots.model_files import model_file
 
 if TYPE_CHECKING:
     import trimesh
@@ -26,6 +28,7 @@ CACHE_VARIABLE = "DRAKE_SAFETY_CACHE"
 _TRANSPARENCY = re.compile(r"^\s*Tr\s+(\d+\.?\d*)\s*$", re.MULTILINE)  # In an MTL file.
 _BARE_FACE = re.compile(r"^\s*f\s(?:.*\s)?-?\d+(?:/-?\d*)?(?=\s|$)", re.MULTILINE)
 """A corner without a normal in an OBJ file, which Drake's renderer refuses."""
+_MESH = re.compile(r"""(?:file(?:name)?\s*=\s*["']|<uri>\s*)([^"'<>]+\.\w+)""")
 _GREY = [0.6, 0.6, 0.6, 1.0]
 _UP_AXIS = re.compile(r"<up_axis>\s*(\w+)")  # In a COLLADA file.
 _X_ZY = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # From y up to z up.
@@ -38,6 +41,68 @@ def cache_folder() -> Path:
     """Returns ``$DRAKE_SAFETY_CACHE``, else ``drake_safety`` in ``$XDG_CACHE_HOME`` or ~/.cache."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(os.environ.get(CACHE_VARIABLE) or Path(base, "drake_safety"))
+
+
+def check_meshes(model: Path) -> None:
+    """Checks the meshes that a model file names, or is, as damaged ones crash Drake.
+
+    Raises:
+        ValueError: An index is beyond what it counts, a number is not finite, or it has no faces.
+    """
+    text = "" if model.suffix in SHOWN_FORMATS else model.read_text("utf-8", "replace")
+    for url in {str(model), *_MESH.findall(text)}:
+        try:
+            path = model_file(url, str(model.parent))
+        except (ValueError, MissingExtraError):
+            continue  # Others say what they cannot find.
+        if path.suffix.lower() in _FAULTS and path.is_file():
+            if fault := _fault(path, path.stat().st_mtime_ns):
+                raise ValueError(f"mesh '{path}' {fault}: export it again")
+
+
+@lru_cache(maxsize=4096)
+def _fault(path: Path, changed_ns: int) -> str:
+    del changed_ns  # Part of the cache key only.
+    try:
+        return _FAULTS[path.suffix.lower()](path.read_bytes())
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        return f"is damaged: {error}"
+
+
+def _obj_fault(content: bytes) -> str:
+    lines = [line.split() for line in content.replace(b"\\\n", b" ").splitlines()]
+    points = [line[1:4] for line in lines if line[:1] == [b"v"]]
+    corners = [one.split(b"/")[0] for line in lines if line[:1] == [b"f"] for one in line[1:]]
+    index = np.array(corners or [b"0"], dtype=float)
+    if not np.isfinite(np.array(points, dtype=float)).all():
+        return "has a vertex that is not three finite numbers"
+    wrong = index[(index == 0) | (np.abs(index) > len(points))]
+    if not corners:
+        return "has no faces"
+    return f"has {len(points)} vertices and a face of vertex {wrong[0]:.0f}" if len(wrong) else ""
+
+
+def _gltf_fault(content: bytes) -> str:
+    found = json.loads(content)
+    views, buffers = found.get("bufferViews", []), found.get("buffers", [])
+    for one in found.get("accessors", []):
+        view = views[one.get("bufferView", 0)]
+        if view.get("byteOffset", 0) + view["byteLength"] > buffers[view["buffer"]]["byteLength"]:
+            return "has a view beyond its buffer"
+    return ""
+
+
+def _vtk_fault(content: bytes) -> str:
+    points = re.search(rb"^POINTS\s+(\d+)", content, re.M)
+    cells = re.search(rb"^CELLS\s+\d+\s+\d+\s+([\d\s]+)", content, re.M)
+    if points is None or cells is None:
+        return ""  # It is binary.
+    corners = np.array(cells[1].split(), dtype=int).reshape(-1, 5)[:, 1:]  # Of tetrahedra.
+    is_beyond = corners.max(initial=0) >= int(points[1])
+    return f"has {int(points[1])} points and a cell of point {corners.max()}" if is_beyond else ""
+
+
+_FAULTS = {".obj": _obj_fault, ".gltf": _gltf_fault, ".vtk": _vtk_fault}
 
 
 @lru_cache(maxsize=1024)
@@ -113,6 +178,7 @@ def _scene(path: Path) -> trimesh.Scene:
     require_extra("robots", f"mesh '{path}', as Drake does not read {path.suffix} files", *modules)
     import trimesh
 
+    check_meshes(path)
     try:
         with warnings.catch_warnings():
             # The reader of COLLADA sets shapes of arrays, which NumPy deprecates from 2.5 on.

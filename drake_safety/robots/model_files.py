@@ -7,7 +7,7 @@ import importlib.util
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
-from urllib.parse import urlparse
+from urllib.parse import unquote, urlparse
 
 from pydrake.multibody.parsing import PackageMap, Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -59,7 +59,8 @@ def _installed_folder(name: str) -> Path | None:
 def model_file(url: str, folder: str = "", requires: str = "") -> Path:
     """Returns the file of a ``package://…`` URL, or of a path relative to ``folder``.
 
-    Packages are this one's (``drake_safety_models``), Drake's, and those installed by pip.
+    ``file://`` may precede a path. Packages are this one's (``drake_safety_models``), Drake's, and
+    those installed by pip.
     ``requires`` is what pip installs without its dependencies; empty for packages of an extra.
 
     Raises:
@@ -67,6 +68,8 @@ def model_file(url: str, folder: str = "", requires: str = "") -> Path:
         ValueError: The package is unknown.
     """
     parts = urlparse(url)
+    if parts.scheme == "file":
+        return Path(unquote(parts.path))
     if parts.scheme != "package":
         return Path(folder) / url
     package_map = PackageMap()

@@ -34,6 +34,7 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import Context
 
 from drake_safety.files.schema import NotNegative, Positive, Triple, schema
+from drake_safety.robots.meshes import check_meshes
 from drake_safety.robots.model_files import model_file, package_parser
 from drake_safety.robots.robot_model import CollisionShape, RobotModel, by_pattern
 from drake_safety.robots.shift import JointShift, Shift
@@ -144,6 +145,8 @@ def _add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceI
     parser = package_parser(plant, robot.urdf)
     path = model_file(robot.urdf, robot.source_dir, robot.requires)
     urdf = None
+    if path.is_file():
+        check_meshes(path)
     if path.suffix == ".urdf":
         urdf = read_urdf(path)
         urdf.remove(*FIXED_MIMIC)

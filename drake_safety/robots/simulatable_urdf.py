@@ -19,7 +19,13 @@ import numpy as np
 
 from drake_safety.extras import MissingExtraError
 from drake_safety.files.reading import is_number
-from drake_safety.robots.meshes import SHOWN_FORMATS, convex_hull, mesh_points, shown_mesh
+from drake_safety.robots.meshes import (
+    SHOWN_FORMATS,
+    check_meshes,
+    convex_hull,
+    mesh_points,
+    shown_mesh,
+)
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.urdf_copy import (
     FIXED_MIMIC,
@@ -47,6 +53,7 @@ _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ROWS, _COLUMNS = np.triu_indices(3)
 _ROUNDING = 1e-6  # Of the digits of moments of inertia.
 _MOST_RAD = 7.0  # Of an angle in rpy, beyond a turn.
+_DESCRIPTIONS = ("urdf", "urdfs", "xacro", "robots", "models", "mjcf")  # Folders in a package.
 _NOISE = 1e-12  # Of moments of inertia that should be zero [kg·m²].
 _WATER_KG_M3 = 1000.0  # Density of the ball in place of a body whose inertia is negative.
 
@@ -196,6 +203,9 @@ def _gather_meshes(copy: UrdfCopy) -> None:
         name, why, until = url if file is None else file.name, "are not where the URDF says", ""
         try:
             if file is not None:
+                if not _is_inside(file, url, copy.source):
+                    raise ValueError("it lies outside the folders of the URDF and of its package")
+                check_meshes(file)
                 return convert(file)
             for other in (other for one in candidates for other in _alike(one)):
                 name = f"{url} (but '{Path(*other.parts[-len(Path(url).parts) :])}' is there)"
@@ -256,6 +266,24 @@ def _alike(path: Path) -> Iterator[Path]:
     letters = (f"[{c.lower()}{c.upper()}]" if c.isalpha() else glob.escape(c) for c in str(path))
     pattern = re.sub("[-_]", "[-_]", "".join(letters))
     return Path(path.anchor).glob(pattern.lstrip("/"))
+
+
+def _is_inside(file: Path, url: str, source: Path) -> bool:
+    """Whether a mesh lies in the package of a URDF, in its folder, or in a folder beside that."""
+    folder, real = source.resolve().parent, file.resolve()
+    around = [folder, *folder.parents]
+    homes = [folder, *(one for one in around if (one / "package.xml").is_file())]
+    homes += [folder.parent] * (folder.name in _DESCRIPTIONS)
+    scheme, _, rest = url.rpartition("://")
+    name = unquote(rest).lstrip("/").partition("/")[0]
+    if name and scheme in ("package", "model"):
+        named = [one / name for one in around]
+        near = [*around, *named[:4]]
+        homes += [one for one in named if one in near or (one / "package.xml").is_file()]
+        with contextlib.suppress(ValueError, MissingExtraError):
+            homes.append(model_file(f"package://{name}"))
+    is_beside = folder.parent in real.parent.parents
+    return is_beside or any(one.resolve() in real.parents for one in homes)
 
 
 def _mesh_files(url: str, source: Path) -> list[Path]:

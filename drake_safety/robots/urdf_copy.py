@@ -295,7 +295,8 @@ class UrdfCopy:
         for name, mesh in self.meshes.items():
             for file in mesh.parent.glob(f"{glob.escape(mesh.stem)}.*"):
                 # Material files and textures have the mesh's stem.
-                if file.suffix in (mesh.suffix, ".mtl", ".png", ".bin"):
+                is_beside = file.resolve().parent == mesh.resolve().parent
+                if is_beside and file.suffix in (mesh.suffix, ".mtl", ".png", ".bin"):
                     shutil.copyfile(file, (path.parent / name).with_suffix(file.suffix))
 
 
