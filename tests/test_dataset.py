@@ -372,7 +372,7 @@ def forged(path, name, row, value, type_=None):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("margins", 2, [0.1, -0.1]), ".*is_safe is True but the margin speed is -0.1 in row 2"),
+        (("margins", 2, [0.1, -0.1]), "episode 0: it is safe, and a margin is negative"),
         (("is_safe", 3, False), r"episode 0: its rows differ in \['is_safe', 'cause', 'first_s"),
         (("cause", 7, ""), "episode 1: its rows differ"),
         (("state", 1, [0.0, np.nan, 0.0]), r"episode 0: \['state'\] hold values that are not fin"),
@@ -418,3 +418,14 @@ def test_a_shard_that_takes_too_much_memory_is_refused_by_its_header(tmp_path, m
     monkeypatch.setattr("drake_safety.files.reading._MOST_BYTES", 600)
     with pytest.raises(ValueError, match=r"00000\.parquet would take \S* GB; expected at most"):
         load_episodes(tmp_path)
+
+
+@pytest.mark.parametrize(("until", "is_refused"), [("wall", False), ("speed", True)])
+def test_where_one_constraint_ends_episodes_the_others_may_be_violated(tmp_path, until, is_refused):
+    margins = np.array([[1.0, 1.0], [1.0, -1.0]])
+    write(tmp_path, [make_episode(0, num_rows=2, margins=margins)], make_info(until=until))
+    if is_refused:
+        with pytest.raises(ValueError, match="it is safe, and a margin is negative"):
+            load_episodes(tmp_path)
+    else:
+        assert len(load_episodes(tmp_path)) == 1

@@ -73,6 +73,7 @@ class EpisodesInfo:
         monitored_states: States that a `ChangeDetector` predicts; None for all of them.
         monitored_features: Features by which it predicts them; None for all of them.
         robot: Name of the robot; empty if it is unknown, or there is none.
+        until: The only constraint whose violation ends an episode; empty for every one.
     """
 
     scenario: str
@@ -91,6 +92,7 @@ class EpisodesInfo:
     monitored_states: list[str] | None = None
     monitored_features: list[str] | None = None
     robot: str = ""
+    until: str = ""
 
     def __post_init__(self) -> None:
         for name, is_valid, expected in (
@@ -306,10 +308,6 @@ def _check_episode(info: EpisodesInfo, episode: Episode) -> None:
         raise ValueError(f"{who}: first_step is {episode.first_step}, expected 0..{num_rows - 1}")
     if episode.is_safe != (episode.cause == ""):
         raise ValueError(f"{who}: is_safe is {episode.is_safe} but the cause is '{episode.cause}'")
-    if episode.is_safe and (episode.margins < 0.0).any():
-        row, column = np.argwhere(episode.margins < 0.0)[0]
-        margin = f"{info.constraint_names[column]} is {episode.margins[row, column]:g} in row {row}"
-        raise ValueError(f"{who}: is_safe is True but the margin {margin}")
     if episode.cause not in ("", DIVERGED, *info.constraint_names):
         raise ValueError(
             f"{who}: unknown cause '{episode.cause}'; the constraints are {info.constraint_names}"

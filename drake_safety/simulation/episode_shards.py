@@ -73,6 +73,7 @@ def from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode
         if arrays[name].dtype.kind != ("f" if width else _KINDS.get(name, "i")):
             raise ValueError(f"{shard}: {name} is {column.type}; expected another type")
     episode = arrays["episode"]
+    watched = slice(None) if not info.until else [info.constraint_names.index(info.until)]
     bounds = [0, *(np.flatnonzero(np.diff(episode)) + 1), num_rows]
     result = []
     for first, last in itertools.pairwise(bounds):
@@ -86,6 +87,9 @@ def from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode
             f"it has more than {longest} steps": last - first > longest + 1,
             f"its rows differ in {[*_OF_EPISODES]}": any(
                 (arrays[name][rows] != arrays[name][first]).any() for name in _OF_EPISODES
+            ),
+            "it is safe, and a margin is negative": (
+                arrays["is_safe"][first] and (arrays["margins"][rows, watched] < 0.0).any()
             ),
             f"{large} hold values that are not finite numbers below {LARGEST:g}": (
                 large and arrays["cause"][first] != DIVERGED

@@ -392,8 +392,11 @@ def run_episodes(
         )
 
     kind = {"until_fall": True} if until_fall else {}
+    info = episodes_info(make(), seed, loop_options | kind)
+    if until_fall:
+        info.until = require(make(), CanFall).fall_name
     return collect_episodes(
-        episodes_info(make(), seed, loop_options | kind),
+        info,
         range(num_episodes),
         make,
         run,
