@@ -6,6 +6,7 @@ hashes, and the verdicts on the first of these episodes; and its card `README.md
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,19 +37,23 @@ def shipped_folder(scenario: str) -> Path:
     return _FOLDER / scenario
 
 
-def load_assessment(scenario: str, mode: str = "sharpened") -> SafetyAssessment:
-    """Loads the shipped assessment of a scenario, by its name, in a mode, "sharpened" or "paper".
+def load_assessment(scenario: str | os.PathLike[str], mode: str = "sharpened") -> SafetyAssessment:
+    """Loads an assessment in a mode, "sharpened" or "paper".
+
+    Args:
+        scenario: Name of a scenario with shipped assessments, or a folder that ``train`` wrote.
 
     Raises:
-        ValueError: The scenario or mode has none; the message lists those that exist.
+        ValueError: The scenario, folder or mode has none; the message lists those that exist.
     """
     from drake_safety.learning.assessment import SafetyAssessment
 
-    folder = shipped_folder(scenario)
+    folder = Path(scenario)
+    if scenario in assessed_scenarios() or not folder.is_dir():
+        folder = shipped_folder(str(scenario))
     modes = sorted(path.stem for path in folder.glob("*.safetensors"))
     if mode not in modes:
         raise ValueError(
-            f"the trained assessments of scenario '{scenario}' that come with the package are "
-            f"{modes}; got '{mode}'"
+            f"the trained assessments of scenario or folder '{scenario}' are {modes}; got '{mode}'"
         )
     return SafetyAssessment.load(folder / f"{mode}.safetensors")

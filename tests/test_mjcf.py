@@ -236,6 +236,7 @@ def test_a_base_that_moves_as_by_a_free_joint_floats(tmp_path, free, names):
 
 LOOP = '<equality><connect body1="arm_j" body2="base" anchor="0 0 0"/></equality>'
 GONE = '<asset><mesh name="gone" file="gone.stl"/></asset>'
+MANY = '<replicate count="3000" offset="1 0 0">{}</replicate>'
 SLIDE = "<joint name='slide_x' type='slide'/>"
 
 
@@ -252,6 +253,15 @@ SLIDE = "<joint name='slide_x' type='slide'/>"
         (robot(arm('stiff="5"')), "unrecognized attribute: 'stiff'"),
         (robot(arm("", '<geom type="mesh" mesh="gone"/>'), GONE), "gone.stl"),
         (robot(free=""), "has no joint"),
+        (
+            robot(more='<asset><hfield name="h" nrow="90000" ncol="90000"/></asset>'),
+            "<hfield> with",
+        ),
+        (
+            robot(arm("", MANY.format(MANY.format(BALL)))),
+            "<replicate> with {'count': '3000'} takes",
+        ),
+        (robot(more='<asset><texture width="1e6" height="1e6"/></asset>'), "<texture> with"),
     ],
 )
 def test_what_cannot_be_converted_is_refused_with_its_name(tmp_path, text, message):

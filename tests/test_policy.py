@@ -206,6 +206,19 @@ def test_weights_in_other_files_are_files_of_the_network(tmp_path):
 
 
 @pytest.mark.train
+def test_weights_of_a_constant_in_another_file_count_too(tmp_path):
+    onnx = pytest.importorskip("onnx")
+    tensor = onnx.numpy_helper.from_array(np.ones(2, dtype=np.float32), "c")
+    node = onnx.helper.make_node("Constant", [], ["y"], value=tensor)
+    onnx.external_data_helper.set_external_data(node.attribute[0].t, "c.data")
+    output = onnx.helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [2])
+    model = onnx.helper.make_model(onnx.helper.make_graph([node], "g", [], [output]))
+    (tmp_path / "c.data").write_bytes(node.attribute[0].t.raw_data)
+    (tmp_path / "p.onnx").write_bytes(model.SerializeToString())
+    assert network_files(tmp_path / "p.onnx") == [tmp_path / "p.onnx", tmp_path / "c.data"]
+
+
+@pytest.mark.train
 def test_weights_outside_the_folder_of_the_network_are_refused(tmp_path):
     (tmp_path / "inner").mkdir()
     path = save_onnx(tmp_path / "inner" / "p.onnx", 4, 2, files=["data"])

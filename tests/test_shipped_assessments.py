@@ -182,6 +182,8 @@ def test_in_python_a_shipped_assessment_is_loaded_by_the_scenario_s_name(package
         assert loaded.parameters.mode == mode
         original = SafetyAssessment.load(assessment_file(shipped / NAME, mode))
         np.testing.assert_array_equal(loaded.beliefs_, original.beliefs_)
+        by_folder = drake_safety.load_assessment(shipped / NAME, mode)
+        np.testing.assert_array_equal(by_folder.beliefs_, original.beliefs_)
     with pytest.raises(ValueError, match=r"are \['paper', 'sharpened'\]; got 'blunt'"):
         load_assessment(NAME, "blunt")
     with pytest.raises(ValueError, match=r"of scenario 'pendulum' .* \['shuttling'\]: .*train"):

@@ -269,7 +269,9 @@ def network_files(path: Path) -> list[Path]:
     import onnx
 
     with _reading(path, "an ONNX network"):
-        weights = onnx.load(str(path), load_external_data=False).graph.initializer
+        model = onnx.load(str(path), load_external_data=False)
+        # Those of constants and of inner graphs, too.
+        weights = [*onnx.external_data_helper._get_all_tensors(model)]
     entries = (entry for weight in weights for entry in weight.external_data)
     names = sorted({entry.value for entry in entries if entry.key == "location"})
     files = {name: path.parent / name for name in names}

@@ -17,8 +17,10 @@ from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.extras import require_extra
-from drake_safety.robots.urdf_copy import DRAKE, as_text
+from drake_safety.robots.urdf_copy import DRAKE, as_number, as_text
 
+_SIZES = ("count", "nrow", "ncol", "width", "height")
+_MOST_CELLS, _MOST_COPIES = 1e8, 1e4  # Of a height field or a picture, and of all replicates.
 _NUM_SHOWN_GROUPS = 3  # MuJoCo shows geoms of the groups 0 to 2.
 _GREY = [0.5, 0.5, 0.5, 1.0]  # MuJoCo's colour of a geom that states none.
 _STL = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
@@ -70,6 +72,7 @@ def mjcf_to_urdf(path: Path, target: Path) -> ModelFacts:
     require_extra("mujoco", f"'{path}' is MJCF")
     import mujoco
 
+    _check_sizes(path)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         spec.compiler.fusestatic = False  # Keeps the names of welded bodies.
@@ -79,6 +82,22 @@ def mjcf_to_urdf(path: Path, target: Path) -> ModelFacts:
     urdf = _tag("robot", *robot.parts, name=target.stem, **{"xmlns:drake": DRAKE})
     target.write_text(urdf, encoding="utf-8")
     return robot.facts
+
+
+def _check_sizes(path: Path) -> None:
+    """Checks what a file asks MuJoCo to allocate, such as height fields and copies of bodies."""
+    try:
+        elements = [*ET.parse(path).iter()]
+    except (OSError, ET.ParseError):
+        return  # MuJoCo says why.
+    copies = 1.0
+    for one in elements:
+        sizes = [as_number(x, 0.0) for key in _SIZES for x in one.get(key, "").split()]
+        size = math.prod(max(x, 1.0) for x in sizes)
+        copies *= size if one.tag == "replicate" else 1.0
+        if not (size <= _MOST_CELLS and copies <= _MOST_COPIES):
+            stated = {key: one.get(key) for key in _SIZES if key in one.attrib}
+            raise ValueError(f"MJCF '{path}': <{one.tag}> with {stated} takes too much memory")
 
 
 class _Robot:
