@@ -126,7 +126,7 @@ def test_a_file_that_differs_by_case_or_hyphens_is_named(url, there, tmp_path):
     source = tmp_path / "my-bot" / "urdf"
     for folder in (source, source.parent / "meshes"):
         folder.mkdir(parents=True)
-    (source.parent / "meshes" / "hull.obj").write_text("v 0 0 0\n")
+    (source.parent / "meshes" / "hull.obj").write_text(TETRAHEDRON)
     (note,) = copy_of(source, mesh("visual", url))[0].left_out
     assert url in note and (f"{there}' is there)" in note if there else "is there" not in note)
 
@@ -292,11 +292,11 @@ def test_no_mesh_from_outside_the_description_is_copied(tmp_path, url, is_copied
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.obj", TETRAHEDRON.replace("1 2 3", "1 2 99"), "4 vertices and a face of vertex 99"),
-        ("a.obj", TETRAHEDRON.replace("1 2 3", "0 2 3"), "4 vertices and a face of vertex 0"),
-        ("a.obj", TETRAHEDRON.replace("1 2 3", "-1 -2 -5"), "4 vertices and a face of vertex -5"),
+        ("a.obj", TETRAHEDRON.replace("3//1", "99//1", 1), "4 vertices and a face of vertex 99"),
+        ("a.obj", TETRAHEDRON.replace("f 1", "f 0", 1), "4 vertices and a face of vertex 0"),
+        ("a.obj", TETRAHEDRON.replace("f 1", "f -5", 1), "4 vertices and a face of vertex -5"),
         ("a.obj", TETRAHEDRON.replace("v 1", "v nan"), "a vertex that is not three finite numbers"),
-        ("a.obj", TETRAHEDRON.replace("f 1", "f a"), "is damaged"),
+        ("a.obj", TETRAHEDRON.replace("f 1", "f a", 1), "is damaged"),
         ("a.obj", "v 0 0 0", "has no faces"),
         ("a.vtk", VTK.replace("0 1 2 3", "0 1 2 9"), "has 4 points and a cell of point 9"),
         ("a.gltf", GLTF.replace('"bufferView": 0', '"bufferView": 7'), "is damaged"),
@@ -325,7 +325,7 @@ def test_a_damaged_mesh_is_refused_by_name_before_drake_sees_it(tmp_path, name, 
 
 def test_meshes_that_are_whole_are_not_refused(tmp_path):
     for name, text in (
-        ("a.obj", TETRAHEDRON.replace("1 2 3", "-2/7/1 2//3 3/1")),
+        ("a.obj", TETRAHEDRON.replace("f 1", "f -2", 1)),
         ("a.vtk", VTK),
         ("a.gltf", GLTF),
     ):

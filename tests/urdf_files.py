@@ -3,7 +3,8 @@
 import numpy as np
 
 LINK = '<link name="{}"><inertial><mass value="1"/>{}</inertial>{}</link>'
-TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+_FACES = "".join(f"f {i}//1 {j}//1 {k}//1\n" for i, j, k in ("123", "124", "134", "234"))
+TETRAHEDRON = f"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvn 0 0 1\n{_FACES}"
 GOOD = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
 
 
