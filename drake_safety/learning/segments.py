@@ -286,13 +286,11 @@ class Episodes(Sequence[Episode]):
                     "nothing is learned; draw starts inside the safe set",
                     *(share, who, name),
                 )
-        for is_safe, what in {True: "safe", False: "unsafe"}.items() if known else ():
-            if not any(one.is_safe == is_safe and one.num_steps > one.first_step for one in known):
-                _LOGGER.warning(
-                    "none of %d episodes of '%s' is %s after its first row, so that Γ learns no "
-                    "difference; draw %s starts",
-                    *(len(known), who, what, "calmer" if is_safe else "wider"),
-                )
+        seen = {one.is_safe for one in known if one.num_steps > one.first_step}
+        if known and len(seen) < 2:
+            what, starts = ("safe", "calmer") if True not in seen else ("unsafe", "wider")
+            text = "none of %d episodes of '%s' is %s after its first row, so that Γ learns no "
+            _LOGGER.warning(text + "difference; draw %s starts", len(known), who, what, starts)
 
 
 def _check_episode(info: EpisodesInfo, episode: Episode) -> None:
