@@ -407,6 +407,13 @@ class Aborted(Pendulum):
         raise SystemExit("Failure at plant.cc: condition failed")
 
 
+class Early(Pendulum):
+    def reset(self, context, rng):
+        first_step = super().reset(context, rng)
+        context.SetTime(-1.0)
+        return first_step
+
+
 class Late(Pendulum):
     count = 0
 
@@ -453,6 +460,10 @@ def cases(junit):
         ("Stuck", "no such part"),
         ("Nameless", "task 'Nameless' has ports whose sizes do not fit their names"),
         ("Aborted", "condition failed"),
+        (
+            "Early",
+            "the candidate: episode 0 of 'Early' (seed 11000000): ValueError: it starts at -1.0",
+        ),
         ("Missing", "Missing"),
     ],
 )

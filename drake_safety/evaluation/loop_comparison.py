@@ -14,19 +14,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, EventStatus
 
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, Outcomes
 from drake_safety.evaluation.paired_test import look, pairs_needed
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import GATE
-from drake_safety.learning.segments import Episode
+from drake_safety.learning.segments import Episode, EpisodeError
 from drake_safety.simulation.capabilities import CanStartAnywhere, HasDisturbances
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.contract import check_contract
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
-from drake_safety.simulation.rollouts import check_kept, episode_rng, episodes_info, run_episode
+from drake_safety.simulation.rollouts import check_kept, episodes_info, run_episode
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import MadeOnce, Progress, map_items
 
@@ -173,23 +172,31 @@ def check_pair(pair: tuple[Loop, Loop], *, metric: Metric = UNSAFE, seed: int = 
     """Builds two loops and begins their first episode, before hours of simulations.
 
     Raises:
-        ValueError: They are the same or do not start alike, one breaks the contract of a
-            :class:`ClosedLoop`, or there is no such metric.
+        ValueError: They are the same or do not start alike, a system of one raised an error, or
+            there is no such metric.
     """
     (one, variation), (two, other) = pair
     if (hash_ := one.simulation_hash(variation)) == two.simulation_hash(other):
         who = f"scenario '{one.name}', variation '{variation}'"
         raise ValueError(f"the candidate is the baseline: {who}, with hash {hash_[:12]}")
-    starts = []
+    starts: list[dict[str, np.ndarray]] = []
     for side, who in enumerate(("baseline", "candidate")):
         loop = make_paired(pair, side)
         Outcomes(loop, metric)
-        if wrong := [each for each in check_contract(loop, seed=seed) if not each.is_ok]:
-            raise ValueError(f"the {who}'s {wrong[0].item}: {wrong[0].message}; {wrong[0].remedy}")
-        context = loop.CreateDefaultContext()
-        loop.reset(context, episode_rng(seed, 0))
-        starts.append(_start_of(loop, context))
+
+        def at_start(context: Context, loop: ClosedLoop = loop) -> None:
+            starts.append(_start_of(loop, context))
+
+        try:
+            run_episode(loop, 0, seed=seed, at_start=at_start, monitor=_after_one_step)
+        except EpisodeError as error:
+            raise ValueError(f"the {who}: {error}") from error
     _check_alike(0, loop, *starts)
+
+
+def _after_one_step(context: Context) -> EventStatus:
+    is_over = context.get_time() > 0.0
+    return EventStatus.ReachedTermination(None, "") if is_over else EventStatus.DidNothing()
 
 
 def _verdict(

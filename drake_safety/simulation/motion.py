@@ -163,7 +163,7 @@ def simulate(
     until_first_row: bool = False,
     events: Iterable[tuple[float, Callable[[Context], object]]] = (),
     each_row: Callable[[Context, float], None] = lambda context, time_s: None,
-    monitor: Callable[[Context], None] | None = None,
+    monitor: Callable[[Context], object] | None = None,
     constraint_names: Sequence[str] | None = None,
     may_fail: bool = False,
     realtime_rate: float = 0.0,
@@ -192,7 +192,7 @@ def simulate(
         until_first_row: Whether it ends at the first row whose future is undisturbed.
         events: Times [s] and what is done then with the Context.
         each_row: Called with Context and time [s] after each row.
-        monitor: Called with the Context after each step of the simulator.
+        monitor: Called with the Context after each step of the simulator; it may end it.
         constraint_names: Names of the margins; by default the diagram's.
         may_fail: Whether a failure of the simulation is a result, ``Motion.failure``. The motion
             then has the rows that are finite.
