@@ -1,3 +1,4 @@
+import copy
 import math
 
 import numpy as np
@@ -54,6 +55,14 @@ def test_before_the_trigger_recovery_changes_nothing_at_all(balancing, recoverin
     for name in ("plant_state", "state", "features", "margins"):
         np.testing.assert_array_equal(alone[name][rows], saved[name][rows])
     assert not np.array_equal(alone["plant_state"][-1], saved["plant_state"][-1])
+
+
+def test_a_trigger_between_two_updates_of_a_slow_controller_is_not_missed(scenario):
+    slow = copy.copy(scenario)
+    slow.control_period_s = 0.05
+    loop = slow.make_loop("actual", ball=True, recovery=True)
+    log = run_throw(loop, 0, seed=5, throws=[HARD], duration_s=0.14, trigger_time_s=0.063)
+    assert log["recovery_active"][-1] == 1.0
 
 
 def test_recovery_steps_save_the_robot_without_cheating(recovering):
