@@ -166,9 +166,9 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_simulated(
 @pytest.mark.parametrize(
     ("number", "message"),
     [
-        (errno.ENOSPC, "error 'there' cannot be written: the disk is full; make room and run the"),
+        (errno.ENOSPC, "error 'there' cannot be read or written: No space left on device"),
         (errno.ENOENT, "error 'there' does not exist"),
-        (errno.EISDIR, "error 'there' cannot be used: Is a directory"),
+        (errno.EISDIR, "error 'there' cannot be read or written: Is a directory"),
     ],
 )
 def test_an_error_of_the_operating_system_is_a_sentence(monkeypatch, capsys, number, message):

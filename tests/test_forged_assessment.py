@@ -79,6 +79,8 @@ def test_the_content_without_a_change_is_loaded(loaded):
             lambda a: a[:5],
             r"has the shape \(5, 256\), expected \(256, ",
         ),
+        ("detector.settings", lambda a: put(a, 0.0, 2), "step 0.0 s"),
+        ("detector.settings", lambda a: put(a, np.nan), "has nan"),
         ("detector.columns", lambda a: put(a, 10**6), "has 1000000.0, expected 0 to"),
         ("detector.watched", lambda a: put(a, -1), "has -1.0, expected 0 to"),
         ("embedding.trunk.0.weight", lambda a: put(a, np.inf), "has inf"),

@@ -19,9 +19,11 @@ from drake_safety.evaluation.results import Results
 from drake_safety.logs.log_map import load_log_map
 from drake_safety.logs.robot_log import read_log
 from drake_safety.models import load_robot
+from drake_safety.robots.meshes import check_meshes
 from drake_safety.robots.simulatable_urdf import simulatable_copy
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
 from log_files import FORMATS, ROBOT, map_beside, part, recorded, write
+from urdf_files import TETRAHEDRON
 
 pytestmark = pytest.mark.train
 
@@ -78,6 +80,8 @@ def formats(tmp_path_factory):
             writer.append(make_episode(index))
     found["info"] = episodes, episodes / "info.json", load_episodes
     found["shard"] = episodes, episodes / "episodes-00000.parquet", load_episodes
+    found["obj"] = *[folder / "a.obj"] * 2, check_meshes
+    (folder / "a.obj").write_text(TETRAHEDRON)
     evaluation = folder / "evaluation.json"
     judged = {"a.b": proportion(5, 10), "c": Estimate.exact(math.nan, 0)}
     Results(judged, {"command": "c", "seed": 1}).write(evaluation)
@@ -89,7 +93,7 @@ def formats(tmp_path_factory):
     return found
 
 
-NAMES = [*FORMATS, "map", "robot", "urdf", "laikago_balancing", "atlas_reaching"]
+NAMES = [*FORMATS, "map", "robot", "urdf", "laikago_balancing", "atlas_reaching", "obj"]
 NAMES += ["info", "shard", "evaluation", "assessment"]
 
 

@@ -164,14 +164,10 @@ def main() -> None:
 
 def _sentence(error: Exception) -> str:
     """An error in words, also one of the operating system."""
-    if not isinstance(error, OSError) or not error.strerror:
+    if not isinstance(error, OSError) or not error.filename:
         return str(error)
-    why = {
-        errno.ENOENT: "does not exist",
-        errno.ENOSPC: "cannot be written: the disk is full; make room and run the command again",
-    }
-    place = f"'{error.filename}'" if error.filename else "a file"
-    return f"{place} {why.get(error.errno or 0, f'cannot be used: {error.strerror}')}"
+    why = f"cannot be read or written: {error.strerror}"
+    return f"'{error.filename}' {'does not exist' if error.errno == errno.ENOENT else why}"
 
 
 def run_app(commands: Callable[..., Any], program: str) -> None:

@@ -73,6 +73,7 @@ _INDICES |= {"detector.columns": "y", "detector.watched": "s"}
 """Arrays of indices, and the sizes below which they are."""
 _SHARES = ("beliefs", "training_score", "correction.guard")
 _POSITIVE = re.compile("limits|deviation|scale|unit|multiplicity")
+_FORGED = ArithmeticError, AttributeError, IndexError, RecursionError, TypeError, ValueError
 _MAYBE_INFINITE = ("trees.threshold", "detector.settings")
 
 
@@ -152,14 +153,7 @@ def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
             return _learned(entries, tensors)
     except KeyError as error:
         raise ValueError(f"'{path}' is a damaged safety assessment: it has no {error}") from error
-    except (
-        ArithmeticError,
-        AttributeError,
-        IndexError,
-        RecursionError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except _FORGED as error:
         raise ValueError(f"'{path}' is a damaged safety assessment: {error}") from error
     raise ValueError(
         f"'{path}' has the schema version {version}, this version reads {SCHEMA_VERSION}: train "
@@ -217,6 +211,9 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: dict[str, int]) -> No
     sums = masses[..., :3].sum(axis=-1) - 1.0, masses[..., 3:].sum(axis=-1) - masses[..., 1]
     if np.abs(sums).max() > _ROUNDING or variances.min() < 0.0:
         raise ValueError("'beliefs' do not sum to 1, or variances of 'novelty' are negative")
+    alarm_level, _, step_s, *_ = arrays["detector.settings"]
+    if not (alarm_level > 0.0 < step_s < math.inf):
+        raise ValueError(f"'detector.settings' have the alarm level {alarm_level}, step {step_s} s")
 
 
 def _learned(
@@ -236,19 +233,11 @@ def _learned(
 
     numbers, columns = entries["numbers"], InputColumns(info, parameters)
     base_logit, adaptation = numbers["base_logit"], entries["adaptation"]
-    num_causes, widths = len(info.constraint_names), info.widths
-    trees, nodes = group("trees."), len(tensors.get("trees.left", ()))
-    sizes = {
-        "1": 1,
-        "2": 2,
-        "6": 6,
-        "r": parameters.resolution**2,
-        "b": 3 + num_causes,
-        "c": num_causes,
-    }
-    sizes |= {"g": 4 if trees else 3, "h": 3 if trees else 2, "l": nodes + 1, "s": widths["state"]}
-    sizes |= {"x": len(columns.names), "m": 2 + numbers["num_margins"]}
-    sizes["v"] = 2 * len(tensors["detector.columns"])
+    trees, widths, causes = group("trees."), info.widths, len(info.constraint_names)
+    known = parameters.resolution**2, 3 + causes, causes, widths["state"], len(columns.names)
+    sizes = {"1": 1, "2": 2, "6": 6} | dict(zip("rbcsx", known, strict=True))
+    sizes |= {"g": 4 if trees else 3, "h": 3 if trees else 2, "m": 2 + numbers["num_margins"]}
+    sizes |= {"l": 1 + len(trees.get("left", ())), "v": 2 * len(tensors["detector.columns"])}
     sizes["y"] = sum(widths[name] for name in ("state", "desired_preview", "features"))
     _check_arrays(tensors, sizes)
     correction = Correction(**group("correction."))
