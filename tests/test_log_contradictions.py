@@ -10,6 +10,7 @@ from drake_safety.logs.robot_log import read_log
 from log_files import (
     ANGLES,
     BASE,
+    GOAL,
     GYRO,
     JOINTS,
     LINEAR,
@@ -59,6 +60,36 @@ def exchanged(one, other):
 
 def about(axis, angle):
     return Rotation.from_rotvec(np.deg2rad(angle) * np.eye(3)["xyz".index(axis)])
+
+
+def with_legs(names):
+    """Columns of joints that were written in another order of the legs."""
+    order = [JOINTS.index(names[one[:2]] + one[2:]) for one in JOINTS]
+
+    def spoil(frame):
+        for columns in (ANGLES, RATES):
+            frame = with_values(frame, columns, frame[[columns[i] for i in order]].to_numpy())
+        return frame
+
+    return spoil
+
+
+def with_signs(*parts):
+    """Motors that count the other way, of the joints whose names have one of the parts."""
+    signs = [-1 if any(part in joint for part in parts) else 1 for joint in JOINTS]
+    return times([*ANGLES, *RATES], *signs, *signs)
+
+
+def turned(R, *, with_base):
+    """A world with other axes, and a base that has them as well or not."""
+
+    def spoil(frame):
+        for columns in (BASE, GOAL, *((GYRO, LINEAR) if with_base else ())):
+            frame = with_values(frame, columns, R.apply(np.array(frame[columns])))
+        back = R.inv() if with_base else Rotation.identity()
+        return with_values(frame, QUATERNION, (R * turns_of(frame) * back).as_quat())
+
+    return spoil
 
 
 WORLD, BODY = "velocity_z], frame: body", "velocity_z]"
@@ -119,6 +150,33 @@ CONTRADICTIONS = {
         "below the ground; it would stand if world and base have z downwards$"),
     "on its side": (oriented(lambda R: R * about("y", -90)), [],
                     r"does not stand .* turned on the base by 90° about \[0.0, -1.0, 0.0\]"),
+    "world with y up": (turned(about("x", -90), with_base=False), [],
+                        "it would stand if the world has y upwards"),
+    "world and base with y up": (turned(about("x", -90), with_base=True), [],
+                                 "it would stand if world and base have y upwards"),
+    # What joints are of, by feet that stand still and lie on the ground.
+    "left is right": (with_legs({"FR": "FL", "FL": "FR", "RR": "RL", "RL": "RR"}), [],
+                      r"of left and right legs are exchanged: {'FR_hip_joint': 'FL_hip_joint_pos'"),
+    "front is rear": (with_legs({"FR": "RR", "FL": "RL", "RR": "FR", "RL": "FL"}), [],
+                      "of front and rear legs are exchanged"),
+    "diagonal": (with_legs({"FR": "RL", "FL": "RR", "RR": "FL", "RL": "FR"}), [],
+                 "of diagonal legs are exchanged"),
+    "motors mounted mirrored": (with_signs("R_hip"), [], r"slide by .* if 'joint_positions.sign' "
+                                r"is {'FR_hip_joint_pos': -1, 'RR_hip_joint_pos': -1}$"),
+    "one motor": (with_signs("RL_hip"), [], "sign' is {'RL_hip_joint_pos': -1}$"),
+    "knees": (with_signs("calf"), [], r"far beyond its stops .*if 'joint_positions.sign' is "
+              r"{'FR_calf_joint_pos': -1, 'FL_calf_joint_pos': -1, 'RR_calf_joint_pos': -1, "),
+    "height from the start": (lambda f: f.assign(base_z=f.base_z - f.base_z[0]), [],
+                              r"below the .* m higher: 'base_position.offset' of .base_z: 4"),
+    # What no robot does.
+    "two frames in turn": (lambda f: f.assign(base_y=f.base_y + 250.0 * (f.index % 2)), [],
+                           "line 3, column 'base_y': .* m/s since the row before"),
+    "an orientation that jumps": (oriented(lambda R: R * Rotation.from_rotvec(np.outer(
+        np.arange(len(R)) > 200, [0, 0, 1.0]))), [], "line 203, column 'quat_x': .* rad/s since"),
+    "a gyroscope's spike": (lambda f: f.assign(gyro_x=f.gyro_x + 9e3 * (f.index == 30)), [],
+                            "line 32, column 'gyro_x': the value is 8947.84, .*rad/s; robots stay"),
+    "a joint's spike": (lambda f: f.assign(**{ANGLES[0]: f[ANGLES[0]] + 30 * (f.index == 99)}), [],
+                        f"line 101, column '{ANGLES[0]}': .* rad/s since the row before"),
 }  # fmt: skip
 
 
@@ -195,3 +253,33 @@ def test_a_robot_that_stands_still_repeats_itself(tmp_path):
     frame = times([*LINEAR, *GYRO, *RATES], 0)(frame_of(walked()))
     still = pd.concat([frame[:1]] * 400).assign(stamp=frame.stamp.to_numpy())
     assert len(read(save(still, tmp_path), reader=read_log).time_s) == 400
+
+
+def test_signs_and_offsets_of_the_map_are_applied_and_a_height_is_noted(tmp_path):
+    frame = times([ANGLES[0], RATES[0]], -1)(frame_of(walked()))
+    frame = frame.assign(base_z=frame.base_z + 20.0)
+    signs = [
+        (f'{{joint}}_{n}"', f'{{joint}}_{n}", sign: {{{JOINTS[0]}_{n}: -1}}')
+        for n in ("pos", "vel")
+    ]
+    found = read(save(frame, tmp_path), *signs)
+    (note,) = found.notes
+    assert "0.02 m above the ground z = 0: 'base_position.offset' of {base_z: -2" in note
+    found = read(tmp_path / "run.csv", *signs, ("base_z], ", "base_z], offset: {base_z: -20}, "))
+    assert not found.cuts
+    np.testing.assert_allclose(found.pieces[0].q, walked().q, atol=1e-9)
+    with pytest.raises(ValueError, match=r"'offset' of 'base_position' are by column.*\['z'\]"):
+        read(tmp_path / "run.csv", ("base_z], ", "base_z], offset: {z: -20}, "))
+
+
+@pytest.mark.parametrize("digits", [0, 1, 2])
+def test_stamps_with_too_few_digits_are_refused(digits, tmp_path):
+    frame = frame_of(walked()).assign(stamp=lambda f: (1e-9 * f.stamp).round(digits).map(str))
+    with pytest.raises(ValueError, match=r"line \d+, column 'stamp': .*too few digits"):
+        read(save(frame, tmp_path), ("unit: ns", "unit: s"))
+
+
+def test_a_unit_of_time_is_suggested_if_its_motion_is_one_of_robots(tmp_path):
+    frame = frame_of(walked(rate_hz=20)).assign(stamp=np.arange(40))
+    with pytest.raises(ValueError, match=r"rows are 1 apart, which as s is implausible$"):
+        read(save(frame, tmp_path), ("unit: ns", "unit: s"))

@@ -9,8 +9,9 @@ import pytest
 
 from command_line import call
 from drake_safety import load_assessment, load_scenario
+from drake_safety.cli import repeat_log
 from drake_safety.learning.change_detector import rows_of
-from drake_safety.logs.episodes import motions_from_log
+from drake_safety.logs.episodes import cut_log, motions_from_log
 from drake_safety.logs.robot_log import read_pieces
 from drake_safety.logs.sequences import SequenceMap, read_sequences
 from log_files import frame_of, map_beside, record, save
@@ -183,7 +184,34 @@ def test_a_log_is_judged_as_its_motions_are_with_its_own_times(monkeypatch, caps
     np.testing.assert_allclose(every_second[0].state, motions[0].state[::2], atol=1e-9)
 
 
-def test_a_log_without_the_policy_s_actions_is_refused():
+def test_a_log_without_the_policy_s_memory_is_refused():
     loop = load_scenario("go2_walking").make_loop("nominal")
-    with pytest.raises(ValueError, match=r"reads \['action_FL_calf_joint', .*npz file"):
-        motions_from_log([], loop)
+    for read in (motions_from_log, cut_log):
+        with pytest.raises(ValueError, match=r"reads \['action_FL_calf_joint', .*npz file"):
+            read([], loop)
+
+
+@pytest.mark.parametrize("kept", [[], range(3), range(0, 50, 2), [*range(4), *range(10, 25)]])
+def test_what_is_too_short_or_missing_is_not_judged(folder, kept, monkeypatch, capsys):
+    rows = observed(motion(30.0, 60))
+    rows[np.setdiff1d(np.arange(50), kept)] = rows[50:] = np.nan
+    log, out = write(folder / "bad.npz", rows), folder / "new" / "out"
+    options = ("--map", folder / "map.yaml", "--assessment", folder, "--out", out)
+    good = folder / "runs" / "b.npz"
+    assert call(monkeypatch, "monitor", "--log", log, good, "laikago_balancing", *options) == 2
+    printed = " ".join(capsys.readouterr().out.split())
+    assert printed.count("no alarm") == 1
+    assert "not judged: 0." in printed
+    assert "error 1 of 2 logs have less than 1 s" in printed
+    logs = json.loads((out / "monitor.json").read_text())["entries"]["logs"]
+    assert logs[0]["judged_s"] < 1.0 < logs[1]["judged_s"] == logs[1]["duration_s"]
+
+
+def test_what_follows_logs_may_be_the_scenario(tmp_path):
+    for name in ("a.csv", "bag"):
+        (tmp_path / name).mkdir()
+    a, bag = str(tmp_path / "a.csv"), str(tmp_path / "bag")
+    for scenario in ("laikago_balancing", "robot/scenario.yaml"):
+        given = ["--log", a, bag, scenario, "--map", "m"]
+        assert repeat_log(given) == ["--log", a, "--log", bag, scenario, "--map", "m"]
+    assert repeat_log([scenario, "--log", a, "x.csv"]) == [scenario, "--log", a, "--log", "x.csv"]

@@ -2,15 +2,19 @@
 
 import dataclasses
 from datetime import UTC, datetime
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from drake_safety.logs.messages import field_of
 from drake_safety.logs.robot_log import read_log
 from log_files import (
     ANGLES,
     BASE,
     GOAL,
+    GYRO,
+    LINEAR,
     MESSAGE_MAP,
     QUATERNION,
     RATES,
@@ -207,8 +211,54 @@ def test_rows_out_of_order_are_sorted_and_a_time_that_repeats_is_left_out(tmp_pa
     assert "line 7, column 'stamp': time stands still in 3.2% of the rows" in found.cuts[1]
     with pytest.raises(ValueError, match=f"{told}.*expected a log of which nothing is lost"):
         read(path, reader=read_log)
-    with pytest.raises(ValueError, match="line 62, column 'stamp': time runs backwards"):
-        read(save(pd.concat([frame, frame]), tmp_path))
+    with pytest.raises(ValueError, match="time runs backwards, from"):
+        read(save(frame.sample(frac=1.0, random_state=0), tmp_path))
+
+
+@pytest.mark.parametrize("since_start", [False, True])
+def test_a_time_that_begins_anew_is_another_log(since_start, tmp_path):
+    frame = frame_of(PLAIN)
+    if since_start:
+        frame.stamp -= frame.stamp[0]
+    path = save(pd.concat([frame, frame, frame[:20]]), tmp_path)
+    found = read(path)
+    assert [(len(one.time_s), one.piece) for one in found.pieces] == [(60, 0), (60, 0), (20, 0)]
+    np.testing.assert_allclose(found.pieces[1].q, PLAIN.q, atol=1e-9)
+    assert found.kept_share == pytest.approx(1.0)
+    assert "line 62, column 'stamp': time begins anew" in found.cuts[0]
+    with pytest.raises(ValueError, match=r"time begins anew.*nothing is lost"):
+        read(path, reader=read_log)
+
+
+def test_entries_of_lists_are_columns_of_parquet(tmp_path):
+    pytest.importorskip("pyarrow")
+    frame = frame_of(PLAIN)
+    listed = frame.drop(columns=BASE).assign(**{"state.base": [*frame[BASE].to_numpy()]})
+    path = save(listed, tmp_path, "parquet")
+    names = ("[base_x, base_y, base_z]", "['state.base[0]', 'state.base[1]', 'state.base[2]']")
+    assert_reads(read(path, names))
+    with pytest.raises(ValueError, match=r"no columns \['state.base\[3\]'\]; it has"):
+        read(path, (names[0], names[1].replace("[2]", "[3]")))
+
+
+def test_an_entry_is_selected_by_its_frame_or_the_message_says_how():
+    def of(name, x):
+        return SimpleNamespace(child_frame_id=name, x=x)
+
+    message = SimpleNamespace(transforms=[of("hip", 1.0), of("/base", 2.0)], ranges=[1.0, 2.0])
+    assert field_of("transforms[base].x")(message) == 2.0
+    with pytest.raises(LookupError, match=r"no entry is named 'foot'; .*\['hip', 'base'\]"):
+        field_of("transforms[foot].x")(message)
+    with pytest.raises(LookupError, match="selected by number, 0 to 1, or by name"):
+        field_of("ranges[base]")(message)
+
+
+def test_three_holds_tell_the_rate_of_updates(tmp_path):
+    frame = frame_of(PLAIN)
+    names = [*ANGLES, *RATES, *BASE, *QUATERNION, *GYRO, *LINEAR]
+    frame[names] = frame[names].to_numpy()[10 * (frame.index // 10)]
+    found = read(save(frame[:40], tmp_path))
+    assert "changes only at every 10th row" in found.cuts[0]
 
 
 def split_joints(number, *, shift_ns=0):

@@ -87,13 +87,21 @@ def join_targets(args: Sequence[str]) -> list[str]:
     return words
 
 
+_YAML = (".yaml", ".yml")
+
+
 def repeat_log(args: Sequence[str]) -> list[str]:
-    """Puts ``--log`` before every file that follows it, as where a shell expands ``log_*.csv``."""
+    """Puts ``--log`` before every file that follows it, as where a shell expands ``log_*.csv``.
+
+    A YAML file, or a name of nothing that exists, is a scenario.
+    """
     words, option = [""], ""
     for word in args:
         if word.startswith("-"):
             option = word
-        elif option == "--log" != words[-1]:
+        elif option == "--log" != words[-1] and (
+            kind not in _YAML if (kind := Path(word).suffix) else Path(word).exists()
+        ):
             words.append(option)
         words.append(word)
     return words[1:]

@@ -22,10 +22,10 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import EpisodePair
 from drake_safety.learning.seeds import ADAPTATION, MOTION
 from drake_safety.learning.segments import Episodes
-from drake_safety.logs.episodes import cut_log, motions_from_log
-from drake_safety.logs.robot_log import RobotLog, read_log, read_pieces
-from drake_safety.models import load_robot
+from drake_safety.logs.episodes import cut_log, motions_from_log, require_loggable
+from drake_safety.logs.robot_log import LogPieces, read_pieces
 from drake_safety.simulation.feedback import EpisodePairs, pair_starts, run_pairs
+from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
@@ -79,8 +79,9 @@ def adapt(
     with console.open_stages() as stages:
         plant = ActualPlant(loaded, variation, learned.out, workers, stages)
         if log_map is not None:
-            read = [log_pieces(loaded, [one], log_map, is_strict=strict) for one in logs]
-            loop, pieces = loaded.make_loop("actual"), list(chain.from_iterable(read))
+            loop = loaded.make_loop("actual")
+            read = [log_pieces(loop, one, log_map, is_strict=strict).pieces for one in logs]
+            pieces = list(chain.from_iterable(read))
             cut = [cut_log(one, loop) for one in read]
             found = enumerate(chain.from_iterable(episodes for episodes, _ in cut))
             actual = Episodes(cut[0][0].info, [replace(one, index=i) for i, one in found])
@@ -161,30 +162,27 @@ class ActualPlant(NamedTuple):
         }
 
 
-def log_pieces(
-    scenario: Scenario, logs: list[Path], log_map: Path, *, is_strict: bool = False
-) -> list[RobotLog]:
-    """The pieces of logs without gaps; where they are cut is printed."""
-    robot = load_robot(scenario.robot)
-    if is_strict:
-        return [read_log(log, log_map, robot) for log in logs]
-    pieces: list[RobotLog] = []
-    for log in logs:
-        found = read_pieces(log, log_map, robot)
-        pieces += found.pieces
-        cuts = found.cuts[:_MOST_CUTS]
-        if num_more := len(found.cuts) - len(cuts):
-            cuts.append(f"... and {num_more} more; --strict refuses such a log")
-        if cuts:
-            console.say(
-                f"log '{log}' is cut where values are missing and at gaps, or resampled: "
-                f"{100 * found.kept_share:.1f} % of {found.duration_s:.1f} s are kept, in "
-                f"{len(found.pieces)} pieces",
-                *cuts,
-                sep="\n",
-                style="yellow",
-            )
-    return pieces
+def log_pieces(loop: LeggedLoop, log: Path, log_map: Path, *, is_strict: bool = False) -> LogPieces:
+    """The pieces of a log without gaps; where it is cut is printed."""
+    require_loggable(loop)
+    found = read_pieces(log, log_map, loop.robot)
+    if is_strict and found.lost:
+        raise ValueError(f"{found.lost[0]}, expected a log of which nothing is lost")
+    cuts = found.cuts[:_MOST_CUTS]
+    if num_more := len(found.cuts) - len(cuts):
+        cuts.append(f"... and {num_more} more; --strict refuses such a log")
+    if cuts:
+        console.say(
+            f"log '{log}' is cut where values are missing and at gaps, or resampled: "
+            if found.lost
+            else f"log '{log}' is read with notes: ",
+            f"{100 * found.kept_share:.1f} % of {found.duration_s:.1f} s are kept, in "
+            f"{len(found.pieces)} pieces",
+            *(f"\n{cut}" for cut in cuts),
+            sep="",
+            style="yellow",
+        )
+    return found
 
 
 def _held_out(

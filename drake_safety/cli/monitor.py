@@ -25,6 +25,7 @@ from drake_safety.simulation.rollouts import worker_loop
 from drake_safety.simulation.scenario import Scenario
 
 _SEQUENCES = ".npz"
+_LEAST_S = 1.0  # Of motion in which no alarm says something.
 
 
 def monitor(
@@ -52,13 +53,19 @@ def monitor(
         for i, file in enumerate(files):
             for what, motions in _motions(file, log_map, loaded, gamma):
                 picture = folder / f"{file.stem}-{len(found) + 1}"
-                found.append(what | _judged(motions, gamma, picture))
+                found.append(_judged(motions, gamma, picture) | what)
             stages("logs", i + 1, len(files))
     entries = {"monitor": gamma.detector_.describe(), "logs": found}
+    folder.mkdir(parents=True, exist_ok=True)
     Results({}, console.made_by(loaded.name) | entries).write(folder / "monitor.json")
     _show(found)
     console.say("figures ", folder / "monitor.json")
     console.say("pictures", folder)
+    if told := [one["log"] for one in found if not one["alarms"] and one["judged_s"] < _LEAST_S]:
+        raise ValueError(
+            f"{len(told)} of {len(found)} logs have less than {_LEAST_S:g} s of motion without a "
+            f"missing value, which is too short to judge: {', '.join(told[:3])}"
+        )
 
 
 def _files(given: Path) -> list[Path]:
@@ -84,24 +91,29 @@ def _motions(
         read = read_sequences(file, read_by, gamma.detector_, gamma.info_)
         yield from ((what | {"sequence": i}, motions) for i, motions in enumerate(read))
     else:
-        pieces = log_pieces(scenario, [file], log_map)
         loop = worker_loop(scenario, "actual")()
-        found = motions_from_log(pieces, loop, step_s=gamma.detector_.step_s)
-        left = {"left_safe_set": next((one.cause for one in found if not one.is_safe), "")}
-        yield what | left, [(one.time_s, rows_of(one)) for one in found]
+        pieces = log_pieces(loop, file, log_map)
+        found = motions_from_log(pieces.pieces, loop, step_s=gamma.detector_.step_s)
+        what["left_safe_set"] = next((one.cause for one in found if not one.is_safe), "")
+        yield (
+            what | {"duration_s": pieces.duration_s},
+            [(one.time_s, rows_of(one)) for one in found],
+        )
 
 
 def _judged(motions: Sequence[Motion], gamma: SafetyAssessment, picture: Path) -> dict[str, Any]:
     """Duration, largest level and alarms of a log, which are drawn into a picture."""
     detector = gamma.detector_
     if not motions:
-        return {"end_s": 0.0, "level": 0.0, "state": "none", "alarms": []}
+        return {"end_s": 0.0, "duration_s": 0.0, "judged_s": 0.0, "level": 0.0, "alarms": []}
     names = [gamma.info_.state_names[i] for i in detector.watched]
     levels, alarms = detector.watch([rows for _, rows in motions], names)
     time_s = np.concatenate([times for times, _ in motions]).round(6)
     save(levels_figure(time_s, levels, names, alarms, detector.alarm_level), picture)
     return {
         "end_s": float(time_s[-1]),
+        "duration_s": float(time_s[-1]),
+        "judged_s": float(sum(times[-1] - times[0] for times, _ in motions)),
         "level": float(levels.max()),
         "state": names[int(levels.max(axis=0).argmax())],
         "alarms": [
@@ -122,14 +134,19 @@ def _show(found: Sequence[Mapping[str, Any]]) -> None:
     for one in found:
         number = "" if one["sequence"] is None else f" [{one['sequence']}]"
         left = one["left_safe_set"] and f", left the safe set: {one['left_safe_set']}"
+        share = one["judged_s"] / max(one["duration_s"], 1e-9)
         head = [f"{Path(*Path(one['log']).parts[-2:])}{number}", f"{one['end_s']:.2f}{left}"]
-        if not one["alarms"]:
+        head.append(f"{share:.0%}")
+        if not one["alarms"] and one["judged_s"] < _LEAST_S:
+            told = f"not judged: {one['judged_s']:.2f} s, expected at least {_LEAST_S:g} s"
+            rows.append([*head, "-", "-", "-", told])
+        elif not one["alarms"]:
             told = f"no alarm; largest: {one['state']}"
             rows.append([*head, "-", "-", f"{one['level']:.2f}", told])
         for alarm in one["alarms"]:
             numbers = (alarm[key] for key in ("begin_s", "end_s", "level"))
             cells = ["goes on" if value is None else f"{value:.2f}" for value in numbers]
             rows.append([*head, *cells, alarm["cause"]])
-            head = ["", ""]
-    columns = ("log", "until [s]", "alarm [s]", "ends [s]", "largest level", "cause")
+            head = ["", "", ""]
+    columns = ("log", "until [s]", "judged", "alarm [s]", "ends [s]", "largest level", "cause")
     console.show(console.new_table(*columns, rows=rows))

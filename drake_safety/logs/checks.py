@@ -6,10 +6,12 @@ spoil less than derivatives; feet that stand must not slide. An error names the 
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -31,27 +33,54 @@ _LEAST = {"base_linear_velocity": 0.01, "base_angular_velocity": 0.05, "joint_ve
 _DISAGREES, _AGREES = 0.4, 0.25  # Of the motion, if another reading agrees.
 _WRONG, _FAR = 0.9, 3.0  # Of the motion, and of the least change, if none does.
 _FACTOR, _TURN_RAD = 1.6, math.radians(30.0)  # Least factor of a unit or rate, and turn of axes.
+_FASTEST_M_S = 15.0
+_FASTEST = {
+    "base_position": _FASTEST_M_S,
+    "base_linear_velocity": _FASTEST_M_S,
+    "base_orientation": 40.0,
+    "base_angular_velocity": 40.0,  # More than gyroscopes measure.
+    "joint_positions": (20.0, 100.0),
+    "joint_velocities": (20.0, 100.0),
+}
+"""Speeds that no robot exceeds; of joints, the range of the limit [m/s, rad/s]."""
+_JUMP_S = 0.005
 _STEP_S, _NUM_STEPS = 0.05, 80  # In which a foot on the ground does not move.
 _UNEVEN, _MANY_CHANGES = 3.0, 20  # Times of even times' variation, of at least so many.
 _SHORTEST_S = 0.5  # Of a log that says how feet move.
-_SLIP_M, _SLIP_FACTOR = 0.004, 3.0
+_SLIP_M, _SLIP_FACTOR, _HIGH_M = 0.004, 3.0, 0.01
+_LONGEST_LEG = 7
+_HOW = ("from their means", "while the lowest one stands", "or rest at several heights")
+_MIRRORS = {"left and right": (1, -1), "front and rear": (-1, 1), "diagonal": (-1, -1)}
 _INVERSE = "'base_orientation' is the inverse, of the world in the base"
 
 _Reading = tuple[str, np.ndarray, np.ndarray]
 """A reading in words, and the changes by positions and by velocities in it, (M, n) each."""
-_Pose = tuple[str, bool, list[float]]
-"""A reading of the base's pose: whether the robot stands at first, and how its feet slide [m]."""
 
 
-def check(sources: list[Source], kinematics: RobotKinematics) -> None:
+class _Pose(NamedTuple):
+    """A reading of pose and joints: whether the robot stands at first, and how its feet rest [m].
+
+    A foot rests by how it moves in a step and differs in height from all, in its best fifth.
+    """
+
+    what: str
+    stands: bool
+    slips: list[float]
+    height: float
+    rest: np.ndarray
+
+
+def check(sources: list[Source], kinematics: RobotKinematics) -> list[str]:
     """Checks the first piece's start and the longest one's motion, and the values of all.
 
+    Returns notes on the height of the feet.
+
     Raises:
-        ValueError: A quaternion's norm is not 1; a joint is far beyond its stops; the robot does
-            not stand on the ground z = 0 at first; z* is far from it; or velocities or feet
-            contradict the positions.
+        ValueError: A quaternion's norm is not 1; something moves faster than robots do; a joint is
+            far beyond its stops; the robot does not stand on the ground z = 0 at first; or
+            velocities or feet contradict the positions.
     """
-    longest = max(sources, key=lambda one: float(np.ptp(one.at_s)))
+    longest, notes = max(sources, key=lambda one: float(np.ptp(one.at_s))), list[str]()
     for source in sources:
         names = source.log_map.base_orientation.columns
         norms = np.linalg.norm(source.table("base_orientation"), axis=1)
@@ -68,9 +97,51 @@ def check(sources: list[Source], kinematics: RobotKinematics) -> None:
             row, joint, text = beyond
             column = source.log_map.joint_positions.column(source.joints[joint])
             raise ValueError(f"{source.channels['joint_positions'].where(row, column)}: {text}")
+        _check_speeds(source, VELOCITIES.values(), kinematics)
         if source is longest:
-            _check_stance(source, kinematics)
+            notes = _check_stance(source, kinematics)
             _check_velocities(source)
+        _check_speeds(source, VELOCITIES, kinematics)
+    return notes
+
+
+def too_fast(source: Source, name: str, kinematics: RobotKinematics) -> str:
+    """Where a quantity moves, or jumps between two rows, as no robot does; "" if nowhere.
+
+    Rare jumps take 5 ms at least, so that noise does not reach the limits. Joints have twice their
+    own speed, from 20 to 100 rad/s.
+    """
+    channel, values, limit = source.channels[name], source.table(name), np.array(_FASTEST[name])
+    if "joint" in name:
+        own = kinematics.velocity_limits
+        limit = np.clip(np.where(own > 1.0, 2 * own, math.inf), *limit)
+    speeds = np.abs(values)
+    if name not in VELOCITIES:
+        speeds = np.abs(np.diff(values, axis=0, prepend=values[:1]))
+        if name == "base_orientation":
+            cosines = np.sum(values[1:] * values[:-1], axis=1)
+            speeds[1:] = 2 * np.arccos(np.minimum(np.abs(cosines), 1.0))[:, None]
+        steps_s = np.diff(channel.time_s)[:, None]
+        is_usual = (np.median(speeds[1:] / steps_s, axis=0) > limit).any()
+        speeds[1:] /= steps_s if is_usual else np.maximum(steps_s, _JUMP_S)
+    if not (is_beyond := speeds > limit).any():
+        return ""
+    row = int(np.argmax(is_beyond.any(axis=1)))
+    column = int(np.argmax(speeds[row] / limit))
+    where = channel.where(row, getattr(source.log_map, name).names(source.joints)[column])
+    jump = "" if name in VELOCITIES else " since the row before"
+    return (
+        f"{where}: the value is {channel.frame.iloc[row].iloc[column]:g}, which means "
+        f"{speeds[row, column]:.3g} {'m/s' if limit.min() == _FASTEST_M_S else 'rad/s'}{jump}; "
+        f"robots stay below {np.broadcast_to(limit, speeds.shape)[row, column]:g}: check units, "
+        f"and that all rows of '{name}' are of one source"
+    )
+
+
+def _check_speeds(source: Source, names: Iterable[str], kinematics: RobotKinematics) -> None:
+    for name in names:
+        if name in source.channels and (told := too_fast(source, name, kinematics)):
+            raise ValueError(told)
 
 
 def _implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:
@@ -81,11 +152,14 @@ def _implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:
     tilt = math.acos(min(max(up, -1.0), 1.0))
     if tilt > _MAX_TILT_RAD:
         return f"its base is tilted by {math.degrees(tilt):.0f}° from upright"
-    height = float((kinematics.contact_positions(q)[:, 2] - kinematics.foot_radii).min())
+    height = _lowest_foot(kinematics, q)
     if abs(height) > _FOOT_SHARE * kinematics.standing_height:
-        side = "above" if height > 0 else "below"
-        return f"its lowest foot is {abs(height):.3g} m {side} the ground"
+        return f"its lowest foot is {_side(height)} the ground"
     return ""
+
+
+def _lowest_foot(kinematics: RobotKinematics, q: np.ndarray) -> float:
+    return float((kinematics.contact_positions(q)[:, 2] - kinematics.foot_radii).min())
 
 
 def _beyond_stops(kinematics: RobotKinematics, joints: np.ndarray) -> tuple[int, int, str] | None:
@@ -122,8 +196,20 @@ def _check_start(source: Source, kinematics: RobotKinematics) -> None:
             log_map = replace(source.log_map, **{name: replace(part, unit=unit)})
             if unit != part.unit and not wrong(replace(source, log_map=log_map)):
                 likely.append(f"'{name}.unit' is {unit}")
-    if best := _stillest(_poses(source, kinematics), 1):
-        likely.append(best[0])
+    poses = list(_poses(source, kinematics))
+    if best := _stillest([one for one in poses if "joint" not in one.what], 1):
+        likely.append(best.what)
+    if not likely:
+        likely = [one.what for one in (_stillest(poses, 1),) if one]
+        q = source.positions(source.at_s[:1])[0]
+        height = _lowest_foot(kinematics, q)
+        q[6] -= height
+        if (
+            not _implausible(kinematics, q)
+            and abs(height) < _REACH_SHARE * kinematics.standing_height
+        ):
+            side = "lower" if height > 0 else "higher"
+            likely.append(f"it were {abs(height):.3g} m {side}: {_offset_text(source, height)}")
     hint = f"; it would stand if {' or '.join(likely)}" if likely else ""
     raise ValueError(
         f"{source.where}: robot '{kinematics.robot.name}' does not stand on the ground z = 0 at "
@@ -141,52 +227,112 @@ def _check_desired_output(source: Source, kinematics: RobotKinematics) -> None:
         raise ValueError(
             f"{source.where}: the desired output is {distance:.3g} m from the base of robot "
             f"'{kinematics.robot.name}': check its frame and its unit, "
-            f"{source.log_map.desired_output.unit}"
+            f"{source.log_map.desired_output.unit}; it is a position, no velocity command"
         )
 
 
-def _check_stance(source: Source, kinematics: RobotKinematics) -> None:
-    """Checks that feet slide no less by another reading of the base's orientation.
+def _check_stance(source: Source, kinematics: RobotKinematics) -> list[str]:
+    """Checks that feet do not rest better by another reading of the base's pose or the joints.
 
-    Both how far they move from their means (rms) and the lowest one in 0.05 s (median) count.
+    How far they move from their means (rms) and the lowest one in 0.05 s (median) count, and how
+    each rests at the height of all. Returns a note if they rest above or below the ground.
     """
     if np.ptp(source.at_s) < _SHORTEST_S:
-        return
-    given, *others = _poses(source, kinematics)
-    for i, how in enumerate(("from their means", "while the lowest one stands")):
-        what, _, slips = _stillest(others, i) or given
-        if given[2][i] > max(_SLIP_M, _SLIP_FACTOR * slips[i]):
+        return []
+    poses = _poses(source, kinematics)
+    given = next(poses)
+    others = list(poses) if max(given.slips) > _SLIP_M else []
+    for i, how in enumerate(_HOW):
+        best, slip = _stillest(others, i) or given, given.slips[i]
+        if slip > max(_SLIP_M, _SLIP_FACTOR * best.slips[i]):
             raise ValueError(
-                f"{source.where} and after it: columns {source.log_map.base_orientation.columns}: "
-                f"the feet of robot '{kinematics.robot.name}' slide by {given[2][i]:.3g} m with "
-                f"the base ({how}), but only by {slips[i]:.3g} m if {what}"
+                f"{source.where} and after it: the feet of robot '{kinematics.robot.name}' slide "
+                f"by {slip:.3g} m with the base ({how}), but only by {best.slips[i]:.3g} m if "
+                f"{best.what}"
             )
+    if abs(height := given.height) < _HIGH_M:
+        return []
+    return [
+        f"{source.where} and after it: the feet rest {_side(height)} the ground z = 0: "
+        f"{_offset_text(source, height)} would put them on it"
+    ]
+
+
+def _side(height: float) -> str:
+    return f"{abs(height):.3g} m {'above' if height > 0 else 'below'}"
+
+
+def _offset_text(source: Source, height: float) -> str:
+    """The map's offset that lowers the base by a height [m]."""
+    part = source.log_map.base_position
+    offset = part.offset.get(column := part.columns[2], 0.0) - height / si_units(part)
+    text = f"'base_position.offset' of {{{column}: {offset:.4g}}}"
+    return f"{text} (and of 'desired_output')" if "desired_output" in source.channels else text
 
 
 def _stillest(poses: Iterator[_Pose] | list[_Pose], i: int) -> _Pose | None:
     """The first of the poses in which a robot stands whose feet slide least, to a millimetre."""
-    standing = [one for one in poses if one[1]]
-    least = min((slips[i] for _, _, slips in standing), default=0.0)
-    return next((one for one in standing if one[2][i] <= least + 0.001), None)
+    standing = [one for one in poses if one.stands]
+    least = min((one.slips[i] for one in standing), default=0.0)
+    return next((one for one in standing if one.slips[i] <= least + 0.001), None)
 
 
 def _poses(source: Source, kinematics: RobotKinematics) -> Iterator[_Pose]:
-    """What the pose's readings say of the feet, the map's reading first."""
+    """What the readings of pose and joints say of the feet, the map's reading first."""
     at_s = source.at_s
     step = max(_STEP_S, float(np.diff(at_s).max(initial=0.0)))
     begins = np.linspace(at_s[0], max(at_s[-1] - step, at_s[0]), _NUM_STEPS)
     q = source.positions(np.concatenate([begins, begins + step]))
-    upright = np.hstack([np.tile([1.0, *np.zeros(6)], (len(q), 1)), q[:, 7:]])
-    p_BC = np.array([kinematics.contact_positions(one) for one in upright])
-    R_WB = Rotation.from_quat(q[:, :4], scalar_first=True)
-    for what, R, p in _readings(source.log_map.base_orientation.order, R_WB, q[:, 4:7]):
+    R_WB, p_WB, joints = Rotation.from_quat(q[:, :4], scalar_first=True), q[:, 4:7], q[:, 7:]
+
+    def contacts(joints: np.ndarray) -> np.ndarray:
+        upright = np.hstack([np.tile([1.0, *np.zeros(6)], (len(q), 1)), joints])
+        return np.array([kinematics.contact_positions(one) for one in upright])
+
+    def pose(what: str, R: Rotation, p: np.ndarray, joints: np.ndarray, p_BC: np.ndarray) -> _Pose:
         feet = p[:, None] + np.einsum("nij,ncj->nci", R.as_matrix(), p_BC)
         first, last = np.split(feet, 2)
         lowest = np.argmin(first[..., 2] + last[..., 2], axis=1)
-        moved = np.linalg.norm(last - first, axis=2)[np.arange(_NUM_STEPS), lowest]
-        start = np.concatenate([R[0].as_quat(scalar_first=True), p[0], q[0, 7:]])
-        slips = [np.sqrt(np.mean((feet - feet.mean(axis=0)) ** 2)), np.median(moved)]
-        yield what, not _implausible(kinematics, start), list(map(float, slips))
+        moved, high = np.linalg.norm(last - first, axis=2), first[..., 2] - kinematics.foot_radii
+        slices = kinematics.foot_slices
+        height = np.median([np.quantile(high[:, s].min(axis=1), 0.2) for s in slices])
+        rest = [np.quantile((moved + abs(high - height))[:, s].mean(1), 0.2) for s in slices]
+        start = np.concatenate([R[0].as_quat(scalar_first=True), p[0], joints[0]])
+        rms = np.sqrt(np.mean((feet - feet.mean(axis=0)) ** 2))
+        slips = rms, np.median(moved[np.arange(_NUM_STEPS), lowest]), np.mean(rest)
+        stands = not _implausible(kinematics, start)
+        return _Pose(what, stands, list(map(float, slips)), float(height), np.array(rest))
+
+    p_BC = contacts(joints)
+    for what, R, p in _readings(source.log_map.base_orientation.order, R_WB, p_WB):
+        yield pose(what, R, p, joints, p_BC)
+    J = np.split(kinematics.contact_positions_and_jacobian(q[0])[1][:, 6:], kinematics.num_contacts)
+    moves = np.array([np.any(J[s], axis=(0, 1)) for s in kinematics.foot_slices])
+    legs = [np.flatnonzero(one & (moves.sum(axis=0) == 1)) for one in moves]
+    if len(set(map(len, legs))) > 1 or len(legs[0]) > _LONGEST_LEG:
+        return
+    columns = source.log_map.joint_positions.names(source.joints)
+    ends = np.array([kinematics.nominal_contacts[s].mean(axis=0) for s in kinematics.foot_slices])
+    for which, mirror in _MIRRORS.items():
+        order = np.linalg.norm(ends[:, None] * mirror - ends, axis=2).argmin(axis=1)
+        read = joints.copy()
+        read[:, np.concatenate(legs)] = joints[:, np.concatenate([legs[i] for i in order])]
+        named = {source.joints[legs[0][0]]: columns[legs[order[0]][0]]}
+        what = f"'joint_positions.columns' of {which} legs are exchanged: {named} and so on"
+        yield pose(what, R_WB, p_WB, read, contacts(read))
+    signs = sorted(itertools.product([1, -1], repeat=len(legs[0])), key=lambda one: -sum(one))
+    factors = np.ones((len(signs), joints.shape[1]))
+    for leg in legs:
+        factors[:, leg] = signs
+    rests = np.array(
+        [pose("", R_WB, p_WB, read, contacts(read)).rest for read in factors[:, None] * joints]
+    )
+    best = np.argmax(rests <= rests.min(axis=0) + 0.001, axis=0)
+    for leg, i in zip(legs, best, strict=True):
+        factors[0, leg] = signs[i]
+    named = {columns[i]: -1 for i in np.flatnonzero(factors[0] < 0)}
+    read = factors[0] * joints
+    yield pose(f"'joint_positions.sign' is {named}", R_WB, p_WB, read, contacts(read))
 
 
 def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rotation, np.ndarray]]:
@@ -199,8 +345,10 @@ def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rot
     yield _INVERSE, R.inv(), p
     yield f"{_INVERSE}, and {text}", other.inv(), p
     yield "the whole pose is the inverse, of the world in the base", R.inv(), -R.inv().apply(p)
-    flip = Rotation.from_euler("x", 180, degrees=True)
-    yield "world and base have z downwards", flip * R * flip, flip.apply(p)
+    for up, angle in (("z downwards", 180), ("y upwards", 90)):
+        turn = Rotation.from_euler("x", angle, degrees=True)
+        yield f"world and base have {up}", turn * R * turn.inv(), turn.apply(p)
+        yield f"the world has {up}", turn * R, turn.apply(p)
     quarters = [one for one in Rotation.create_group("O") if one.magnitude() > 0]
     for turn in sorted(quarters, key=lambda one: np.count_nonzero(abs(one.as_rotvec()) > 1e-6)):
         what = f"'base_orientation' is of a sensor turned on the base by {_turn_text(turn)}"

@@ -46,7 +46,11 @@ class Source:
     def table(self, name: str) -> np.ndarray:
         """Returns a quantity's columns in the unit m or rad, per second, (N, n)."""
         part = getattr(self.log_map, name)
-        return si_units(part) * self.channels[name].frame[part.names(self.joints)].to_numpy()
+        values = self.channels[name].frame[columns := part.names(self.joints)].to_numpy()
+        factors, offsets = (
+            [of.get(one, by) for one in columns] for of, by in ((part.sign, 1), (part.offset, 0))
+        )
+        return si_units(part) * (factors * values + offsets)
 
     def at(self, name: str, at_s: np.ndarray) -> np.ndarray:
         """Returns a quantity's columns at times (M,) [s], linearly, (M, n)."""

@@ -37,6 +37,17 @@ def episodes_from_log(
     return cut_log(log, loop, desired_output=desired_output)[0]
 
 
+def require_loggable(loop: LeggedLoop) -> None:
+    """Raises ValueError if the controller has a memory, which no log has."""
+    if loop.memory_features:
+        raise ValueError(
+            f"scenario '{loop.scenario.name}' reads {sorted(loop.memory_features)}, its policy's "
+            "memory, which a log of positions and velocities does not have: 'adapt' has no logs of "
+            "such robots; for 'monitor' write what the policy observes and commands as sequences "
+            "of an .npz file"
+        )
+
+
 def cut_log(
     log: RobotLog | Sequence[RobotLog],
     loop: LeggedLoop | Scenario,
@@ -63,10 +74,11 @@ def cut_log(
 
     Raises:
         ValueError: A log is of another robot, has no z*, begins outside the safe set, or is
-            too short for one segment.
+            too short for one segment; or the loop's controller has a memory, which no log has.
     """
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")
+    require_loggable(loop)
     scenario, assessment = loop.scenario, loop.scenario.assessment
     shortest = assessment.preview_stride * mode_settings(assessment).shortest
     cutter = _Cutter(loop, desired_output, scenario.step_s, scenario.episode_duration_s, shortest)
@@ -96,16 +108,11 @@ def motions_from_log(
     """Converts logs to motions for a `ChangeDetector`, with their times in the log.
 
     Each lasts up to a minute, in the stance frame of its first row. The arguments and errors are
-    those of :func:`cut_log`; a log is also refused if the monitor reads the controller's memory.
-    Rows are `step_s` apart, by default the scenario's `monitor_step_s`.
+    those of :func:`cut_log`. Rows are `step_s` apart, by default the scenario's `monitor_step_s`.
     """
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")
-    if unlogged := set(loop.memory_features).intersection(loop.monitored.get("features", ())):
-        raise ValueError(
-            f"the monitor reads {sorted(unlogged)}, which a log of positions and velocities does "
-            "not have: write what the policy observes and commands as sequences of an .npz file"
-        )
+    require_loggable(loop)
     step_s = step_s or loop.scenario.monitor_step_s
     cutter = _Cutter(loop, desired_output, step_s, MOTION_PIECE_S, shortest=2)
     motions: list[Episode] = []

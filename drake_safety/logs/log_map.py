@@ -47,11 +47,19 @@ class LogTime:
 
 
 @schema(kw_only=True)
-class _Columns:
-    """Columns of one quantity."""
-
+class _Quantity:
     topic: str = ""
     """Topic of the messages; empty for a table."""
+    sign: dict[str, Literal[1, -1]] = field(default_factory=dict)
+    """Factor by column; 1 by default."""
+    offset: dict[str, float] = field(default_factory=dict)
+    """What is added then by column, in its unit; 0 by default."""
+
+
+@schema(kw_only=True)
+class _Columns(_Quantity):
+    """Columns of one quantity."""
+
     columns: list[str] = field(default_factory=list)
     """Columns, or fields of the messages such as ``pose.pose.position.x``."""
     multiple: ClassVar[int] = 3
@@ -102,10 +110,9 @@ class AngularVelocity(_Columns):
 
 
 @schema(kw_only=True)
-class Joints:
+class Joints(_Quantity):
     """Positions or velocities of all joints."""
 
-    topic: str = ""
     template: str = ""
     """Column of a joint, with ``{joint}`` in place of its name: ``q_{joint}``, or for messages with
     names (sensor_msgs/JointState) ``position[{joint}]``."""

@@ -87,7 +87,8 @@ def _recover(source: Path, target: Path, wanted: Wanted) -> float:
         writer.finish()
     for topic in filter(others.get, wanted):
         raise ValueError(
-            f"messages of topic '{topic}' are encoded as '{others[topic]}', expected ROS's 'cdr'"
+            f"log '{source}': messages of topic '{topic}' are encoded as '{others[topic]}', "
+            "expected ROS's 'cdr'"
         )
     return end / max(source.stat().st_size, 1)
 
@@ -173,7 +174,8 @@ def field_of(path: str) -> Callable[[Any], Any]:
     """Returns a function that reads a field of a message.
 
     A path is ``pose.pose.position.x``; ``position[3]``; or ``position[NAME]``, the entry with the
-    index of NAME in the sibling field ``name``, as in sensor_msgs/JointState.
+    index of NAME in the sibling field ``name``, as in sensor_msgs/JointState, or the entry with the
+    ``child_frame_id`` or ``name`` NAME, as in ``transforms[base]``.
     """
     if not path or "".join(match.group() for match in _STEP.finditer(path)) != path:
         raise ValueError(f"'{path}' is not a field path, such as pose.position.x or q[3]")
@@ -194,13 +196,23 @@ def field_of(path: str) -> Callable[[Any], Any]:
                 return math.nan  # Not filled in, as sensor_msgs/JointState allows.
             elif index.isdecimal():
                 value = value[int(index)]
-            elif index in (names := list(field(owner, "name"))):
+            elif index in (names := _names_of(owner, value)):
                 value = value[names.index(index)]
             else:
                 raise LookupError(f"no entry is named '{index}'; the names are {listed(names)}")
         return value
 
     return read
+
+
+def _names_of(owner: Any, entries: Any) -> list[str]:
+    """Names of a field's entries: their own, as of transforms, or those beside the field."""
+    for key in ("child_frame_id", "name"):
+        if all(hasattr(one, key) for one in entries):
+            return [str(getattr(one, key)).lstrip("/") for one in entries]
+    if not hasattr(owner, "name"):
+        raise LookupError(f"entries are selected by number, 0 to {len(entries) - 1}, or by name")
+    return list(owner.name)
 
 
 def _number(value: Any) -> Any:

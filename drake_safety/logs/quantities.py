@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -12,13 +13,33 @@ from drake_safety.learning.segments import LARGEST
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.log_map import COMMANDS, QUANTITIES, TIME_UNITS, VELOCITIES, LogMap, si_units
 
+RESTART_GAPS = 2.0
+"""Gap where time begins anew, relative to the longest one."""
 MIN_ROWS = 3
 """Least number of rows, for derivatives."""
 _INTERVALS_S = (1e-4, 0.5)  # Range of the median time between two rows.
 _SPARSE = 0.9  # Share of complete rows below which every quantity has rows of its own.
-_MANY_HOLDS, _REGULAR = 5, 0.9  # Least number of holds of a value, and share of equally long ones.
+_MANY_HELD, _REGULAR = 6, 0.9  # Least rows of whole holds of a value, and share of equal holds.
+_MANY_SAME, _MANY_RESTARTS = 0.4, 0.1  # Of the rows.
 _JUMPS = {"base_position": 0.1, "base_orientation": 0.1, "joint_positions": 0.3}
 """Least change from what is logged before an estimator starts [m, 1, rad]."""
+
+
+def continued(channel: Channel, max_gap_s: float) -> tuple[Channel, dict[str, float | int]]:
+    """Lets a time that begins anew, as in every episode of a data set, go on after a gap.
+
+    Returns also where it does, with the later time. A time that does so in many rows is unchanged.
+    """
+    step = np.diff(channel.time)
+    gap = step.dtype.type(RESTART_GAPS * max_gap_s * TIME_UNITS[channel.time_unit])
+    rows = np.flatnonzero(step < -max_gap_s * TIME_UNITS[channel.time_unit]) + 1
+    if not 0 < len(rows) <= _MANY_RESTARTS * len(step):
+        return channel, {}
+    shift = np.zeros_like(channel.time)
+    shift[rows] = gap - step[rows - 1]
+    time = channel.time + np.cumsum(shift)
+    places = [channel.where(row, channel.time_name) for row in rows.tolist()]
+    return replace(channel, time=time), dict(zip(places, time[rows].tolist(), strict=True))
 
 
 def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
@@ -28,7 +49,8 @@ def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
     as messages have that name some joints only.
 
     Raises:
-        ValueError: A time is not finite, or runs backwards by more than ``max_gap_s``.
+        ValueError: A time is not finite, runs backwards by more than ``max_gap_s``, or is that of
+            another row in most of the rows.
     """
     time, clock = channel.time, channel.time_name
     if (is_bad := ~np.isfinite(time)).any():
@@ -54,6 +76,12 @@ def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
     if num_lost:
         where = channel.where(int(np.argmax(pd.Index(time).duplicated())), clock)
         share = num_lost / len(time)
+        # Equal rows of one time are one measurement.
+        if (groups.nunique() - 1).clip(lower=0).sum().max() > _MANY_SAME * len(time):
+            raise ValueError(
+                f"{where}: {share:.1%} of the rows share a time with another row: its stamps have "
+                "too few digits, or are of another column"
+            )
         lost.append(f"{where}: time stands still in {share:.1%} of the rows: the first is kept")
     joined = channel.select(np.unique(time, return_index=True)[1])
     return replace(joined, frame=groups.first().set_axis(joined.frame.index)), lost
@@ -137,7 +165,7 @@ def _without_holds(channel: Channel) -> tuple[Channel, float]:
     values = np.nan_to_num(channel.frame.to_numpy())
     hold = np.append(0, np.diff(values, axis=0).any(axis=1).cumsum())
     holds = np.bincount(hold)[1:-1]  # Rows of each but the first and the last.
-    if len(holds) < _MANY_HOLDS:
+    if len(holds) < 2 or holds.sum() < _MANY_HELD:
         return channel, 1.0
     number = float(holds[holds < 3 * np.median(holds)].mean())
     is_regular = np.abs(holds - number) < max(1.0, number / 3)
@@ -171,12 +199,14 @@ def _held(command: Channel, base: Channel, max_gap_s: float) -> Channel:
 
 
 def cut(
-    channels: Mapping[str, Channel], max_gap_s: float
+    channels: Mapping[str, Channel],
+    max_gap_s: float,
+    is_plausible: Callable[[str, Channel], bool],
 ) -> tuple[list[dict[str, Channel]], list[str]]:
     """Cuts quantities where a value is missing or a gap in time is longer than ``max_gap_s``.
 
     Returns the channels of each piece in order of time, whose common time is covered by all without
-    a cut, and the reasons of the cuts.
+    a cut, and the reasons of the cuts. A unit of time is suggested if its motion is plausible.
 
     Raises:
         ValueError: A quantity has less than three rows, or rows that are implausibly far apart.
@@ -184,7 +214,7 @@ def cut(
     pieces: list[tuple[float, float, dict[str, Channel]]] = [(-math.inf, math.inf, {})]
     reasons: dict[str, None] = {}
     for name, channel in channels.items():
-        stretches, found = _unbroken(channel, max_gap_s)
+        stretches, found = _unbroken(channel, max_gap_s, partial(is_plausible, name))
         reasons |= dict.fromkeys(found)
         joined, i, k = [], 0, 0
         while i < len(pieces) and k < len(stretches):
@@ -197,7 +227,9 @@ def cut(
     return [piece for _, _, piece in pieces], list(reasons)
 
 
-def _unbroken(channel: Channel, max_gap_s: float) -> tuple[list[Channel], list[str]]:
+def _unbroken(
+    channel: Channel, max_gap_s: float, is_plausible: Callable[[Channel], bool]
+) -> tuple[list[Channel], list[str]]:
     """Stretches of rows without a missing value and without a gap, and what lies between them."""
     steps_s, clock = np.diff(channel.time_s), channel.time_name
     if len(channel.time) < MIN_ROWS:
@@ -210,9 +242,11 @@ def _unbroken(channel: Channel, max_gap_s: float) -> tuple[list[Channel], list[s
     if not low <= (usual_s := float(np.median(steps_s))) <= high:
         usual = usual_s * TIME_UNITS[channel.time_unit]
         likely = [unit for unit, n in TIME_UNITS.items() if low <= usual / n <= high]
+        likely = [one for one in likely if is_plausible(replace(channel, time_unit=one))]
         raise ValueError(
             f"{channel.where(0, clock)}: rows are {usual:g} apart, which as "
-            f"{channel.time_unit} is implausible; 'time.unit' may rather be one of {likely}"
+            f"{channel.time_unit} is implausible"
+            + (f"; 'time.unit' may rather be one of {likely}" if likely else "")
         )
     # A value that is missing, not finite or absurdly large is bad.
     bad = ~(channel.frame.abs() < LARGEST).to_numpy()

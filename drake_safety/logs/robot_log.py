@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 
@@ -12,12 +13,19 @@ from scipy.spatial.transform import Rotation
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.extras import require_extra
 from drake_safety.files.schema import check_times, load_typed
-from drake_safety.logs.channel import Wanted
-from drake_safety.logs.checks import check
+from drake_safety.logs.channel import Channel, Wanted
+from drake_safety.logs.checks import check, too_fast
 from drake_safety.logs.conversion import Source, common_span, rotations_at, values_at
-from drake_safety.logs.log_map import COMMANDS, QUANTITIES, Joints, LogMap, load_log_map
+from drake_safety.logs.log_map import COMMANDS, QUANTITIES, TIME_UNITS, Joints, LogMap, load_log_map
 from drake_safety.logs.messages import read_messages
-from drake_safety.logs.quantities import MIN_ROWS, cut, in_order, quantities
+from drake_safety.logs.quantities import (
+    MIN_ROWS,
+    RESTART_GAPS,
+    continued,
+    cut,
+    in_order,
+    quantities,
+)
 from drake_safety.logs.tables import read_csv, read_parquet
 from drake_safety.robots.robot_model import RobotModel
 
@@ -44,7 +52,7 @@ class RobotLog:
         v: Velocities: of the base in the world, angular first, then of the joints, (N, n_v).
         desired_output: z* in the world, (N, n_z) [m], or None.
         foot_positions: Desired foot positions, (N, 3 n_c) [m], or None.
-        piece: Number of this piece of a log that was cut, from 0.
+        piece: Number of this piece of a log that was cut, from 0, and again where time begins anew.
         begin_s: Time of the first row since the log's first row of any topic [s].
     """
 
@@ -78,12 +86,14 @@ class LogPieces:
 
     Attributes:
         duration_s: Duration of the whole log [s].
+        row_share: Share of its rows that have a time of their own.
         lost: What was cut or left out, and where.
         notes: What was resampled, or is a derivative, and where.
     """
 
     pieces: list[RobotLog]
     duration_s: float
+    row_share: float
     lost: list[str]
     notes: list[str]
 
@@ -94,8 +104,8 @@ class LogPieces:
 
     @property
     def kept_share(self) -> float:
-        """Share of the log's duration that was kept."""
-        return sum(piece.duration_s for piece in self.pieces) / self.duration_s
+        """Share of the log's rows that was kept, if they are evenly spaced."""
+        return self.row_share * sum(one.duration_s for one in self.pieces) / self.duration_s
 
 
 def read_pieces(
@@ -132,17 +142,26 @@ def read_pieces(
             "a ROS 2 bag"
         )
     topics, lost = _READERS[suffix](path, _wanted(log_map, kinematics), log_map.time)
+    restarts, row_share = dict[str, float | int](), 1.0
     for topic, channel in topics.items():
+        if len(topics) == 1:  # Else all topics would have to begin anew together.
+            channel, restarts = continued(channel, log_map.max_gap_s)
         topics[topic], unsorted = in_order(channel, log_map.max_gap_s)
         lost += unsorted
+        if unsorted:
+            row_share = min(row_share, len(topics[topic].time) / len(channel.time))
     origin = min((one.time[0] for one in topics.values() if len(one.time)), default=0)
     topics = {topic: replace(channel, origin=origin) for topic, channel in topics.items()}
     channels, log_map, notes = quantities(topics, log_map, joints)
-    found, reasons = cut(channels, log_map.max_gap_s)
-    lost += reasons
-    sources = [
-        Source(log_map=log_map, joints=joints, channels=part, step_s=step_s) for part in found
-    ]
+    read = partial(Source, log_map=log_map, joints=joints)
+
+    def is_plausible(name: str, channel: Channel) -> bool:
+        return not too_fast(read(channels={name: channel}), name, kinematics)
+
+    found, reasons = cut(channels, log_map.max_gap_s, is_plausible)
+    lost += [f"{where}: time begins anew, with another log" for where in restarts]
+    lost += [one for one in reasons if not one.startswith(tuple(restarts))]
+    sources = [read(channels=part, step_s=step_s) for part in found]
     sources = [source for source in sources if len(source.at_s) > 1]
     measured = {getattr(log_map, name).topic for name in channels if name not in COMMANDS}
     begin, end = common_span(topics[topic] for topic in measured)
@@ -155,7 +174,10 @@ def read_pieces(
             f"log '{path}' has no {MIN_ROWS} rows without a missing value or a gap between "
             f"them: {why}"
         )
-    check(sources, kinematics)
+    notes += check(sources, kinematics)
+    channel = next(iter(topics.values()))
+    begins = (np.array([*restarts.values()]) - origin) / TIME_UNITS[channel.time_unit]
+    logs = np.searchsorted(begins, [one.at_s[0] for one in sources], "right")
     pieces = [
         RobotLog(
             path=path,
@@ -163,13 +185,16 @@ def read_pieces(
             time_s=one.at_s - one.at_s[0],
             q=one.positions(one.at_s),
             v=one.velocities(one.at_s),
-            piece=i,
+            piece=i - int(np.searchsorted(logs, logs[i])),
             begin_s=float(one.at_s[0]),
             **{name: one.at(name, one.at_s) for name in COMMANDS if name in one.channels},
         )
         for i, one in enumerate(sources)
     ]
-    return LogPieces(pieces=pieces, duration_s=end - begin, lost=lost, notes=notes)
+    duration_s = end - begin - RESTART_GAPS * log_map.max_gap_s * len(restarts)
+    return LogPieces(
+        pieces=pieces, duration_s=duration_s, row_share=row_share, lost=lost, notes=notes
+    )
 
 
 def read_log(
@@ -217,6 +242,10 @@ def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> Wanted:
             raise ValueError(
                 f"map: 'foot_positions.columns' must be x, y, z of {kinematics.num_contacts} "
                 f"contact points of robot '{kinematics.robot.name}'; got {len(columns)} columns"
+            )
+        if others := [one for one in (*part.sign, *part.offset) if one not in columns]:
+            raise ValueError(
+                f"map: 'sign' and 'offset' of '{name}' are by column, of {columns}; got {others}"
             )
         if columns:
             wanted.setdefault(part.topic, []).extend(columns)

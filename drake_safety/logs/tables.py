@@ -71,18 +71,30 @@ def read_csv(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Chann
 def read_parquet(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Channel], list[str]]:
     """Reads columns of a Parquet file; of one that is cut off nothing can be read."""
     require_extra("logs", f"log '{path}'", "pyarrow")
+    import pandas as pd
     import pyarrow.parquet as pq
 
+    # A list's entries are columns.
+    roots, lists = {name.split("[")[0] for name in wanted.get("", ())}, dict[str, pd.Series]()
     with (
         reading(path, "damaged, cut off, or not a Parquet file: log", Exception),
         pq.ParquetFile(path, page_checksum_verification=True) as file,
     ):
-        existing = file.schema_arrow.names
-        places = _places(path, wanted, time, existing)
-        names = [existing[place] for place in places.values()]
-        check_memory(8 * file.metadata.num_rows * len(names), f"'{path}'")
-        table = file.read(columns=names).select(names).rename_columns([*places])
+        check_memory(8 * file.metadata.num_rows * len(wanted.get("", ())), f"'{path}'")
+        existing = list(file.schema_arrow.names)
+        for one in file.schema_arrow:
+            if one.name in roots and hasattr(one.type, "value_field"):
+                cells = file.read(columns=[one.name])[one.name].to_pylist()
+                entries = pd.DataFrame([cell or [] for cell in cells]).add_prefix(f"{one.name}[")
+                lists |= {f"{key}]": values for key, values in entries.items()}
+                existing.remove(one.name)
+        known = [*existing, *lists]
+        places = _places(path, wanted, time, known)
+        names = [known[place] for place in places.values()]
+        table = file.read(columns=[name for name in names if name in existing])
         frame = table.to_pandas(timestamp_as_object=False, ignore_metadata=True)
+        frame = frame.assign(**{name: lists[name] for name in names if name in lists})
+        frame = frame[names].set_axis([*places], axis=1)
         return {"": _channel(path, frame, time, "row")}, []
 
 
