@@ -130,8 +130,7 @@ class Balancing(LeggedLoop):
             hold=recovery_active,
         )
         if assessor is not None and recovery:
-            for name in ("safety_probability", "belief"):
-                builder.Connect(assessor.GetOutputPort(name), switch.GetInputPort(name))
+            assessor.connect_recovery(builder, switch)
         elif recovery:
             builder.ExportInput(switch.GetInputPort("safety_probability"), "safety_probability")
         builder.BuildInto(self)

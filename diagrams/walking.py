@@ -160,8 +160,7 @@ class Walking(LeggedLoop):
         if guard_system is not None and assessor is not None:
             builder.Connect(assessor.GetOutputPort("learned"), guard_system.GetInputPort("learned"))
         if trigger is not None and assessor is not None:
-            for name in ("safety_probability", "belief"):
-                builder.Connect(assessor.GetOutputPort(name), trigger.GetInputPort(name))
+            assessor.connect_recovery(builder, trigger)
         elif trigger is not None:
             builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
         # What the policy sees: its last actions, its phase and the command.

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_safety.cli.run import event_rows
+from drake_safety.cli.run import event_rows, reason_events
 from drake_safety.evaluation.timeline_figure import levels_figure
 from drake_safety.learning.change_detector import RECOVERED_LEVEL, RECOVERY_S, Alarm
 from drake_safety.simulation.motion import Motion
@@ -60,6 +60,41 @@ def test_the_events_of_a_run_have_begin_and_end_of_every_alarm():
     ]
     assert told[1][0][1] == "monitor: inputs frozen. The promise is withdrawn"
     assert told[2] == []
+    without = SimpleNamespace(calibrations_={})
+    of_other = event_rows([], Motion(time_s=time_s, ports=ports), without, "actual")
+    assert of_other[0][1] == "monitor: inputs frozen. Γ has not learned plant 'actual'"
+
+
+SAFE, UNSAFE, UNKNOWN = [0.7, 0.0, 0.3], [0.1, 0.6, 0.3], [0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("happens", "alarm", "belief", "without_alarm", "told"),
+    [
+        ("", 0, UNSAFE, UNSAFE, "probability 0.030 < 0.06; likely cause: height, -2.0 cm"),
+        ("", 0, UNKNOWN, UNKNOWN, "don't know: unlike training"),
+        ("", 1, UNKNOWN, SAFE, "don't know: monitor's alarm since 0.10 s"),
+        ("steps: ", 1, UNKNOWN, UNSAFE, "probability 0.030 < 0.06; likely cause: height, -2.0 cm"),
+        ("steps: ", 1, UNKNOWN, UNKNOWN, "don't know: unlike training"),
+        ("steps: ", 0, UNKNOWN, UNKNOWN, "don't know: unlike training"),
+    ],
+)
+def test_an_event_names_the_reason_of_a_low_probability(
+    happens, alarm, belief, without_alarm, told
+):
+    rows = {"belief": belief, "belief_without_alarm": without_alarm, "alarm": [alarm]}
+    rows |= {"safety_probability": [0.03], "probability_without_alarm": [0.03]}
+    rows |= {"cause_probability": [0.6], "predicted_margins": [-0.02]}
+    ports = {name: np.tile(np.asarray(row, dtype=float), (20, 1)) for name, row in rows.items()}
+    ports["alarm"][:5] = 0.0
+    parameters = SimpleNamespace(initial_uncertainty=0.3, margin_unit=1.0)
+    loop = SimpleNamespace(
+        constraint_names=["height"],
+        angular_constraints=(),
+        assessment=SimpleNamespace(parameters=parameters),
+    )
+    motion = Motion(time_s=0.02 * np.arange(20), ports=ports)
+    assert reason_events(loop, motion, [0.2], 0.06, happens) == [(0.2, happens + told)]
 
 
 def test_the_figure_has_the_largest_levels_the_limit_and_the_alarms():

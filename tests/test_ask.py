@@ -193,6 +193,14 @@ def test_an_answer_takes_none_of_the_packages_that_training_takes(folder):
     assert loaded & heavy == set()
 
 
+@pytest.mark.parametrize("target", [(), ("--target", "1", "0", "0"), ("--command", "1", "0", "0")])
+def test_a_task_without_targets_is_told_what_to_do_instead(call, target):
+    code, told = call("ask", "laikago_balancing", *target)
+    assert code == 2
+    assert "task 'Balancing' has no targets or commands to ask about" in told
+    assert "`drake-safety run laikago_balancing`" in told and "--push ball" in told
+
+
 def test_the_region_of_the_other_hand_is_the_mirrored_one(ask):
     assert ask("--target", NEAR[0], -NEAR[1], NEAR[2], "--hand", "right")[0] == 0
 

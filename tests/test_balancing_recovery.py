@@ -4,6 +4,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from balancing_loops import PACKAGED, packaged_loop, standing_loop, started
+from drake_safety import load_assessment, load_scenario
 from drake_safety.control.safe_sets import BalanceSafeSet
 from drake_safety.simulation.throws import run_throw
 
@@ -33,6 +34,25 @@ def test_a_low_probability_makes_the_robot_step_and_hand_over_again():
     assert np.all(clearance[active > 0].max(axis=0) > 0.01)  # Every foot swung.
     assert margins[-1].min() > 0
     assert clearance[-1].max() < 0.005
+
+
+def test_in_an_alarm_that_lasts_the_robot_steps_when_gamma_says_so_and_not_for_ever():
+    scenario, gamma = load_scenario("laikago_balancing"), load_assessment("laikago_balancing")
+    gamma.detector_ = replace(gamma.detector_, alarm_level=-1.0)
+    scenario.on_alarm = "unknown"
+    weak, strong = scenario.parameters.demonstration
+    loop = scenario.make_loop("nominal", assessment=gamma, ball=True)
+    log = run_throw(
+        loop,
+        0,
+        seed=7_000_000,
+        throws=[replace(weak, time_s=0.4), replace(strong, time_s=1.2)],
+        duration_s=1.5,
+        ports=["alarm", "belief"],
+    )
+    assert log["alarm"][5:].all() and (log["belief"][5:] == [0.0, 0.0, 1.0]).all()
+    ((start_s, _),) = log.recovery_intervals_s
+    assert 1.2 < start_s < 1.3
 
 
 def test_during_recovery_features_and_preview_tell_of_the_same_plan():

@@ -22,6 +22,9 @@ def running(assessment=None, without=(), **options):
     return assessment, Bench(evaluator, **given)
 
 
+OF = {"probability": "safety_", "belief": ""}
+
+
 def test_every_part_of_the_verdict_comes_out_at_its_own_port_and_before_it_nothing_is_known():
     _, bench = running()
     np.testing.assert_array_equal(bench.get("belief"), [0.0, 0.0, 1.0])
@@ -36,8 +39,23 @@ def test_every_part_of_the_verdict_comes_out_at_its_own_port_and_before_it_nothi
         "novelty": [NOVELTY],
         "fall_probability": [0.125],
     }
+    expected |= {f"{one}_without_alarm": expected[f"{of}{one}"] for one, of in OF.items()}
     for name, numbers in expected.items():
         np.testing.assert_allclose(bench.get(name), numbers)
+
+
+def test_an_alarm_takes_nothing_from_what_a_recovery_reads():
+    evaluator = BeliefEvaluator(AssessmentDouble(), period_s=PERIOD_S)
+    bench = Bench(evaluator, **INPUTS | {"alarm": np.ones(1)})
+    bench.begin()
+    assert bench.get("safety_probability") == [0.0]
+    np.testing.assert_array_equal(bench.get("belief"), [0.0, 0.0, 1.0])
+    assert bench.get("probability_without_alarm") == [0.25]
+    np.testing.assert_allclose(bench.get("belief_without_alarm"), [0.25, 0.65, 0.1])
+    bench = Bench(evaluator, **INPUTS | {"alarm": np.ones(1), "margins": np.array([0.1, -0.1])})
+    bench.begin()
+    assert bench.get("probability_without_alarm") == [0.0]
+    np.testing.assert_allclose(bench.get("belief_without_alarm"), [0.0, 0.9, 0.1])
 
 
 def test_the_assessment_is_asked_once_a_period_with_what_stands_at_the_ports():

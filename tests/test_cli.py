@@ -1,10 +1,13 @@
 """The command line: every command is listed, and what a user did wrong is one line."""
 
 import errno
+import inspect
 import math
 import os
+import re
 import subprocess
 import sys
+from importlib import import_module
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +15,7 @@ import typer
 
 import drake_safety
 from command_line import call
+from drake_safety.assessments import assessed_scenarios
 from drake_safety.cli import main, make_app
 from drake_safety.cli.run import parse_pushes
 from drake_safety.cli.training_folder import MODES, assessment_file, load_assessment
@@ -56,10 +60,20 @@ def test_only_the_module_of_the_called_command_is_imported():
 
 def test_a_table_of_scenarios_and_the_version_are_printed(monkeypatch, capsys):
     assert call(monkeypatch, "scenarios") in (0, None)
-    assert "nominal, actual" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "nominal, actual" in printed
+    rows = dict(re.findall(r"│ (\w+) +│ (yes|no) ", printed))
+    assert {name for name, trained in rows.items() if trained == "yes"} == {*assessed_scenarios()}
+    assert rows["pendulum"] == "no"
     assert call(monkeypatch, "--version") in (0, None)
     printed = capsys.readouterr().out
     assert printed.startswith(f"drake-safety {drake_safety.__version__}, drake ")
+
+
+@pytest.mark.parametrize("command", ["run", "play"])
+def test_what_is_shown_runs_by_default_on_the_plant_that_was_learned(command):
+    function = getattr(import_module(f"drake_safety.cli.{command}"), command)
+    assert inspect.signature(function).parameters["variation"].default == "nominal"
 
 
 SCENE, MISSING = "laikago_balancing", "error there is no folder 'x': run"

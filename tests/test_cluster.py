@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import joblib
 import pytest
 
 from cart_episodes import assert_identical
@@ -14,6 +15,7 @@ from command_line import call
 from drake_safety import load_scenario, run_episodes
 from drake_safety.simulation import cluster, worker_processes
 from drake_safety.simulation.cluster import connected
+from drake_safety.simulation.worker_processes import map_items
 from gliding_task import gliding
 
 NUM_EPISODES, PATIENCE_S = 120, 60.0
@@ -67,6 +69,13 @@ def two_workers(tmp_path):
             for worker in workers:
                 worker.terminate()
                 worker.wait(PATIENCE_S)
+
+
+@pytest.mark.parametrize("backend", ["threading", "multiprocessing"])
+def test_a_backend_that_is_no_cluster_is_not_called_one(backend):
+    name = rf"joblib's {backend.capitalize()}Backend has its own number of workers; got 2"
+    with joblib.parallel_config(backend), pytest.raises(ValueError, match=name):
+        next(map_items(abs, [1, 2], num_workers=2, batch_size=1))
 
 
 @pytest.mark.train

@@ -138,7 +138,7 @@ HERE, ALL = "127.0.0.1", "0.0.0.0"
 )
 def test_only_requests_of_its_own_page_are_answered(host, asked, origin, is_answered):
     pytest.importorskip("nicegui")
-    from drake_safety.live.page import _OwnRequests
+    from drake_safety.live.page import _only_own
 
     reached, sent = [], []
 
@@ -148,7 +148,7 @@ def test_only_requests_of_its_own_page_are_answered(host, asked, origin, is_answ
     async def send(message):
         sent.append(message)
 
-    own = _OwnRequests(application, host, ["Robot.example"])
+    own = _only_own(application, host, ["Robot.example"])
     headers = {"host": asked} | ({} if origin is None else {"origin": origin})
     raw = [(name.encode(), value.encode()) for name, value in headers.items()]
     for kind in ("http", "websocket", "lifespan"):

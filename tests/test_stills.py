@@ -56,6 +56,21 @@ def test_a_still_is_an_rgb_image_with_the_dark_robot_in_the_middle_of_a_light_sc
     assert not is_dark[[0, -1]].any() and not is_dark[:, [0, -1]].any()
 
 
+@pytest.mark.parametrize(
+    ("turned", "height_m"),
+    [([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0], 0.12), ([0.0, 1.0, 0.0, 0.0], 0.1)],
+)
+def test_a_robot_that_fell_is_in_the_picture(loop, standing, turned, height_m):
+    fallen = standing.copy()
+    start = loop.plant.GetBodyByName(loop.robot.base).floating_positions_start()
+    fallen[start : start + 4], fallen[start + 4 : start + 7] = turned, [1.0, 2.0, height_m]
+    log, time_s = np.array([standing, fallen]), np.arange(2.0)
+    for _, image in render_stills(loop, time_s, log, time_s, **SIZE):
+        is_dark = image.max(axis=-1) < 90
+        assert 0.01 < is_dark.mean()
+        assert not is_dark[[0, -1]].any() and not is_dark[:, [0, -1]].any()
+
+
 def test_the_camera_follows_the_base_over_the_ground_but_not_up(loop, camera, standing):
     reference = camera.render(standing).astype(int)
     base = loop.robot.base

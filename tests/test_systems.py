@@ -47,6 +47,7 @@ SEEN = f"state {N_S}, desired_preview {N_P}, features {N_F}"
 PLAN = "desired_output 3, desired_preview 12, desired_outlook 9"
 ALARM = f"alarm 1, levels {N_S}, alarm_cause -"
 BELIEF = "safety_probability 1, belief 3, embedding 2, novelty 1, fall_probability 1, "
+BELIEF += "probability_without_alarm 1, belief_without_alarm 3, "
 BELIEF += "cause_probability {0}, predicted_margins {0}, learned -"
 # Ports with their sizes; `?`: may be left open; `<`: of these inputs, or of all of them, at once.
 CASES = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from drake_safety.evaluation.figure_style import BALL_COLOUR, RECOVERY_COLOUR
+from drake_safety.evaluation.figure_style import BALL_COLOUR, RECOVERY_COLOUR, UNSAFE_COLOUR
 from drake_safety.evaluation.timeline_figure import timeline_figure
 from drake_safety.plants.pushes import Push
 
@@ -109,6 +109,15 @@ def test_the_timeline_marks_a_push_for_as_long_as_it_lasts_and_the_leaving(run):
     labels = {text.get_text() for text in fig.axes[2].texts}
     assert {"push of 500 N for 0.1 s", "alarm", "leaves the safe set"} <= labels
     assert "trigger" not in labels
+
+
+def test_the_timeline_marks_alarms_of_the_monitor_for_as_long_as_they_last(run):
+    fig = timeline_figure(**run, alarm_intervals_s=[(0.5, 0.9), (1.7, 1.98)])
+    axes = fig.axes[2]
+    spans = [one for one in axes.patches if to_hex(one.get_facecolor()) == UNSAFE_COLOUR]
+    ends = [(one.get_x(), one.get_x() + one.get_width()) for one in spans]
+    assert ends == [pytest.approx((0.5, 0.9)), pytest.approx((1.7, 1.98))]
+    assert [text.get_text() for text in axes.texts].count("monitor's alarm") == 2
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from drake_safety.cli.training_folder import MODES
 from drake_safety.files.reading import did_you_mean, is_number
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
-from drake_safety.simulation.capabilities import HasGoals, goal_words, require
+from drake_safety.simulation.capabilities import HasBall, HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 _SEARCH_SEED = 0  # Fixed, so that results are reproducible.
@@ -39,10 +39,16 @@ def ask(
     Prints belief and verdict; for a refusal also the likely cause and the nearest accepted target.
     Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
     """
-    if target is None:
-        raise ValueError("ask: pass --target, or for a walking robot --command")
     loaded, folder, gamma = folders.open_assessment(scenario, assessment, mode, is_told=not as_json)
     loop = loaded.make_loop(assessment=gamma, **console.given(hand=hand, command_s=duration))
+    if not isinstance(loop, HasGoals):
+        balls = ", and throws balls with --push ball" if isinstance(loop, HasBall) else ""
+        raise ValueError(
+            f"ask: task '{type(loop).__name__}' has no targets or commands to ask about; "
+            f"`drake-safety run {scenario}` shows what Γ says during its motion{balls}"
+        )
+    if target is None:
+        raise ValueError("ask: pass --target, or for a walking robot --command")
     goal, rule = parse_target(loop, target), folders.goal_threshold(folder.path, gamma)
     verdict, nearest = judge_target(loop, goal, rule)
     if as_json:

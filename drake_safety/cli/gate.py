@@ -39,6 +39,7 @@ from drake_safety.evaluation.tables import Column
 from drake_safety.files.atomic import write_file
 from drake_safety.files.reading import parse_yaml
 from drake_safety.learning.seeds import GATE, RATE
+from drake_safety.live.following_camera import follow
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import load_scenario
 
@@ -223,9 +224,10 @@ def _record(first: Loop, others: Mapping[str, Loop], index: int, seed: int, file
     panels = [_PANELS]
     for side, (name, loop) in enumerate({"baseline": first, **others}.items()):
         viewer = console.open_recorder()
-        viewer.StartRecording()
         diagram = make_paired((first, loop), min(side, 1), meshcat=viewer)
-        episode = run_episode(diagram, index, seed=seed, after_leaving_s=math.inf)
+        viewer.StartRecording()
+        camera = follow(diagram, viewer)
+        episode = run_episode(diagram, index, seed=seed, after_leaving_s=math.inf, monitor=camera)
         viewer.StopRecording()
         viewer.PublishRecording()
         cause = spoken(episode.cause)

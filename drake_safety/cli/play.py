@@ -24,7 +24,7 @@ def play(
     scenario: console.ScenarioArgument,
     assessment: console.AssessmentOption = None,
     hand: console.HandOption = None,
-    variation: console.VariationOption = "actual",
+    variation: console.VariationOption = "nominal",
     recovery: console.RecoveryOption = None,
     seed: Annotated[int, Option(help="Seed of start and noise.")] = DEMONSTRATION.first,
     mode: console.ModeOption = MODES[0],

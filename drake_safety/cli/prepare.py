@@ -8,6 +8,7 @@ from typing import Annotated
 from rich.text import Text
 from typer import Argument, Exit, Option
 
+from drake_safety.assessments import assessed_scenarios
 from drake_safety.cli import console
 from drake_safety.control.policy_template import survey_policy
 from drake_safety.evaluation.figure_style import save
@@ -23,18 +24,21 @@ from drake_safety.simulation.scenario_check import check_scenario
 def scenarios() -> None:
     """List the scenarios that come with the package."""
     rows: list[tuple[str, ...]] = []
+    trained = assessed_scenarios()
     for name in scenario_names():
+        is_trained = "yes" if name in trained else "no"
         try:
             scenario = load_scenario(name)
             scenario.task_class().model_files(scenario)
         except MissingExtraError as error:
-            rows.append((name, *3 * ["–"], f"needs {error.needs}"))
+            rows.append((name, is_trained, *3 * ["–"], f"needs {error.needs}"))
             continue
         horizon = f"{scenario.assessment.horizon * scenario.preview_step_s:g} s"
         task, plants = scenario.task.rpartition(":")[2], ", ".join(scenario.variations)
-        rows.append((name, task, scenario.robot, horizon, plants))
-    columns = ("scenario", "task", "robot", "horizon", "plants")
+        rows.append((name, is_trained, task, scenario.robot, horizon, plants))
+    columns = ("scenario", "trained", "task", "robot", "horizon", "plants")
     console.show(console.new_table(*columns, rows=rows))
+    console.say("trained: an assessment comes with the package; `train` learns that of any other")
 
 
 def new(

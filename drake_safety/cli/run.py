@@ -30,7 +30,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.causes import cause_words, likely_cause
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import DEMONSTRATION
-from drake_safety.live.following_camera import FollowingCamera
+from drake_safety.live.following_camera import follow
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import CanBePushed, HasBall, HasGoals, goal_words, require
@@ -54,6 +54,8 @@ _HAPPENING = {
     "controller_status": "the policy returns no finite action: the last one is held",
 }
 """Ports that a loop may have, and what it means when they become positive."""
+_GAMMA = ("safety_probability", "belief", "cause_probability", "predicted_margins")
+_WITHOUT_ALARM = ("probability_without_alarm", "belief_without_alarm")  # What recovery heeds.
 _COLUMNS = ("time [s]", "event", "probability")  # Of events.
 # Keys of a ball on the command line, and fields of a throw.
 _THROW_FIELDS = {field.name.partition("_")[0]: field.name for field in fields(Throw)}
@@ -76,7 +78,7 @@ def run(
             "[s, kg, m/s, degrees from x]."
         ),
     ] = None,
-    variation: console.VariationOption = "actual",
+    variation: console.VariationOption = "nominal",
     recovery: console.RecoveryOption = None,
     duration: Annotated[
         float | None,
@@ -134,11 +136,9 @@ def run(
     if meshcat:
         console.say(f"live at {viewer.web_url()}")
         input("Press Enter when the browser shows the robot. ")
-    if isinstance(loop, LeggedLoop):
-        FollowingCamera(loop, viewer).begin(loop.CreateDefaultContext())
     viewer.StartRecording()
-    rate = 1.0 if meshcat else 0.0
-    shown = simulated(loop, duration_s=duration or duration_s, seed=seed, realtime_rate=rate)
+    options = {"seed": seed, "realtime_rate": float(meshcat), "monitor": follow(loop, viewer)}
+    shown = simulated(loop, duration_s=duration or duration_s, **options)
     console.warn_of_empty_scene(viewer, loaded.task)
     _save(folder, viewer, loop, shown)
 
@@ -178,8 +178,13 @@ def _go(
     instants = [motion.leave_time_s, motion.fall_time_s]
     events: _Events = [(0.0, f"{words.subject} starts")]
     for port, happens in _HAPPENING.items():
-        if port in motion.ports and (motion[port] > 0).any():
-            events.append((float(motion.time_s[np.argmax(motion[port][:, 0] > 0)]), happens))
+        if port not in motion.ports or not (motion[port] > 0).any():
+            continue
+        time_s = float(motion.time_s[np.argmax(motion[port][:, 0] > 0)])
+        events.append((time_s, happens))
+        if port == "recovery_active":
+            limit = loop.scenario.parameters.recovery.threshold
+            events[-1:] = reason_events(loop, motion, [time_s], limit, f"{happens}: ")
     if push is not None:
         timeline["pushes"] = [push]
         instants += [push.time_s, push.time_s + push.duration_s + _AFTER_PUSH_S]
@@ -206,7 +211,8 @@ def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
     for throw in throws:
         flight = f"{throw.speed_m_s:g} m/s towards {np.degrees(throw.direction_rad):.0f}°"
         events.append((throw.time_s, f"ball of {throw.mass_kg:g} kg at {flight}"))
-    events += _expected(loop, motion, triggers, "recovery triggered") + _end(motion, "standing")
+    told = "recovery triggered: "
+    events += reason_events(loop, motion, triggers, threshold, told) + _end(motion, "standing")
     instants = [throw.time_s + after_s for throw in throws for after_s in _AROUND_IMPACT_S]
     instants += [trigger_s + _AFTER_TRIGGER_S for trigger_s in triggers[:1]]
     marked = {"start": 0.0} | {f"ball {i}": one.time_s for i, one in enumerate(throws, start=1)}
@@ -240,7 +246,7 @@ def _move(loop: ClosedLoop, rule: folders.GoalThreshold, *, seed: int, **options
 
 def _outcome(loop: Any, motion: Motion, alarms_s: list[float], threshold: float) -> _Events:
     """The alarms of a motion, and where it leaves the safe set."""
-    events = _expected(loop, motion, alarms_s, f"probability below {threshold:.3f}")
+    events = reason_events(loop, motion, alarms_s, threshold)
     if motion.has_left:
         events.append((motion.leave_time_s, f"left the safe set: {motion.cause}"))
     return events
@@ -252,28 +258,36 @@ def _end(motion: Motion, standing: str) -> _Events:
     return [fall if motion.has_fallen else (float(motion.time_s[-1]), standing)]
 
 
-def _expected(loop: Any, motion: Motion, times_s: list[float], happens: str) -> _Events:
-    """What happens at given times, with the constraint most likely to be violated then."""
+def reason_events(
+    loop: Any, motion: Motion, times_s: list[float], threshold: float, happens: str = ""
+) -> _Events:
+    """Why Γ was low at given times: "don't know" and its reason, or a cause.
+
+    What happens then, a recovery, heeds no alarm.
+    """
     names, parameters = loop.constraint_names, loop.assessment.parameters
+    probability, belief = map(motion.__getitem__, _WITHOUT_ALARM if happens else _GAMMA[:2])
     events = []
     for time_s in times_s:
         row = int(np.abs(motion.time_s - time_s).argmin())
-        margins = motion["predicted_margins"][row]
-        mass, unit = motion["cause_probability"][row], parameters.margin_unit
-        told = "unknown cause"
-        if cause := likely_cause(names, mass, margins, unit):
+        margins, unit = motion["predicted_margins"][row], parameters.margin_unit
+        alarms_s = [begin for begin, end in motion.intervals_s("alarm") if begin <= time_s <= end]
+        told = f"probability {probability[row, 0]:.3f} < {threshold:.3g}"
+        if is_unknown(belief[row], parameters.initial_uncertainty):
+            told = "don't know: unlike training"
+            if alarms_s and not happens:
+                told = f"don't know: monitor's alarm since {alarms_s[0]:.2f} s"
+        elif cause := likely_cause(names, motion["cause_probability"][row], margins, unit):
             margin = margins[names.index(cause)]
-            is_known = not is_unknown(motion["belief"][row], parameters.initial_uncertainty)
-            words = cause_words(cause, margin, loop.angular_constraints, is_known=is_known)
-            told = ": ".join(words)
-        events.append((time_s, f"{happens}; {told}"))
+            told += "; " + ": ".join(cause_words(cause, margin, loop.angular_constraints))
+        events.append((time_s, happens + told))
     return events
 
 
 def _logged_ports(loop: ClosedLoop) -> tuple[str, ...]:
     """The ports of Γ and, if the loop has them, of the monitor and of what happens."""
-    of_gamma = ("safety_probability", "belief", "cause_probability", "predicted_margins")
-    return (*of_gamma, *filter(loop.HasOutputPort, ("alarm", "alarm_cause", *_HAPPENING)))
+    some = filter(loop.HasOutputPort, ("alarm", "alarm_cause", *_HAPPENING))
+    return (*_GAMMA, *_WITHOUT_ALARM, *some)
 
 
 def _times_below(motion: Motion, threshold: float) -> list[float]:
@@ -312,6 +326,7 @@ def _timeline(loop: Any, shown: _Shown) -> Figure:
         shown.threshold,
         leave_time_s=motion.leave_time_s,
         recovery_intervals_s=motion.recovery_intervals_s,
+        alarm_intervals_s=motion.intervals_s("alarm"),
         belief=motion["belief"],
         margins=motion["margins"],
         constraint_names=loop.constraint_names,
@@ -321,13 +336,18 @@ def _timeline(loop: Any, shown: _Shown) -> Figure:
 
 
 def event_rows(
-    events: _Events, motion: Motion, gamma: SafetyAssessment
+    events: _Events, motion: Motion, gamma: SafetyAssessment, other_plant: str = ""
 ) -> list[tuple[str, str, str]]:
-    """Rows of events and of the monitor's alarms: time [s], words, and the probability then."""
+    """Rows of events and of the monitor's alarms: time [s], words, and the probability then.
+
+    Alarms on a plant that is not the one of training say so.
+    """
     time_s, probability = motion.time_s, motion["safety_probability"][:, 0]
-    is_on = motion.ports.get("alarm", np.zeros((len(time_s), 1)))[:, 0] > 0.5
     withdrawn = ". The promise is withdrawn" if gamma.calibrations_ else ""
+    if other_plant:
+        withdrawn += f". Γ has not learned plant '{other_plant}'"
     alarms = []
+    is_on = motion.ports.get("alarm", np.zeros((len(time_s), 1)))[:, 0] > 0.5
     for k in np.flatnonzero(np.diff(is_on, prepend=False)).tolist():
         told = f"{motion['alarm_cause'][k]}{withdrawn}" if is_on[k] else "the alarm ends"
         alarms.append((float(time_s[k]), f"monitor: {told}"))
@@ -344,7 +364,8 @@ def _save(folder: Path, viewer: Meshcat, loop: Any, shown: _Shown) -> None:
     viewer.PublishRecording()
     recording = folder / "recording.html"
     write_file(recording, viewer.StaticHtml())
-    rows = event_rows(shown.events, motion, loop.assessment)
+    other_plant = loop.variation if loop.variation != loop.assessment.info_.variation else ""
+    rows = event_rows(shown.events, motion, loop.assessment, other_plant)
     content = console.made_by(loop.scenario.name) | {"columns": _COLUMNS, "rows": rows}
     write_file(folder / "run.json", json.dumps(content, indent=2, ensure_ascii=False) + "\n")
     console.show(console.new_table(*_COLUMNS, rows=rows))

@@ -43,8 +43,8 @@ class StillCamera:
     """A camera that looks at a closed loop's robot from a fixed direction and follows its base.
 
     Args:
-        positions: Positions of the plant from which distance and lights are set, such as the first
-            of a log, (n_q,).
+        positions: Positions of the plant, (n_q,) or (N, n_q). The camera aims by the first of
+            them, and from where it stands the robot is in view in all.
         width: Width of the stills [pixels].
         height: Their height [pixels].
     """
@@ -57,19 +57,26 @@ class StillCamera:
         self._base = plant.GetBodyByName(loop.robot.base, self._instance)
         self.context = loop.CreateDefaultContext()  # The root Context that is rendered.
         self._plant_context = plant.GetMyMutableContextFromRoot(self.context)
-        self._pose(positions)
-
-        centre, radius = self._extent()
+        first, *others = np.atleast_2d(positions)
+        self._pose(first)
+        corners = self._corners()
+        centre = 0.5 * (corners.min(axis=1) + corners.max(axis=1))
+        radius = float(np.linalg.norm(corners - centre[:, None], axis=0).max())
         base = self._base.EvalPoseInWorld(self._plant_context).translation()
         # Only the horizontal motion of the base is followed, so that a fall remains visible.
         self._look_at_height = centre[2]
         self._offset = (centre - base)[:2]
+        farthest = radius
+        for one in others:
+            self._pose(one)
+            reach = np.linalg.norm(self._corners() - self._target()[:, None], axis=0).max()
+            farthest = max(farthest, float(reach))
         narrow = 0.5 * _FIELD_OF_VIEW_RAD * min(1.0, width / height)
-        self._eye = view.room * radius / math.sin(narrow) * view.direction()
+        self._eye = view.room * farthest / math.sin(narrow) * view.direction()
         core = RenderCameraCore(
             _RENDERER,
             CameraInfo(width * SUPERSAMPLING, height * SUPERSAMPLING, _FIELD_OF_VIEW_RAD),
-            ClippingRange(0.05, 30.0 * max(radius, 1.0)),
+            ClippingRange(0.05, 30.0 * max(farthest, 1.0)),
             RigidTransform(),
         )
         self._camera = ColorRenderCamera(core)
@@ -81,8 +88,7 @@ class StillCamera:
     def render(self, positions: np.ndarray) -> np.ndarray:
         """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8."""
         self._pose(positions)
-        base = self._base.EvalPoseInWorld(self._plant_context).translation()
-        target = np.append(base[:2] + self._offset, self._look_at_height)
+        target = self._target()
         query = self._plant.get_geometry_query_input_port().Eval(self._plant_context)
         self._X_WC = _look_at(target + self._eye, target)
         image = query.RenderColorImage(self._camera, self._world, self._X_WC)
@@ -90,6 +96,11 @@ class StillCamera:
         rows, columns = pixels.shape[0] // SUPERSAMPLING, pixels.shape[1] // SUPERSAMPLING
         blocks = pixels.reshape(rows, SUPERSAMPLING, columns, SUPERSAMPLING, 3)
         return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+    def _target(self) -> np.ndarray:
+        """Point of the world that the camera aims at, (3,)."""
+        base = self._base.EvalPoseInWorld(self._plant_context).translation()
+        return np.append(base[:2] + self._offset, self._look_at_height)
 
     def _pose(self, positions: np.ndarray) -> None:
         if not np.isfinite(positions).all():
@@ -120,8 +131,8 @@ class StillCamera:
         found = {i: one.source() for i, one in shapes if isinstance(one, Mesh)}
         return {i: str(one.path()) for i, one in found.items() if one.extension().endswith(suffix)}
 
-    def _extent(self) -> tuple[np.ndarray, float]:
-        """Centre of the visible geometry of the robot in the world (3,) and its radius [m]."""
+    def _corners(self) -> np.ndarray:
+        """Corners of boxes around the visible geometry of the robot in the world, (3, N) [m]."""
         plant, context = self._plant, self._plant_context
         query = plant.get_geometry_query_input_port().Eval(context)
         inspector = query.inspector()
@@ -139,9 +150,7 @@ class StillCamera:
                     corners.append(X_WB.multiply(signs * np.reshape(box.half_width(), (3, 1))))
         if not corners:
             raise ValueError("stills: the robot has no visible geometry")
-        points = np.hstack(corners)
-        centre = 0.5 * (points.min(axis=1) + points.max(axis=1))
-        return centre, float(np.linalg.norm(points - centre[:, None], axis=0).max())
+        return np.hstack(corners)
 
 
 def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -187,8 +196,9 @@ def render_stills(
 
     ``time_s`` (N,) increases; ``positions`` (N, n_q) are all positions of the loop's plant.
     """
-    camera = StillCamera(loop, positions[0], width=width, height=height)
     rows = _nearest_rows(time_s, still_times_s)
+    shown = np.array([positions[row] for row in (0, *rows)])
+    camera = StillCamera(loop, shown, width=width, height=height)
     return [(float(time_s[row]), camera.render(positions[row])) for row in rows]
 
 

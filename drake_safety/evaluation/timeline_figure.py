@@ -63,6 +63,7 @@ def timeline_figure(
     trigger_label: str = "trigger",
     leave_time_s: float = math.inf,
     recovery_intervals_s: Sequence[tuple[float, float]] = (),
+    alarm_intervals_s: Sequence[tuple[float, float]] = (),
     stills: Sequence[tuple[float, np.ndarray]] = (),
     belief: np.ndarray | None = None,
     margins: np.ndarray | None = None,
@@ -79,6 +80,7 @@ def timeline_figure(
         trigger_times_s: Times of triggers or alarms [s].
         leave_time_s: Time at which the robot leaves the safe set [s]; infinite for never.
         recovery_intervals_s: (start, end) of each recovery [s].
+        alarm_intervals_s: (start, end) of each alarm of the monitor [s].
         stills: (time [s], RGB image (height, width, 3)), each joined to its instant on the curve.
         belief: Masses (safe, unsafe, unknown), (N, 3); drawn stacked below.
         margins: Signed margins [m, rad], (N, n_c); drawn at the bottom.
@@ -113,6 +115,8 @@ def timeline_figure(
         events.append(_Event(leave_time_s, "leaves the safe set", style.INK, _LEAVING))
     for start, _ in recovery_intervals_s:
         events.append(_Event(start, "recovery", style.RECOVERY_COLOUR))
+    for start, _ in alarm_intervals_s:
+        events.append(_Event(start, "monitor's alarm", style.UNSAFE_COLOUR))
     heights = [_CURVE_HEIGHT + _place_names(events, time_s[0], time_s[-1])]
     if belief is not None:
         heights.append(_BELIEF_HEIGHT)
@@ -137,6 +141,8 @@ def timeline_figure(
                     panel.axvline(event.time_s, color=event.colour, **event.line)
         for start, end in recovery_intervals_s:
             _span(curve_axes, start, end, style.RECOVERY_COLOUR, 0.14)
+        for start, end in alarm_intervals_s:
+            _span(curve_axes, start, end, style.UNSAFE_COLOUR, 0.14)
         for instant in trigger_times_s:
             mark: _Style = {"color": style.UNSAFE_COLOUR, "markersize": 8, "zorder": 5}
             curve_axes.plot(instant, threshold, "v", **mark)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from pydrake.geometry import Meshcat, Rgba
 from pydrake.math import RigidTransform
@@ -15,7 +17,7 @@ WORLD = "/drake"
 _OWN = ("/Grid", "/Axes")  # Meshcat's own, which are hidden.
 _GROUND, _GRID = f"{WORLD}/visualizer/ground", f"{WORLD}/grid"
 _DISTANCE = 1.55  # From the camera to the robot, by the robot's size.
-_FOLLOWED = 0.2  # Share of the way to the robot by which the camera follows in a tick.
+_TICK_S, _FOLLOWED = 0.04, 0.2  # The camera goes this share of the way to the robot in a tick.
 _CELL_M, _NUM_CELLS = 0.5, 7  # Of the grid: size, and number from its middle.
 
 
@@ -29,7 +31,7 @@ class FollowingCamera:
     def __init__(self, loop: LeggedLoop, meshcat: Meshcat):
         self.meshcat = meshcat
         self._state_port = loop.GetOutputPort("plant_state")
-        self._target = np.zeros(2)
+        self._target, self._time_s = np.zeros(2), 0.0
         q = loop.kinematics.standing_positions()
         contacts = loop.kinematics.contact_positions(q)
         self.size_m = float(max(2 * q[6], *np.ptp(contacts, axis=0)))
@@ -41,17 +43,20 @@ class FollowingCamera:
 
     def begin(self, context: Context) -> None:
         """Aims at the robot in a Context of the loop."""
-        self._target = self._base(context)
+        self._target, self._time_s = self._base(context), context.get_time()
         self.follow(context)
 
     def follow(self, context: Context) -> None:
         """Moves the world so that the robot stays in the picture, from wherever a viewer looks."""
-        self._target = self._target + _FOLLOWED * (self._base(context) - self._target)
-        self.meshcat.SetTransform(WORLD, RigidTransform([*-self._target, -self._height_m]))
+        elapsed_s, self._time_s = context.get_time() - self._time_s, context.get_time()
+        share = 1.0 - (1.0 - _FOLLOWED) ** (elapsed_s / _TICK_S)
+        self._target = self._target + share * (self._base(context) - self._target)
         # The ground has no end: its disc and whole cells of its grid stay below the robot.
         cells = _CELL_M * np.round(self._target / _CELL_M)
-        self.meshcat.SetTransform(_GROUND, RigidTransform([*self._target, 0.0]))
-        self.meshcat.SetTransform(_GRID, RigidTransform([*cells, 0.0]))
+        poses = {WORLD: [*-self._target, -self._height_m]}
+        poses |= {_GROUND: [*self._target, 0.0], _GRID: [*cells, 0.0]}
+        for path, place in poses.items():
+            self.meshcat.SetTransform(path, RigidTransform(place), self._time_s)
 
     def _base(self, context: Context) -> np.ndarray:
         return self._state_port.Eval(context)[4:6]
@@ -68,3 +73,12 @@ class FollowingCamera:
         self.meshcat.SetLineSegments(
             _GRID, _CELL_M * starts, _CELL_M * ends, 1.0, Rgba(0.65, 0.67, 0.7)
         )
+
+
+def follow(loop: object, meshcat: Meshcat) -> Callable[[Context], None] | None:
+    """Aims at a robot on legs; returns what makes the camera follow it, called with a Context."""
+    if not isinstance(loop, LeggedLoop):
+        return None
+    camera = FollowingCamera(loop, meshcat)
+    camera.begin(loop.CreateDefaultContext())
+    return camera.follow

@@ -24,6 +24,7 @@ _PERIOD_S = 0.1  # Between updates of a page.
 _SCENE = "/scene"  # Path of the scene on the page's server.
 _FAREWELL_S = 1.0  # From the end of a session to that of its page, so that the page shows it.
 _WITHIN_S = 20.0  # For the server to start, and to stop.
+_NAMED = (b"host", b"origin")  # Headers: the server that is asked, and the page that asks.
 _Message = MutableMapping[str, Any]  # Of ASGI, the interface of servers and applications.
 _Application = Callable[[_Message, Any, Any], Awaitable[None]]
 _BELIEF = {"safe": "safe", "unsafe": "unsafe", "unknown": "don't know"}
@@ -45,7 +46,7 @@ def serve_page(
     Raises:
         ValueError: The server does not start.
     """
-    app.add_middleware(_OwnRequests, host=host, names=names)
+    app.add_middleware(_only_own, host=host, names=names)
     app.mount(_SCENE, _forward(scene_url))
     options: dict[str, Any] = {
         "root": lambda: build_page(panel),
@@ -76,37 +77,34 @@ def serve_page(
         thread.join(_WITHIN_S)
 
 
-class _OwnRequests:
+def _only_own(application: _Application, host: str, names: Collection[str]) -> _Application:
     """Answers requests that name this server, and of pages only those of its own.
 
     A page elsewhere may reach it by a name that it resolves to this machine (DNS rebinding), and
     websockets have no rule of the same origin.
     """
+    known = {"127.0.0.1", "::1", *map(str.lower, ("localhost", host, *names))}
+    # At all addresses of this machine, which cannot be forged as names can.
+    if is_for_all := host in ("0.0.0.0", "::"):
+        known.add(socket.gethostname().lower())
 
-    def __init__(self, application: _Application, host: str, names: Collection[str]) -> None:
-        self._application = application
-        self._names = {host, "localhost", "127.0.0.1", "::1", *(name.lower() for name in names)}
-        # Served at all addresses of this machine, which cannot be forged as names can.
-        self._is_for_all = host in ("0.0.0.0", "::")
+    def is_own(headers: dict[bytes, bytes]) -> bool:
+        asked, origin = (headers.get(one, b"").decode("latin-1").lower() for one in _NAMED)
+        with contextlib.suppress(ValueError):
+            name = urlsplit(f"//{asked}").hostname or ""
+            if name in known or (is_for_all and ip_address(name)):
+                return urlsplit(origin or f"//{asked}").netloc == asked
+        return False
 
-    async def __call__(self, scope: _Message, receive: Any, send: Any) -> None:
-        if scope["type"] not in ("http", "websocket") or self._is_own(dict(scope["headers"])):
-            await self._application(scope, receive, send)
+    async def answer(scope: _Message, receive: Any, send: Any) -> None:
+        if scope["type"] not in ("http", "websocket") or is_own(dict(scope["headers"])):
+            await application(scope, receive, send)
         elif scope["type"] == "http":
             await _answer(send, 403, b"not served to other hosts or pages")
         else:
             await send({"type": "websocket.close"})  # Before it was accepted: 403.
 
-    def _is_own(self, headers: dict[bytes, bytes]) -> bool:
-        host = headers.get(b"host", b"").decode("latin-1").lower()
-        origin = headers.get(b"origin", b"").decode("latin-1").lower() or f"//{host}"
-        with contextlib.suppress(ValueError):
-            name = urlsplit(f"//{host}").hostname or ""
-            own = name in self._names
-            if not own and self._is_for_all:
-                own = name == socket.gethostname().lower() or bool(ip_address(name))
-            return own and urlsplit(origin).netloc == host
-        return False
+    return answer
 
 
 def _forward(url: str) -> _Application:

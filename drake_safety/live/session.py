@@ -185,7 +185,10 @@ class LiveSession:
                 self._camera.follow(self.context)
             status = self._status()
             if self._is_on("alarm"):
-                notes = filter(None, [status.note, f"monitor: {self._eval('alarm_cause')}"])
+                told = f"monitor: {self._eval('alarm_cause')}"
+                if self.loop.variation != self.assessment.info_.variation:
+                    told += f" (Γ has not learned plant '{self.loop.variation}')"
+                notes = filter(None, [status.note, told])
                 status = replace(status, note="; ".join(notes))
             self.panel.status = status
         return self._num_waits == 0

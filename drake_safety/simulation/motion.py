@@ -72,8 +72,12 @@ class Motion:
 
     @property
     def recovery_intervals_s(self) -> list[tuple[float, float]]:
-        """First and last time of each recovery [s]; one still active at the end ends there."""
-        active = self.ports.get("recovery_active", np.zeros((len(self.time_s), 1)))[:, 0]
+        """First and last time of each recovery [s]; see :meth:`intervals_s`."""
+        return self.intervals_s("recovery_active")
+
+    def intervals_s(self, port: str) -> list[tuple[float, float]]:
+        """First and last times at which a port was 1 [s]; what lasts to the end ends there."""
+        active = self.ports.get(port, np.zeros((len(self.time_s), 1)))[:, 0]
         is_first, is_last = np.diff(active, prepend=0.0) > 0, np.diff(active, append=0.0) < 0
         pairs = zip(self.time_s[is_first].tolist(), self.time_s[is_last].tolist(), strict=True)
         return list(pairs)

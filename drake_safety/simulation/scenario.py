@@ -59,8 +59,8 @@ class Scenario:
     control_period_s: Positive = 0.01
     """Period of the controller and of the safety monitor [s]."""
     on_alarm: OnAlarm = "unknown"
-    """What an alarm of the monitor does: ``unknown`` makes every belief "don't know", so that the
-    robot recovers or refuses plans; ``report`` only reports it."""
+    """What an alarm of the monitor does: ``unknown`` makes every belief "don't know", so that
+    plans are refused; ``report`` only reports it. Recovery heeds no alarm."""
     variations: dict[str, PlantVariation] = field(default_factory=dict)
     """Plants by name; training episodes are those of ``nominal``."""
     assessment: AssessmentParameters = field(default_factory=AssessmentParameters)

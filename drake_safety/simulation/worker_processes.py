@@ -64,7 +64,7 @@ def map_items(
 
     Raises:
         ChildProcessError: A worker was killed.
-        ValueError: A number of processes is given, but another backend has its own, or a worker has
+        ValueError: A number of processes is given, but the backend has its own, or a worker has
             other versions of Python, Drake, NumPy or this package.
     """
     pending = list(items)
@@ -90,11 +90,13 @@ def _map_batches(
     from joblib.externals.loky.process_executor import BrokenProcessPool
     from joblib.parallel import get_active_backend
 
-    is_local = type(get_active_backend()[0]).__name__ in _LOCAL_BACKENDS
+    backend = type(get_active_backend()[0]).__name__
+    is_local = backend in _LOCAL_BACKENDS
     if not is_local and num_workers is not None:
+        who = "a cluster" if backend.startswith("Dask") else f"joblib's {backend}"
         raise ValueError(
-            f"a cluster has its own number of workers; got {num_workers}: leave out num_workers, "
-            "on the command line --workers"
+            f"{who} has its own number of workers; got {num_workers}: leave out num_workers, on "
+            "the command line --workers"
         )
     num_workers = num_workers or joblib.cpu_count()
     if is_local and (num_workers == 1 or len(batches) <= 1):

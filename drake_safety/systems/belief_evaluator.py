@@ -38,6 +38,8 @@ class BeliefEvaluator(LeafSystem):
         - embedding: 2
         - predicted_margins: n_c
         - novelty: 1
+        - probability_without_alarm: 1
+        - belief_without_alarm: 3
         - fall_probability: 1
         - learned: abstract
 
@@ -54,9 +56,10 @@ class BeliefEvaluator(LeafSystem):
     belief is safe: its mass for "safe" counts as unsafe by the first constraint that is not finite,
     else the most violated one. The beliefs of the grid, the correction and the novelty are
     parameters of the Context: :meth:`adopt` replaces them by those of an adapted assessment,
-    between simulations and during them. ``learned`` has all three, with empty beliefs during an
-    alarm, for a :class:`~drake_safety.systems.command_guard.CommandGuard`. The embedding is
-    immutable.
+    between simulations and during them. ``probability_without_alarm`` and ``belief_without_alarm``
+    are what they are without an alarm, for a recovery. ``learned`` has all three, with empty
+    beliefs during an alarm, for a :class:`~drake_safety.systems.command_guard.CommandGuard`. The
+    embedding is immutable.
 
     Args:
         period_s: Time between two evaluations [s].
@@ -100,10 +103,12 @@ class BeliefEvaluator(LeafSystem):
             "embedding": 2,
             "predicted_margins": n_c,
             "novelty": 1,
+            "probability_without_alarm": 1,
+            "belief_without_alarm": 3,
             "fall_probability": 1,
         }
         first = np.concatenate(
-            [EMPTY if name == "belief" else np.zeros(size) for name, size in sizes.items()]
+            [EMPTY if "belief" in name else np.zeros(size) for name, size in sizes.items()]
         )
         first[-1] = np.nan  # The probability of a fall.
         state = self._state = self.DeclareDiscreteState(first)
@@ -157,27 +162,31 @@ class BeliefEvaluator(LeafSystem):
     def _is_alarmed(self, context: Context) -> bool:
         return self._alarm_port is not None and is_on(self._alarm_port.Eval(context)[0])
 
-    def _present(self, context: Context) -> dict[str, Any]:
-        """Arguments of a prediction; during an alarm all beliefs are empty."""
+    def _beliefs_now(self, context: Context) -> dict[str, Any]:
+        """What has been learned, as arguments of a prediction."""
         correction, novelty = context.get_abstract_parameter(self._learned).get_value()
         beliefs = self.get_beliefs(context)
-        if self._is_alarmed(context):
-            beliefs = empty(self._shape[:-1], self._shape[-1] - 3)
         return {"beliefs": beliefs, "correction": correction, "novelty": novelty}
+
+    def _present(self, context: Context) -> dict[str, Any]:
+        """The same; during an alarm all beliefs are empty."""
+        none = {"beliefs": empty(self._shape[:-1], self._shape[-1] - 3)}
+        return self._beliefs_now(context) | (none if self._is_alarmed(context) else {})
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         prediction = self._assessment.predict_one(
             self._state_port.Eval(context),
             self._preview_port.Eval(context),
             self._features_port.Eval(context) if self.reads_features else None,
-            **self._present(context),
+            **self._beliefs_now(context),
         )
-        if self._is_alarmed(context):
-            prediction = prediction.unknown()
-        elif self._margins_port is not None:
+        if self._margins_port is not None:
             margins = self._margins_port.Eval(context)
             if is_outside(margins):
                 prediction = prediction.outside(violated(margins))
+        without_alarm = prediction
+        if self._is_alarmed(context):
+            prediction = prediction.unknown()
         # In the order of the ports.
         discrete_state.set_value(
             self._state,
@@ -189,6 +198,8 @@ class BeliefEvaluator(LeafSystem):
                     prediction.embedding,
                     prediction.predicted_margins,
                     (min(prediction.novelty, _LARGEST_NOVELTY),),
+                    (without_alarm.probability,),
+                    without_alarm.belief,
                     (prediction.fall_probability,),
                 ]
             ),

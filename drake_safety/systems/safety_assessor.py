@@ -38,6 +38,8 @@ class SafetyAssessor(Diagram):
         - embedding: 2
         - predicted_margins: n_c
         - novelty: 1
+        - probability_without_alarm: 1
+        - belief_without_alarm: 3
         - fall_probability: 1
         - learned: abstract
         - alarm: 1
@@ -96,6 +98,16 @@ class SafetyAssessor(Diagram):
                 port = system.get_output_port(i)
                 builder.ExportOutput(port, port.get_name())
         builder.BuildInto(self)
+
+    def connect_recovery(self, builder: DiagramBuilder, recovery: System) -> None:
+        """Connects a `RecoveryTrigger` or `RecoverySwitch`, which heeds no alarm of the monitor.
+
+        An alarm says that Γ cannot be relied on, not that the robot falls: while it lasts, recovery
+        steps by what Γ says all the same, neither for ever nor never.
+        """
+        for of_recovery, own in {"safety_probability": "probability", "belief": "belief"}.items():
+            port = self.GetOutputPort(f"{own}_without_alarm")
+            builder.Connect(port, recovery.GetInputPort(of_recovery))
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
         """Takes over what an assessment adapted from this system's own has learned.
