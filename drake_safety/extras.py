@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from importlib.util import find_spec
 
 MODULES = {
@@ -28,8 +29,7 @@ class MissingExtraError(ValueError):
     """
 
     def __init__(self, message: str, needs: str, options: str = ""):
-        quoted = f"'{needs}'" if "[" in needs else needs
-        super().__init__(f"{message}: pip install {options}{quoted}")
+        super().__init__(f"{message}: pip install {options}{shlex.quote(needs)}")
         self.needs = needs
 
 

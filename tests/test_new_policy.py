@@ -122,7 +122,7 @@ def test_metadata_of_a_network_are_not_asked_for(tmp_path):
     )
     network = PolicyNetwork(tmp_path / "p.onnx", lambda batch: batch, (45, 2), metadata)
     text, asked = PolicyTemplate(network=network).yaml(["a", "b", "c"], {})
-    assert [what.partition(":")[2].split()[1] for what in asked] == ["time", "terms"]
+    assert [what.partition(":")[2].split()[1] for what in asked] == ["limit", "time", "terms"]
     assert "45 entries" in text
     stated = yaml.safe_load(text)
     assert stated["command"] == {"lowest": [-0.5, -0.3, -1.0], "highest": [1.0, 0.3, 1.0]}
@@ -180,3 +180,47 @@ def test_new_refuses_a_policy_before_it_writes_anything(tmp_path):
     assert result.exit_code != 0
     with pytest.raises(ValueError, match=r"is neither a deploy\.yaml"):
         survey_policy(tmp_path / "odd.yaml")
+
+
+def test_more_joints_named_than_moved_are_observed_and_the_moved_ones_asked_for(tmp_path):
+    said = {"joint_names": "a,b,c", "observation_names": "joint_pos,actions"}
+    network = PolicyNetwork(
+        tmp_path / "p.onnx", list, (5, 2), read_metadata(said), outputs=["actions", "velocity"]
+    )
+    text, asked = PolicyTemplate(network=network).yaml(["a", "b", "c", "d"], {})
+    assert "# joints: [a, b, c]  # ASK the 2 joints that it moves" in text
+    assert "# action_clip: 1.0  # ASK the limit of actions in training" in text
+    stated = load_typed(PolicyParameters, yaml.safe_load(text), "policy")
+    assert [term.joints for term in stated.observation] == [["a", "b", "c"], []]
+    assert any("['actions', 'velocity']: the first is the action" in one for one in asked)
+
+
+@pytest.mark.train
+def test_a_policy_that_reads_its_observation_wrongly_is_told_about_its_policy(tmp_path):
+    network = save_network(tmp_path / "walk.pt", 42, 18, scale=-0.0005)
+    out, _ = new(tmp_path, network)
+    stated = {
+        "network": network.name,
+        "joints": LEGS,
+        "default_positions": yaml.safe_load((out / "robot.yaml").read_text())["posture"],
+        "action_scale": {".*": 0.25},
+        "gains": {".*": {"stiffness": 200.0, "damping": 4.0}},
+        "observation": [{"name": name} for name in TERMS],
+    }
+    (out / "policy.yaml").write_text(yaml.safe_dump(stated))
+    found = {one.item: one for one in check_scenario(out / "walking.yaml", num_episodes=0)}
+    assert f"{network.name} is TorchScript: code of its author" in found["network"].message
+    assert list(found).index("network") < list(found).index("diagram")
+    walks = found["walks for 2 s at half the command"]
+    assert not walks.is_ok and "it leaves the safe set at" in walks.message
+    assert "order of 'joints' and of the terms" in walks.remedy
+    assert not any("joint_gains" in one.remedy for one in found.values())
+
+
+def test_new_says_what_a_network_is_before_it_is_loaded(tmp_path):
+    (tmp_path / "p.pt").write_bytes(b"")
+    said = []
+    with pytest.raises(ValueError, match="not a TorchScript network"):
+        survey_policy(tmp_path / "p.pt", announce=said.append)
+    (text,) = said
+    assert text.endswith("p.pt is TorchScript: code of its author, which runs here")

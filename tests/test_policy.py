@@ -2,7 +2,12 @@
 
 import math
 import re
+import signal
+import threading
+import zipfile
+from contextlib import suppress
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -24,10 +29,16 @@ from drake_safety.control.policy_network import (
     load_network,
     network_files,
     read_metadata,
+    waited,
 )
 from drake_safety.extras import MissingExtraError
 from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern
-from policy_networks import save_network, save_onnx
+from policy_networks import save_network, save_onnx, save_script
+
+try:
+    import torch
+except ImportError:
+    torch = None
 
 JOINTS = ["hip", "knee", "tail"]  # The robot's; the policy moves two, in another order.
 TERMS = ["base_ang_vel", "projected_gravity", "velocity_commands", "joint_pos_rel", "last_action"]
@@ -360,3 +371,138 @@ def test_a_network_whose_actions_are_not_finite_is_refused(evaluate):
     network = PolicyNetwork(None, evaluate, (9, 2))
     with pytest.raises(ValueError, match=r"p: the network returns [12] of 2 actions that are not"):
         network.check("p", 9, 2, "terms")
+
+
+def test_ctrl_c_ends_the_wait_for_a_network_that_loops_for_ever():
+    is_over = threading.Event()
+
+    def evaluate(batch, parts):
+        for _ in range(50):  # As native code, it does not end by a signal.
+            with suppress(KeyboardInterrupt):
+                is_over.wait(0.1)
+        return batch[:, :2], {}
+
+    main = threading.main_thread().ident
+    threading.Timer(0.2, lambda: signal.pthread_kill(main, signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt), mock.patch("atexit.register"):
+        waited(PolicyNetwork(None, evaluate, (9, 2)).check, "p", 9, 2, "terms")
+    is_over.set()
+
+
+@pytest.mark.train
+def test_a_term_has_the_joints_that_it_names_also_those_that_are_not_moved(tmp_path):
+    observed = terms("joint_pos_rel", "joint_vel_rel", joints=["tail", "hip"])
+    made = policy(tmp_path, network=str(saved(tmp_path, 4)), observation=observed)
+    found = made.observe(see(made), np.full(4, np.nan))
+    np.testing.assert_allclose(found, [2.0, 0.1, 8.0, 6.0])
+    assert see(made).all_positions[2] == 2.0
+    with pytest.raises(ValueError, match=r"'joint_pos_rel' has joints \['ear'\] .* has \['hip'"):
+        policy(tmp_path, observation=terms("joint_pos_rel", joints=["ear"]))
+
+
+@pytest.mark.train
+def test_joints_that_a_network_names_but_does_not_move_are_asked_for(tmp_path):
+    network = save_onnx(tmp_path / "p.onnx", 8, 2, metadata={"joint_names": "hip,knee,tail"})
+    with pytest.raises(ValueError, match="'joints' in the network's order, 2 that it moves; the"):
+        policy(tmp_path, network=str(network), joints=[], observation=terms("joint_pos_rel"))
+
+
+class Last(torch.nn.Module if torch else object):
+    def forward(self, x):
+        return x[:, -1, :2]
+
+
+@pytest.mark.train
+@pytest.mark.parametrize(
+    ("shape", "width"),
+    [
+        ([1, 5, 9], 45),
+        (["batch", 5, 9], 45),
+        (["batch", "time", 9], None),
+        ([5, 1, 9], 45),
+        ([45], 45),
+        ("script", None),
+    ],
+)
+def test_a_history_may_be_an_axis_of_its_own(tmp_path, shape, width):
+    if shape == "script":
+        path = save_script(tmp_path / "p.pt", Last())
+    else:
+        path = save_onnx(tmp_path / "p.onnx", 45, 2, shape=shape)
+    network = load_network(path)
+    assert network.widths[0] == width
+    network.check("p", 45, 2, "terms", 5)
+    action, _ = network(np.arange(45.0), network.initial_memory)
+    assert action.shape == (2,)
+    if shape == "script":
+        np.testing.assert_array_equal(action, [36.0, 37.0])
+    with pytest.raises(ValueError, match="44"):
+        load_network(path).check("p", 44, 2, "terms", 5)
+
+
+class Two(torch.nn.Module if torch else object):
+    def __init__(self, is_lost=False):
+        super().__init__()
+        self.net, self.is_lost = torch.nn.Linear(9, 2), is_lost
+
+    def forward(self, x):
+        first = self.net(x)
+        if self.is_lost:
+            first = first + torch.zeros([1], device=torch.device("cuda:0"))
+        return first, x[:, :3]
+
+
+@pytest.mark.train
+def test_two_outputs_and_double_precision_are_taken_and_the_reason_of_others_is_told(tmp_path):
+    network = load_network(save_script(tmp_path / "p.pt", Two().double()))
+    network.check("p", 9, 2, "terms")
+    assert network.outputs == ["[1, 2]", "[1, 3]"]
+    action, _ = network(np.full(9, 1 / 3), np.zeros(0))
+    assert np.any(action != action.astype(np.float32))  # In double precision.
+    with pytest.raises(
+        ValueError, match=r"returns 2 actions, .*'\[1, 3\]'\], the first the action"
+    ):
+        network.check("p", 9, 3, "terms")
+    lost = load_network(save_script(tmp_path / "q.pt", Two(is_lost=True)))
+    with pytest.raises(ValueError, match=r"\): \w+Error: .*export it on the CPU$"):
+        lost.check("p", 9, 2, "terms")
+
+
+def written(*keys):
+    """A dictionary of ones, as Python would write it."""
+    items = (b"X" + len(key).to_bytes(4, "little") + key.encode() + b"K\x01s" for key in keys)
+    return b"\x80\x02}" + b"".join(items) + b"."
+
+
+CHECKPOINT = ("model_state_dict", "actor.0.weight", "iter")
+
+
+@pytest.mark.train
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.pt", CHECKPOINT, r"checkpoint \(model_state_dict, .* iter"),
+        (
+            "a.pt",
+            CHECKPOINT[1:2],
+            r"checkpoint \(actor\.0\.weight\): export the policy as TorchScript",
+        ),
+        ("a.onnx", CHECKPOINT, "not an ONNX network, but a training checkpoint"),
+        ("a.pth", ("optimizer",), r"got '\.pth', but a training checkpoint"),
+        ("a.pt", written("iter"), r"training checkpoint \(iter\)"),
+        ("a.pkl", written(), "but a Python pickle: export"),
+        ("a.onnx", b"<!DOCTYPE html><html>", "but a web page: download the file itself"),
+        ("a.pt", b"\n <html>", "not a TorchScript network, but a web page"),
+        ("a.onnx", b"version https://git-lfs.github.com/spec/v1\noid x", "pointer of git-lfs"),
+        ("a.safetensors", b"\x40" + bytes(7) + b"{}", r"but weights alone \(safetensors\)"),
+        ("a.pt", b"\x08\x08\x12\x07pytorch", r"like an ONNX network: name it \.onnx"),
+    ],
+)
+def test_a_file_that_is_something_else_is_called_that(tmp_path, name, content, message):
+    if isinstance(content, bytes):
+        (tmp_path / name).write_bytes(content)
+    else:
+        with zipfile.ZipFile(tmp_path / name, "w") as archive:
+            archive.writestr("model/data.pkl", written(*content))
+    with pytest.raises(ValueError, match=message):
+        load_network(tmp_path / name)

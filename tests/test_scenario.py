@@ -7,9 +7,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import yaml
 
 import drake_safety
 import gliding_task
+from command_line import invoked
 from drake_safety import load_scenario
 from drake_safety.cli.training_folder import check_fresh
 from drake_safety.models import load_robot
@@ -395,3 +397,26 @@ def test_a_strangers_scenario_is_checked_without_running_its_code(tmp_path, monk
     code = next(f for f in check_scenario("pendulum", num_episodes=0) if f.item == "code")
     assert "drake_safety.diagrams.pendulum:Pendulum" in code.message
     assert code.message.endswith("pendulum.py")
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "seen"),
+    [
+        ("name", "\x1b[2J\nOK  ready", "␛[2J\n    OK  ready"),
+        ("name", "b\u202eyb", "b\ufffdyb"),
+        ("requires", "x; rm -rf ~", "must be a package"),
+        ("requires", "x --index-url http://a", "must be a package"),
+        ("requires", "$(id)", "must be a package"),
+    ],
+)
+def test_texts_of_strangers_print_nothing_but_themselves(tmp_path, key, text, seen):
+    robot = {"name": "r", "urdf": "package://not-there/r.urdf", "base": "base"} | {key: text}
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(robot))
+    file = tmp_path / "s.yaml"
+    stated = {"task": "stranger:Task", "robot": "robot.yaml", "variations": {"nominal": {}}}
+    file.write_text(yaml.safe_dump(stated))
+    result = invoked("check", file, "--no-import")
+    assert seen in result.output
+    for sign in "\x1b\r\u202e":
+        assert sign not in result.output
+    assert "pip install" not in result.output

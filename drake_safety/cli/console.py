@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shlex
 import socket
 import sys
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 from typer import Argument, Option
 
 from drake_safety.files import progress
@@ -74,8 +76,30 @@ ClusterOption = Annotated[
 LOOPBACK = "127.0.0.1"
 """Address that only this machine reaches."""
 
+_UNSEEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
+
+
+def seen(text: str) -> str:
+    """A text without characters that move the cursor or hide others: ESC is ␛."""
+    return _UNSEEN.sub(lambda one: chr(0x2400 + ord(one[0])) if one[0] < " " else "\ufffd", text)
+
+
+class _Console(Console):
+    """A console on which texts of files print nothing but themselves."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Prints texts, and tables of :func:`new_table`."""
+        for one in objects:
+            if isinstance(one, Text):
+                one.plain = seen(one.plain)
+        plain = (
+            seen(f"{one}") if isinstance(one, (str, Path, Exception)) else one for one in objects
+        )
+        super().print(*plain, **options)
+
+
 # Square brackets are units here, not markup. Output to a file has no width of its own.
-console = Console(markup=False, width=None if sys.stdout.isatty() else 120)
+console = _Console(markup=False, width=None if sys.stdout.isatty() else 120)
 show = console.print
 say = partial(console.print, highlight=False, soft_wrap=True)
 """Prints words or a path without line breaks, so that they can be copied."""
@@ -85,7 +109,7 @@ open_stages = partial(progress.open_stages, console)
 
 def new_table(*columns: str, rows: Iterable[Iterable[str]] = (), title: str | None = None) -> Table:
     """A table whose cells fold if they do not fit, columns of single words (names) last."""
-    table, cells = Table(title=title), [[*row] for row in rows]
+    table, cells = Table(title=title), [[*map(seen, row)] for row in rows]
     for name, *column in zip(columns, *cells, strict=True):
         table.add_column(name, overflow="fold", no_wrap=not any(" " in one for one in column))
     for row in cells:

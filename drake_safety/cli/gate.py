@@ -20,6 +20,7 @@ from typer import Argument, Exit, Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
+from drake_safety.control.policy_network import network_kinds
 from drake_safety.evaluation.failure_rate import estimate_failure_rate
 from drake_safety.evaluation.figure_style import save, spoken
 from drake_safety.evaluation.gate_figure import gate_figure
@@ -207,6 +208,8 @@ def changed_loop(scenario: str, changes: str) -> Loop:
         values[key] = str(path.resolve()) if path.is_file() else parse_yaml(value, f"'{text}'")
     loaded = load_scenario(scenario, values)
     loaded.variation(variation)  # There is one.
+    for text in network_kinds(loaded.task_class().model_files(loaded)):
+        console.say(text)
     return Loop(loaded, variation)
 
 

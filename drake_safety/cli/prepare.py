@@ -78,7 +78,7 @@ def new(
             f"policy {policy}"
         )
     # Before anything is written.
-    template = None if policy is None else survey_policy(policy, _names(motors))
+    template = None if policy is None else survey_policy(policy, _names(motors), console.say)
     moved = () if template is None else template.joints or None
     limbs = {"feet": _names(feet) or None, "hands": _names(hands) or None}
     written = write_robot(name, model, task, out or Path(name), **limbs, moved=moved)
@@ -153,9 +153,13 @@ def check(
             word = ("problem", "red")
             if finding.is_ok:
                 word = ("warning", "bold yellow") if finding.is_warning else ("OK     ", "green")
-            text = Text.assemble(word, f"  {finding.item}: {finding.message}")
-            if finding.remedy:
-                text.append(f"\n         fix: {finding.remedy}")
+            # A line of a file cannot look like a finding.
+            message, remedy = (
+                one.replace("\n", "\n    ") for one in (finding.message, finding.remedy)
+            )
+            text = Text.assemble(word, f"  {finding.item}: {message}")
+            if remedy:
+                text.append(f"\n         fix: {remedy}")
             console.say(text)
     if picture is not None:
         loop = load_scenario(scenario).make_loop()
@@ -169,7 +173,10 @@ def check(
         console.say(f"{num_problems} problem{'s' * (num_problems > 1)}", style="red")
         raise Exit(1)
     if not import_:
-        console.say("its files are right; its code was not run")
+        console.say(
+            "its files are right; not checked, as its code was not run: parameters, policy and "
+            "network, diagram, standing, episodes"
+        )
         return
     if not num_episodes:
         console.say(

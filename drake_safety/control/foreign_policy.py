@@ -69,7 +69,10 @@ def converted_policy(path: Path, motors: Sequence[str] = ()) -> dict[str, Any]:
                 f"its keys are {list(raw) or content}"
             )
         count = len(found["default_positions"])
-        names = found["joints"] or load_network(Path(found["network"])).metadata.joints
+        network = Path(found["network"])
+        names = found["joints"]
+        if not names and network.suffix == ".onnx":  # Others have no metadata.
+            names = load_network(network).metadata.joints
         if len(names) != count:
             raise ValueError(
                 f"'{path}' has {count} joints; got {len(names)} names: {names}. A deploy.yaml "

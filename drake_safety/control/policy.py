@@ -12,12 +12,13 @@ from pydrake.math import RotationMatrix
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.observation import quaternion_of
-from drake_safety.control.policy_network import PolicyNetwork, load_network
+from drake_safety.control.policy_network import PolicyNetwork, load_network, waited
 from drake_safety.files.schema import (
     Count,
     NotNegative,
     Pattern,
     Positive,
+    Requirement,
     Triple,
     load_typed_file,
     schema,
@@ -41,6 +42,8 @@ class PolicyInput:
         command: (v_x, v_y, ω_z), (3,) [m/s, rad/s].
         action: The last action, (n_a,).
         phases: Phases of the gait clock, in [-π, π], (n_p,) [rad].
+        all_positions: As ``positions``, of all joints of the robot in its order, (n_j,) [rad].
+        all_rates: Their rates, (n_j,) [rad/s].
     """
 
     R_WB: np.ndarray
@@ -51,6 +54,8 @@ class PolicyInput:
     command: np.ndarray
     action: np.ndarray
     phases: np.ndarray
+    all_positions: np.ndarray
+    all_rates: np.ndarray
 
 
 Term = Callable[[PolicyInput], np.ndarray]
@@ -103,6 +108,8 @@ class ObservationTerm:
     """Largest absolute value after scaling."""
     history: Count = 1
     """Number of samples, the oldest first."""
+    joints: list[str] = field(default_factory=list)
+    """Joints whose positions or rates it has, in its order; by default those that are moved."""
 
 
 @schema(kw_only=True)
@@ -158,7 +165,7 @@ class PolicyParameters:
 
     network: str = ""
     """ONNX or TorchScript file: ``package://…`` or a path relative to the YAML file."""
-    requires: str = ""
+    requires: Requirement = ""
     """Requirement by which pip installs the network's package without its dependencies."""
     joints: list[str] = field(default_factory=list)
     """Joints in the network's order; by default those of the network's metadata."""
@@ -213,7 +220,9 @@ class Policy:
         who = f"policy '{parameters.network}' for robot '{robot}'"
         self.network: PolicyNetwork = load_network(network_file(parameters, folder))
         metadata = self.network.metadata
-        names = parameters.joints or metadata.joints
+        names, (width, num_moved) = parameters.joints or metadata.joints, self.network.widths
+        if not parameters.joints and num_moved not in (None, len(names)):
+            names = []  # Some are observed, and not moved.
         unknown = [name for name in names if name not in joint_names]
         if unknown or len(set(names)) != len(names):
             raise ValueError(
@@ -243,7 +252,8 @@ class Policy:
         self.gains: dict[str, JointGains] = servos | by_joint("gains", names)
         missing = []
         if not names:
-            missing.append(f"'joints' in the network's order; the robot has {joint_names}")
+            count = f", {num_moved} that it moves" if num_moved else ""
+            missing.append(f"'joints' in the network's order{count}; the robot has {joint_names}")
         if not positions:
             missing.append("'default_positions' [rad], such as {.*: 0.0}")
         for key, found in (("'action_scale' [rad]", scales), ("'gains' [N·m/rad]", self.gains)):
@@ -251,7 +261,6 @@ class Policy:
             if without:
                 missing.append(f"{key} of joints {without}")
         if not parameters.observation:
-            width, _ = self.network.widths
             entries = "" if width is None else f", {width} entries in all"
             missing.append(
                 f"'observation', the terms of the network's input in its order{entries}; "
@@ -272,7 +281,13 @@ class Policy:
                 f"{who}: observation has unknown terms {unknown}; registered are "
                 f"{registered_terms()}"
             )
-        self._terms = [(TERMS[one.name], one) for one in parameters.observation]
+        for one in parameters.observation:
+            if unknown := [name for name in one.joints if name not in joint_names]:
+                raise ValueError(
+                    f"{who}: term '{one.name}' has joints {unknown} that the robot lacks; it has "
+                    f"{joint_names}"
+                )
+        self._terms = [(_term(one, joint_names), one) for one in parameters.observation]
         q = np.concatenate([np.eye(1, NUM_BASE_POSITIONS)[0], self.default_positions])
         v = np.zeros(NUM_BASE_VELOCITIES + len(joint_names))
         still = self.see(q, v, np.zeros(3), np.zeros(len(names)), self.initial_phases)
@@ -296,7 +311,8 @@ class Policy:
             f"{spec.name} {width}" + f" x {len(ages)}" * (len(ages) > 1)
             for (_, spec), width, ages in zip(self._terms, widths, samples, strict=True)
         )
-        self.network.check(who, sum(self.sizes), len(names), described)
+        sizes = sum(self.sizes), len(names)
+        waited(self.network.check, who, *sizes, described, max(len(ages), 1))
 
     def _lay_out(self, widths: list[int], samples: list[list[int]], *, by_time: bool) -> None:
         """Sets, for each entry of the network's input, where it comes from.
@@ -323,16 +339,18 @@ class Policy:
         phases: np.ndarray,
     ) -> PolicyInput:
         """The input of the terms, with a command (3,) [m/s, rad/s] and phases (n_p,) [rad]."""
-        joints = q[NUM_BASE_POSITIONS:] - self.default_positions
+        joints, rates = q[NUM_BASE_POSITIONS:] - self.default_positions, v[NUM_BASE_VELOCITIES:]
         return PolicyInput(
             R_WB=RotationMatrix(quaternion_of(q)).matrix(),
             w_WB=v[:3],
             v_WB=v[3:NUM_BASE_VELOCITIES],
             positions=joints[self.joints],
-            rates=v[NUM_BASE_VELOCITIES:][self.joints],
+            rates=rates[self.joints],
             command=command,
             action=action,
             phases=phases,
+            all_positions=joints,
+            all_rates=rates,
         )
 
     def observe(self, seen: PolicyInput, history: np.ndarray) -> np.ndarray:
@@ -372,6 +390,17 @@ class Policy:
         """Returns the command of the next period, of limited change, (3,)."""
         change = np.asarray(self.parameters.command.change)
         return np.clip(wanted, applied - change, applied + change)
+
+
+def _term(spec: ObservationTerm, joint_names: list[str]) -> Term:
+    """The function of a term, of its own joints if it has some."""
+    term = TERMS[spec.name]
+    if not spec.joints:
+        return term
+    own = [joint_names.index(name) for name in spec.joints]
+    return lambda seen: term(
+        replace(seen, positions=seen.all_positions[own], rates=seen.all_rates[own])
+    )
 
 
 def network_file(parameters: PolicyParameters, folder: str = "") -> Path:

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import ast
+import atexit
 import json
 import math
+import os
+import pickletools
 import re
+import sys
 import warnings
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -24,6 +32,9 @@ _SUPPORTED = (
     "supported are one observation, an action, and as memory further inputs and outputs of ONNX in "
     "pairs of one shape, such as h_in and h_out, or buffers of TorchScript"
 )
+_EXPORT = "export the policy as TorchScript (torch.jit.save) or ONNX"
+_MOST_PICKLED = 1_000_000  # Bytes of a checkpoint that are searched for its keys.
+_KEYS_OF_CHECKPOINTS = r".*state_dict|.*\.(weight|bias)|iter|epoch|optimizer"
 _Memory = Mapping[str, np.ndarray]
 
 
@@ -156,10 +167,12 @@ class PolicyNetwork:
     """A network that maps an observation (n_o,) and its memory (n_m,) to an action (n_a,).
 
     Args:
-        evaluate: Maps a batch (1, n_o) of float32 and parts of the memory by name to the action and
-            the new parts.
+        evaluate: Maps a batch and parts of the memory by name to the action and the new parts.
         widths: Of observation and action; None where the file does not say them.
         start: All that may be memory, at the start.
+        shape: Of a batch of one observation.
+        dtype: Of a batch.
+        outputs: What else than an action it returns, and the action first.
 
     Attributes:
         initial_memory: (n_m,), known after :meth:`check`; n_m is 0 without a memory.
@@ -172,8 +185,13 @@ class PolicyNetwork:
         widths: tuple[int | None, int | None],
         metadata: PolicyMetadata | None = None,
         start: _Memory | None = None,
+        *,
+        shape: tuple[int, ...] = (1, -1),
+        dtype: Any = np.float32,
+        outputs: list[str] | None = None,
     ):
-        self.path = path
+        self.path, self.outputs = path, outputs if outputs is not None else []
+        self._shape, self._dtype = shape, dtype
         self.widths = widths
         self.metadata = metadata or PolicyMetadata()
         self._evaluate = evaluate
@@ -187,21 +205,28 @@ class PolicyNetwork:
         ends = np.cumsum([part.size for part in self._start.values()])
         pairs = zip(self._start.items(), np.split(memory, ends), strict=False)
         given = {name: new.reshape(one.shape).astype(one.dtype) for (name, one), new in pairs}
-        batch = np.asarray(observation, dtype=np.float32)[np.newaxis]
+        batch = np.asarray(observation, dtype=self._dtype).reshape(self._shape)
         action, after = self._evaluate(batch, given)
         return np.asarray(action, dtype=float).reshape(-1), _flat(after[name] for name in given)
 
-    def check(self, who: str, num_inputs: int, num_outputs: int, terms: str) -> None:
-        """Checks the widths of the network, and that it remembers nothing but its memory."""
+    def check(
+        self, who: str, num_inputs: int, num_outputs: int, terms: str, num_samples: int = 1
+    ) -> None:
+        """Checks widths and actions of the network, and that it remembers only its memory.
+
+        An observation of several samples that is no row for it is one of (1, num_samples, n).
+        """
         seen, acting = self.widths
         if seen not in (None, num_inputs):
             raise ValueError(
                 f"{who}: the network expects an observation of {seen} entries; the terms have "
-                f"{num_inputs}: {terms}"
+                f"{num_inputs}: {terms}. If it observes joints that it does not move, name them "
+                "under 'joints' of a term"
             )
         probe = np.linspace(-1.0, 1.0, num_inputs, dtype=np.float32)
         try:
-            _, after = self._evaluate(probe[np.newaxis], self._start)
+            batch = probe.astype(self._dtype).reshape(self._shape)
+            _, after = self._evaluate(batch, self._start)
             # What does not change is no memory, and what grows has no place in a Context.
             self._start = {
                 name: part
@@ -213,14 +238,17 @@ class PolicyNetwork:
             self(probe, later)
             again, _ = self(probe, self.initial_memory)
         except Exception as error:  # Those of onnxruntime have no common base but this.
+            if self._shape == (1, -1) and num_samples > 1:
+                self._shape = (1, num_samples, -1)
+                return self.check(who, num_inputs, num_outputs, terms, num_samples)
             raise ValueError(
                 f"{who}: the network takes no observation of {num_inputs} entries ({terms}): "
-                f"{str(error).splitlines()[0]}"
+                f"{_reason(error)}"
             ) from error
         if action.shape != (num_outputs,) or acting not in (None, num_outputs):
             raise ValueError(
                 f"{who}: the network returns {action.size} actions, expected one for each of "
-                f"{num_outputs} joints"
+                f"{num_outputs} joints; its outputs are {self.outputs}, the first the action"
             )
         if not np.isfinite(action).all():
             raise ValueError(
@@ -234,6 +262,39 @@ class PolicyNetwork:
                 f"though its memory of {len(self._start)} buffers was set back: it draws random "
                 f"numbers, or has a memory that is no buffer of a fixed size; {_SUPPORTED}"
             )
+
+
+def waited(call: Callable[..., Any], *arguments: Any) -> Any:
+    """Calls a network in a thread: Ctrl-C ends the wait for a network that loops for ever."""
+    found: Future[Any] = Future()
+
+    def run() -> None:
+        try:
+            found.set_result(call(*arguments))
+        except BaseException as error:
+            found.set_exception(error)
+
+    def leave() -> None:
+        if thread.is_alive():  # It would abort the process as this ends.
+            sys.stdout.flush()
+            os._exit(130)
+
+    thread = Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        return found.result()
+    except KeyboardInterrupt:
+        atexit.register(leave)
+        raise
+
+
+def _reason(error: Exception) -> str:
+    """The line of an error that says why; TorchScript puts tracebacks before it."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    reasons = [line for line in lines if re.match(r"[\w.]*(Error|Exception): ", line)]
+    text = (reasons or [" ".join(lines)])[-1][:200]
+    is_of_gpu = re.search("cuda|nvidia", text, re.IGNORECASE)
+    return f"{text}; export it on the CPU" if is_of_gpu else text
 
 
 def _flat(parts: Iterable[np.ndarray]) -> np.ndarray:
@@ -250,10 +311,19 @@ def load_network(path: Path) -> PolicyNetwork:
     if path.suffix not in LOADERS:
         raise ValueError(
             f"{path}: a policy's network is one of {list(LOADERS)}; got '{path.suffix}'"
+            f"{_described(path)}"
         )
     if not path.is_file() or path.stat().st_size > _MOST:
         raise ValueError(f"{path}: the policy's network does not exist")
     return LOADERS[path.suffix](path)
+
+
+def network_kinds(paths: Iterable[Path]) -> list[str]:
+    """What whoever runs them must know of those files that are networks."""
+    script = "TorchScript: code of its author, which runs here"
+    kinds = {end: "ONNX, which is no code" if end == ".onnx" else script for end in LOADERS}
+    found = dict.fromkeys(path for path in paths if path.suffix in kinds)
+    return [f"the policy's network {path} is {kinds[path.suffix]}" for path in found]
 
 
 def network_files(path: Path) -> list[Path]:
@@ -289,7 +359,39 @@ def _reading(path: Path, what: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # Those of onnxruntime and protobuf have no common base but this.
-        raise ValueError(f"{path}: not {what}: {str(error).splitlines()[0][:200]}") from error
+        text = _described(path) or f": {_reason(error)}"
+        raise ValueError(f"{path}: not {what}{text}") from error
+
+
+def _described(path: Path) -> str:
+    """What else than a network a file is, with the remedy; "" if it cannot be told."""
+    head = b""
+    with suppress(OSError), path.open("rb") as file:
+        head = file.read(_MOST_PICKLED)
+    with suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+        names = {Path(name).name: name for name in archive.namelist()}
+        if "constants.pkl" in names:
+            return ", but TorchScript: name it .pt" if path.suffix == ".onnx" else ""
+        if "data.pkl" in names:
+            head = archive.open(names["data.pkl"]).read(_MOST_PICKLED)
+    keys: list[str] = []
+    with suppress(ValueError):  # Its end may be missing. Nothing of it is run.
+        for _, key, _ in pickletools.genops(head):
+            if isinstance(key, str) and re.fullmatch(_KEYS_OF_CHECKPOINTS, key):
+                keys.append(key)
+    if head.startswith(b"\x80"):
+        kind = f"a training checkpoint ({', '.join(keys[:4])})" if keys else "a Python pickle"
+        return f", but {kind}: {_EXPORT}"
+    if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < _MOST:
+        return f", but weights alone (safetensors): {_EXPORT}"
+    for start, text in {
+        b"version https://git-lfs": "a pointer of git-lfs: get the file by `git lfs pull`",
+        b"<": "a web page: download the file itself, such as by 'raw'",
+        b"\x08": "like an ONNX network: name it .onnx",
+    }.items():
+        if head.lstrip().startswith(start) and path.suffix != text[-5:]:
+            return f", but {text}"
+    return ""
 
 
 def _load_onnx(path: Path) -> PolicyNetwork:
@@ -320,17 +422,32 @@ def _load_onnx(path: Path) -> PolicyNetwork:
             f"outputs {[f'{one.name} {one.shape}' for one in outputs]}; {_SUPPORTED}"
         )
     (observed,) = seen
-    start = {one.name: np.zeros(_shape(one), np.float32) for one in memory}
-    lasts = (one.shape[-1] if one.shape else None for one in (observed, acting[0]))
-    num_seen, num_acting = (size if isinstance(size, int) else None for size in lasts)
+    dtypes = {"tensor(double)": np.float64, "tensor(float16)": np.float16}
+    start = {one.name: np.zeros(_shape(one), dtypes.get(one.type, np.float32)) for one in memory}
+    shape, last = _shape(observed), (acting[0].shape or [None])[-1]
+    free = [i for i, size in enumerate(observed.shape) if i and not isinstance(size, int)]
+    # A size between that varies is a history's; of a network with a memory it is one step of time.
+    if free and (not memory or free[-1] == len(shape) - 1):
+        shape[free[-1]] = -1
+    num_seen = None if -1 in shape else math.prod(shape)
+    num_acting = last if isinstance(last, int) else None
 
     def evaluate(batch: np.ndarray, parts: _Memory) -> tuple[np.ndarray, _Memory]:
-        given = {**start, **parts, observed.name: batch.reshape(*_shape(observed)[:-1], -1)}
+        given = {**start, **parts, observed.name: batch}
         action, *new = session.run([acting[0].name, *after.values()], given)
         return action, dict(zip(start, new, strict=True))
 
     metadata = read_metadata(session.get_modelmeta().custom_metadata_map)
-    return PolicyNetwork(path, evaluate, (num_seen, num_acting), metadata, start)
+    return PolicyNetwork(
+        path,
+        evaluate,
+        (num_seen, num_acting),
+        metadata,
+        start,
+        shape=tuple(shape),
+        dtype=dtypes.get(observed.type, np.float32),
+        outputs=[f"{one.name} {one.shape}" for one in acting],
+    )
 
 
 def _shape(one: Any) -> list[int]:
@@ -362,19 +479,31 @@ def _load_torchscript(path: Path) -> PolicyNetwork:
                 buffers = dict(module.named_buffers())
                 for name, part in parts.items():
                     buffers[name].copy_(torch.from_numpy(part))
-                action = module(torch.from_numpy(batch)).numpy()
+                found = module(torch.from_numpy(batch))
+                found = found if isinstance(found, (tuple, list)) else [found]
+                outputs[:] = [f"{[*one.shape]}" for one in found]
+                action = found[0].numpy()
                 buffers = dict(module.named_buffers())  # The script may have replaced them.
                 return action, {name: buffers[name].numpy().copy() for name in parts}
         finally:
             torch.set_num_threads(threads)
 
     start = {name: buffer.numpy().copy() for name, buffer in module.named_buffers()}
-    return PolicyNetwork(path, evaluate, (None, None), start=start)
+    outputs: list[str] = []
+    kinds = [str(one.dtype).removeprefix("torch.") for one in module.parameters()]
+    return PolicyNetwork(
+        path,
+        partial(waited, evaluate),
+        (None, None),
+        start=start,
+        dtype=np.dtype(next((kind for kind in kinds if kind.startswith("float")), "float32")),
+        outputs=outputs,
+    )
 
 
 LOADERS: dict[str, Callable[[Path], PolicyNetwork]] = {
     ".onnx": _load_onnx,
-    ".pt": _load_torchscript,
-    ".jit": _load_torchscript,
+    ".pt": partial(waited, _load_torchscript),
+    ".jit": partial(waited, _load_torchscript),
 }
 """Readers of networks by the ends of their files' names."""

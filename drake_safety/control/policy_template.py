@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,10 @@ import yaml
 from drake_safety.control.foreign_policy import converted_policy
 from drake_safety.control.policy import registered_terms
 from drake_safety.control.policy_network import (
-    LOADERS,
     PolicyNetwork,
     load_network,
     network_files,
+    network_kinds,
 )
 from drake_safety.files.atomic import write_file
 from drake_safety.files.reading import yaml_text
@@ -68,6 +68,13 @@ class PolicyTemplate:
         if missing:
             found.pop("joints", None)
             ask(names, f"the robot's joints in the network's order; {missing} are none of them")
+        _, num_moved = self.network.widths
+        observed = self.joints if num_moved not in (None, len(self.joints)) else []
+        if observed and not missing:
+            found.pop("joints", None)
+            names = f"joints: [{', '.join(map(yaml_text, observed))}]"
+            what = f"the {num_moved} joints that it moves, in its order, of the {len(observed)} "
+            ask(names, f"{what}that it names, which joint_pos_rel and joint_vel_rel observe")
         elif not self.joints:
             ask(names, "the joints that the network moves, in its order")
         keys = {yaml_text(as_pattern(name)): value for name, value in posture.items() if value}
@@ -84,12 +91,19 @@ class PolicyTemplate:
             if not said[line.partition(":")[0]]:
                 ask(line, what)
         lines.append("# rotor_inertia: {.*: 0.01}  # that of training, if it had any [kg·m²]")
+        if "action_clip" not in found:
+            ask("action_clip: 1.0", "the limit of actions in training, if any")
+        if len(self.network.outputs) > 1:
+            asked.append(f"its outputs are {self.network.outputs}: the first is the action")
         if "period_s" not in found:
             lines.append("period_s: 0.02  # ASK the time between two actions [s]")
             asked.append("the time between two actions [s]; 0.02 is assumed")
         if metadata.observation and "observation" not in found:
             without = {"name": "", "clip": math.inf}
             found["observation"] = [without | term for term in metadata.observation]
+            for term in found["observation"] if observed else []:
+                if term["name"] in ("joint_pos_rel", "joint_vel_rel"):
+                    term["joints"] = [*observed]
             unstated = [k for k in ("scale", "history") if k not in metadata.observation[0]]
             if unstated:
                 what = f"{' and '.join(unstated)} of the terms of the observation"
@@ -132,14 +146,20 @@ class PolicyTemplate:
         return "\n".join([*head, *lines]) + "\n", asked
 
 
-def survey_policy(path: Path, motors: Sequence[str] = ()) -> PolicyTemplate:
+def survey_policy(
+    path: Path, motors: Sequence[str] = (), announce: Callable[[str], object] = lambda text: None
+) -> PolicyTemplate:
     """Reads what the files of a policy tell.
 
     Args:
         path: A network (``.onnx``, ``.pt``, ``.jit``), a ``deploy.yaml`` of unitree_rl_lab or a
             ``config.yaml`` of rl_sar.
         motors: Joints in the order of the robot's motors, which a ``deploy.yaml`` numbers.
+        announce: Called with what the network is, before it is loaded.
     """
-    found = {} if path.suffix in LOADERS else converted_policy(path, motors)
-    network = load_network(Path(found.pop("network", path)))
-    return PolicyTemplate(network=network, found=found, source=path.name)
+    is_described = path.suffix in (".yaml", ".yml")
+    found = converted_policy(path, motors) if is_described else {}
+    file = Path(found.pop("network", path))
+    for text in network_kinds([file]):
+        announce(text)
+    return PolicyTemplate(network=load_network(file), found=found, source=path.name)

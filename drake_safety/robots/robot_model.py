@@ -12,6 +12,7 @@ from drake_safety.files.schema import (
     NotNegative,
     Pattern,
     Positive,
+    Requirement,
     Triple,
     load_typed_file,
     schema,
@@ -134,7 +135,7 @@ class RobotModel:
     urdf: str = ""
     """``package://…`` (ours, Drake's or a pip package's) or a path relative to the YAML file; any
     format that Drake's Parser reads."""
-    requires: str = ""
+    requires: Requirement = ""
     """Requirement by which pip installs the package of ``urdf`` without its dependencies, if no
     extra does."""
     base: str = ""

@@ -6,7 +6,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 from pydrake.geometry import Sphere
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
+from drake_safety.control.policy_network import network_kinds
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
 from drake_safety.files.progress import StageProgress, ignore
 from drake_safety.learning.causes import describe_margin, is_outside
@@ -32,16 +34,20 @@ from drake_safety.robots.urdf_survey import (
     odd_inertias,
     odd_limits,
 )
-from drake_safety.simulation.capabilities import HasBall
+from drake_safety.simulation.capabilities import FollowsCommands, HasBall
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed
 from drake_safety.simulation.hidden_state import difference
 from drake_safety.simulation.legged_loop import LeggedLoop
+from drake_safety.simulation.motion import simulate
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
 
 _Check = Generator[Finding, None, None]
 _STANDS = "stands for 1 s"
+_WALKS = "walks for 2 s at half the command"
+_WALKED_S = 2.0
+_SLOW = 0.1  # Error of the velocity that is none [m/s].
 _SINK_SHARE = 0.1  # Share of the standing height by which a robot may sink.
 _AT_STOP_RAD = 0.05
 _LEVEL_M = 2e-3  # Largest difference of the feet's heights.
@@ -54,6 +60,11 @@ _LINE_REMEDY = (
 _GAINS_REMEDY = (
     "if it sinks, raise 'joint_gains' in robot.yaml, such as twofold [N·m/rad, N·m·s/rad]; if it "
     "trembles, halve them; look for shapes that overlap by `check --picture FILE`"
+)
+_POLICY_REMEDY = (
+    "compare policy.yaml with the policy's training: order of 'joints' and of the terms of "
+    "'observation', their 'scale' and 'history', 'default_positions', 'action_scale', "
+    "'action_clip', 'gains', 'period_s', and a normalizer of observations that the export lacks"
 )
 _EFFORT_REMEDY = "state their largest torques under 'effort_limits' in robot.yaml [N·m]"
 
@@ -92,6 +103,9 @@ def check_scenario(
         yield from _guarded("collision shapes", _collisions, robot)
     if not is_imported:
         return
+    with suppress(ValueError):  # Which building the diagram finds, too.
+        for text in network_kinds(scenario.task_class().model_files(scenario)):
+            yield passed("network", text)
     loop = yield from _guarded("diagram", _diagram, scenario)
     if loop is None:
         return
@@ -102,9 +116,12 @@ def check_scenario(
         progress(_STANDS, 0, 1)
         yield from _guarded(_STANDS, _stands, loop)
         progress(_STANDS, 1, 1)
+    remedy = ""
+    if isinstance(loop, FollowsCommands):
+        remedy = yield from _guarded(_WALKS, _walks, loop)
     yield from _guarded("contract", check_contract, loop, seed=seed)
     if num_episodes:
-        yield from _guarded("episodes", _episodes, loop, num_episodes, seed, progress)
+        yield from _guarded("episodes", _episodes, loop, num_episodes, seed, progress, remedy)
 
 
 def _guarded(
@@ -440,7 +457,36 @@ def _stands(loop: LeggedLoop) -> _Check:
         f"after 1 s it has sunk {100 * sunk:.1f} cm, {touching} of {kinematics.num_contacts} "
         f"contact points touch, the fastest joint turns at {speed:.2f} rad/s"
     )
-    yield _judged(_STANDS, is_still and touching > 0, message, message, _GAINS_REMEDY)
+    remedy = _POLICY_REMEDY if isinstance(loop, FollowsCommands) else _GAINS_REMEDY
+    yield _judged(_STANDS, is_still and touching > 0, message, message, remedy)
+
+
+def _walks(loop: Any) -> Generator[Finding, None, str]:
+    """Checks that a policy follows a command; returns the remedy if it does not."""
+    command = 0.5 * np.array(loop.policy.parameters.command.highest) * (1.0, 0.0, 0.0)
+
+    def begin(context: Context) -> None:
+        plan = loop.command_plan(command)
+        loop.reset_to(context, None, replace(loop.standing_start(), plan=plan))
+
+    ports = ("output", "margins", "controller_status")
+    motion = simulate(loop, begin, ports, duration_s=_WALKED_S, may_fail=True)
+    mean = motion["output"][len(motion.time_s) // 2 :].mean(axis=0)
+    message = f"asked for {command[0]:.2f} m/s, it moves at {mean[0]:.2f} m/s"
+    if motion.failure:
+        message = f"the simulation fails: {motion.failure}"
+    elif motion["controller_status"].any():
+        message += "; the network returns actions that are not finite, and the last one is held"
+    elif motion.has_left:
+        message += f"; it leaves the safe set at {motion.leave_time_s:.2f} s: {motion.cause}"
+    elif np.linalg.norm(mean - command) > 0.5 * command[0] + _SLOW:
+        yield passed(_WALKS, message, f"if it should be faster, {_POLICY_REMEDY}")
+        return ""
+    else:
+        yield passed(_WALKS, message)
+        return ""
+    yield failed(_WALKS, message, _POLICY_REMEDY)
+    return f"correct '{_WALKS}' first: the policy does not walk"
 
 
 def _stands_safely(loop: LeggedLoop, margins: np.ndarray) -> _Check:
@@ -470,7 +516,9 @@ def _stands_safely(loop: LeggedLoop, margins: np.ndarray) -> _Check:
     yield _judged(item, not wrong, ok, problem, remedy)
 
 
-def _episodes(loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgress) -> _Check:
+def _episodes(
+    loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgress, first: str | None
+) -> _Check:
     episodes = []
     for index in range(num_episodes):
         report("episodes", index, num_episodes)
@@ -492,7 +540,7 @@ def _episodes(loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgr
         yield failed(
             "starts are safe",
             f"{lost} of {num_episodes} episodes begin outside the safe set",
-            "narrow the ranges under 'start' in the scenario, or widen 'safe_set'",
+            first or "narrow the ranges under 'start' in the scenario, or widen 'safe_set'",
         )
     if causes.pop(DIVERGED, 0):
         yield failed(
@@ -504,12 +552,12 @@ def _episodes(loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgr
         ", ".join(f"{name} {count}" for name, count in causes.items()) or "none"
     )
     start = getattr(loop.scenario.parameters, "start", None)
-    present = f"; 'start' is {vars(start)}" if is_dataclass(start) else ""
+    present = "'safe_set'" + (f"; 'start' is {vars(start)}" if is_dataclass(start) else "")
     change, other = ("widen", "narrow") if share < low else ("narrow", "widen")
     yield _judged(
         "share of unsafe episodes",
         low <= share <= high,
         message,
         f"{message}; expected {100 * low:.0f} to {100 * high:.0f} %: Γ learns from both",
-        f"{change} the ranges of starts and plans in the scenario, or {other} 'safe_set'{present}",
+        first or f"{change} the ranges of starts and plans in the scenario, or {other} {present}",
     )
