@@ -1,9 +1,11 @@
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import naive
+from drake_safety import SafetyAssessment
 from drake_safety.learning.change_detector import (
     FALSE_ALARMS_PER_HOUR,
     LEAST_MOTION_S,
@@ -115,7 +117,7 @@ def test_too_little_motion_gives_levels_and_no_alarm():
 
 
 def test_what_an_actual_robot_does_is_no_alarm_after_its_motion_is_known():
-    adapted = learned().with_motions([motion(MOTION_S, seed, ALWAYS, 0.1) for seed in range(4)])
+    adapted = learned().with_motions([motion(MOTION_S, seed, ALWAYS, 0.1) for seed in range(7)])
     same, other = motion(300.0, 9, ALWAYS, 0.1), motion(5.0, 10, ALWAYS, -0.1)
     assert worst(same).max() > 1.0
     assert worst(same, adapted).max() < 1.0
@@ -125,6 +127,93 @@ def test_what_an_actual_robot_does_is_no_alarm_after_its_motion_is_known():
     # Three rows tell next to nothing.
     few = learned().with_motions([same[:3]])
     assert worst(same, few).max() > 1.0 and np.isfinite(few.limits).all()
+
+
+def wild(duration_s, seed):
+    """Motion with a rare shove, rows that repeat, and more noise than the nominal plant's."""
+    rows = motion(duration_s, seed, slice(30, 36), 3.0, noise=0.02)
+    rows[100:105] = rows[100]
+    return rows
+
+
+@pytest.mark.parametrize("num_pieces", [1, 5, 30])
+@pytest.mark.parametrize("make", [motion, wild])
+def test_little_motion_of_an_actual_robot_widens_no_limit(num_pieces, make):
+    duration_s = 0.8 * LEAST_MOTION_S
+    adapted = learned().with_motions(
+        [make(duration_s / num_pieces, seed) for seed in range(num_pieces)]
+    )
+    for name in ("limits", "deviation", "longest_repeat", "alarm_level"):
+        np.testing.assert_array_equal(getattr(adapted, name), getattr(learned(), name))
+    assert (adapted.widening() == 1.0).all()
+    assert "4 min of an actual robot's correct its prediction, 6 are needed" in adapted.describe()
+    assert "no rate of false alarms is promised" in adapted.describe()
+    assert worst(motion(5.0, 10, ALWAYS, -0.4), adapted).max() > 1.0
+
+
+def test_an_adapted_detector_says_how_much_its_limits_were_widened():
+    rows = [wild(MOTION_S, seed) for seed in range(8)]
+    adapted = learned().with_motions(rows)
+    assert adapted.widening().min() >= 1.0 and np.median(adapted.widening()) > 1.0
+    assert adapted.longest_repeat == 4 + 3  # As of a fitted one.
+    told = adapted.describe()
+    assert "11 min of motion for its limits; 7 min of an actual robot's correct" in told
+    assert f"widen limits, {np.median(adapted.widening()):.2f} times in the median and " in told
+    assert "7 repeated inputs are no alarm" in told
+
+
+@pytest.mark.parametrize("is_read", [False, True])
+@pytest.mark.parametrize("num_motions", [1, 8])
+def test_each_adaptation_starts_from_the_nominal_detector(num_motions, is_read):
+    first = learned().with_motions([wild(MOTION_S, seed) for seed in range(8)])
+    again = ChangeDetector.from_arrays(first.arrays()) if is_read else first
+    rows = [motion(MOTION_S, seed, ALWAYS, 0.1) for seed in range(num_motions)]
+    found, expected = again.with_motions(rows).arrays(), learned().with_motions(rows).arrays()
+    assert found.keys() == expected.keys()
+    for name, values in found.items():
+        np.testing.assert_array_equal(values, expected[name], err_msg=name)
+    assert again.describe() == first.describe()
+    assert again.nominal.describe() == learned().describe()
+
+
+def lively(first_seed, num=40, info=INFO, **changes):
+    """Episodes that begin with an impact, before their first row without a disturbance."""
+    rows = [motion(3.0, first_seed + i, slice(0, 3), 9.0, noise=0.03) for i in range(num)]
+    return recorded(rows, info, first_step=6, **changes)
+
+
+def test_a_monitor_knows_safe_episodes_that_are_livelier_than_its_motion():
+    told, is_ok = learned().describe_alarms(lively(2000))
+    assert not is_ok and re.match(r"monitor: alarms in (2\d|3\d|40) of 40 safe episodes: tr", told)
+    calm = recorded([motion(MOTION_S, seed) for seed in range(10)])
+    both = ChangeDetector.fit(calm, episodes=lively(1000, 60))
+    told, is_ok = both.describe_alarms(lively(2000))
+    assert is_ok and re.fullmatch(r"monitor: alarms in [0-4] of 40 safe episodes", told)
+    assert worst(motion(5.0, 10, ALWAYS, -0.8), both).max() > 1.0
+    # Unsafe episodes do not count.
+    unsafe = lively(1000, 60, is_safe=False, cause="reach")
+    told = ("monitor: alarms in 0 of 0 safe episodes", True)
+    assert learned().describe_alarms(unsafe) == told
+
+
+@pytest.mark.parametrize(
+    "change", [{"state_names": ["hip", "hip_rate"]}, {"step_s": 0.1}, {"output_names": ["end"]}]
+)
+def test_motions_of_another_diagram_than_the_episodes_are_refused(change):
+    other = lively(0, 3, replace(INFO, **change))
+    with pytest.raises(ValueError, match=f"motions and episodes differ in {''.join(change)}: "):
+        SafetyAssessment().fit(other, motions=recorded([motion(3.0, 0), motion(3.0, 1)]))
+
+
+def test_fit_warns_of_a_monitor_that_never_alarms(monkeypatch, caplog):
+    learned_of = lambda self, episodes, progress, detector: {"detector_": detector}  # noqa: E731
+    monkeypatch.setattr(SafetyAssessment, "_learned", learned_of)
+    with caplog.at_level("WARNING"):
+        SafetyAssessment().fit(lively(0, 3))
+        assert "0 min of motion for its limits, 6 are needed: it reports levels" in caplog.text
+        caplog.clear()
+        SafetyAssessment().fit(lively(0, 3), detector=learned())
+        assert "never alarms" not in caplog.text
 
 
 def test_motion_counts_from_its_first_step_until_shortly_before_it_leaves():

@@ -126,6 +126,24 @@ def test_a_short_log_without_a_difference_is_said_to_change_nothing(
     log = logged(0, tmp_path)
     assert not call(monkeypatch, "adapt", folder / "short.yaml", *log, *options)
     printed = capsys.readouterr().out
-    assert "nothing changed (sharpened): the only pair ends as on the nominal plant" in printed
+    assert "nothing changed" not in printed
+    assert "no correction of Γ (sharpened): the only pair ends as on the nominal plant" in printed
+    assert "0 min of an actual robot's correct its prediction" in printed
     assert "about 40 pairs, as of 24 s of logs" in printed
     assert "sharpened: one pair, so that none is held out" in printed
+
+
+def test_a_promise_after_logs_is_for_a_plant_that_is_named(folder, capsys, monkeypatch, tmp_path):
+    scenario = load_scenario(folder / "short.yaml")
+    actual, starts = cut_log(recorded(0), scenario)
+    pairs = pair_starts(scenario, actual, starts).feedback()
+    load(folder, MODES[0]).adapt(pairs).save(assessment_file(tmp_path, MODES[0]))
+    few = ("--episodes", 24, "--workers", 1, "--miss-rate", 0.5, "--false-alarm-rate", 0.5)
+    asked = ("calibrate", folder / "short.yaml", "--assessment", tmp_path, *few)
+    assert call(monkeypatch, *asked) == 2
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "nothing can be promised for it. --variation actual promises for" in printed
+    assert not load(tmp_path, MODES[0]).calibrations_
+    assert call(monkeypatch, *asked, "--variation", "actual") == 0
+    for one in load(tmp_path, MODES[0]).calibrations_.values():
+        assert "on the plant 'simulated actual'" in one.promise

@@ -68,10 +68,12 @@ def test_motions_are_the_same_for_any_number_of_workers_and_go_on_where_they_sto
         run_episodes(drifting, 3, seed=MOTION.first, **options)
 
 
-def test_motions_of_other_tasks_are_episodes_with_the_monitors_rows():
-    motions = run_motions(gliding(), 4.0, num_workers=1, seed=3)
+@pytest.mark.parametrize("options", [("Drifting", True), ("", True), ("", False)])
+def test_motions_of_other_tasks_are_episodes_with_the_monitors_rows(options):
+    scenario = gliding(*filter(None, options[:1]))
+    motions = run_motions(scenario, 4.0, num_workers=1, seed=3, are_episodes=options[1])
     assert len(motions) == 5
-    loop = gliding().make_loop()
+    loop = scenario.make_loop()
     for motion in motions:
         episode = run_episode(loop, motion.index, seed=3)
         assert (motion.is_safe, motion.first_step) == (episode.is_safe, 2 * episode.first_step)

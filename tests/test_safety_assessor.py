@@ -1,3 +1,4 @@
+import copy
 import dataclasses
 
 import numpy as np
@@ -54,6 +55,16 @@ def added(assessment, inputs, **options):
     assessor = AddSafetyAssessor(builder, assessment, **ports, **options)
     simulator = Simulator(builder.Build())
     return assessor, simulator, assessor.GetMyContextFromRoot(simulator.get_context())
+
+
+@pytest.mark.parametrize("level", [1.0, np.inf])
+def test_it_warns_of_a_monitor_that_never_alarms(assessment, inputs, caplog, level):
+    found = copy.copy(assessment)
+    found.detector_ = dataclasses.replace(assessment.detector_, alarm_level=level)
+    added(found, inputs, on_alarm=None)
+    assert "never alarms" not in caplog.text
+    added(found, inputs)
+    assert ("AddSafetyAssessor: monitor: " in caplog.text) == np.isinf(level)
 
 
 def test_one_call_adds_gamma_the_monitor_and_the_check_of_the_margins(assessment, inputs):

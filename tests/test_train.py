@@ -1,7 +1,10 @@
+import re
+
 import numpy as np
 import pytest
 
 from command_line import call
+from drake_safety.cli import train as training
 from drake_safety.cli.training_folder import MODES, adapted_folder, load_assessment
 from drake_safety.learning.change_detector import usual_rows
 from drake_safety.learning.seeds import FALLS, MOTION
@@ -22,6 +25,9 @@ def test_the_monitor_is_learned_from_undisturbed_motion_that_is_kept(monkeypatch
     assert call(monkeypatch, *train, out, "--motion", 0.4) == 0
     printed = capsys.readouterr().out
     assert "0 min of motion for its limits" in printed
+    told = re.search(r"monitor: alarms in 0 of (\d+) safe episodes", printed)
+    watched = load_episodes(out / "watched")
+    assert len(watched) == 60 and int(told[1]) == sum(one.is_safe for one in [*watched][1::2])
     assert "gradient boosting has an AUC of" in printed
     motions = load_episodes(out / "motion")
     assert (len(motions), motions.info.seed, motions.info.step_s) == (30, MOTION.first, 0.02)
@@ -34,6 +40,8 @@ def test_the_monitor_is_learned_from_undisturbed_motion_that_is_kept(monkeypatch
     assert load_assessment(out, MODES[0]).fall_logit_ is not None
     assert load_assessment(out, MODES[1]).fall_logit_ is None
     halves = [len(one) - 2 for one in usual_rows(motions) if len(one) > 2]
+    safe = [len(one.state) - one.first_step - 2 for one in [*watched][::2] if one.is_safe]
+    halves += [num for num in safe if num > 0]
     assert learned["paper"].motion_s == pytest.approx(0.02 * sum(halves[1::2]))
     # Of an actual plant the monitor learns from its motion too, which no pair is.
     adapt = ("adapt", file, "--assessment", out, "--feedback", 10, "--workers", 1)
@@ -51,3 +59,25 @@ def test_the_monitor_is_learned_from_undisturbed_motion_that_is_kept(monkeypatch
     assert not (alone / "motion").exists()
     assert load_assessment(alone, "paper").detector_.step_s == 0.04
     assert not (alone / "falls").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted_s"),
+    [
+        (("--episodes", 4), 24.0),
+        (("--episodes", 64), 384.0),
+        (("--episodes", 128), 768.0),
+        (("--episodes", 2048), 2880.0),
+        (("--episodes", 64, "--motion", 5), 300.0),
+    ],
+)
+def test_there_is_more_motion_for_more_episodes(monkeypatch, capsys, tmp_path, given, wanted_s):
+    def stopped(scenario, duration_s, **options):
+        raise ValueError(f"asked for {duration_s:g} s")
+
+    monkeypatch.setattr(training, "run_episodes", lambda *arguments, **options: None)
+    monkeypatch.setattr(training, "run_motions", stopped)
+    file = tmp_path / "shuttling.yaml"
+    file.write_text(SCENARIO)
+    assert call(monkeypatch, "train", file, "--out", tmp_path / "run", *given) == 2
+    assert f"asked for {wanted_s:g} s" in capsys.readouterr().out

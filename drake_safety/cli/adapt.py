@@ -19,6 +19,7 @@ from drake_safety.evaluation.metrics import Bootstrap, Estimate, mean
 from drake_safety.evaluation.results import Results
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.change_detector import LEAST_MOTION_S
 from drake_safety.learning.feedback import EpisodePair
 from drake_safety.learning.seeds import ADAPTATION, MOTION
 from drake_safety.learning.segments import Episodes
@@ -31,7 +32,7 @@ from drake_safety.simulation.scenario import Scenario, load_scenario
 
 _MOST_CUTS = 3  # Printed of a log.
 _NUM_FOLDS = 5  # Of the feedback, each of which is judged after adapting to the others.
-_MOTION_S = 240.0  # Undisturbed motion of a simulated actual plant, for the monitor.
+_MOTION_S = 1.25 * LEAST_MOTION_S  # Of a simulated actual plant, some of which may leave.
 
 
 def adapt(
@@ -111,6 +112,7 @@ def adapt(
         "feedback_sets": gap[1],
         "differing_pairs": gap[0],
         "change": {mode: one.correction_.change.tolist() for mode, one in adapted.items()},
+        "monitor": adapted[MODES[0]].detector_.describe(),
     }
     figures = {
         f"held_out.{mode}.{key}": one
@@ -226,7 +228,7 @@ def _told_of(found: Mapping[str, Estimate], held: str) -> str:
 def _print_changes(
     scenario: Scenario, adapted: Mapping[str, SafetyAssessment], gap: tuple[int, int], name: str
 ) -> None:
-    """Prints how many pairs differ, and what is needed if that changes nothing."""
+    """Prints how many pairs differ, what the monitor takes over, and what an update needs."""
     differing, num_pairs = gap
     unchanged = [
         mode
@@ -234,14 +236,15 @@ def _print_changes(
         if one.base_logit_ is not None and not one.correction_.is_any
     ]
     console.say(f"adapted to '{name}': {differing} of {num_pairs} pairs end differently")
+    console.say(adapted[MODES[0]].detector_.describe())
     if differing or not unchanged:
         return
     num_needed = scenario.assessment.adaptation.update_interval
     duration_s = num_needed * scenario.episode_duration_s
     pairs = "the only pair ends" if num_pairs == 1 else f"all {num_pairs} pairs end"
     console.say(
-        f"nothing changed ({', '.join(unchanged)}): {pairs} as on the nominal plant, and it learns "
-        f"from those that do not. A first update takes about {num_needed} pairs, as of "
-        f"{duration_s:g} s of logs, some of which end otherwise",
+        f"no correction of Γ ({', '.join(unchanged)}): {pairs} as on the nominal plant, and it "
+        f"learns from those that do not. A first update takes about {num_needed} pairs, as of "
+        f"{duration_s:g} s of logs, some of which end otherwise. Its inputs are known from now on",
         style="yellow",
     )

@@ -14,7 +14,7 @@ from drake_safety.evaluation.figure_style import label_of
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.calibration import KINDS, check_share, episode_scores
 from drake_safety.learning.calibration import calibrate as choose
-from drake_safety.learning.seeds import CALIBRATION
+from drake_safety.learning.seeds import CALIBRATION, NOT_DRAWN
 from drake_safety.learning.segments import split
 from drake_safety.simulation.scenario import load_scenario
 
@@ -34,7 +34,7 @@ def calibrate(
     episodes: Annotated[int, Option(help="Fresh episodes.", min=2)] = 1000,
     variation: Annotated[
         str | None,
-        Option(help="Plant of the promise; by default that of the adaptation, else nominal."),
+        Option(help="Plant of the promise; by default of `adapt`, but not --log, else nominal."),
     ] = None,
     seed: Annotated[int, Option(help="Seed of the episodes.")] = CALIBRATION.first,
     workers: console.WorkersOption = None,
@@ -42,7 +42,8 @@ def calibrate(
 ) -> None:
     """Choose thresholds with a promised miss rate on fresh episodes.
 
-    The promise holds for the plant of the episodes: calibrate again after `adapt`. `ask`, `run` and
+    The promise holds for the plant of the episodes: calibrate again after `adapt`, or before
+    `adapt --log`, whose robot no plant simulates. `ask`, `run` and
     `evaluate` use the thresholds. Episodes are kept in ASSESSMENT: a stopped calibration
     continues, and another promise reuses them. A shipped assessment is not changed; its calibrated
     copy is written to runs/SCENARIO-shipped.
@@ -56,6 +57,13 @@ def calibrate(
     learned = folders.load_assessments(folder.path)
     adaptation = learned[MODES[0]].adaptation_
     plant = variation or ("nominal" if adaptation is None else adaptation.variation)
+    drawn = [one.seed for one in learned[MODES[0]].used_ if one.purpose == "adaptation"]
+    if (is_of_logs := NOT_DRAWN in drawn) and variation is None:
+        raise ValueError(
+            f"calibrate: '{folder.path}' is adapted to a robot of logs, which no plant simulates: "
+            f"nothing can be promised for it. --variation {plant} promises for that simulated "
+            f"plant alone; plants are {list(loaded.variations)}"
+        )
     for gamma in learned.values():
         folders.check_fresh(gamma, loaded)
         gamma.check_unused(seed, purpose="calibration")
@@ -74,7 +82,7 @@ def calibrate(
         confidence=confidence,
         seed=seed,
         scenario_hash=loaded.simulation_hash(plant),
-        variation=plant,
+        variation=f"simulated {plant}" if is_of_logs else plant,
     )
     found = {}
     for mode, gamma in learned.items():

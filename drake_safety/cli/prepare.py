@@ -10,6 +10,7 @@ from typer import Argument, Exit, Option
 
 from drake_safety.assessments import assessed_scenarios
 from drake_safety.cli import console
+from drake_safety.cli.training_folder import MODES, load_assessment
 from drake_safety.control.policy_template import survey_policy
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.robot_figure import robot_figure
@@ -17,6 +18,7 @@ from drake_safety.extras import MissingExtraError
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.robots.robot_template import write_robot
 from drake_safety.simulation.legged_loop import LeggedLoop
+from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import load_scenario, scenario_names
 from drake_safety.simulation.scenario_check import check_scenario
 
@@ -121,6 +123,9 @@ def check(
     episodes: Annotated[int, Option(help="Episodes for the share of unsafe ones.", min=0)] = 16,
     quick: Annotated[bool, Option("--quick", help="The same as --episodes 0.")] = False,
     seed: Annotated[int, Option(help="Seed of these episodes.")] = DEMONSTRATION.first,
+    assessment: Annotated[
+        Path | None, Option(help="Folder of `train`: says whether its monitor knows the episodes.")
+    ] = None,
     picture: Annotated[
         Path | None,
         Option(
@@ -169,6 +174,12 @@ def check(
             )
         for path in save(robot_figure(loop), picture):
             console.say("picture", path)
+    if assessment is not None and num_episodes and import_ and not num_problems:
+        loaded, detector = load_scenario(scenario), load_assessment(assessment, MODES[0]).detector_
+        duration_s = num_episodes * loaded.episode_duration_s
+        watched = run_motions(loaded, duration_s, seed=seed, are_episodes=True, num_workers=1)
+        told, is_ok = detector.describe_alarms(watched)
+        console.say(told, style=None if is_ok else "yellow")
     if num_problems:
         console.say(f"{num_problems} problem{'s' * (num_problems > 1)}", style="red")
         raise Exit(1)

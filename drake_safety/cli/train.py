@@ -24,6 +24,8 @@ from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.rollouts import motion_piece_s, run_episodes, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
+_WATCHED = 128  # Of the episodes, which the monitor watches too.
+
 
 def train(
     scenario: console.ScenarioArgument,
@@ -31,9 +33,13 @@ def train(
     episodes: Annotated[int, Option(help="Nominal training episodes.", min=1)] = 2048,
     seed: Annotated[int, Option(help="Seed of the episodes.")] = TRAINING.first,
     motion: Annotated[
-        float,
-        Option(help="Minutes of undisturbed motion, half for the monitor's limits.", min=0.0),
-    ] = 48.0,
+        float | None,
+        Option(
+            help="Minutes of undisturbed motion, half for the monitor's limits; by default 6 s an "
+            "episode, 48 at most.",
+            min=0.0,
+        ),
+    ] = None,
     falls: Annotated[
         int | None,
         Option(
@@ -70,10 +76,13 @@ def train(
             )
     folders.check_writable(out)
     loop = loaded.make_loop()
-    if 0.0 < 60.0 * motion <= motion_piece_s(loop):
+    piece_s = motion_piece_s(loop)
+    motion_s = max(min(6.0 * episodes, 2880.0), 2.0 * piece_s) if motion is None else 60.0 * motion
+    if 0.0 < motion_s <= piece_s:
         raise ValueError(
-            f"train: --motion {motion:g} gives one motion, and the monitor needs one for its "
-            "prediction and one for its limits: give 2 or more, or 0 to learn it from the episodes"
+            f"train: --motion {motion_s / 60.0:g} gives one motion, and the monitor needs one for "
+            "its prediction and one for its limits: give 2 or more, or 0 to learn it from the "
+            "episodes"
         )
     with console.open_stages() as stages:
         for folder, options in sets.items():
@@ -88,15 +97,26 @@ def train(
                 **options,
             )
         detector = None
-        if motion:
+        if motion_s:
             motions = run_motions(
                 loaded,
-                60.0 * motion,
+                motion_s,
                 num_workers=workers,
                 path=out / "motion",
                 progress=partial(stages, "undisturbed motion"),
             )
-            detector = ChangeDetector.fit(motions, stage_of(stages, "monitor"))
+            watched = run_motions(
+                loaded,
+                min(episodes, _WATCHED) * loaded.episode_duration_s,
+                seed=seed,
+                are_episodes=True,
+                num_workers=workers,
+                path=out / "watched",
+                progress=partial(stages, "episodes for the monitor"),
+            )
+            # Those of one half, of which nothing is learned, say what the monitor knows.
+            known, fresh = (Episodes(watched.info, list(watched)[i::2]) for i in range(2))
+            detector = ChangeDetector.fit(motions, stage_of(stages, "monitor"), episodes=known)
         num_falls = episodes // 4 if falls is None else falls
         fallen = None
         if num_falls and MODES[0] in modes and isinstance(loop, CanFall):
@@ -112,6 +132,9 @@ def train(
         rows = [_learn(loaded, name, out, detector, fallen, stages) for name in modes]
     console.show(console.new_table("mode", "segments", "unsafe episodes", "CPU time", rows=rows))
     console.say(folders.load_assessment(out, modes[0]).detector_.describe())
+    if detector is not None:
+        told, is_ok = detector.describe_alarms(fresh)
+        console.say(told, style=None if is_ok else "yellow")
     console.say(describe(learning_curve(load_episodes(next(iter(sets))), loaded.assessment)))
     for folder in sets:
         console.say("episodes  ", folder)

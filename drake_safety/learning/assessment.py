@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 import math
 import os
 from collections.abc import Sequence
@@ -54,6 +55,8 @@ __all__ = [
     "Prediction",
     "SafetyAssessment",
 ]
+
+_LOGGER = logging.getLogger("drake_safety")
 
 
 class SafetyAssessment:
@@ -138,14 +141,17 @@ class SafetyAssessment:
         progress: StageProgress | bool | None = None,
         *,
         detector: ChangeDetector | None = None,
+        motions: Episodes | None = None,
     ) -> SafetyAssessment:
         """Learns embedding and beliefs from nominal episodes.
 
         Args:
             progress: Called with a stage ("distances", "t-SNE", "training", "beliefs", "monitor"),
                 the percentage done and 100; True shows it.
-            detector: That of undisturbed motion. By default it is learned from the episodes, whose
-                motion rarely suffices for its limits.
+            detector: That of undisturbed motion.
+            motions: Long undisturbed motions of the same diagram, from which the detector is
+                learned in its place. By default it is learned from the episodes, whose motion
+                rarely suffices for its limits.
 
         Raises:
             MissingExtraError: The extra "train" is not installed.
@@ -161,14 +167,20 @@ class SafetyAssessment:
             threadpool_limits(1, user_api="blas"),
             shown(progress, lambda stages: stages) as report,
         ):
+            if detector is None:
+                together = (episodes, None) if motions is None else (motions, episodes)
+                of_monitor = stage_of(report, "monitor")
+                detector = ChangeDetector.fit(together[0], of_monitor, episodes=together[1])
             vars(self).update(self._learned(episodes, report, detector))
+        if math.isinf(detector.alarm_level):
+            _LOGGER.warning("SafetyAssessment.fit: %s", detector.describe())
         return self
 
     def _learned(
         self,
         episodes: Episodes,
         progress: StageProgress | None,
-        detector: ChangeDetector | None,
+        detector: ChangeDetector,
     ) -> dict[str, Any]:
         """The learned attributes, stage by stage."""
         parameters, info = self.parameters, episodes.info
@@ -194,7 +206,6 @@ class SafetyAssessment:
             range_limit=parameters.novelty_range,
             plan=columns.plan,
         )
-        detector = detector or ChangeDetector.fit(episodes, stage_of(progress, "monitor"))
         return {
             "info_": info,
             "grid_": grid,

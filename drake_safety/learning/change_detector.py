@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -21,9 +21,11 @@ TIME_CONSTANTS_S = (0.1, 0.5, 2.0)
 FALSE_ALARMS_PER_HOUR = 0.1
 """Rate to which the limits are extrapolated: one in ten hours of nominal motion."""
 LEAST_MOTION_S = 360.0
-"""Motion for the limits, below which there is no alarm."""
+"""Motion for limits, of the nominal plant and of an actual robot; below it they are not learned."""
 MOST_PREDICTOR_S = 3600.0
 """Longest motion for the prediction; the rest is for the limits."""
+LEAST_JUDGED = 0.5
+"""Share of inputs that can be judged, below which there is an alarm."""
 RECOVERED_LEVEL, RECOVERY_S = 0.7, 5.0
 """Every level must be below the first for a time before an alarm ends [s]."""
 NUM_PREVIEWED = 2
@@ -34,8 +36,12 @@ _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
 _TAIL_SHARE = 0.1  # Of the blocks.
 _NUM_FOLDS = 12  # Of motions, whose levels are those by limits of the others.
 _LEAST_LIMIT = 0.3  # Of a chart, in standard deviations of its value for white innovations.
+_MOST_ALARMS = 0.1  # Share of safe episodes, above which the monitor does not know their motion.
 _FREE_REPEATS = 3  # Beyond the longest run of repeated inputs in training.
 _SETTINGS = ("alarm_level", "longest_repeat", "step_s", "motion_s")
+_LINEAR = ("predictor.linear.weight", "predictor.linear.bias")
+_ADAPTED = ("deviation", "limits", "settings", *_LINEAR)
+"""Arrays in which an adapted detector differs from the nominal one."""
 
 
 class Alarm(NamedTuple):
@@ -67,7 +73,9 @@ class ChangeDetector:
         alarm_level: 1, or infinite where there was too little motion for limits.
         longest_repeat: Longest known run of repeated inputs.
         step_s: Time between two inputs [s].
-        motion_s: Duration of the motion for the limits [s].
+        motion_s: Duration of the motion for the limits, of an adapted detector of the actual
+            robot's motion [s].
+        nominal: The detector before it was adapted to an actual robot; None if it was not.
     """
 
     predictor: StatePredictor
@@ -79,6 +87,7 @@ class ChangeDetector:
     longest_repeat: int
     step_s: float
     motion_s: float
+    nominal: ChangeDetector | None = None
 
     def __deepcopy__(self, memo: object) -> ChangeDetector:
         return self
@@ -90,16 +99,39 @@ class ChangeDetector:
 
     def describe(self) -> str:
         """What the limits were learned from, and what they promise."""
-        # Rounded down: a little too little is too little.
-        motion = f"monitor: {math.floor(self.motion_s / 60.0)} min of motion for its limits"
-        if math.isfinite(self.alarm_level):
-            hours = f"{1 / FALSE_ALARMS_PER_HOUR:.0f} h"
-            return f"{motion}, extrapolated to one false alarm in {hours}"
-        needed = f"{LEAST_MOTION_S / 60.0:.0f} are needed"
-        return f"{motion}, {needed}: it reports levels and never alarms"
+        nominal, needed = self.nominal or self, f"{LEAST_MOTION_S / 60.0:.0f} are needed"
+        told = f"monitor: {_minutes(nominal.motion_s)} of motion for its limits"
+        promise = f"extrapolated to one false alarm in {1 / FALSE_ALARMS_PER_HOUR:.0f} h"
+        if not math.isfinite(self.alarm_level):
+            promise = f"{needed}: it reports levels and never alarms"
+        if self.nominal is None:
+            return f"{told}, {promise}"
+        told += f"; {_minutes(self.motion_s)} of an actual robot's correct its prediction"
+        if self.motion_s < LEAST_MOTION_S:
+            return f"{told}, {needed} to widen limits: no rate of false alarms is promised on it"
+        ratio = self.widening()
+        told += (
+            f" and widen limits, {np.median(ratio):.2f} times in the median and {ratio.max():.2f}"
+        )
+        return f"{told} at most, {promise}; {self.longest_repeat} repeated inputs are no alarm"
+
+    def widening(self) -> np.ndarray:
+        """Limits in units of the nominal ones, (6, n_w): of the error, or of its deviation."""
+        sizes = []
+        for one in (self, self.nominal or self):
+            means, squares = np.split(one.limits, 2)
+            sizes.append(one.deviation * np.concatenate([means, np.sqrt(1.0 + squares)]))
+        ratio: np.ndarray = sizes[0] / sizes[1]
+        return ratio
 
     @classmethod
-    def fit(cls, motions: Episodes, progress: Callable[[float], object] = ignore) -> ChangeDetector:
+    def fit(
+        cls,
+        motions: Episodes,
+        progress: Callable[[float], object] = ignore,
+        *,
+        episodes: Episodes | None = None,
+    ) -> ChangeDetector:
         """Learns a prediction from half of the motions, at most an hour; limits from the rest.
 
         Limits from the errors of other predictions, as in cross-validation, do not see what this
@@ -109,10 +141,13 @@ class ChangeDetector:
             motions: Undisturbed motions, such as those of `run_motions`; those that leave the safe
                 set count until shortly before.
             progress: Called with the fraction done.
+            episodes: Nominal episodes with rows as far apart, which may be less calm. The safe ones
+                belong to the motions.
 
         Raises:
             MissingExtraError: The extra "train" is not installed.
-            ValueError: Fewer than two motions have three rows, or a name is unknown.
+            ValueError: Fewer than two motions have three rows, a name is unknown, or motions and
+                episodes are of different diagrams.
         """
         require_extra("train", "ChangeDetector.fit", "torch")
         info = motions.info
@@ -122,7 +157,14 @@ class ChangeDetector:
         plan = num_states + np.arange(min(NUM_PREVIEWED, info.horizon) * num_outputs)
         features += num_states + info.horizon * num_outputs
         columns = np.concatenate([watched, plan, features])
-        rows = [one for one in usual_rows(motions) if len(one) > 2]
+        safe = safe_rows(episodes or [])
+        for what in ("state_names", "output_names", "feature_names", "horizon", "step_s"):
+            found, expected = getattr((episodes or motions).info, what), getattr(info, what)
+            if found != expected:
+                raise ValueError(
+                    f"ChangeDetector: motions and episodes differ in {what}: {expected} and {found}"
+                )
+        rows = [one for one in [*usual_rows(motions), *safe] if len(one) > 2]
         seen, states = [one[:, columns] for one in rows], [one[:, watched] for one in rows]
         if len(seen) < 2:
             raise ValueError(
@@ -141,11 +183,20 @@ class ChangeDetector:
                 deviation=np.full(len(watched), 1e-9),
                 limits=np.ones((2 * len(TIME_CONSTANTS_S), len(watched))),
                 alarm_level=math.inf,
-                longest_repeat=max(map(_longest_repeat, seen)) + _FREE_REPEATS,
+                longest_repeat=_free_repeats(seen),
                 step_s=float(info.step_s),
                 motion_s=0.0,
             )
             return unlimited._limited([seen[i] for i in of_limits], [states[i] for i in of_limits])
+
+    def describe_alarms(self, episodes: Episodes) -> tuple[str, bool]:
+        """Says how many safe episodes have an alarm, and whether these are few."""
+        safe = safe_rows(episodes)
+        alarms = sum(bool(self.watch([one])[1]) for one in safe)
+        told, is_ok = f"monitor: alarms in {alarms} of {len(safe)} safe episodes", True
+        if alarms > _MOST_ALARMS * len(safe):
+            told, is_ok = f"{told}: train with more, or choose on_alarm: report", False
+        return told, is_ok
 
     def _limited(self, seen: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> ChangeDetector:
         """Chooses deviations and limits from inputs (K, n_u) and states (K, n_w) of motions."""
@@ -181,10 +232,8 @@ class ChangeDetector:
 
     def _charts(self, innovations: np.ndarray) -> np.ndarray:
         """The charts, signed, after each of consecutive innovations (K, n_w), (K, 6, n_w)."""
-        from scipy.signal import lfilter
-
         found = [
-            lfilter([rate], [1.0, rate - 1.0], values, axis=0)
+            _smoothed(values, rate)
             for values in (innovations, np.square(innovations) - 1.0)
             for rate in self.rates
         ]
@@ -203,49 +252,67 @@ class ChangeDetector:
         found = old + self.rates[:, None] * (values[:, None] - old)
         return found.reshape(charts.shape)
 
-    def levels(self, charts: np.ndarray, repeats: float | np.ndarray = 0.0) -> np.ndarray:
+    def levels(
+        self,
+        charts: np.ndarray,
+        repeats: float | np.ndarray = 0.0,
+        judged: float | np.ndarray = 1.0,
+    ) -> np.ndarray:
         """Largest chart of each state, in units of its limit, (..., n_w).
 
         Args:
             charts: Their values, (..., 6, n_w).
             repeats: Length of the run of repeated inputs, which concerns all states, (..., 1).
+            judged: Share of inputs that could be judged, which concerns all states, (..., 1).
         """
         levels: np.ndarray = (_sizes(charts) / self.limits).max(axis=-2)
-        return np.maximum(levels, repeats / self.longest_repeat)
+        blind = (1.0 - judged) / (1.0 - LEAST_JUDGED)
+        return np.maximum(levels, np.maximum(repeats / self.longest_repeat, blind))
 
     def watch(
         self, motions: Sequence[np.ndarray], state_names: Sequence[str] | None = None
     ) -> tuple[np.ndarray, list[Alarm]]:
         """Levels at each row of consecutive motions (K, n), (sum of K, n_w), and the alarms.
 
-        Between motions the charts keep their values, which the first two rows of a motion show.
-        Causes need the names of the watched states.
+        Between motions the charts keep their values, which the first two rows of a motion show. A
+        row that is not finite, and the two after it, are not judged, as in the diagram. Causes need
+        the names of the watched states.
         """
-        is_charted = np.concatenate([np.arange(len(one)) > 1 for one in motions])
-        levels = np.zeros((len(is_charted), len(self.watched)))
-        if not is_charted.any():
-            return levels, []
-        parts = [(one[:, self.columns], one[:, self.watched]) for one in motions if len(one) > 2]
-        errors = np.concatenate([self.predictor.errors(*one) for one in parts])
-        charts = self._charts(np.clip(errors / self.deviation, -_CLIP, _CLIP))
-        repeats = np.concatenate([_repeats(x)[1:] for x, _ in parts])
-        levels[is_charted] = self.levels(charts, repeats[:, None])
-        last = np.maximum.accumulate(np.where(is_charted, np.arange(len(levels)), 0))
-        levels = levels[last]
-        rows = [*np.flatnonzero(is_charted).tolist(), len(levels)]
-        states = [(0.0, 0.0)]
+        # Of no row, then of each judged one.
+        errors, repeats = [np.zeros((0, len(self.watched)))], [np.zeros(1)]
+        lost, judged = [], []
+        for one in motions:
+            x, states, row = one[:, self.columns], one[:, self.watched], np.arange(len(one))
+            is_gap = ~np.isfinite(x).all(axis=1)
+            last = np.maximum.accumulate(np.where(is_gap, row, -3))
+            lost.append(row - last < 3)
+            judged.append((row > 1) & ~lost[-1])
+            if judged[-1].any():
+                every = self.predictor.errors(np.where(is_gap[:, None], 0.0, x), states)
+                errors.append(every[judged[-1][2:]])
+                repeats.append(_repeats(x)[1:][judged[-1][2:]])
+        is_lost, is_judged = np.concatenate(lost), np.concatenate(judged)
+        innovations = np.concatenate(errors) / self.deviation
+        charts = self._charts(np.clip(innovations, -_CLIP, _CLIP))
+        charts, runs = np.insert(charts, 0, 0.0, axis=0), np.concatenate(repeats)
+        rate, newest = self.rates[-1], np.cumsum(is_judged)
+        share = 1.0 - _smoothed(is_lost.astype(float), rate)
+        levels = self.levels(charts[newest], runs[newest, None], share[:, None])
+        rows = [*np.flatnonzero(is_judged | is_lost).tolist(), len(levels)]
+        alarms = [(0.0, 0.0)]
         for level in levels[rows[:-1]].max(axis=1):
-            states.append(self.next_alarm(*states[-1], level))
-        changes = np.flatnonzero(np.diff([alarm for alarm, _ in states], append=0.0)).tolist()
-        state_names = state_names or [""] * len(self.watched)
-        return levels, [
-            Alarm(rows[i], rows[k], self.cause(charts[i], repeats[i], state_names))
-            for i, k in zip(changes[::2], changes[1::2], strict=True)
-        ]
+            alarms.append(self.next_alarm(*alarms[-1], level))
+        changes = np.flatnonzero(np.diff([alarm for alarm, _ in alarms], append=0.0)).tolist()
+        names, found = state_names or [""] * len(self.watched), []
+        for begin, end in zip(changes[::2], changes[1::2], strict=True):
+            first, last = rows[begin], newest[rows[begin]]
+            cause = self.cause(charts[last], runs[last], names, float(share[first]))
+            found.append(Alarm(first, rows[end], cause))
+        return levels, found
 
     def next_alarm(self, alarm: float, calm_s: float, level: float) -> tuple[float, float]:
         """Alarm (0 or 1), and time for which all levels have been low [s], after one more level."""
-        if level > self.alarm_level:
+        if not level <= self.alarm_level:  # Also for NaN.
             return 1.0, 0.0
         calm_s = calm_s + self.step_s if level < RECOVERED_LEVEL else 0.0
         if alarm == 0.0 or calm_s > RECOVERY_S - 0.5 * self.step_s:
@@ -253,31 +320,45 @@ class ChangeDetector:
         return 1.0, calm_s
 
     def with_motions(self, motions: Sequence[np.ndarray]) -> ChangeDetector:
-        """Returns the detector for which an actual robot's motions (K, n) are known as well.
+        """Returns the nominal detector for which an actual robot's motions (K, n) are known too.
 
-        The prediction gets a linear correction, and no limit becomes lower.
+        The prediction gets a linear correction. With `LEAST_MOTION_S` of motion limits widen to it,
+        and none becomes lower; with less they stay, as they would only say how little was seen.
         """
-        rows = [one for one in motions if len(one) > 2]
+        nominal, rows = self.nominal or self, [one for one in motions if len(one) > 2]
         if not rows:
-            return self
+            return nominal
         seen = [one[:, self.columns] for one in rows]
         states = [one[:, self.watched] for one in rows]
-        corrected = replace(self, predictor=self.predictor.corrected(seen, states))
+        predictor = nominal.predictor.corrected(seen, states)
+        corrected = replace(nominal, predictor=predictor, nominal=nominal)
         limited = corrected._limited(seen, states)
+        corrected = replace(corrected, motion_s=limited.motion_s)
+        if limited.motion_s < LEAST_MOTION_S:
+            return corrected
         return replace(
             corrected,
             deviation=limited.deviation,
-            limits=np.maximum(limited.limits, self.limits),
-            longest_repeat=max(self.longest_repeat, *map(_longest_repeat, seen)),
+            limits=np.maximum(limited.limits, nominal.limits),
+            longest_repeat=max(nominal.longest_repeat, _free_repeats(seen)),
         )
 
-    def cause(self, charts: np.ndarray, repeats: float, state_names: Sequence[str]) -> str:
+    def cause(
+        self,
+        charts: np.ndarray,
+        repeats: float,
+        state_names: Sequence[str],
+        judged: float = 1.0,
+    ) -> str:
         """Says what an alarm saw: which state, for how long, and of what kind.
 
         Args:
             charts: Their values at the alarm, (6, n_w).
             state_names: Names of the watched states.
+            judged: Share of inputs that could be judged.
         """
+        if judged < LEAST_JUDGED:
+            return "blind: most inputs are not finite, or follow one that is not"
         if repeats > self.longest_repeat:
             return "inputs frozen"
         ratio = _sizes(charts) / self.limits
@@ -302,15 +383,21 @@ class ChangeDetector:
         found = {"deviation": self.deviation, "limits": self.limits}
         found |= {name: getattr(self, name).astype(np.int32) for name in ("columns", "watched")}
         found["settings"] = np.array([getattr(self, name) for name in _SETTINGS], dtype=float)
-        return found | {f"predictor.{k}": v for k, v in self.predictor.arrays().items()}
+        found |= {f"predictor.{k}": v for k, v in self.predictor.arrays().items()}
+        before = {} if self.nominal is None else self.nominal.arrays()
+        return found | {f"nominal.{k}": before[k] for k in _ADAPTED if before}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ChangeDetector:
         """Makes the detector of arrays written by `arrays`."""
         alarm_level, longest_repeat, step_s, motion_s = arrays["settings"].tolist()
-        prefix = "predictor."
-        of_predictor = {k.removeprefix(prefix): v for k, v in arrays.items() if prefix in k}
+        of_predictor, before = (
+            {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+            for prefix in ("predictor.", "nominal.")
+        )
+        own = {k: v for k, v in arrays.items() if not k.startswith("nominal.")}
         return cls(
+            nominal=cls.from_arrays(own | before) if before else None,
             predictor=StatePredictor.from_arrays(of_predictor),
             columns=arrays["columns"].astype(int),
             watched=arrays["watched"].astype(int),
@@ -343,6 +430,19 @@ def usual_rows(motions: Episodes) -> list[np.ndarray]:
     """(state, desired preview, features) of motions (K, n), until shortly before they leave."""
     lost = math.ceil(_BEFORE_LEAVING_S / motions.info.step_s)
     return [rows_of(one)[one.first_step : None if one.is_safe else -lost] for one in motions]
+
+
+def _smoothed(values: np.ndarray, rate: float) -> np.ndarray:
+    """Exponentially weighted means of values (K, ...) until each, from zero on."""
+    from scipy.signal import lfilter
+
+    found: np.ndarray = lfilter([rate], [1.0, rate - 1.0], values, axis=0)
+    return found
+
+
+def safe_rows(episodes: Iterable[Episode]) -> list[np.ndarray]:
+    """Rows of safe episodes (K, n) whose future is undisturbed."""
+    return [rows_of(one)[one.first_step :] for one in episodes if one.is_safe]
 
 
 def _sizes(charts: np.ndarray) -> np.ndarray:
@@ -390,5 +490,11 @@ def _repeats(x: np.ndarray) -> np.ndarray:
     return np.array([*runs][1:], dtype=float)
 
 
-def _longest_repeat(x: np.ndarray) -> int:
-    return int(_repeats(x).max(initial=0.0))
+def _free_repeats(seen: Sequence[np.ndarray]) -> int:
+    """Length of a run of repeated inputs that is no alarm after motions (K, n_u)."""
+    return int(max(_repeats(x).max(initial=0.0) for x in seen)) + _FREE_REPEATS
+
+
+def _minutes(duration_s: float) -> str:
+    # Rounded down: a little too little is too little.
+    return f"{math.floor(duration_s / 60.0)} min"

@@ -246,6 +246,7 @@ def run_motions(
     variation: str = "nominal",
     seed: int = MOTION.first,
     until_s: float = math.inf,
+    are_episodes: bool = False,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
     progress: Progress | bool | None = None,
@@ -261,6 +262,7 @@ def run_motions(
     Args:
         duration_s: Duration of all motions together, if none leaves the safe set [s].
         until_s: Time at which each ends, if not sooner [s].
+        are_episodes: Whether they are ordinary episodes of any task.
         path, **loop_options: As for `run_episodes`.
 
     Raises:
@@ -270,25 +272,26 @@ def run_motions(
     check_times("run_motions", duration_s=duration_s)
     make = worker_loop(scenario, variation, **loop_options)
     loop = make()
-    piece_s = min(motion_piece_s(loop), until_s)
-    info = episodes_info(loop, seed, {**loop_options, "undisturbed_s": piece_s})
+    piece_s = min(motion_piece_s(loop, are_episodes), until_s)
+    kind = "episodes_s" if are_episodes else "undisturbed_s"
+    info = episodes_info(loop, seed, {**loop_options, kind: piece_s})
     step_s = scenario.monitor_step_s
     return collect_episodes(
         replace(info, step_s=step_s, num_steps=round(piece_s / step_s)),
         range(math.ceil(duration_s / piece_s - 1e-6)),
         make,
-        partial(run_motion, seed=seed, until_s=until_s),
+        partial(run_motion, seed=seed, until_s=until_s, is_episode=are_episodes),
         num_workers=num_workers,
         path=path,
         progress=progress,
         extra=extra,
-        batch_size=1 if isinstance(loop, MovesUndisturbed) else BATCH_SIZE,
+        batch_size=1 if piece_s > scenario.episode_duration_s else BATCH_SIZE,
     )
 
 
-def motion_piece_s(loop: ClosedLoop) -> float:
-    """Duration of one undisturbed motion of a loop [s]."""
-    is_long = isinstance(loop, MovesUndisturbed)
+def motion_piece_s(loop: ClosedLoop, is_episode: bool = False) -> float:
+    """Duration of one undisturbed motion of a loop, or of an episode [s]."""
+    is_long = isinstance(loop, MovesUndisturbed) and not is_episode
     return MOTION_PIECE_S if is_long else loop.scenario.episode_duration_s
 
 
@@ -299,6 +302,7 @@ def run_motion(
     seed: int = MOTION.first,
     until_s: float = math.inf,
     with_features: bool = False,
+    is_episode: bool = False,
     start: Callable[[Context], None] | None = None,
 ) -> Episode:
     """Simulates one undisturbed motion; see `run_motions`.
@@ -307,8 +311,9 @@ def run_motion(
         start: Sets state and plan of the root Context, in place of random ones.
         until_s: Time at which it ends, if not sooner [s].
         with_features: Whether to record features that the monitor does not read, too.
+        is_episode: Whether it is an ordinary episode, with the monitor's rows.
     """
-    scenario, piece_s = loop.scenario, motion_piece_s(loop)
+    scenario, piece_s = loop.scenario, motion_piece_s(loop, is_episode)
     step_s = scenario.monitor_step_s
 
     def begin(context: Context) -> int | None:
@@ -316,7 +321,7 @@ def run_motion(
         if start is not None:
             return start(context)
         rng = episode_rng(seed, index)
-        if isinstance(loop, MovesUndisturbed):
+        if isinstance(loop, MovesUndisturbed) and not is_episode:
             return loop.reset_undisturbed(context, rng, piece_s)
         return math.ceil(loop.reset(context, rng) * scenario.step_s / step_s)
 

@@ -31,15 +31,18 @@ class ChangeMonitor(LeafSystem):
         - alarm: 1
         - levels: n_w
         - alarm_cause: abstract
+        - judged_share: 1
 
     Every step of its training it predicts the state and updates the charts of a
     :class:`~drake_safety.learning.change_detector.ChangeDetector`. ``levels`` has the level of each
     watched state in units of its limit. When one exceeds 1, ``alarm`` becomes 1 and
     ``alarm_cause`` says what was seen; it ends when all were below 0.7 for five seconds, or with a
-    reset. Without enough motion for limits there is no alarm. The charts wait while a disturbance
-    that is known acts, such as a ball, a push or a recovery step, and `SETTLING_S` longer: while
-    ``hold`` is above 0.5, or as told by :meth:`expect_disturbance`. The detector is a parameter of
-    the Context, see :meth:`adopt`.
+    reset. Without enough motion for limits there is no alarm. An input that is not finite cannot be
+    judged, nor the two after it: ``judged_share`` is the share of the others over the last two
+    seconds, and below a half every level is above 1. The charts wait while a disturbance that is
+    known acts, such as a ball, a push or a recovery step, and `SETTLING_S` longer: while ``hold``
+    is above 0.5, or as told by :meth:`expect_disturbance`. The detector is a parameter of the
+    Context, see :meth:`adopt`.
     """
 
     def __init__(self, assessment: SafetyAssessment):
@@ -60,9 +63,10 @@ class ChangeMonitor(LeafSystem):
         self._hold_port = self.DeclareVectorInputPort("hold", 1)
         n_w, n_u = len(detector.watched), len(detector.columns)
         n_charts = 2 * len(TIME_CONSTANTS_S) * n_w
-        # `seen` are charts and repeats at the alarm.
+        # `num_lost` rows lack a row before them; `seen` are charts, repeats and share at the alarm.
         parts = {"state": n_w, "x": n_u, "previous": n_u, "charts": n_charts, "repeats": 1}
-        parts |= {"levels": n_w, "alarm": 1, "calm_s": 1, "seen": n_charts + 1}
+        parts |= {"judged": 1, "num_lost": 1}
+        parts |= {"levels": n_w, "alarm": 1, "calm_s": 1, "seen": n_charts + 2}
         parts |= {"expected_s": 2, "held_s": 1}  # Begin and end; last time with `hold`.
         starts = np.cumsum([0, *parts.values()]).tolist()
         self._places = {
@@ -74,6 +78,7 @@ class ChangeMonitor(LeafSystem):
             self._initial[self._places[name]] = np.nan
         for name in ("expected_s", "held_s"):
             self._initial[self._places[name]] = -math.inf
+        self._initial[self._places["judged"]] = 1.0
         state = self.DeclareDiscreteState(self._initial)
         self.DeclarePeriodicDiscreteUpdateEvent(detector.step_s, 0.0, self._update)
         ticket = {self.discrete_state_ticket(state)}
@@ -82,6 +87,7 @@ class ChangeMonitor(LeafSystem):
         self.DeclareAbstractOutputPort(
             "alarm_cause", lambda: Value(""), self._calc_alarm_cause, ticket
         )
+        self.DeclareVectorOutputPort("judged_share", BasicVector(1), self._calc_share, ticket)
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
         """Takes over the detector of an assessment adapted from this system's own."""
@@ -122,41 +128,49 @@ class ChangeMonitor(LeafSystem):
         detector = self._detector_of(context)
         values = context.get_discrete_state_vector().get_value().copy()
         part = {name: values[place] for name, place in self._places.items()}  # Views.
-        row = self.row(context)
-        x, state = row[detector.columns], row[detector.watched]
         now_s, (begin_s, end_s) = context.get_time(), part["expected_s"]
         if self.is_held(context):
             part["held_s"][0] = now_s
         if begin_s <= now_s:
             part["held_s"][0] = max(part["held_s"][0], min(now_s, end_s))
-        is_settled = now_s - part["held_s"][0] > SETTLING_S - 1e-9
-        if not is_settled or not x @ x < math.inf:  # As for NaN.
+        if now_s - part["held_s"][0] <= SETTLING_S - 1e-9:
             part["x"][:] = part["previous"][:] = np.nan
-            part["repeats"][0] = 0.0
+            part["repeats"][0] = part["num_lost"][0] = 0.0
         else:
-            is_repeated = np.array_equal(x, part["x"])
-            part["repeats"][0] = part["repeats"][0] + 1.0 if is_repeated else 0.0
-            if not math.isnan(part["previous"][0]):
-                self._chart(part, detector, state)
-            part["previous"][:] = part["x"]
-            part["x"][:], part["state"][:] = x, state
+            self._chart(part, detector, self.row(context))
         discrete_state.set_value(values)
 
     def _chart(
-        self, part: dict[str, np.ndarray], detector: ChangeDetector, state: np.ndarray
+        self, part: dict[str, np.ndarray], detector: ChangeDetector, row: np.ndarray
     ) -> None:
         """Updates charts, levels and alarm in a copy of the discrete state."""
-        change = state - part["state"]
-        innovation = detector.innovation(part["x"], part["previous"], change)
-        charts = detector.updated(part["charts"].reshape(-1, len(state)), innovation)
-        levels = detector.levels(charts, part["repeats"][0])
-        part["charts"][:], part["levels"][:] = charts.ravel(), levels
+        x, state = row[detector.columns], row[detector.watched]
+        is_finite = bool(x @ x < math.inf)  # Not for NaN.
+        num_lost, is_charted = part["num_lost"], not math.isnan(part["previous"][0]) and is_finite
+        is_lost = not is_finite or num_lost[0] > 0.0
+        num_lost[0] = max(num_lost[0] - 1.0, 0.0) if is_finite else 2.0
+        part["judged"] += detector.rates[-1] * (float(not is_lost) - part["judged"])
+        if is_charted:
+            innovation = detector.innovation(part["x"], part["previous"], state - part["state"])
+            charts = part["charts"].reshape(-1, len(state))
+            part["charts"][:] = detector.updated(charts, innovation).ravel()
+        is_repeated = np.array_equal(x, part["x"])  # Not for NaN.
+        part["repeats"][0] = part["repeats"][0] + 1.0 if is_repeated else 0.0
+        part["previous"][:] = part["x"] if is_finite else np.nan
+        part["x"][:], part["state"][:] = x if is_finite else np.nan, state
+        if is_lost or is_charted:
+            self._judge(part, detector)
+
+    def _judge(self, part: dict[str, np.ndarray], detector: ChangeDetector) -> None:
+        """Updates levels and alarm in a copy of the discrete state."""
+        seen = part["charts"].reshape(-1, len(self.level_names)), part["repeats"], part["judged"]
+        part["levels"][:] = detector.levels(*seen)
         before = part["alarm"][0]
         part["alarm"][0], part["calm_s"][0] = detector.next_alarm(
-            before, part["calm_s"][0], float(levels.max())
+            before, part["calm_s"][0], float(part["levels"].max())
         )
         if part["alarm"][0] > before:
-            part["seen"][:-1], part["seen"][-1] = part["charts"], part["repeats"][0]
+            part["seen"][:] = np.concatenate([part["charts"], *seen[1:]])
 
     def _detector_of(self, context: Context) -> ChangeDetector:
         detector: ChangeDetector = context.get_abstract_parameter(self._detector).get_value()
@@ -176,6 +190,9 @@ class ChangeMonitor(LeafSystem):
         cause = ""
         if self._of(context, "alarm")[0] > 0.0:
             seen = self._of(context, "seen")
-            charts = seen[:-1].reshape(-1, len(self.level_names))
-            cause = self._detector_of(context).cause(charts, seen[-1], self.level_names)
+            charts = seen[:-2].reshape(-1, len(self.level_names))
+            cause = self._detector_of(context).cause(charts, seen[-2], self.level_names, seen[-1])
         output.set_value(cause)
+
+    def _calc_share(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._of(context, "judged"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable, Iterator
 from typing import Literal, get_args
 
@@ -45,6 +46,7 @@ class SafetyAssessor(Diagram):
         - alarm: 1
         - levels: n_w
         - alarm_cause: abstract
+        - judged_share: 1
 
     The ports are those of its two systems.
 
@@ -138,7 +140,8 @@ def AddSafetyAssessor(
 ) -> SafetyAssessor:
     """Adds a :class:`SafetyAssessor` named ``safety_assessor`` to a diagram, and connects it.
 
-    It warns of plants whose ports show the next state to what updates at the same time.
+    It warns of plants whose ports show the next state to what updates at the same time, and of a
+    monitor that never alarms.
 
     Args:
         state: Port of the state, as in the training episodes.
@@ -180,6 +183,8 @@ def AddSafetyAssessor(
                 f"the assessment was fitted with {size}{_lacking(name, port, assessment)}"
             )
     warn_of_sampled_ports("AddSafetyAssessor", builder.GetSystems())
+    if on_alarm is not None and math.isinf(assessment.detector_.alarm_level):
+        _LOGGER.warning("AddSafetyAssessor: %s", assessment.detector_.describe())
     builder.AddNamedSystem("safety_assessor", assessor)
     for name, port in ports.items():
         builder.Connect(port, assessor.GetInputPort(name))
