@@ -56,10 +56,6 @@ class RobotKinematics:
     Positions are Drake's ``q = [q_WB (w, x, y, z), p_WB, joints]`` and velocities
     ``v = [w_WB, v_WB, joint rates]``. The object keeps one scratch Context a thread, which every
     method overwrites. Of a plant variation only the masses are used.
-
-    Raises:
-        ValueError: The robot has no feet, its base is not the only floating body, or a foot's body
-            or joint does not exist.
     """
 
     def __init__(self, robot: RobotModel, variation: PlantVariation | None = None):
@@ -185,12 +181,8 @@ class RobotKinematics:
         )
 
     def _jacobian(self) -> np.ndarray:
-        calculate, context, world = (
-            self.plant.CalcJacobianTranslationalVelocity,
-            self.context,
-            self.world_frame,
-        )
-        kind = JacobianWrtVariable.kV
+        calculate, context = self.plant.CalcJacobianTranslationalVelocity, self.context
+        kind, world = JacobianWrtVariable.kV, self.world_frame
         return np.concatenate(
             [calculate(context, kind, frame, points, world, world) for frame, points in self._feet]
         )
@@ -207,10 +199,8 @@ class RobotKinematics:
         The ground forces minimise the sum of squared point forces subject to the six floating-base
         rows ``0 = g_b + J_bᵀ f``; J is the contact Jacobian at ``q``, if known.
         """
-        if J is None:
-            J = self.contact_jacobian(q)  # Sets the positions.
-        else:
-            self.set_positions(q)
+        self.set_positions(q)
+        J = self._jacobian() if J is None else J
         g = self.plant.CalcGravityGeneralizedForces(self.context)
         if not is_stance.all():
             if not is_stance.any():

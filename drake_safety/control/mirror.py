@@ -121,11 +121,7 @@ class Mirror:
         return mirrored_q, mirrored_v
 
     def hand(self, name: str) -> str:
-        """Returns the name of the mirrored reaching frame.
-
-        Raises:
-            ValueError: The hand does not exist, or no reaching frame has its joints' partners.
-        """
+        """Returns the name of the mirrored reaching frame."""
         robot, names = self._kinematics.robot, self._kinematics.joint_names
         partners = robot.mirror_partners(names)
         wanted = {partners[joint] for joint in robot.reaching_frame(name).joints}

@@ -12,11 +12,7 @@ from filelock import BaseFileLock, FileLock, Timeout
 
 @contextlib.contextmanager
 def replacing(final: Path) -> Iterator[Path]:
-    """A temporary file beside a final one, renamed to it on success and removed on any exception.
-
-    Raises:
-        OSError: It cannot be written; the message names the file.
-    """
+    """A temporary file beside a final one, renamed to it on success, removed on any exception."""
     # Readers of folders (pyarrow, pandas) skip names that start with a dot.
     temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
     try:
@@ -42,11 +38,7 @@ def write_file(path: Path, content: str | bytes) -> None:
 
 
 def lock_folder(path: Path) -> BaseFileLock:
-    """Makes a folder if it does not exist, and locks it until this process ends or releases it.
-
-    Raises:
-        ValueError: It is locked.
-    """
+    """Makes a folder if it does not exist, and locks it until this process ends or releases it."""
     path.mkdir(parents=True, exist_ok=True)
     lock = FileLock(path / ".lock", thread_local=False)
     try:

@@ -74,11 +74,7 @@ class YamlLoader(yaml.SafeLoader):
     """Reads ``1e-3`` as a number, as YAML 1.2 does, and refuses keys that stand twice."""
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        """Composes a mapping; keys differ as texts, as in JSON, by which :func:`load_typed` reads.
-
-        Raises:
-            ValueError: A key stands twice.
-        """
+        """Composes a mapping; keys differ as texts, as in JSON, which :func:`load_typed` reads."""
         node: yaml.MappingNode = super().compose_mapping_node(anchor)
         lines: dict[str, int] = {}
         for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):

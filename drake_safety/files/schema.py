@@ -88,9 +88,6 @@ def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
     """Reads plain values, such as those of a YAML document, into a dataclass.
 
     A nested mapping that leaves keys out keeps their values in the field's default.
-
-    Raises:
-        ValueError: A key is unknown, or a value has another type or is out of range.
     """
     try:
         text = json.dumps({"value": _merged(schema, raw)}, default=_plain)

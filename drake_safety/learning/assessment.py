@@ -152,10 +152,6 @@ class SafetyAssessment:
             motions: Long undisturbed motions of the same diagram, from which the detector is
                 learned in its place. By default it is learned from the episodes, whose motion
                 rarely suffices for its limits.
-
-        Raises:
-            MissingExtraError: The extra "train" is not installed.
-            ValueError: A parameter is invalid, the horizons differ, or there are too few segments.
         """
         require_extra("train", "SafetyAssessment.fit")
         self.parameters.check()
@@ -234,11 +230,6 @@ class SafetyAssessment:
 
         Returns:
             This assessment.
-
-        Raises:
-            MissingExtraError: The extra "train" is not installed.
-            ValueError: The maps have no margin heads, as in the paper's mode, there is no such
-                feature, the seed was used, or no episode ends in a fall, or every one does.
         """
         require_extra("train", "SafetyAssessment.fit_falls", "sklearn")
         self._check_fitted()
@@ -285,11 +276,6 @@ class SafetyAssessment:
             motions: Motion of the actual robot that the monitor is to know as well, or its rows
                 (state, desired preview, features), (K, n) each, as far apart as in its training;
                 of motion with more rows those between are left out.
-
-        Raises:
-            MissingExtraError: The extra "train" is not installed.
-            ValueError: Unknown method, maps without heads for "recalibration", no feedback, or
-                feedback of another scenario.
         """
         require_extra("train", "SafetyAssessment.adapt", "sklearn")
         self._check_fitted()
@@ -369,9 +355,6 @@ class SafetyAssessment:
         Args:
             purpose: "calibration" or "adaptation" if the sets replace those of an earlier one,
                 which are then ignored; the default is evaluation.
-
-        Raises:
-            ValueError: A seed was used; the message names its purpose and a free seed.
         """
         self._check_fitted()
         used = [one for one in self.used_ if one.purpose != purpose]
@@ -380,11 +363,7 @@ class SafetyAssessment:
     def adopt_calibrations(
         self, calibrations: Sequence[Calibration], info: EpisodesInfo, num_episodes: int
     ) -> None:
-        """Replaces the calibrations.
-
-        Raises:
-            ValueError: The episodes were used for training or adaptation.
-        """
+        """Replaces the calibrations."""
         self.check_unused(info.seed, purpose="calibration")
         kept = [one for one in self.used_ if one.purpose != "calibration"]
         self.calibrations_ = {one.kind: one for one in calibrations}
@@ -427,9 +406,6 @@ class SafetyAssessment:
         Returns:
             The prediction. Novel inputs and those that are not finite get the empty belief, whose
             probability is 0. A row has the same bits whatever the others are.
-
-        Raises:
-            ValueError: A width or a shape is wrong, or the assessment is not fitted.
         """
         self._check_fitted()
         x = self.inputs_of(state, desired_preview, features)
@@ -523,9 +499,6 @@ class SafetyAssessment:
 
         Returns:
             x (N, n_x), the logit (N,) and its gradient (N, n_x).
-
-        Raises:
-            ValueError: The maps have no safety head, as in the paper's mode.
         """
         x = self.inputs_of(state, desired_preview, features)
         return x, *self.embedding_.logit_gradient(x)
@@ -541,10 +514,6 @@ class SafetyAssessment:
 
         It is that of the present beliefs, correction and novelty, and its metadata say what its
         inputs are, what its thresholds promise and for which plant.
-
-        Raises:
-            MissingExtraError: The extra "onnx" is not installed.
-            ValueError: The assessment is not fitted.
         """
         from drake_safety.learning import onnx_graph
 
@@ -553,11 +522,7 @@ class SafetyAssessment:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SafetyAssessment:
-        """Reads a file written by `save`.
-
-        Raises:
-            ValueError: The file is truncated, not an assessment, or of another schema version.
-        """
+        """Reads a file written by `save`."""
         parameters, learned = assessment_file.read(Path(path))
         assessment = cls(parameters)
         vars(assessment).update(learned)

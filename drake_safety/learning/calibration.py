@@ -124,10 +124,6 @@ def calibrate(
         miss_rate: Promised share of unsafe episodes with the verdict "safe", in (0, 1).
         false_alarm_rate: Promised share of safe episodes with the verdict "unsafe", in (0, 1).
         confidence: Confidence of both rates, in (0, 1); None for rates on average.
-
-    Raises:
-        ValueError: Too few unsafe or safe episodes for the promised rates; the message names the
-            number that is needed.
     """
     score, label = _checked(unsafe_score, is_unsafe)
     above = score_threshold(score, label, miss_rate, confidence=confidence)
@@ -171,9 +167,6 @@ def score_threshold(
     Returns:
         The midpoint between the k-th lowest unsafe score and the next lower score of either label;
         just below the former if there is none.
-
-    Raises:
-        ValueError: Too few samples have the label, no score is finite, or a rate is not in (0, 1).
     """
     score, label = _checked(unsafe_score, is_unsafe)
     if not np.isfinite(score).any():
@@ -195,11 +188,7 @@ def score_threshold(
 
 
 def allowed_misses(num_unsafe: int, miss_rate: float, *, confidence: float | None = None) -> int:
-    """How many of n unsafe episodes may be missed, see `score_threshold`; -1 if n is too small.
-
-    Raises:
-        ValueError: A rate is not in (0, 1).
-    """
+    """How many of n unsafe episodes may be missed, see `score_threshold`; -1 if n is too small."""
     check_share("miss_rate", miss_rate)
     if confidence is None:
         return math.floor(miss_rate * (num_unsafe + 1) + 1e-9) - 1
@@ -213,11 +202,7 @@ def allowed_misses(num_unsafe: int, miss_rate: float, *, confidence: float | Non
 
 
 def episodes_needed(miss_rate: float, *, confidence: float | None = None) -> int:
-    """Returns the least number of unsafe episodes for a promised miss rate.
-
-    Raises:
-        ValueError: A rate is not in (0, 1).
-    """
+    """Returns the least number of unsafe episodes for a promised miss rate."""
     check_share("miss_rate", miss_rate)
     if confidence is None:
         return math.ceil(1.0 / miss_rate - 1e-9) - 1
@@ -244,9 +229,6 @@ def episode_scores(
 
     Returns:
         Score and label of each episode that has segments, (M,) each.
-
-    Raises:
-        ValueError: Unknown kind.
     """
     if kind not in KINDS:
         raise ValueError(f"calibration: unknown kind '{kind}'; the kinds are {list(KINDS)}")

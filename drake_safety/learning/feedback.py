@@ -68,9 +68,6 @@ def pair_episodes(
         nominal: The twins; further episodes are ignored.
         nominal_hash: Scenario hash of the nominal plant, if the twins' hash also covers the options
             of the pairs; the twins' hash by default.
-
-    Raises:
-        ValueError: A twin is missing or starts in another state, or the sets are of other tasks.
     """
     who = f"feedback of '{actual.info.scenario}'"
     for name in _SAME_TASK:
@@ -163,9 +160,6 @@ def feedback_segments(
 
     A twin that has left the safe set before a segment starts scores 1 there. As in training, an
     unsafe episode has segments only where a complete one has them.
-
-    Raises:
-        ValueError: There is no segment.
     """
     settings, discount = mode_settings(parameters), parameters.discount
     parts = []

@@ -194,12 +194,7 @@ class Episodes(Sequence[Episode]):
     """A set of episodes that share one `EpisodesInfo`; a slice is a set."""
 
     def __init__(self, info: EpisodesInfo, episodes: Iterable[Episode]):
-        """Checks every episode against `info`.
-
-        Raises:
-            ValueError: An array's shape does not fit `info` and `time_s`, or the cause is unknown
-                or contradicts `is_safe`.
-        """
+        """Checks every episode against `info`."""
         self.info = info
         self._is_warned = False
         self._episodes = list(episodes)
@@ -385,10 +380,6 @@ def split(
         stride: Rows between two starts; `stride=H` is the paper's split.
         discount: gamma of the unsafety score.
         shortest: Least number of samples left of a complete episode; H by default.
-
-    Raises:
-        ValueError: The stride is below 1, `shortest` is not in 1..H, or no episode gives a
-            segment.
     """
     if stride < 1:
         raise ValueError(f"split: stride is {stride}, expected >= 1")
@@ -441,12 +432,7 @@ def split(
 
 
 def training_segments(episodes: Episodes, parameters: AssessmentParameters) -> Segments:
-    """Splits training episodes into segments according to the mode.
-
-    Raises:
-        ValueError: Horizon or preview stride are not those of the episodes, or they give no
-            segment.
-    """
+    """Splits training episodes into segments according to the mode."""
     for name in ("horizon", "preview_stride"):
         here, there = getattr(parameters, name), getattr(episodes.info, name)
         if here != there:

@@ -80,9 +80,6 @@ class Ball:
         The impact point is found by sphere tracing along the line of flight to the robot's
         collision geometry in its present pose. The initial velocity compensates gravity, so that
         the ball arrives horizontally.
-
-        Raises:
-            ValueError: The line misses the robot, or the flight would start under the ground.
         """
         if not lead_s >= 0:
             raise ValueError(f"throw: lead_s must not be negative; got {lead_s}")

@@ -44,11 +44,7 @@ def cache_folder() -> Path:
 
 
 def check_meshes(model: Path) -> None:
-    """Checks the meshes that a model file names, or is, as damaged ones crash Drake.
-
-    Raises:
-        ValueError: An index is beyond what it counts, a number is not finite, or it has no faces.
-    """
+    """Checks the meshes that a model file names, or is, as damaged ones crash Drake."""
     text = "" if model.suffix in SHOWN_FORMATS else model.read_text("utf-8", "replace")
     for url in {str(model), *_MESH.findall(text)}:
         try:

@@ -265,9 +265,6 @@ def add_robot(
         servos: Whether the joints get robot.yaml's position servos. Torque control needs False: in
             Drake 1.51 an actuator with gains whose desired state is not connected ignores its
             torque input.
-
-    Raises:
-        ValueError: A body or joint in robot.yaml does not exist, or a pattern is ambiguous.
     """
     variation = variation or PlantVariation()
     instance = _add_description(plant, robot)

@@ -175,11 +175,7 @@ class RobotModel:
             raise ValueError(f"shapes {list(self.shapes)} need collision: stated")
 
     def gains_of(self, joint_name: str) -> JointGains | None:
-        """Returns a joint's servo gains, by the pattern that it matches; None without one.
-
-        Raises:
-            ValueError: Several patterns match.
-        """
+        """Returns a joint's servo gains, by the pattern that it matches; None without one."""
         return by_pattern(self.joint_gains, joint_name, "gains", self.name)
 
     def limbs(self) -> list[Foot | ReachingFrame]:
@@ -187,11 +183,7 @@ class RobotModel:
         return [*self.feet.values(), *self.reaching_frames.values()]
 
     def reaching_frame(self, hand: str) -> ReachingFrame:
-        """Returns the reaching frame of a hand.
-
-        Raises:
-            ValueError: The hand does not exist.
-        """
+        """Returns the reaching frame of a hand."""
         if hand not in self.reaching_frames:
             raise ValueError(
                 f"robot '{self.name}' has no reaching frame '{hand}'; "
@@ -203,9 +195,6 @@ class RobotModel:
         """Returns each joint's mirrored joint; joints without a pattern map to themselves.
 
         Patterns hold in both directions, so one side's names suffice.
-
-        Raises:
-            ValueError: A pattern matches no joint, or maps a joint to a missing one or to two.
         """
         who, names, partners = f"robot '{self.name}'", list(joint_names), dict[str, str]()
         for pattern, template in self.mirror.items():
@@ -237,11 +226,7 @@ class RobotModel:
 
 
 def load_robot_file(path: str | Path) -> RobotModel:
-    """Reads a ``robot.yaml``; its folder is the robot's ``source_dir``.
-
-    Raises:
-        ValueError: The file does not exist or does not fit the schema.
-    """
+    """Reads a ``robot.yaml``; its folder is the robot's ``source_dir``."""
     path = Path(path)
     robot = load_typed_file(RobotModel, path, f"robot file '{path}'")
     robot.source_dir = str(path.resolve().parent)

@@ -168,9 +168,6 @@ def write_robot(
         hands: Links that arms end in; those of limbs of four joints or more by default.
         moved: Joints that a policy moves: they are not fixed, though they may move neither a foot
             nor a hand; None for all.
-
-    Raises:
-        ValueError: Invalid name, unknown task, existing folder, or a file without a legged robot.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise ValueError(f"new: a robot's name is letters, digits and _; got '{name}'")

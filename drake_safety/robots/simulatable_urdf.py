@@ -63,9 +63,6 @@ def simulatable_copy(path: Path) -> UrdfCopy:
 
     Of meshes that Drake does not read, visual ones are converted to glTF and collision ones become
     convex hulls, see :mod:`~drake_safety.robots.meshes`; what cannot be read is left out.
-
-    Raises:
-        ValueError: The file does not exist or is not a URDF.
     """
     copy = read_urdf(path)
     for place, tag in _IGNORED:

@@ -301,11 +301,7 @@ class UrdfCopy:
 
 
 def read_urdf(path: Path) -> UrdfCopy:
-    """Reads a URDF as an editable copy.
-
-    Raises:
-        ValueError: The file does not exist, is not a URDF, or has masses or limits that none has.
-    """
+    """Reads a URDF as an editable copy."""
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"URDF '{path}' does not exist")

@@ -479,11 +479,7 @@ def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]
 
 
 def require_shapes(survey: Survey, copy: UrdfCopy, *, are_feet_named: bool) -> None:
-    """Refuses shapes of another order of magnitude, and to guess feet whose meshes were not found.
-
-    Raises:
-        ValueError: It names the links and the files of their meshes.
-    """
+    """Refuses shapes of another order of magnitude, and to guess feet of meshes not found."""
     robot_m = extent(survey.plant, survey.context, survey.instance)
     for link, size in survey.oversized(10 * robot_m).items():
         raise ValueError(
@@ -513,11 +509,7 @@ def require_shapes(survey: Survey, copy: UrdfCopy, *, are_feet_named: bool) -> N
 
 
 def require_motors(survey: Survey, legs: list[Limb], moved: Collection[str]) -> None:
-    """Refuses legs with joints that no motor moves by itself, unless a policy ``moved`` them.
-
-    Raises:
-        ValueError: It names the joints and what the file says of them.
-    """
+    """Refuses legs with joints that no motor moves by itself, unless a policy ``moved`` them."""
     drives = survey.drives
     chains = [survey.chain(limb.body) for limb in legs]
     joints = list(dict.fromkeys(joint for one in chains for joint in one))
@@ -548,11 +540,7 @@ def listed(reasons: Mapping[str, str]) -> str:
 
 
 def require_masses(survey: Survey) -> None:
-    """Refuses joints that move nothing with mass or inertia, whose acceleration is infinite.
-
-    Raises:
-        ValueError: It names the joint and its link.
-    """
+    """Refuses joints that move nothing with mass or inertia, whose acceleration is infinite."""
     M = survey.plant.CalcMassMatrix(survey.context)
     for joint in survey.joints:
         if M[joint.velocity_start(), joint.velocity_start()] < _LEAST_INERTIA:

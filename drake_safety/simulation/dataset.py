@@ -52,9 +52,6 @@ class EpisodeWriter:
     Args:
         extra: Further content of ``info.json``, as JSON types (the command, the scenario's text,
             ...). In a folder that is continued, it replaces entries of the same names.
-
-    Raises:
-        ValueError: The folder holds another set of episodes, or something else, or has a writer.
     """
 
     def __init__(
@@ -131,11 +128,7 @@ class EpisodeWriter:
 
 
 def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any]]:
-    """Reads the metadata of a folder's episodes, and the extra stored with it.
-
-    Raises:
-        ValueError: There is no ``info.json``, or it has another schema.
-    """
+    """Reads the metadata of a folder's episodes, and the extra stored with it."""
     file = Path(path) / _INFO_NAME
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
@@ -158,11 +151,7 @@ def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any
 
 
 def completed(path: str | os.PathLike[str]) -> set[int]:
-    """Indices of the episodes on disk; empty if nothing was written yet.
-
-    Raises:
-        ValueError: A shard is truncated or damaged, or there are shards but no ``info.json``.
-    """
+    """Indices of the episodes on disk; empty if nothing was written yet."""
     shards = shards_in(Path(path))
     if shards and not (Path(path) / _INFO_NAME).exists():
         raise ValueError(
@@ -179,10 +168,6 @@ def load_episodes(path: str | os.PathLike[str]) -> Episodes:
     """Loads all episodes of a folder, sorted by index, bit for bit as they were appended.
 
     An episode in two shards is loaded once if both copies are identical.
-
-    Raises:
-        ValueError: The folder has no ``info.json``, a shard is truncated, damaged or of another
-            set, or two shards hold different episodes of the same index.
     """
     info, _ = read_info(path)
     episodes: dict[int, tuple[Episode, Path]] = {}

@@ -108,11 +108,7 @@ class Scenario:
         return round(self.episode_duration_s / self.step_s)
 
     def variation(self, name: str) -> PlantVariation:
-        """A plant variation by name.
-
-        Raises:
-            ValueError: No such variation.
-        """
+        """A plant variation by name."""
         if name not in self.variations:
             raise ValueError(
                 f"scenario '{self.name}' has no variation '{name}'"
@@ -127,11 +123,7 @@ class Scenario:
         return load_robot_file(self.robot).name if is_file else self.robot
 
     def task_class(self) -> type[ClosedLoop]:
-        """The task, imported.
-
-        Raises:
-            ValueError: The import path is malformed or is not that of a ClosedLoop.
-        """
+        """The task, imported."""
         return _import_task(self.task, self.name, self.folder)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -152,10 +144,6 @@ class Scenario:
             assessment: Adds an assessor and, for example, recovery.
             meshcat: Adds a visualiser; a task whose constructor does not take it draws nothing.
             **options: Options of the task, such as ``recovery=False``.
-
-        Raises:
-            ValueError: Unknown variation or option, an assessment of another diagram, or a diagram
-                without the ports of a ClosedLoop.
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
         options = _accepted(task, options, meshcat)
@@ -207,9 +195,6 @@ class Scenario:
             variation: The simulated plant. The nominal one is always included, because it is the
                 controllers' model.
             name: That the file may have had, which is part of the hash.
-
-        Raises:
-            ValueError: No such variation.
         """
         if variation != "nominal":
             self.variation(variation)
@@ -364,9 +349,6 @@ def load_scenario(name: str | Path, changes: Mapping[str, Any] | None = None) ->
 
     Args:
         changes: Values that replace those of the file, by key, such as ``parameters.policy``.
-
-    Raises:
-        ValueError: No such scenario, unknown or ill-typed keys, or no such task.
     """
     path = _scenario_file(name)
     with reading(path, errors=ValueError):
