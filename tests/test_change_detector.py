@@ -111,6 +111,7 @@ def test_too_little_motion_gives_levels_and_no_alarm():
     levels, alarms = detector.watch([motion(5.0, 12, ALWAYS)])
     assert levels.max() > 1.0 and alarms == []
     assert "never alarms" in detector.describe()
+    assert "never alarms; 3 min of" in detector.with_motions(rows).describe()
     assert "extrapolated to one false alarm in" in learned().describe()
     with pytest.raises(ValueError, match="1 motions have three rows; two are needed"):
         ChangeDetector.fit(recorded([one[: 2 + i] for i, one in enumerate(rows[:2])]))

@@ -187,7 +187,8 @@ def _known(made: type, entries: Mapping[str, Any]) -> dict[str, Any]:
 def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: dict[str, int]) -> None:
     """Raises ValueError if an array does not fit the sizes by letter, or has impossible values."""
     for name, values in sorted(arrays.items()):
-        letters = _SIZES.get(name, "*" * values.ndim)
+        kind = name.replace(".nominal.", ".")  # Of an adapted detector.
+        letters = _SIZES.get(kind, "*" * values.ndim)
         if len(letters) != values.ndim or not all(
             one == "*" or sizes.setdefault(one, size) == size
             for one, size in zip(letters, values.shape, strict=True)
@@ -198,7 +199,7 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: dict[str, int]) -> No
             of_weight = arrays[f"{name.removesuffix('bias')}weight"].shape
             if values.shape != of_weight[:-2] + of_weight[-1:]:
                 raise ValueError(f"'{name}' has the shape {values.shape}, its weight {of_weight}")
-        most = math.inf if name in _MAYBE_INFINITE else float(np.finfo(float).max)
+        most = math.inf if kind in _MAYBE_INFINITE else float(np.finfo(float).max)
         least = float(np.finfo(float).tiny) if _POSITIVE.search(name) else -most
         if name in _SHARES:
             least, most = 0.0, 1.0 + _ROUNDING

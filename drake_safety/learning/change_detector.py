@@ -102,18 +102,19 @@ class ChangeDetector:
         nominal, needed = self.nominal or self, f"{LEAST_MOTION_S / 60.0:.0f} are needed"
         told = f"monitor: {_minutes(nominal.motion_s)} of motion for its limits"
         promise = f"extrapolated to one false alarm in {1 / FALSE_ALARMS_PER_HOUR:.0f} h"
+        own = f"; {_minutes(self.motion_s)} of an actual robot's correct its prediction"
+        own *= self.nominal is not None
         if not math.isfinite(self.alarm_level):
-            promise = f"{needed}: it reports levels and never alarms"
+            return f"{told}, {needed}: it reports levels and never alarms{own}"
         if self.nominal is None:
             return f"{told}, {promise}"
-        told += f"; {_minutes(self.motion_s)} of an actual robot's correct its prediction"
         if self.motion_s < LEAST_MOTION_S:
-            return f"{told}, {needed} to widen limits: no rate of false alarms is promised on it"
-        ratio = self.widening()
-        told += (
-            f" and widen limits, {np.median(ratio):.2f} times in the median and {ratio.max():.2f}"
-        )
-        return f"{told} at most, {promise}; {self.longest_repeat} repeated inputs are no alarm"
+            kept = f"{needed} to widen limits: no rate of false alarms is promised on it"
+            return f"{told}{own}, {kept}"
+        median, most = np.median(self.widening()), self.widening().max()
+        widened = f"widen limits, {median:.2f} times in the median and {most:.2f} at most"
+        kept = f"{self.longest_repeat} repeated inputs are no alarm"
+        return f"{told}{own} and {widened}, {promise}; {kept}"
 
     def widening(self) -> np.ndarray:
         """Limits in units of the nominal ones, (6, n_w): of the error, or of its deviation."""
