@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.console import Console
 from rich.logging import RichHandler
 from typer.core import TyperCommand
 
@@ -183,7 +184,9 @@ def run_app(commands: Callable[..., Any], program: str) -> None:
 
     SIGTERM stops it as Ctrl-C does.
     """
-    handler = RichHandler(console=console.console, show_path=False)
+    # What reads a pipe, such as the JSON of `ask`, gets results alone.
+    log = console.console if console.console.is_terminal else Console(stderr=True)
+    handler = RichHandler(console=log, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
     logging.getLogger("drake").setLevel(logging.WARNING)  # Whoever serves a page that stays tells.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
