@@ -169,12 +169,7 @@ def compare_loops(
 
 
 def check_pair(pair: tuple[Loop, Loop], *, metric: Metric = UNSAFE, seed: int = GATE.first) -> None:
-    """Builds two loops and begins their first episode, before hours of simulations.
-
-    Raises:
-        ValueError: They are the same or do not start alike, a system of one raised an error, or
-            there is no such metric.
-    """
+    """Builds two loops and begins their first episode, before hours of simulations."""
     (one, variation), (two, other) = pair
     if (hash_ := one.simulation_hash(variation)) == two.simulation_hash(other):
         who = f"scenario '{one.name}', variation '{variation}'"

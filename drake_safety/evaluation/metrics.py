@@ -94,11 +94,7 @@ _MEDIAN_BOOTSTRAP = Bootstrap(num_resamples=2000)
 
 
 def proportion(count: int, n: int) -> Estimate:
-    """The share `count` of `n` independent samples, with its Clopper-Pearson interval.
-
-    Raises:
-        ValueError: `count` is not in 0..n.
-    """
+    """The share `count` of `n` independent samples, with its Clopper-Pearson interval."""
     from scipy.stats import binomtest
 
     if not 0 <= count <= n:
@@ -113,9 +109,6 @@ def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> E
     """The median of independent values (N,), with its bootstrap interval.
 
     Infinite values are allowed: a fall that never happens is later than any other.
-
-    Raises:
-        ValueError: A value is NaN.
     """
     if np.isnan(values).any():
         raise ValueError(f"median: {np.isnan(values).sum()} of {values.size} values are NaN")

@@ -54,9 +54,6 @@ class Outcomes:
 
     Attributes:
         simulated: Options of the simulation.
-
-    Raises:
-        ValueError: There is no such metric.
     """
 
     def __init__(self, loop: ClosedLoop, metric: Metric, gamma: SafetyAssessment | None = None):
@@ -69,11 +66,7 @@ class Outcomes:
             self.simulated["until"] = name
 
     def of(self, episode: Episode) -> Outcome:
-        """What is kept of an episode.
-
-        Raises:
-            ValueError: The metric is not in [0, 1].
-        """
+        """What is kept of an episode."""
         is_held = episode.num_controller_failures > 0
         is_bad = self._bad_rows(episode) | _last_row(episode, is_held or episode.cause == DIVERGED)
         value = float(self._metric(episode) if callable(self._metric) else is_bad.any())

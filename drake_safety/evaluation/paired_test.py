@@ -52,9 +52,6 @@ def look(
 
     Args:
         before: Earlier looks. What they have excluded stays so.
-
-    Raises:
-        ValueError: An outcome is not in [-bound, bound].
     """
     scaled = np.array(outcomes) / bound
     if not (worst := np.abs(scaled).max()) <= 1.0 + _EDGE:

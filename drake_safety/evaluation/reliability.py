@@ -65,9 +65,6 @@ def reliability(
     """Compares 1 - probability of rows, (N,), NaN counting as one, with outcomes of their episodes.
 
     There are fewer than ``num_bins`` bins if rows share probabilities.
-
-    Raises:
-        ValueError: There is no episode, or a probability outside [0, 1].
     """
     p = np.asarray(unsafe_probability, dtype=float)
     p = np.where(np.isnan(p), 1.0, p)

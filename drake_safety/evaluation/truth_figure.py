@@ -45,10 +45,6 @@ def truth_figure(
         episodes: Episodes that it has not used.
         x: Name of the state variable on the horizontal axis, of `episodes.info.state_names`.
         labels: Labels of the two axes, such as "tilt [rad]"; the names by default.
-
-    Raises:
-        ValueError: A state variable does not exist, the assessment has used the episodes' seed, or
-            no episode starts inside the safe set and has an outcome.
     """
     names = episodes.info.state_names
     for name in (x, y):
@@ -108,10 +104,7 @@ def _grid_order(points: np.ndarray) -> np.ndarray | None:
 def _draw_points(
     axes: Axes, points: np.ndarray, value: np.ndarray, is_outside: np.ndarray
 ) -> tuple[ScalarMappable, list[Artist]]:
-    """Draws a point for each start: coloured, hollow (NaN, "don't know") or grey (outside).
-
-    Returns the colours, and what a legend explains.
-    """
+    """Draws coloured, hollow (NaN) or grey (outside) starts; returns colours and legend."""
     x, y = points.T
     hollow, rows = np.isnan(value) & ~is_outside, ~np.isnan(value) & ~is_outside
     ring: dict[str, Any] = {"facecolors": "white", "edgecolors": INK, "linewidths": 0.6}

@@ -42,9 +42,6 @@ def serve_page(
 
     Args:
         scene_url: Address at which this process reaches Meshcat.
-
-    Raises:
-        ValueError: The server does not start.
     """
     app.add_middleware(_only_own, host=host, names=names)
     app.mount(_SCENE, _forward(scene_url))

@@ -149,9 +149,6 @@ class ClosedLoop(Diagram):
             margins: Those by which the assessor sees that the safe set was left; by default the
                 exported ones.
             hold: See :func:`~drake_safety.systems.safety_assessor.AddSafetyAssessor`.
-
-        Raises:
-            ValueError: The assessment is that of another diagram.
         """
         for name, port in ports.items():
             builder.ExportOutput(port, name)
@@ -217,11 +214,7 @@ def require_ports(diagram: Diagram, names: Iterable[str], who: str = "") -> None
 
 
 def check_ports(loop: ClosedLoop) -> None:
-    """Checks that the required ports exist, and have as many entries as names.
-
-    Raises:
-        ValueError: A port is missing, has no names of its entries, or another size than these.
-    """
+    """Checks that the required ports exist, and have as many entries as names."""
     task = f"task '{type(loop).__name__}'"
     require_ports(loop, REQUIRED_PORTS + (ASSESSMENT_PORTS if loop.assessment else ()))
     if missing := [name for name in _NAMES if not hasattr(loop, name)]:

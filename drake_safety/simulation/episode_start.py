@@ -46,11 +46,7 @@ class EpisodeStart:
         return fit_stance(self.feet(kinematics), kinematics.nominal_contacts)
 
     def check(self, who: str, num_positions: int, num_velocities: int) -> None:
-        """Checks the sizes of the state.
-
-        Raises:
-            ValueError: The state has another size, or is not finite.
-        """
+        """Checks the sizes of the state."""
         for name, size in {"q": num_positions, "v": num_velocities}.items():
             value = getattr(self, name)
             if np.shape(value) != (size,) or not np.isfinite(value).all():
@@ -60,10 +56,6 @@ class EpisodeStart:
         """Checks that the start fits a robot, and returns it with a quaternion of unit norm.
 
         The quaternion of a simulated plant drifts: its norm changes by up to 1e-4 a second.
-
-        Raises:
-            ValueError: A part has another size than the robot or is not finite, or the quaternion's
-                norm is not near 1.
         """
         who = f"start of robot '{kinematics.robot.name}'"
         self.check(who, kinematics.num_positions, kinematics.num_velocities)

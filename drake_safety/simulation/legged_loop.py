@@ -211,11 +211,7 @@ class LeggedLoop(PlannedLoop):
         builder.Connect(self._push_source.get_output_port(), self._physics.applied_spatial_force)
 
     def set_push(self, context: Context, push: Push) -> None:
-        """Sets a push, in place of an earlier one; the monitor waits while it acts.
-
-        Raises:
-            ValueError: The robot has no such body, or the task adds no source of pushes.
-        """
+        """Sets a push, in place of an earlier one; the monitor waits while it acts."""
         if self._push_source is None:
             raise ValueError(f"task '{type(self).__name__}' has no pushes on its robot")
         self._push_source.set_push(self._push_source.GetMyMutableContextFromRoot(context), push)

@@ -111,9 +111,6 @@ class Recorder:
 
     Args:
         names: Ports to record; a mapping from recorded names to those of ports renames them.
-
-    Raises:
-        ValueError: The diagram has no such port.
     """
 
     def __init__(self, diagram: Diagram, names: Iterable[str] | Mapping[str, str] = RECORDED):

@@ -226,9 +226,6 @@ def inputs_at(loop: ClosedLoop, start: EpisodeStart) -> tuple[np.ndarray, np.nda
 
     Returns:
         State (n_s,) without noise, desired preview (H*n_z,) and features (n_f,).
-
-    Raises:
-        ValueError: The task takes no start, or the start does not fit the plant.
     """
     context = loop.CreateDefaultContext()
     require(loop, CanStartAnywhere).reset_to(context, None, start)
@@ -490,11 +487,7 @@ def collect_episodes(
 
 
 def check_kept(path: Path, kept: Sequence[Episode], run: Callable[[int], Episode]) -> None:
-    """Simulates one of a folder's episodes again, a long unsafe one if there is one.
-
-    Raises:
-        ValueError: It is not the same any more.
-    """
+    """Simulates one of a folder's episodes again, a long unsafe one if there is one."""
     one = min(kept, key=lambda episode: (episode.is_safe, -episode.num_steps, episode.index))
     with ONE_BLAS_THREAD:
         again = run(one.index)

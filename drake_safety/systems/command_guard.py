@@ -51,9 +51,6 @@ class CommandGuard(LeafSystem):
         threshold: Lowest probability of an accepted command.
         period_s: Time between two decisions [s].
         num_outlook: M, samples of the outlook.
-
-    Raises:
-        ValueError: The threshold is outside [0, 1].
     """
 
     def __init__(

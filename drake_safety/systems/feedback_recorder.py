@@ -78,9 +78,6 @@ class FeedbackRecorder(LeafSystem):
     Args:
         num_steps: Steps of a safe window.
         watch_period_s: Sampling period of ``safe`` [s].
-
-    Raises:
-        ValueError: A window is shorter than the horizon, or a time out of range.
     """
 
     def __init__(

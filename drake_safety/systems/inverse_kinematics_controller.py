@@ -42,9 +42,6 @@ class InverseKinematicsController(LeafSystem):
     Args:
         stiffness: Servo stiffness of every joint, (n_j,) [N·m/rad]; robot.yaml's by default.
         offset_s: Time of the first update, after those of its inputs [s].
-
-    Raises:
-        ValueError: A joint has no stiffness, or one that is not positive.
     """
 
     def __init__(

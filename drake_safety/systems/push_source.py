@@ -46,11 +46,7 @@ class PushSource(LeafSystem):
         )
 
     def set_push(self, context: Context, push: Push) -> None:
-        """Sets the push; it replaces an earlier one.
-
-        Raises:
-            ValueError: The robot has no such body.
-        """
+        """Sets the push; it replaces an earlier one."""
         if push.body not in self._bodies:
             raise ValueError(
                 f"push: robot '{self._robot_name}' has no body '{push.body}'; its bodies are "

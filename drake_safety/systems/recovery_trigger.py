@@ -39,9 +39,6 @@ class RecoveryTrigger(LeafSystem):
             is "don't know" [s]; none by default, as in the paper.
         initial_uncertainty: μ_ini of the assessment, which says what is "don't know"; see
             :func:`~drake_safety.learning.prediction.is_unknown`.
-
-    Raises:
-        ValueError: Threshold or initial uncertainty is outside [0, 1], or a time out of range.
     """
 
     def __init__(
