@@ -107,14 +107,6 @@ class RobotKinematics:
         posture = posture_positions(self.plant, robot)
         self.posture = np.array([posture[name] for name in self.joint_names])
         self.total_mass = self.plant.CalcTotalMass(self.context)
-        self._set_standing()
-
-    @property
-    def context(self) -> Context:
-        """The scratch Context of the calling thread."""
-        return self._scratch.value.context
-
-    def _set_standing(self) -> None:
         q = self.positions_at(RigidTransform(), self.posture)
         p_WC = self.contact_positions(q)
         lowest = np.min(p_WC[:, 2] - self.foot_radii)
@@ -125,6 +117,11 @@ class RobotKinematics:
         """Contact points of the standing posture relative to their centroid, (n_c, 2) [m]."""
         self.nominal_base_offset = -centroid[:2]
         """Base relative to the contact points' centroid in the standing posture, (2,) [m]."""
+
+    @property
+    def context(self) -> Context:
+        """The scratch Context of the calling thread."""
+        return self._scratch.value.context
 
     def positions_at(self, X_WB: RigidTransform, joints: np.ndarray) -> np.ndarray:
         """Returns positions (n_q,) from a base pose and joint positions (n_j,) [rad]."""

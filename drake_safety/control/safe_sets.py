@@ -74,8 +74,7 @@ def support_margin(kinematics: RobotKinematics, q: np.ndarray, clearance_m: floa
     """
     p_WC = kinematics.contact_positions(q)
     points = zip(p_WC.tolist(), kinematics.foot_radii.tolist(), strict=True)
-    support = [(x, y) for (x, y, z), radius in points if z - radius < clearance_m]
-    if support:
+    if support := [(x, y) for (x, y, z), radius in points if z - radius < clearance_m]:
         return signed_distance_to_polygon(q[4:6], convex_hull(support))
     x, y = (q[4:6] - p_WC[:, :2].mean(axis=0)).tolist()
     return -math.hypot(x, y) - 1e-3

@@ -75,8 +75,7 @@ class WalkingSafeSet:
             plant.get_body(i).name()
             for i in plant.GetBodyIndices(plant.GetModelInstanceByName(kinematics.robot.name))
         ]
-        unknown = [name for name in limits.clearance_m if name not in known]
-        if unknown:
+        if unknown := [name for name in limits.clearance_m if name not in known]:
             raise ValueError(
                 f"robot '{kinematics.robot.name}' has no bodies {unknown} for clearance_m; it has "
                 f"{known}"
@@ -151,7 +150,10 @@ class WalkingSafeSet:
         kinematics = self.kinematics
         p_WC = kinematics.contact_positions(q)
         heights = p_WC[:, 2] - kinematics.foot_radii
-        x_axis = _heading(q)
+        w, x, y, z = q[:4].tolist()
+        forward = np.array([w * w + x * x - y * y - z * z, 2 * (x * y + w * z)])
+        length = math.hypot(*forward)
+        x_axis = forward / length if length > 0 else np.array([1.0, 0.0])
         to_heading = np.array([x_axis, [-x_axis[1], x_axis[0]]])
         center = kinematics.center_of_mass(q)
         rate = math.sqrt(max(center[2], 0.1 * kinematics.standing_height) / GRAVITY_M_S2)
@@ -202,10 +204,3 @@ def _tilt_rate(q: np.ndarray, v: np.ndarray) -> float:
         return math.hypot(v[0], v[1])
     # The axis (z_x, z_y) tilts farther by rotation about the horizontal normal (-z_y, z_x).
     return float((-z_axis[1] * v[0] + z_axis[0] * v[1]) / length)
-
-
-def _heading(q: np.ndarray) -> np.ndarray:
-    w, x, y, z = q[:4].tolist()
-    forward = np.array([w * w + x * x - y * y - z * z, 2 * (x * y + w * z)])
-    length = math.hypot(*forward)
-    return forward / length if length > 0 else np.array([1.0, 0.0])

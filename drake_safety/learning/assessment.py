@@ -34,7 +34,7 @@ from drake_safety.learning.mode_settings import ModeSettings, mode_settings
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.points import embedded_points
 from drake_safety.learning.prediction import BaseLogit, Correction, Prediction
-from drake_safety.learning.recalibration import recalibrated
+from drake_safety.learning.recalibration import recalibrated_beliefs
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
 from drake_safety.learning.segments import (
     DIVERGED,
@@ -227,9 +227,6 @@ class SafetyAssessment:
             episodes: Episodes whose unsafe end is a fall, as those of `run_episodes` with
                 ``until_fall``, of seeds without other use.
             features: Features that it reads beside predicted margins and base logit.
-
-        Returns:
-            This assessment.
         """
         require_extra("train", "SafetyAssessment.fit_falls", "sklearn")
         self._check_fitted()
@@ -317,7 +314,7 @@ class SafetyAssessment:
                 num_causes,
             )
         else:
-            adapted.correction_, adapted.beliefs_ = recalibrated(
+            adapted.correction_, adapted.beliefs_ = recalibrated_beliefs(
                 feedback,
                 segments,
                 columns=columns,
@@ -352,9 +349,7 @@ class SafetyAssessment:
     def check_unused(self, *seeds: int, purpose: str = "") -> None:
         """Checks that seeds were not used for training, calibration or adaptation.
 
-        Args:
-            purpose: "calibration" or "adaptation" if the sets replace those of an earlier one,
-                which are then ignored; the default is evaluation.
+        Earlier sets of the ``purpose``, such as "calibration", which these replace, are ignored.
         """
         self._check_fitted()
         used = [one for one in self.used_ if one.purpose != purpose]
@@ -477,11 +472,8 @@ class SafetyAssessment:
     ) -> tuple[str, float]:
         """Returns the entry of x that contradicts the others most, and by how much.
 
-        The arguments are those of `predict_one`.
-
-        Returns:
-            Its name, one of `columns_.names`, and the difference from what the other entries
-            say, in standard deviations of training.
+        It is one of `columns_.names`; the difference from what the others say is in standard
+        deviations of training. The arguments are those of `predict_one`.
         """
         self._check_fitted()
         found = self.novelty_.contradictions(self.inputs_of(state, desired_preview, features))
@@ -491,14 +483,11 @@ class SafetyAssessment:
     def unsafe_logits(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns the maps' mean logit of an unsafe end and its gradient with respect to x.
+        """Returns x, the maps' mean logit (N,) of an unsafe end and its gradient, (N, n_x) both.
 
         The belief is constant where all corners of a cell agree; the safety heads' logit has a
         slope everywhere, for planners that need a gradient. Trees have none: they are left out. The
         arguments are those of `predict`.
-
-        Returns:
-            x (N, n_x), the logit (N,) and its gradient (N, n_x).
         """
         x = self.inputs_of(state, desired_preview, features)
         return x, *self.embedding_.logit_gradient(x)

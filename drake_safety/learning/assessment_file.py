@@ -151,10 +151,9 @@ def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
             version = str(entries["schema_version"])
         if version in (str(SCHEMA_VERSION), str(_WITHOUT_TREES)):
             return _learned(entries, tensors)
-    except KeyError as error:
-        raise ValueError(f"'{path}' is a damaged safety assessment: it has no {error}") from error
-    except _FORGED as error:
-        raise ValueError(f"'{path}' is a damaged safety assessment: {error}") from error
+    except (KeyError, *_FORGED) as error:
+        what = f"it has no {error}" if isinstance(error, KeyError) else error
+        raise ValueError(f"'{path}' is a damaged safety assessment: {what}") from error
     raise ValueError(
         f"'{path}' has the schema version {version}, this version reads {SCHEMA_VERSION}: train "
         "the assessment again (episodes are kept: `--resume`)"

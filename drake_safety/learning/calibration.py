@@ -218,7 +218,7 @@ def least_miss_rate(num_unsafe: int) -> float:
 def episode_scores(
     segments: Segments, unsafe_score: np.ndarray, kind: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Reduces the scores of segments to one score per episode.
+    """Reduces the scores of segments to score and label (M,) of each episode with segments.
 
     A plan is assessed once, by its first row. A motion is monitored and unsafe as soon as one row
     is, so its score is the largest of all rows.
@@ -226,9 +226,6 @@ def episode_scores(
     Args:
         segments: The N segments of some episodes, from every row.
         unsafe_score: Unsafe score of each, (N,); NaN counts as most unsafe.
-
-    Returns:
-        Score and label of each episode that has segments, (M,) each.
     """
     if kind not in KINDS:
         raise ValueError(f"calibration: unknown kind '{kind}'; the kinds are {list(KINDS)}")

@@ -64,7 +64,7 @@ def neighbour_graph(
     backend: Backend = "dtaidistance",
     progress: Callable[[float], object] = ignore,
 ) -> NeighbourGraph:
-    """Finds the nearest neighbours under the safety distance Omega.
+    """Finds nearest neighbours under Omega = DTW / w_max + delta |lambda_i - lambda_j|.
 
     Args:
         error: Error sequences z* - z [m], each held at its last value beyond its length, (N, H,
@@ -78,9 +78,6 @@ def neighbour_graph(
             cost grows as N^2.
         cost: Cost of a warping path.
         backend: "dtaidistance", or "tslearn", which ignores the bounds and has no "absolute" cost.
-
-    Returns:
-        The graph, with distances Omega = DTW / w_max + delta |lambda_i - lambda_j|.
     """
     if backend == "tslearn" and cost == "absolute":
         raise ValueError("distance: the backend 'tslearn' has no cost 'absolute'")
@@ -92,7 +89,9 @@ def neighbour_graph(
     from scipy.spatial import cKDTree
 
     series = [np.ascontiguousarray(one[:n]) for one, n in zip(error, length, strict=True)]
-    held = _hold_last(error, length)
+    # Each with its last counted sample repeated, flattened, (N, H*n_z).
+    steps = np.minimum(np.arange(error.shape[1]), np.asarray(length)[:, None] - 1)
+    held = np.take_along_axis(error, steps[:, :, None], axis=1).reshape(num_segments, -1)
     # Omega is 1 / w_max * DTW ** power; bounds and DTW itself are those without the power.
     power = 2.0 if cost == "squared" else 1.0
     # sum ||.|| over H pairs is at most sqrt(H) times the root of sum ||.||^2.
@@ -150,12 +149,6 @@ def _places(held: np.ndarray, score: np.ndarray, power: float) -> np.ndarray:
     # A tree is quick in few dimensions.
     num_kept = int(np.searchsorted(share, _KEPT_VARIANCE)) + 1
     return points @ axes[:, ::-1][:, :num_kept]
-
-
-def _hold_last(error: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Each sequence with its last counted sample repeated, flattened, (N, H*n_z)."""
-    steps = np.minimum(np.arange(error.shape[1]), np.asarray(length)[:, None] - 1)
-    return np.take_along_axis(error, steps[:, :, None], axis=1).reshape(len(error), -1)
 
 
 def _dtw(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -79,8 +79,7 @@ def pair_episodes(
     twins = {episode.index: episode for episode in nominal}
     pairs = []
     for episode in actual:
-        twin = twins.get(episode.index)
-        if twin is None:
+        if (twin := twins.get(episode.index)) is None:
             raise ValueError(
                 f"{who}: episode {episode.index} of the variation '{actual.info.variation}' has no "
                 f"nominal twin; there are {len(twins)} twins"
@@ -187,9 +186,8 @@ def feedback_segments(
                 nominal_is_unsafe=is_unsafe,
             )
         )
-    names = [field.name for field in fields(FeedbackSegments)]
     segments = FeedbackSegments(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        **{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
     )
     if not len(segments):
         raise ValueError(

@@ -22,8 +22,7 @@ _MATTERS = 0.05  # Share of the area over the ROC curve that the last doubling c
 def learning_curve(episodes: Episodes, parameters: AssessmentParameters) -> np.ndarray:
     """AUC of gradient boosting on every fifth of the episodes, after learning from the others.
 
-    Returns:
-        For a quarter, half and all of the others, (3, 5); empty with few episodes of a label.
+    It is for a quarter, half and all of the others, (3, 5); empty with few episodes of a label.
     """
     from sklearn import model_selection
     from sklearn.ensemble import HistGradientBoostingClassifier

@@ -204,7 +204,7 @@ def train_map(
     held_out: MapData | None = None,
     progress: _Report = ignore,
 ) -> dict[str, np.ndarray]:
-    """Trains one map Psi, deterministically for a seed and a machine.
+    """Trains one map Psi, the same for a seed and a machine; names its arrays as in `Embedding`.
 
     Departure: the paper trains Psi on ||y - Psi(x)|| alone. With a safety head on y and a margin
     head on the trunk, the map separates neighbours in t-SNE that end differently; held-out accuracy
@@ -215,9 +215,6 @@ def train_map(
             nearly constant columns are not amplified.
         held_out: If given, the weights of the epoch with the smallest distance to t-SNE's points of
             these inputs are kept instead of the last epoch's.
-
-    Returns:
-        The weights of one member, named as in `Embedding`, without the leading member axis.
     """
     import torch
 

@@ -249,10 +249,7 @@ class Novelty:
         """Returns the novelty for which an actual robot's inputs are known as well.
 
         They replace those of earlier feedback. If at most a share of `rate` of them is beyond the
-        training inputs, these alone describe the robot.
-
-        Args:
-            rate: Largest share of novel inputs of a robot without a reality gap, in (0, 1).
+        training inputs, as of a robot without a reality gap, these alone describe the robot.
         """
         alone = Novelty(training=self.training, limits=self.limits, plan=self.plan)
         if np.mean(alone.of(x) > 1.0) <= rate:

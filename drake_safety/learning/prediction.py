@@ -185,10 +185,7 @@ class Correction:
 
 
 def _weighted(heads: np.ndarray, slopes: Sequence[float], offset: float = 0.0) -> np.ndarray:
-    """The weighted sum of heads, (N,).
-
-    Not a product of matrices, which would round a row differently beside other rows.
-    """
+    """The weighted sum of heads, (N,); a product of matrices would round by the number of rows."""
     return np.add.reduce(heads * slopes, axis=1) + offset
 
 
@@ -276,15 +273,13 @@ def predict(
     is_empty = ~((distance <= 1.0) & np.isfinite(np.add.reduce(masses, axis=1)))
     if np.count_nonzero(is_empty):
         masses[is_empty] = belief_masses.empty((), num_columns - 3)
-    safe = masses[:, belief_masses.SAFE]
+    margins = np.full((len(x), num_columns - 3), np.nan)
     if output.margins.shape[2]:
         margins = mean_of_maps(output.margins)
-    else:
-        margins = np.full((len(x), num_columns - 3), np.nan)
     fall_probability = np.full(len(x), np.nan)
     if base_logit is None:
         # The paper's Γ(x) = b_safe of the cell of Psi(x).
-        probability = safe.copy()
+        probability = masses[:, belief_masses.SAFE].copy()
     else:
         trees_logit = None if trees is None else trees.evaluate(x)
         heads = base_logit.heads(output, trees_logit, margins)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -59,32 +60,23 @@ def outcomes(
     actual = [(one.rows.state, one.rows.desired_preview, one.rows.features) for one in feedback]
     first = [(one.twin, slice(one.twin.first_step, one.twin.first_step + 1)) for one in feedback]
     twins = [(one.state[k], one.desired_preview[k], one.features[k]) for one, k in first]
-    found = []
-    for rows, is_unsafe, weight in (
-        (
-            actual,
-            np.repeat([not one.actual.is_safe for one in feedback], num_rows),
-            row_weights(num_rows),
-        ),
-        (twins, np.array([not one.twin.is_safe for one in feedback]), np.ones(len(feedback))),
-    ):
+    fell = np.repeat([not one.actual.is_safe for one in feedback], num_rows)
+    twin_fell = np.array([not one.twin.is_safe for one in feedback])
+
+    def of(rows: list[Any], is_unsafe: np.ndarray, weight: np.ndarray) -> Outcomes:
         x = columns.of(*map(np.concatenate, zip(*rows, strict=True)))
         trees_logit = None if trees is None else trees.evaluate(x)
-        found.append(
-            Outcomes(
-                heads=base_logit.heads(embedding.evaluate(x), trees_logit),
-                activations=embedding.activations(x),
-                is_unsafe=is_unsafe,
-                weight=weight,
-            )
-        )
-    return found[0], found[1]
+        heads = base_logit.heads(embedding.evaluate(x), trees_logit)
+        known = embedding.activations(x)
+        return Outcomes(heads=heads, activations=known, is_unsafe=is_unsafe, weight=weight)
+
+    return of(actual, fell, row_weights(num_rows)), of(twins, twin_fell, np.ones(len(feedback)))
 
 
 def fitted_change(
     actual: Outcomes, twins: Outcomes, base_logit: BaseLogit, settings: AdaptationParameters
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fits the correction of the base logit.
+    """Fits `change` (3,) or (4,), `hidden` (K, n + 1) and `hidden_range` (2,) of a `Correction`.
 
     With phi = (1, heads, activations) and the base logit ell, w minimises the log
     loss of sigma(ell + w . phi) on the actual episodes with a normal prior, minus the error of ell
@@ -93,9 +85,6 @@ def fitted_change(
     no counterpart, as the twin is then in another state. Activations are centred and divided by
     their mean distance from the mean, so that their joint contribution has the standard deviation
     `hidden_std`. The corrected slopes stay >= 0.
-
-    Returns:
-        `change` (3,) or (4,), `hidden` (K, n + 1) and `hidden_range` (2,) of a `Correction`.
     """
     from scipy.optimize import minimize
 
@@ -137,7 +126,19 @@ def fitted_change(
     return found[: 1 + num_heads], hidden, np.array([added.min(), added.max()])
 
 
-def recalibrated(
+def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
+    """Averages values (M,) at points (K, M, 2) in each map's cells, (K, R*R); 0 in empty ones."""
+    means = []
+    for member_points in points:
+        cells = grid.locate(member_points)
+        inside = cells >= 0
+        count = np.bincount(cells[inside], minlength=grid.num_cells)
+        total = np.bincount(cells[inside], values[inside], minlength=grid.num_cells)
+        means.append(total / np.maximum(count, 1))
+    return np.array(means)
+
+
+def recalibrated_beliefs(
     feedback: Sequence[EpisodePair],
     segments: FeedbackSegments,
     *,
@@ -153,77 +154,36 @@ def recalibrated(
     """Corrects base logit and beliefs, (K, R*R, 3 + n_c), by feedback and its segments.
 
     Only pairs with different outcomes are evidence of a reality gap; without any, the correction is
-    zero.
-    """
-    x = columns.of(segments.state, segments.desired_preview, segments.features)
-    points = embedding.embed(x)
-    correction = Correction.none(embedding, grid, trees)
-    if any(pair.differs for pair in feedback):
-        change, hidden, hidden_range = fitted_change(
-            *outcomes(feedback, columns, embedding, base_logit, trees),
-            base_logit,
-            parameters.adaptation,
-        )
-        # Where most feedback was unsafe, the base logit must not fall.
-        vote = np.where(segments.is_unsafe, 1.0, -1.0)
-        guard = (cell_means(vote, points, grid) > 0.0).astype(float)
-        correction = Correction(
-            change=change, hidden=hidden, hidden_range=hidden_range, guard=guard
-        )
-    residual = correction.residual(embedding, x)
-    return correction, recalibrated_beliefs(
-        training, base_logit, correction, segments, points, residual, grid, parameters, num_causes
-    )
-
-
-def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
-    """Averages values (M,) at points (K, M, 2) in each map's cells, (K, R*R); 0 in empty ones."""
-    means = []
-    for member_points in points:
-        cells = grid.locate(member_points)
-        inside = cells >= 0
-        count = np.bincount(cells[inside], minlength=grid.num_cells)
-        total = np.bincount(cells[inside], values[inside], minlength=grid.num_cells)
-        means.append(total / np.maximum(count, 1))
-    return np.array(means)
-
-
-def recalibrated_beliefs(
-    training: TrainingScores,
-    base_logit: BaseLogit,
-    correction: Correction,
-    feedback: FeedbackSegments,
-    points: np.ndarray,
-    residual: np.ndarray,
-    grid: Grid,
-    parameters: AssessmentParameters,
-    num_causes: int,
-) -> np.ndarray:
-    """Computes beliefs from training scores shifted as the base logit is, (K, R*R, 3 + n_c).
-
-    Cells that training leaves empty are filled by the feedback.
+    zero. Training scores are shifted as the base logit is; cells that training leaves empty are
+    filled by the feedback.
 
     Departure: the paper raises the uncertainty where nominal scores are unreliable. That hardly
     changes the safe share of a cell, as F keeps the ratio of its masses and the discrepancy has no
     sign. Adding sigma(ell + shift) - sigma(ell) to every score moves the boundary between safe and
     unsafe. The hidden layer's contribution is known at the feedback only; its mean in a cell is
     used for all training segments of the cell.
-
-    Args:
-        points: Psi(x) of the feedback, (K, M, 2).
-        residual: Contribution of the hidden layer at the feedback, (M,).
     """
     if training.heads is None or training.nearest is None:
         raise ValueError("recalibrated_beliefs: the maps have no heads")
+    x = columns.of(segments.state, segments.desired_preview, segments.features)
+    points = embedding.embed(x)
+    correction = Correction.none(embedding, grid, trees)
+    if any(pair.differs for pair in feedback):
+        both = outcomes(feedback, columns, embedding, base_logit, trees)
+        fitted = fitted_change(*both, base_logit, parameters.adaptation)
+        # Where most feedback was unsafe, the base logit must not fall.
+        vote = np.where(segments.is_unsafe, 1.0, -1.0)
+        guard = (cell_means(vote, points, grid) > 0.0).astype(float)
+        correction = Correction(*fitted, guard)
     all_logit = base_logit.of_heads(training.heads)
     actual = belief_masses.from_scores(
-        feedback.score, parameters.initial_uncertainty, feedback.cause, num_causes
+        segments.score, parameters.initial_uncertainty, segments.cause, num_causes
     )
     fuse = partial(
         belief_masses.fuse_cells, num_cells=grid.num_cells, min_count=parameters.min_count
     )
     fused = []
-    means = cell_means(residual, points, grid)
+    means = cell_means(correction.residual(embedding, x), points, grid)
     members = zip(training.points, points, means, correction.guard, strict=True)
     for training_points, actual_points, added, guard in members:
         cells = grid.locate(training_points)
@@ -239,11 +199,11 @@ def recalibrated_beliefs(
         masses = belief_masses.from_scores(score, parameters.initial_uncertainty, cause, num_causes)
         times = training.times[inside]
         learned = fuse(masses, here, multiplicity=times)
-        both = fuse(
+        filled = fuse(
             np.concatenate([masses, actual]),
             np.concatenate([here, grid.locate(actual_points)]),
             multiplicity=np.concatenate([times, np.ones(len(actual))]),
         )
         is_empty = learned[:, belief_masses.UNCERTAINTY] == 1.0
-        fused.append(np.where(is_empty[:, None], both, learned))
-    return np.stack(fused)
+        fused.append(np.where(is_empty[:, None], filled, learned))
+    return correction, np.stack(fused)

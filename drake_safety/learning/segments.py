@@ -225,24 +225,20 @@ class Episodes(Sequence[Episode]):
         episodes, info = self._episodes, self.info
         counts = [len(episode.time_s) for episode in episodes]
 
-        def repeated(values: list) -> np.ndarray:
-            return np.repeat(np.array(values), counts)
+        def repeated(name: str) -> np.ndarray:
+            return np.repeat(np.array([getattr(one, name) for one in episodes]), counts)
 
         columns = {
-            "episode": repeated([episode.index for episode in episodes]),
+            "episode": repeated("index"),
             "row": np.concatenate([np.arange(0), *map(np.arange, counts)]),
             "time_s": np.concatenate([np.empty(0), *(episode.time_s for episode in episodes)]),
         }
         for array, names in info.columns.items():
-            table = np.concatenate(
-                [np.empty((0, len(names))), *(getattr(one, array) for one in episodes)]
-            )
-            for name, column in zip(names, table.T, strict=True):
-                columns[f"{array}.{name}"] = column
-        columns["is_safe"] = repeated([episode.is_safe for episode in episodes])
-        columns["cause"] = repeated([episode.cause for episode in episodes])
-        columns["first_step"] = repeated([episode.first_step for episode in episodes])
-        return pa.table(columns)
+            rows = (getattr(one, array) for one in episodes)
+            table = np.concatenate([np.empty((0, len(names))), *rows])
+            columns |= {f"{array}.{name}": table[:, i] for i, name in enumerate(names)}
+        of_episodes = {name: repeated(name) for name in ("is_safe", "cause", "first_step")}
+        return pa.table(columns | of_episodes)
 
     @overload
     def __getitem__(self, key: int) -> Episode: ...
@@ -310,12 +306,10 @@ def _check_episode(info: EpisodesInfo, episode: Episode) -> None:
 def unsafety_score(
     remaining_steps: np.ndarray, is_unsafe: np.ndarray, discount: float
 ) -> np.ndarray:
-    """Computes the unsafety score lambda of segments, (N,), in [0, 1]; 0 where safe.
+    """The unsafety score lambda = gamma^R if a trajectory is unsafe, else 0, (N,), in [0, 1].
 
-    Args:
-        remaining_steps: R, steps from the segment's start to the termination, (N,).
+    R are the steps from the segment's start to the termination, (N,).
     """
-    # Eq. (unsafety_score): lambda = gamma^R(i) if the trajectory is unsafe, else 0.
     return np.where(is_unsafe, float(discount) ** np.asarray(remaining_steps, dtype=float), 0.0)
 
 

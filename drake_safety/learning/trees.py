@@ -21,7 +21,7 @@ class Trees:
     At a node with ``x[feature] > threshold`` an input goes to the right, in single precision. There
     is no walk from root to leaf: every node with that outcome excludes the leaves on its left, and
     the first leaf that no node excludes is the one that is reached ("QuickScorer", Lucchese et
-    al., 2015). That costs the same for any depth.
+    al., 2015). That costs the same for any depth. Attribute `arrays` has the arguments.
 
     Args:
         feature: Columns of x that the nodes compare, (M, T), M < 32.
@@ -34,13 +34,13 @@ class Trees:
     def __init__(
         self, *, feature: np.ndarray, threshold: np.ndarray, left: np.ndarray, value: np.ndarray
     ):
-        self._arrays: dict[str, np.ndarray] = {
+        self.arrays: dict[str, np.ndarray] = {
             "feature": feature.astype(np.uint16),
             "threshold": threshold.astype(np.float32),
             "left": left.astype(np.uint32),
             "value": value.astype(np.float32),
         }
-        for array in self._arrays.values():
+        for array in self.arrays.values():
             array.setflags(write=False)
         self._feature, self._value = feature.astype(np.intp), value.astype(np.float32).astype(float)
         self._first = np.arange(len(value)) * value.shape[1]
@@ -48,11 +48,6 @@ class Trees:
     def __len__(self) -> int:
         """T."""
         return len(self._value)
-
-    @property
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The arguments of the constructor."""
-        return dict(self._arrays)
 
     @classmethod
     def fit(
@@ -138,8 +133,8 @@ class Trees:
         if len(x) > _CHUNK:
             parts = [self.evaluate(x[i : i + _CHUNK]) for i in range(0, len(x), _CHUNK)]
             return np.concatenate(parts)
-        is_right = x.astype(np.float32).take(self._feature, axis=1) > self._arrays["threshold"]
-        excluded = np.bitwise_or.reduce(is_right * self._arrays["left"], axis=1)
+        is_right = x.astype(np.float32).take(self._feature, axis=1) > self.arrays["threshold"]
+        excluded = np.bitwise_or.reduce(is_right * self.arrays["left"], axis=1)
         # The lowest bit that is not set.
         leaf = np.frexp(~excluded & (excluded + 1))[1] - 1
         return np.add.reduce(self._value.take(self._first + leaf), axis=1)

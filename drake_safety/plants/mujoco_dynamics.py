@@ -25,10 +25,8 @@ class MujocoDynamics:
     steps are deterministic. MuJoCo's free joint has the position before the quaternion, and the
     origin's velocity in the world before the angular velocity in the *body*; Drake's has the
     quaternion before the position, and the angular velocity in the world before the origin's. The
-    object keeps one scratch MjData, which every method overwrites.
-
-    Args:
-        servos: Whether the command is a joint state for robot.yaml's servos instead of torques.
+    object keeps one scratch MjData, which every method overwrites. With ``servos`` the command is a
+    joint state for robot.yaml's servos instead of torques.
     """
 
     def __init__(

@@ -240,10 +240,6 @@ def build_model(
     Returns the model, and for each of its controls the index of its value in the command: joint
     positions and velocities with servos, joint torques without, in the order of
     :func:`~drake_safety.robots.robot.servo_joints`.
-
-    Raises:
-        ValueError: The robot's model is not a URDF or MuJoCo cannot read it, its base is not the
-            root, MuJoCo does not have a shape, or another body in the scene moves.
     """
     mujoco = import_mujoco()
     spec = _read_robot(robot)

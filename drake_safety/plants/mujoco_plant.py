@@ -26,10 +26,7 @@ class MujocoPlant(LeafSystem):
     ``command`` has joint torques, or the desired joint state ``[q; v]`` of servos, in the order of
     the robot's velocities. ``applied_spatial_force`` is that of a MultibodyPlant. ``state`` is the
     MultibodyPlant's ``[q; v]``, ``positions`` its q. MuJoCo's state, including the solver's warm
-    start, is discrete state of the Context.
-
-    Args:
-        plant: The finalised Drake plant of the same robot, used for the default state only.
+    start, is discrete state of the Context. The Drake ``plant`` gives the default state only.
     """
 
     def __init__(self, dynamics: MujocoDynamics, plant: MultibodyPlant):

@@ -10,7 +10,6 @@ from pydrake.geometry import (
     CollisionFilterDeclaration,
     GeometryId,
     GeometrySet,
-    QueryObject,
     SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
@@ -65,8 +64,7 @@ def add_obstacles(plant: MultibodyPlant, obstacles: list[Obstacle]) -> list[Mode
 def _root_link(plant: MultibodyPlant, instance: ModelInstanceIndex, who: str) -> RigidBody:
     """The only root link of a rigid model."""
     joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
-    moving = [joint.name() for joint in joints if joint.num_velocities() > 0]
-    if moving:
+    if moving := [joint.name() for joint in joints if joint.num_velocities() > 0]:
         raise ValueError(f"{who}: obstacles do not move; the model has the joints {moving}")
     held = {joint.child_body().index() for joint in joints}
     links = [plant.get_body(i) for i in plant.GetBodyIndices(instance)]
@@ -171,9 +169,6 @@ class Clearance:
         plant = self._plant.GetMyMutableContextFromRoot(root)
         return root, plant, self._scene_graph.GetMyContextFromRoot(root)
 
-    def _query(self) -> QueryObject:
-        return self._query_port.Eval(self._scratch.value[2])
-
     def of_arms(self, q: np.ndarray) -> float:
         """Distance of the arms to the nearest obstacle at q (n_q,), negative in contact [m]."""
         # Drake's plant aborts the process for positions that are not finite.
@@ -182,7 +177,8 @@ class Clearance:
         if not self._obstacles:
             return self.range_m
         self._plant.SetPositions(self._scratch.value[1], q)
-        pairs = self._query().ComputeSignedDistancePairwiseClosestPoints(self.range_m)
+        query = self._query_port.Eval(self._scratch.value[2])
+        pairs = query.ComputeSignedDistancePairwiseClosestPoints(self.range_m)
         return min((pair.distance for pair in pairs), default=self.range_m)
 
     def of_points(self, p_WP: np.ndarray, radius_m: float = 0.0) -> np.ndarray:
@@ -190,7 +186,7 @@ class Clearance:
 
         Their centres p_WP, (N, 3), are in the world.
         """
-        query, range_m = self._query(), self.range_m + radius_m
+        query, range_m = self._query_port.Eval(self._scratch.value[2]), self.range_m + radius_m
         distances = np.full(len(p_WP), range_m)
         if self._obstacles:
             for i, p in enumerate(p_WP):

@@ -237,15 +237,6 @@ def add_ground(plant: MultibodyPlant, friction: float) -> None:
     )
 
 
-def _incline(plant: MultibodyPlant, shift: Shift) -> None:
-    """Inclines the gravity against the ground, which stays at z = 0."""
-    field = plant.mutable_gravity_field()
-    magnitude = np.linalg.norm(field.gravity_vector())
-    direction, slope = shift.slope_direction_rad, shift.slope_rad
-    downhill = math.sin(slope) * np.array([math.cos(direction), math.sin(direction)])
-    field.set_gravity_vector(magnitude * np.append(downhill, -math.cos(slope)))
-
-
 def _dig_holes(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
@@ -276,9 +267,8 @@ def _dig_holes(
         own = [hole for name, hole in holes.items() if robot.feet[name].body == body.name()]
         others = [hole for hole in holes.values() if hole not in own] + (ground if own else [])
         if shapes and others:
-            declaration = CollisionFilterDeclaration()
-            declaration.ExcludeBetween(GeometrySet(shapes), GeometrySet(others))
-            filters.Apply(declaration)
+            sides = GeometrySet(shapes), GeometrySet(others)
+            filters.Apply(CollisionFilterDeclaration().ExcludeBetween(*sides))
 
 
 def _furnish(
@@ -303,8 +293,11 @@ def _furnish(
     shift = variation.shift or Shift()
     if shift.holes_m:
         _dig_holes(plant, scene_graph, robot, instance, shift.holes_m, friction)
-    if shift.slope_rad:
-        _incline(plant, shift)
+    if slope := shift.slope_rad:  # Gravity inclines: the ground stays at z = 0.
+        gravity, direction = plant.mutable_gravity_field(), shift.slope_direction_rad
+        magnitude = np.linalg.norm(gravity.gravity_vector())
+        downhill = math.sin(slope) * np.array([math.cos(direction), math.sin(direction)])
+        gravity.set_gravity_vector(magnitude * np.append(downhill, -math.cos(slope)))
     obstacles = add_obstacles(plant, list(scene.obstacles or ()))
     decorations = add_obstacles(plant, list(scene.decorations))
     plant.Finalize()

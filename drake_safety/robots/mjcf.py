@@ -63,11 +63,6 @@ def mjcf_to_urdf(path: Path, target: Path) -> ModelFacts:
     zero positions of bodies and joints. Joints with actuators get transmissions, and those that a
     linear equality couples a <mimic>. Geoms of the groups 0 to 2 are visuals, those that can touch
     others are collision shapes.
-
-    Raises:
-        MissingExtraError: MuJoCo is not installed.
-        ValueError: MuJoCo cannot read the file, or the robot has ball joints, loops, or a base that
-            moves by other joints than a free one.
     """
     require_extra("mujoco", f"'{path}' is MJCF")
     import mujoco

@@ -62,10 +62,6 @@ def model_file(url: str, folder: str = "", requires: str = "") -> Path:
     ``file://`` may precede a path. Packages are this one's (``drake_safety_models``), Drake's, and
     those installed by pip.
     ``requires`` is what pip installs without its dependencies; empty for packages of an extra.
-
-    Raises:
-        MissingExtraError: An extra installs the package, and it is not installed.
-        ValueError: The package is unknown.
     """
     parts = urlparse(url)
     if parts.scheme == "file":

@@ -173,10 +173,7 @@ def _add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceI
 
 @contextmanager
 def _quiet_about(robot: RobotModel) -> Iterator[None]:
-    """Logs the parser's warnings about files of other packages at debug level.
-
-    Users cannot change these files, and every worker process would repeat the warnings.
-    """
+    """Logs warnings about files of other packages, which no user can change, at debug level."""
     drake = logging.getLogger("drake")
 
     def pass_on(record: logging.LogRecord) -> bool:
@@ -197,8 +194,7 @@ def _add_stated_shapes(
 ) -> None:
     """Adds the collision geometry of robot.yaml: contact points and shapes."""
     names = [plant.get_body(index).name() for index in plant.GetBodyIndices(instance)]
-    unused = [one for one in robot.shapes if not any(re.fullmatch(one, body) for body in names)]
-    if unused:
+    if unused := [one for one in robot.shapes if not any(re.fullmatch(one, b) for b in names)]:
         raise ValueError(f"robot '{robot.name}' has no body for shapes {unused}; it has {names}")
 
     def add(body: str, name: str, X_BG: RigidTransform, shape: Shape, mu: float) -> None:
@@ -219,10 +215,7 @@ def _add_stated_shapes(
 def _ignore_neighbours(
     plant: MultibodyPlant, scene_graph: SceneGraph, instance: ModelInstanceIndex
 ) -> None:
-    """Filters collisions of links connected by a joint, and of links welded to them.
-
-    Drake filters the two bodies of a joint, but not bodies that are welded to them.
-    """
+    """Filters collisions of links welded to the bodies of a joint, which Drake does not."""
     for joint in map(plant.get_joint, plant.GetJointIndices(instance)):
         ends = joint.parent_body(), joint.child_body()
         sides = [plant.GetBodiesWeldedTo(body) for body in ends]
@@ -270,11 +263,17 @@ def add_robot(
     instance = _add_description(plant, robot)
     shifts, joint_names = variation.shift or Shift(), servo_joints(plant, robot)
     _require(robot, "joint for shift", shifts.joints, joint_names, re.fullmatch)
-    _add_base_force(plant, robot, shifts)
+    if force_n := np.linalg.norm(shifts.base_force_n):
+        # A spring so long that motion hardly changes its force or direction.
+        far = _SPRING_LENGTH_M * np.array(shifts.base_force_n) / force_n
+        rest_m = 1e-3 * _SPRING_LENGTH_M
+        stiffness = force_n / (_SPRING_LENGTH_M - rest_m)
+        ends = plant.world_body(), far, plant.GetBodyByName(robot.base, instance), np.zeros(3)
+        plant.AddForceElement(LinearSpringDamper(*ends, rest_m, stiffness, damping=0.0))
     bodies = [plant.get_body(i).name() for i in plant.GetBodyIndices(instance)]
     joints = [plant.get_joint(i).name() for i in plant.GetJointIndices(instance)]
-    ends = (limb.body for limb in robot.limbs())
-    _require(robot, "body", (robot.base, *ends, *robot.whole_body.orientation), bodies)
+    links = (limb.body for limb in robot.limbs())
+    _require(robot, "body", (robot.base, *links, *robot.whole_body.orientation), bodies)
     _require(robot, "joint", (name for limb in robot.limbs() for name in limb.joints), joints)
     robot.mirror_partners(joint_names)
     if robot.collision == "stated" and plant.geometry_source_is_registered():
@@ -325,19 +324,6 @@ def add_robot(
     return instance
 
 
-def _add_base_force(plant: MultibodyPlant, robot: RobotModel, shift: Shift) -> None:
-    """Adds a steady force: a spring so long that motion hardly changes its force or direction."""
-    force_n = np.linalg.norm(shift.base_force_n)
-    if force_n == 0.0:
-        return
-    far = _SPRING_LENGTH_M * np.array(shift.base_force_n) / force_n
-    base = plant.GetBodyByName(robot.base, plant.GetModelInstanceByName(robot.name))
-    rest_m = 1e-3 * _SPRING_LENGTH_M
-    stiffness = force_n / (_SPRING_LENGTH_M - rest_m)
-    ends = plant.world_body(), far, base, np.zeros(3)
-    plant.AddForceElement(LinearSpringDamper(*ends, rest_m, stiffness, damping=0.0))
-
-
 def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
     """Checks that every joint of legs and arms has a motor.
 
@@ -349,8 +335,7 @@ def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
     driven = {actuator.joint().name() for actuator in actuators}
     names = dict.fromkeys(name for limb in robot.limbs() for name in limb.joints)
     # Limbs may leave out their joints; then all joints are checked.
-    without = [name for name in names or servo_joints(plant, robot) if name not in driven]
-    if without:
+    if without := [name for name in names or servo_joints(plant, robot) if name not in driven]:
         raise ValueError(
             f"robot '{robot.name}': joints {without} have no motor: '{robot.urdf}' has no "
             "transmission with an effort limit for them, and effort_limits in robot.yaml is "

@@ -60,17 +60,14 @@ def _stands(survey: Survey, legs: list[Limb], posture: dict[str, float]) -> bool
 
 
 def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]:
-    """Solves for joint positions in which the robot can stand.
+    """Solves for joint positions by name [rad] in which the robot can stand.
 
     Every foot is under its hip (the joint where the long links begin), with the lateral offset of
     the straight leg, and level if it has more than one contact point. The height of the hips is
     four fifths of a leg's length, or the nearest feasible share. Legs that spread at zero, as a
     spider's, keep half of their spread. Of several solutions for a leg, the one with small angles
     and a knee that bends backwards (bipeds: forwards, spread legs: upwards) is used. If the
-    centre of mass is then not amid the feet, all feet are moved under it.
-
-    Returns:
-        Positions of all joints by name [rad]; those of no leg are where they rest.
+    centre of mass is then not amid the feet, all feet are moved under it. Joints of no leg rest.
     """
     survey.set_joints({})
     solvers = [_Leg(survey, leg, len(legs)) for leg in legs]

@@ -107,11 +107,8 @@ def from_table(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode
 
 def shards_in(path: Path) -> list[Path]:
     """The shards of a folder, in the order of their numbers; none if it does not exist."""
-    if not path.is_dir():
-        return []
-    return sorted(
-        (file for file in path.iterdir() if _SHARD_NAME.fullmatch(file.name)), key=shard_number
-    )
+    files = path.glob("episodes-*.parquet")
+    return sorted((one for one in files if _SHARD_NAME.fullmatch(one.name)), key=shard_number)
 
 
 def shard_number(shard: Path) -> int:

@@ -160,18 +160,14 @@ class Scenario:
         return yaml.safe_dump(self._values(), default_flow_style=None, sort_keys=False)
 
     def _values(self) -> dict[str, Any]:
-        """All values but optional ones that are not set, by the types of the schema.
-
-        A value that was set in Python, such as an integer in place of a float, is no other one.
-        """
-
-        def plain(one: Any) -> dict[str, Any]:
-            values: dict[str, Any] = pydantic.TypeAdapter(type(one)).dump_python(
-                one, mode="json", exclude_none=True, warnings=False
-            )
-            return values
-
-        return plain(self) | {"parameters": plain(self.parameters)}
+        """All values but optional ones that are not set, by the types of the schema."""
+        options: Any = {"mode": "json", "exclude_none": True, "warnings": False}
+        # By the schema, an integer that Python code set in place of a float is a float.
+        values, parameters = (
+            pydantic.TypeAdapter(type(one)).dump_python(one, **options)
+            for one in (self, self.parameters)
+        )
+        return values | {"parameters": parameters}
 
     def adopt(self, info: EpisodesInfo) -> bool:
         """Whether it simulates what an assessment was learned from, whatever its file's name is.
@@ -244,8 +240,7 @@ def _accepted(
     """The options of a task's constructor, Meshcat among them if it takes it."""
     known = inspect.signature(task).parameters
     takes_all = any(p.kind is p.VAR_KEYWORD for p in known.values())
-    unknown = [name for name in options if not takes_all and name not in known]
-    if unknown:
+    if unknown := [name for name in options if not takes_all and name not in known]:
         # Arguments of make_loop itself.
         own = [n for n in known if n not in ("scenario", "variation", "assessment", "meshcat")]
         raise ValueError(
@@ -346,9 +341,7 @@ def load_scenario(name: str | Path, changes: Mapping[str, Any] | None = None) ->
     Importing runs the task's code, wherever the file says that it is; :func:`read_scenario` does
     not. The task's module may stand in the scenario file's folder, where modules are searched last,
     while the task is imported. A relative ``robot`` path is relative to the scenario file's folder.
-
-    Args:
-        changes: Values that replace those of the file, by key, such as ``parameters.policy``.
+    ``changes`` replace values of the file by key, such as ``parameters.policy``.
     """
     path = _scenario_file(name)
     with reading(path, errors=ValueError):
@@ -394,11 +387,7 @@ def _scenario_file(name: str | Path) -> Path:
 
 
 def parse_scenario(text: str, *, name: str, folder: Path, task_folder: str = "") -> Scenario:
-    """Reads a scenario from YAML text; errors are as of `load_scenario`.
-
-    Args:
-        task_folder: Folder in which the task's module may stand; "" for none.
-    """
+    """Reads a scenario from YAML text; the task's module may stand in ``task_folder``."""
     scenario = _parsed(text, name, folder)
     scenario.folder = task_folder
     schema, stated = scenario.task_class().Parameters, scenario.parameters

@@ -170,8 +170,7 @@ def _scenario(name: str | Path, is_imported: bool) -> Generator[Finding, None, S
 def _robot(scenario: Scenario) -> Generator[Finding, None, RobotModel | None]:
     robot = load_robot(scenario.robot)
     yield passed("robot.yaml", f"'{robot.name}' fits the schema")
-    missing = [str(path) for path in robot_files(scenario.robot) if not path.is_file()]
-    if missing:
+    if missing := [str(path) for path in robot_files(scenario.robot) if not path.is_file()]:
         yield failed("files", f"not found: {missing}", "set 'urdf' to a path beside robot.yaml")
         return None
     yield passed("files", "found")
@@ -262,16 +261,14 @@ def _motors(kinematics: RobotKinematics) -> _Check:
         f"joints {without} have none",
         _EFFORT_REMEDY,
     )
-    unlimited = [name for name, limit in limits.items() if not np.isfinite(limit)]
-    if unlimited:
+    if unlimited := [name for name, limit in limits.items() if not np.isfinite(limit)]:
         yield failed(
             "effort limits",
             f"the motors of joints {unlimited} have none, so that no load is too heavy",
             _EFFORT_REMEDY,
         )
     if robot.joint_gains:
-        loose = [name for name in kinematics.joint_names if robot.gains_of(name) is None]
-        if loose:
+        if loose := [name for name in kinematics.joint_names if robot.gains_of(name) is None]:
             yield failed(
                 "servo gains", f"joints {loose} have none", "add them under 'joint_gains' [N·m/rad]"
             )
@@ -279,10 +276,8 @@ def _motors(kinematics: RobotKinematics) -> _Check:
     kinematics.set_positions(q)
     instance = plant.GetModelInstanceByName(robot.name)
     if odd := odd_limits(plant, kinematics.context, instance, limits)[1]:
-        remedy = (
-            "correct <limit> in the model file, or 'effort_limits' [N·m] and 'velocity_limits' "
-        )
-        yield passed("motor limits", odd, f"{remedy}[rad/s] in robot.yaml")
+        remedy = "correct <limit> in the model file, or 'effort_limits' [N·m] and"
+        yield passed("motor limits", odd, f"{remedy} 'velocity_limits' [rad/s] in robot.yaml")
     torques = kinematics.gravity_torques(q, np.ones(kinematics.num_contacts, dtype=bool))
     needs = dict(zip(kinematics.joint_names, np.abs(torques), strict=True))
     shares = {name: need / limits[name] for name, need in needs.items() if name in limits}
@@ -306,8 +301,7 @@ def _model_file(kinematics: RobotKinematics) -> _Check:
     robot, plant = kinematics.robot, kinematics.plant
     path = model_file(robot.urdf, robot.source_dir, robot.requires)
     mimics = read_urdf(path).drives.mimics if path.suffix == ".urdf" else {}
-    coupled = [name for foot in robot.feet.values() for name in foot.joints if name in mimics]
-    if coupled:
+    if coupled := [one for foot in robot.feet.values() for one in foot.joints if one in mimics]:
         yield failed(
             "joints of legs",
             f"{coupled} follow others by <mimic>, but servos move every joint by itself",
@@ -317,15 +311,13 @@ def _model_file(kinematics: RobotKinematics) -> _Check:
     endless = {name for name, is_free in zip(kinematics.joint_names, free, strict=True) if is_free}
     legs = [Limb(body=foot.body, joints=foot.joints) for foot in robot.feet.values()]
     legs = [limb for limb in legs if limb.joints and limb.joints[-1] in endless]
-    wheels: list[str] = []
     with suppress(ValueError):  # Meshes that Drake does not read, which `add_robot` replaces.
-        wheels = Survey(path).wheels(legs) if legs else []
-    if wheels:
-        yield passed(
-            "wheels",
-            f"joints {wheels} turn wheels, and position servos hold them",
-            "judge by this scenario only a robot whose wheels are braked",
-        )
+        if wheels := Survey(path).wheels(legs) if legs else []:
+            yield passed(
+                "wheels",
+                f"joints {wheels} turn wheels, and position servos hold them",
+                "judge by this scenario only a robot whose wheels are braked",
+            )
     kinematics.set_positions(kinematics.standing_positions())
     instance = plant.GetModelInstanceByName(robot.name)
     if odd := odd_inertias(plant, kinematics.context, instance):
@@ -412,10 +404,8 @@ def _off_the_ground(loop: LeggedLoop) -> _Check:
     for pair in query.ComputePointPairPenetration():
         frames = map(query.inspector().GetFrameId, (pair.id_A, pair.id_B))
         bodies = [plant.GetBodyFromFrameId(frame) for frame in frames]
-        if (
-            plant.world_body().index() in {body.index() for body in bodies}
-            and pair.depth > _MATCH_M
-        ):
+        is_ground = plant.world_body().index() in [body.index() for body in bodies]
+        if is_ground and pair.depth > _MATCH_M:
             for body in bodies:
                 if body.model_instance() == loop.robot_instance and body.index() not in allowed:
                     depths[body.name()] = max(pair.depth, depths.get(body.name(), 0.0))
@@ -479,11 +469,9 @@ def _walks(loop: Any) -> Generator[Finding, None, str]:
         message += "; the network returns actions that are not finite, and the last one is held"
     elif motion.has_left:
         message += f"; it leaves the safe set at {motion.leave_time_s:.2f} s: {motion.cause}"
-    elif np.linalg.norm(mean - command) > 0.5 * command[0] + _SLOW:
-        yield passed(_WALKS, message, f"if it should be faster, {_POLICY_REMEDY}")
-        return ""
     else:
-        yield passed(_WALKS, message)
+        is_slow = bool(np.linalg.norm(mean - command) > 0.5 * command[0] + _SLOW)
+        yield passed(_WALKS, message, f"if it should be faster, {_POLICY_REMEDY}" * is_slow)
         return ""
     yield failed(_WALKS, message, _POLICY_REMEDY)
     return f"correct '{_WALKS}' first: the policy does not walk"
