@@ -267,8 +267,6 @@ def _ranks(score: np.ndarray) -> np.ndarray:
 
 
 def _ranked_area(rank: np.ndarray, label: np.ndarray, weight: np.ndarray) -> float:
-    if rank.size == 0:
-        return math.nan
     unsafe = np.bincount(rank, weights=weight * label)
     safe = np.bincount(rank, weights=weight * ~label)
     pairs = unsafe.sum() * safe.sum()

@@ -98,11 +98,7 @@ def monitored(
 def _sure_and_wrong(
     motion: Episode, judge: Judge, every: int, horizon: int
 ) -> tuple[np.ndarray, float]:
-    """Rows that are sure and wrong, of those that are judged, all ``every`` rows; see `monitored`.
-
-    Returns:
-        The rows, and the least probability of the judged rows that can be wrong.
-    """
+    """Rows that are sure and wrong, and the least probability of judged rows that can be wrong."""
     rows = np.arange(0, len(motion.time_s), every)
     if motion.is_safe:
         return rows[:0], np.nan

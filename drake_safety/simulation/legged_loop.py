@@ -106,10 +106,7 @@ class LeggedLoop(PlannedLoop):
     def _add_robot(
         self, builder: DiagramBuilder, scene: Scene, *, servos: bool, meshcat: Meshcat | None
     ) -> Physics:
-        """Adds the robot, its scene and, with Meshcat, a visualiser.
-
-        The joints have position servos or torque inputs.
-        """
+        """Adds the robot, with position servos or torque inputs, and its scene."""
         physics = self._physics = add_physics(
             builder,
             self.robot,

@@ -31,14 +31,12 @@ class PlannedLoop(ClosedLoop):
 
     def _check_variation(self, *varied: str) -> None:
         """Checks that a variation of a task's own plant changes only the entries ``varied``."""
-        for entry in fields(PlantVariation):
-            is_plain = getattr(self._plant_variation, entry.name) == getattr(
-                PlantVariation(), entry.name
-            )
-            if not is_plain and entry.name not in varied:
+        found, plain = self._plant_variation, PlantVariation()
+        for name in (entry.name for entry in fields(PlantVariation)):
+            if name not in varied and getattr(found, name) != getattr(plain, name):
                 raise ValueError(
                     f"{type(self).__name__.lower()}: variation '{self.variation}' sets "
-                    f"{entry.name}; entries of this plant are {list(varied)}"
+                    f"{name}; entries of this plant are {list(varied)}"
                 )
 
     def _add_planner(

@@ -95,8 +95,7 @@ def record_episodes(
     """
     name = str(name or getattr(make_diagram, "__name__", type(make_diagram).__name__))
     period_s = step_s / 10 if monitor_period_s is None else monitor_period_s
-    who = "record_episodes"
-    check_times(who, duration_s=duration_s, step_s=step_s, monitor_period_s=period_s)
+    check_times("record_episodes", duration_s=duration_s, step_s=step_s, monitor_period_s=period_s)
     if round(duration_s / step_s) < 1:
         raise ValueError(
             f"record_episodes: an episode has at least one step; got duration_s {duration_s} and "
@@ -188,8 +187,7 @@ def _record(
 
 def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str], dict[str, int]]:
     """The diagram's names of the contract's ports, and their sizes."""
-    unknown = set(given) - set(REQUIRED_PORTS)
-    if unknown:
+    if unknown := set(given) - set(REQUIRED_PORTS):
         raise ValueError(
             f"record_episodes: ports has {sorted(unknown)}; expected some of {REQUIRED_PORTS}"
         )

@@ -447,10 +447,10 @@ def collect_episodes(
 
         def run(index: int) -> Episode:
             found = make.run(function, index)
-            if is_repeated and index == pending[0]:
-                if text := difference(found, make.make, function):
-                    who = f"episode {index} of '{info.scenario}', simulated a second time"
-                    raise ValueError(f"{who}, {text}")
+            is_tried = is_repeated and index == pending[0]
+            if is_tried and (text := difference(found, make.make, function)):
+                who = f"episode {index} of '{info.scenario}', simulated a second time"
+                raise ValueError(f"{who}, {text}")
             return found
 
         results = map_items(
@@ -508,8 +508,8 @@ def _checked_goals(loop: ClosedLoop, goals: np.ndarray, num_episodes: int) -> np
             f"run_episodes: goals must have one row per episode, {num_episodes} in all; got shape "
             f"{goals.shape}"
         )
-    is_finite = np.isfinite(goals).all(axis=1)
-    if not is_finite.all():
-        first = int(np.argmin(is_finite))
-        raise ValueError(f"run_episodes: goals must be finite; goal {first} is {goals[first]}")
+    if len(wrong := np.flatnonzero(~np.isfinite(goals).all(axis=1))):
+        raise ValueError(
+            f"run_episodes: goals must be finite; goal {wrong[0]} is {goals[wrong[0]]}"
+        )
     return goals
