@@ -287,7 +287,7 @@ def test_learning_gives_the_same_bits_for_any_number_of_threads():
         np.testing.assert_array_equal(*pair)
     np.testing.assert_array_equal(one.novelty_.limits, other.novelty_.limits)
     assert_same_detector(one, other)
-    stages = ["distances", "t-SNE", "training", "beliefs", "monitor"]
+    stages = ["monitor", "distances", "t-SNE", "training", "beliefs"]
     assert list(dict.fromkeys(stage for stage, *_ in seen)) == stages
     assert all(0 <= done <= total == 100 for _, done, total in seen)
 
