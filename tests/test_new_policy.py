@@ -217,6 +217,7 @@ def test_a_policy_that_reads_its_observation_wrongly_is_told_about_its_policy(tm
     assert not any("joint_gains" in one.remedy for one in found.values())
 
 
+@pytest.mark.train
 def test_new_says_what_a_network_is_before_it_is_loaded(tmp_path):
     (tmp_path / "p.pt").write_bytes(b"")
     said = []

@@ -61,6 +61,7 @@ def test_the_monitor_is_learned_from_undisturbed_motion_that_is_kept(monkeypatch
     assert not (alone / "falls").exists()
 
 
+@pytest.mark.train
 @pytest.mark.parametrize(
     ("given", "wanted_s"),
     [

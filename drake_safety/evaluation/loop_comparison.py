@@ -183,15 +183,17 @@ def check_pair(pair: tuple[Loop, Loop], *, metric: Metric = UNSAFE, seed: int = 
             starts.append(_start_of(loop, context))
 
         try:
-            run_episode(loop, 0, seed=seed, at_start=at_start, monitor=_after_one_step)
+            run_episode(
+                loop, 0, seed=seed, at_start=at_start, monitor=partial(_after_one_step, loop)
+            )
         except EpisodeError as error:
             raise ValueError(f"the {who}: {error}") from error
     _check_alike(0, loop, *starts)
 
 
-def _after_one_step(context: Context) -> EventStatus:
+def _after_one_step(loop: ClosedLoop, context: Context) -> EventStatus:
     is_over = context.get_time() > 0.0
-    return EventStatus.ReachedTermination(None, "") if is_over else EventStatus.DidNothing()
+    return EventStatus.ReachedTermination(loop, "") if is_over else EventStatus.DidNothing()
 
 
 def _verdict(
