@@ -7,7 +7,6 @@ import atexit
 import json
 import math
 import os
-import pickletools
 import re
 import sys
 import warnings
@@ -374,11 +373,12 @@ def _described(path: Path) -> str:
             return ", but TorchScript: name it .pt" if path.suffix == ".onnx" else ""
         if "data.pkl" in names:
             head = archive.open(names["data.pkl"]).read(_MOST_PICKLED)
-    keys: list[str] = []
-    with suppress(ValueError):  # Its end may be missing. Nothing of it is run.
-        for _, key, _ in pickletools.genops(head):
-            if isinstance(key, str) and re.fullmatch(_KEYS_OF_CHECKPOINTS, key):
-                keys.append(key)
+    # The strings of a pickle stand after their length, of one byte or four. Nothing of it is run.
+    texts = (
+        head[found.end() :][: (found[1] or found[2])[0]].decode(errors="replace")
+        for found in re.finditer(rb"X(.)\0{3}|\x8c(.)", head, re.DOTALL)
+    )
+    keys = [text for text in texts if re.fullmatch(_KEYS_OF_CHECKPOINTS, text)]
     if head.startswith(b"\x80"):
         kind = f"a training checkpoint ({', '.join(keys[:4])})" if keys else "a Python pickle"
         return f", but {kind}: {_EXPORT}"
