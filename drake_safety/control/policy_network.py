@@ -375,7 +375,7 @@ def _described(path: Path) -> str:
             head = archive.open(names["data.pkl"]).read(_MOST_PICKLED)
     # The strings of a pickle stand after their length, of one byte or four. Nothing of it is run.
     texts = (
-        head[found.end() :][: (found[1] or found[2])[0]].decode(errors="replace")
+        head[found.end() : found.end() + (found[1] or found[2])[0]].decode(errors="replace")
         for found in re.finditer(rb"X(.)\0{3}|\x8c(.)", head, re.DOTALL)
     )
     keys = [text for text in texts if re.fullmatch(_KEYS_OF_CHECKPOINTS, text)]
