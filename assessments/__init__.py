@@ -27,7 +27,7 @@ def shipped_folder(scenario: str) -> Path:
     """Returns the folder of a scenario's shipped assessments, by its name.
 
     Raises:
-        ValueError: The scenario has none; the message lists those that do.
+        ValueError: The scenario has no assessment; the message lists all that exist.
     """
     if scenario not in assessed_scenarios():
         raise ValueError(
@@ -44,7 +44,7 @@ def load_assessment(scenario: str | os.PathLike[str], mode: str = "sharpened") -
         scenario: Name of a scenario with shipped assessments, or a folder that ``train`` wrote.
 
     Raises:
-        ValueError: The scenario, folder or mode has none; the message lists those that exist.
+        ValueError: The scenario, folder or mode has no assessment; the message lists all that exist.
     """
     from drake_safety.learning.assessment import SafetyAssessment
 
