@@ -44,7 +44,7 @@ def load_assessment(scenario: str | os.PathLike[str], mode: str = "sharpened") -
         scenario: Name of a scenario with shipped assessments, or a folder that ``train`` wrote.
 
     Raises:
-        ValueError: The scenario, folder or mode has no assessment; the message lists all that exist.
+        ValueError: The scenario, folder or mode has no assessment; the message lists all.
     """
     from drake_safety.learning.assessment import SafetyAssessment
 
