@@ -56,9 +56,9 @@ def path_figure(
         shown = np.vstack([grid.centres[~is_empty], points[known]])
         low, high = shown.min(axis=0) - grid.cell_length, shown.max(axis=0) + grid.cell_length
         left.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        left.set(
-            title="Path through the embedding", xlabel="hatched, and dotted arrows: don't know"
-        )
+        left.set_title("Path through the embedding")
+        # Below the numbers, which stand around the path.
+        left.set_xlabel("hatched, and dotted arrows: don't know", labelpad=16.0)
         wait: dict[str, Any] = {"step": "post", "color": UNKNOWN_COLOUR, "linewidth": 0}
         right.fill_between(time_s, -0.04, 1.0, where=~np.asarray(is_known), **wait)
         right.step(time_s, probability, where="post", color=SAFE_COLOUR, linewidth=2.0)
