@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from drake_safety import Scenario, load_assessment
 from drake_safety.learning.feedback import EpisodePair
 from drake_safety.simulation.feedback import run_pairs
-from drake_safety.systems.safety_assessor import SafetyAssessor
+from drake_safety.systems.monitored_assessor import MonitoredSafetyAssessor
 
 NUM_PAIRS = 40
 ROUNDS = 3
@@ -66,7 +66,7 @@ def test_one_update(
 @pytest.mark.benchmark(timer=time.process_time)
 def test_adopting_beliefs(benchmark: Any, report: Callable[..., None], scenario: Scenario) -> None:
     assessment = load_assessment(scenario.name)
-    assessor = SafetyAssessor(assessment, period_s=scenario.control_period_s)
+    assessor = MonitoredSafetyAssessor(assessment, period_s=scenario.control_period_s)
     context = assessor.CreateDefaultContext()
 
     def adopt() -> None:

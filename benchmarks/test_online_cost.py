@@ -23,8 +23,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from drake_safety import SafetyAssessment, Scenario
 from drake_safety.learning.segments import Episodes
 from drake_safety.learning.trained_maps import Embedding
-from drake_safety.systems.belief_evaluator import BeliefEvaluator
 from drake_safety.systems.change_monitor import ChangeMonitor
+from drake_safety.systems.safety_assessor import SafetyAssessor
 from studies.baselines import DirectClassifier
 
 INPUT_NAMES = ("state", "desired_preview", "features")
@@ -95,8 +95,8 @@ class Running:
         self._simulator.AdvanceTo((self._num_updates - 0.5) * PERIOD_S)
 
 
-def evaluator(assessment: SafetyAssessment) -> BeliefEvaluator:
-    return BeliefEvaluator(assessment, period_s=PERIOD_S, checks_margins=False, heeds_alarm=False)
+def evaluator(assessment: SafetyAssessment) -> SafetyAssessor:
+    return SafetyAssessor(assessment, period_s=PERIOD_S, checks_margins=False, heeds_alarm=False)
 
 
 class EagerNetworks:

@@ -27,8 +27,11 @@ if TYPE_CHECKING:
     from drake_safety.simulation.scenario import Scenario as Scenario
     from drake_safety.simulation.scenario import load_scenario as load_scenario
     from drake_safety.systems.change_monitor import ChangeMonitor as ChangeMonitor
+    from drake_safety.systems.monitored_assessor import AddSafetyAssessor as AddSafetyAssessor
+    from drake_safety.systems.monitored_assessor import (
+        MonitoredSafetyAssessor as MonitoredSafetyAssessor,
+    )
     from drake_safety.systems.recovery_switch import RecoverySwitch as RecoverySwitch
-    from drake_safety.systems.safety_assessor import AddSafetyAssessor as AddSafetyAssessor
     from drake_safety.systems.safety_assessor import SafetyAssessor as SafetyAssessor
     from drake_safety.systems.sensor_faults import SensorFaults as SensorFaults
 
@@ -60,7 +63,7 @@ if not (_PACKAGE / "models").is_dir():
 
 # Resolved on first use: an online run needs neither the training code nor the rollouts.
 _HOMES = {
-    "AddSafetyAssessor": "drake_safety.systems.safety_assessor",
+    "AddSafetyAssessor": "drake_safety.systems.monitored_assessor",
     "AssessmentParameters": "drake_safety.learning.assessment_parameters",
     "ChangeDetector": "drake_safety.learning.change_detector",
     "ChangeMonitor": "drake_safety.systems.change_monitor",
@@ -69,6 +72,7 @@ _HOMES = {
     "EpisodeStart": "drake_safety.simulation.episode_start",
     "Episodes": "drake_safety.learning.segments",
     "Fault": "drake_safety.robots.shift",
+    "MonitoredSafetyAssessor": "drake_safety.systems.monitored_assessor",
     "RecoverySwitch": "drake_safety.systems.recovery_switch",
     "SafetyAssessment": "drake_safety.learning.assessment",
     "SafetyAssessor": "drake_safety.systems.safety_assessor",

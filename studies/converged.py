@@ -11,10 +11,14 @@ import typer
 
 from drake_safety.cli.adapt import ActualPlant
 from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption
+from drake_safety.diagrams.balancing.throw_study import (
+    PAPER_THRESHOLD,
+    TriggerRule,
+    evaluate_throws,
+)
 from drake_safety.evaluation.episode_study import PROMISED_UNSAFE_RECALL
 from drake_safety.evaluation.metrics import Estimate, segment_estimates, threshold_at
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
-from drake_safety.evaluation.throw_study import PAPER_THRESHOLD, TriggerRule, evaluate_throws
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.calibration import score_threshold

@@ -28,6 +28,7 @@ from drake_safety.cli.evaluate import (
     evaluating,
 )
 from drake_safety.cli.training_folder import check_writable, episodes_folder
+from drake_safety.diagrams.balancing.throws import run_throws
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer
@@ -44,7 +45,6 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import load_scenario
-from drake_safety.simulation.throws import run_throws
 from studies.alarms import (
     ALARMS,
     evaluate_alarms,

@@ -16,6 +16,7 @@ from pydrake.math import RigidTransform
 
 from drake_safety.assessments import shipped_folder
 from drake_safety.cli.training_folder import MODES, load_assessment
+from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.evaluation import figure_style as style
 from drake_safety.evaluation.stills import SUPERSAMPLING, StillCamera, stack_positions
 from drake_safety.learning.prediction import is_unknown
@@ -26,7 +27,6 @@ from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.rollouts import run_to_goal
 from drake_safety.simulation.scenario import load_scenario
-from drake_safety.simulation.throws import run_throw
 
 _WIDTH, _PICTURE, _CAPTION, _CURVE = 8.8, 3.7, 0.45, 1.5  # [inches]
 _DOTS_PER_INCH = 100

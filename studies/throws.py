@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from drake_safety.diagrams.balancing.throw_study import TriggerRule, log_probability
 from drake_safety.evaluation.scorers import Scorer
-from drake_safety.evaluation.throw_study import TriggerRule, log_probability
 from drake_safety.simulation.motion import Motion
 
 

@@ -7,18 +7,18 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from cart_episodes import make_info
-from drake_safety.control.policy import (
+from drake_safety.diagrams.walking.command_guard import CommandGuard
+from drake_safety.learning.novelty import Moments, Novelty
+from drake_safety.learning.prediction import Correction, Prediction
+from drake_safety.policies.policy import (
     CommandLimits,
     GaitClock,
     ObservationTerm,
     Policy,
     PolicyParameters,
 )
-from drake_safety.control.policy_network import PolicyNetwork
-from drake_safety.learning.novelty import Moments, Novelty
-from drake_safety.learning.prediction import Correction, Prediction
+from drake_safety.policies.policy_network import PolicyNetwork
 from drake_safety.robots.robot_model import JointGains
-from drake_safety.systems.command_guard import CommandGuard
 from drake_safety.systems.policy_controller import PolicyController
 
 NOVELTY, STEP_S = 0.7, 0.04
@@ -167,5 +167,5 @@ def controller(evaluate=lambda batch, parts: (batch[:, :2] + 1.0, {}), **start):
         observation=[ObservationTerm(name=name) for name in terms],
         gait=GaitClock(period_s=0.2),
     )
-    with mock.patch("drake_safety.control.policy.load_network", lambda path: network):
+    with mock.patch("drake_safety.policies.policy.load_network", lambda path: network):
         return PolicyController(Kinematics(), Policy(parameters, ["a", "b"]))

@@ -5,7 +5,7 @@ from dataclasses import asdict
 import pytest
 
 from drake_safety.control.kinematics import RobotKinematics
-from drake_safety.diagrams.balancing_parameters import (
+from drake_safety.diagrams.balancing.parameters import (
     BalancingParameters,
     fitted_to_robot,
     largest_twist,

@@ -6,7 +6,7 @@ from pydrake.systems.analysis import Simulator
 from balancing_loops import PACKAGED, packaged_loop, standing_loop, started
 from drake_safety import load_assessment, load_scenario
 from drake_safety.control.safe_sets import BalanceSafeSet
-from drake_safety.simulation.throws import run_throw
+from drake_safety.diagrams.balancing.throws import run_throw
 
 
 def test_a_low_probability_makes_the_robot_step_and_hand_over_again():

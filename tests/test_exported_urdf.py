@@ -11,10 +11,10 @@ from scipy.spatial import ConvexHull
 
 import legged_robots
 from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.importing.robot_template import write_robot
+from drake_safety.importing.simulatable_urdf import simulatable_copy
+from drake_safety.importing.urdf_survey import Survey
 from drake_safety.robots.robot_model import load_robot_file
-from drake_safety.robots.robot_template import write_robot
-from drake_safety.robots.simulatable_urdf import simulatable_copy
-from drake_safety.robots.urdf_survey import Survey
 from drake_safety.simulation.scenario_check import check_scenario
 from exported_robots import CALF, FOOT, LIMIT, biped, chain, edited, joint, link, quadruped, renamed
 from exported_robots import shape as shaped

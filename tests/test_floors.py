@@ -25,13 +25,16 @@ ALLOWED = {
     "models": {"robots"},
     "plants": {"learning", "robots"},
     "control": {"learning", "plants", "robots"},
-    "systems": {"learning", "control", "plants", "robots"},
+    "policies": {"control", "robots"},
+    "systems": {"learning", "control", "plants", "policies", "robots"},
 }
 ALLOWED["simulation"] = {*ALLOWED["systems"], "systems", "models"}
 ALLOWED["planning"] = {*ALLOWED["simulation"], "simulation"}
-ALLOWED["diagrams"] = ALLOWED["logs"] = ALLOWED["planning"]
-ALLOWED["evaluation"] = ALLOWED["live"] = {*ALLOWED["planning"], "planning"}
-ALLOWED["cli"] = {*ALLOWED["evaluation"], "evaluation", "live", "logs", "assessments"}
+ALLOWED["evaluation"] = {*ALLOWED["planning"], "planning"}
+ALLOWED["diagrams"] = {*ALLOWED["evaluation"], "evaluation"}
+LEAVES = ("importing", "live", "logs")
+ALLOWED |= {leaf: {*ALLOWED["diagrams"], "diagrams"} for leaf in LEAVES}
+ALLOWED["cli"] = {*ALLOWED["diagrams"], "diagrams", "assessments", *LEAVES}
 # Every room may name the extra that it needs, and write files.
 EVERYWHERE = ("extras", "files")
 ALLOWED |= {"extras": set(), "files": set()}
@@ -44,30 +47,30 @@ EXTRAS = {
     "cluster": ("drake_safety/simulation/cluster",),
     "live": ("drake_safety/live/page",),
     "logs": ("drake_safety/logs/",),
-    "mujoco": ("drake_safety/plants/mujoco", "drake_safety/robots/mjcf.py"),
+    "mujoco": ("drake_safety/plants/mujoco", "drake_safety/importing/mjcf.py"),
     "onnx": ("drake_safety/learning/onnx_graph.py",),
     "report": ("drake_safety/evaluation/report.py",),
     "robots": ("drake_safety/robots/",),
     "train": (
-        "drake_safety/control/policy_network.py",
+        "drake_safety/policies/policy_network.py",
         "drake_safety/evaluation/baselines.py",
         "drake_safety/evaluation/shift_study.py",
         "drake_safety/learning/",
         "drake_safety/simulation/dataset.py",
         "drake_safety/simulation/episode_shards.py",
     ),
-    "walking": ("drake_safety/control/policy_network.py",),
+    "walking": ("drake_safety/policies/policy_network.py",),
 }
 ONLY_IN = {
     "cloudpickle": ("drake_safety/simulation/worker_processes.py",),
     "torch": (
         "drake_safety/learning/maps.py",
         "drake_safety/learning/state_predictor.py",
-        "drake_safety/control/policy_network.py",
+        "drake_safety/policies/policy_network.py",
     ),
     "tslearn": ("drake_safety/learning/distance.py",),
     "dtaidistance": ("drake_safety/learning/distance.py",),
-    "mujoco": ("drake_safety/plants/mujoco_model.py", "drake_safety/robots/mjcf.py"),
+    "mujoco": ("drake_safety/plants/mujoco_model.py", "drake_safety/importing/mjcf.py"),
 }
 PICKLING = {"pickle", "cPickle", "dill", "shelve", "marshal"}
 PICKLING_CALLS = {"torch.save", "torch.load", "joblib.dump", "joblib.load", "pd.read_pickle"}

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_safety.control.foreign_policy import converted_policy
-from drake_safety.control.policy import load_policy
-from drake_safety.control.policy_template import survey_policy
+from drake_safety.importing.foreign_policy import converted_policy
+from drake_safety.importing.policy_template import survey_policy
+from drake_safety.policies.policy import load_policy
 from policy_networks import save_network
 
 pytestmark = pytest.mark.train

@@ -16,11 +16,11 @@ from drake_safety import SafetyAssessment, load_scenario
 from drake_safety.assessments import shipped_folder
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.results import Results
+from drake_safety.importing.simulatable_urdf import simulatable_copy
 from drake_safety.logs.log_map import load_log_map
 from drake_safety.logs.robot_log import read_log
 from drake_safety.models import load_robot
 from drake_safety.robots.meshes import check_meshes
-from drake_safety.robots.simulatable_urdf import simulatable_copy
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
 from log_files import FORMATS, ROBOT, map_beside, part, recorded, write
 from urdf_files import TETRAHEDRON

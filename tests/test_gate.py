@@ -17,14 +17,14 @@ from cart_episodes import assert_identical
 from command_line import call
 from drake_safety import cli, compare_loops, load_scenario, run_episode, run_episodes
 from drake_safety.cli import gate
-from drake_safety.control.policy import network_file, read_policy_file
-from drake_safety.diagrams.walking import policy_files
+from drake_safety.diagrams.walking.task import policy_files
 from drake_safety.evaluation import loop_comparison
 from drake_safety.evaluation.loop_comparison import Loop
 from drake_safety.evaluation.outcomes import Outcomes
 from drake_safety.evaluation.paired_test import look, pairs_needed
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.segments import DIVERGED, RECORDED
+from drake_safety.policies.policy import network_file, read_policy_file
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.motion import simulate
 from drake_safety.simulation.rollouts import episode_rng
@@ -388,7 +388,7 @@ def test_a_candidate_that_is_none_is_an_error(monkeypatch, capsys, tmp_path, arg
 
 
 BROKEN = """
-from drake_safety.diagrams.pendulum import Pendulum
+from drake_safety.diagrams.pendulum.task import Pendulum
 
 
 class Stuck(Pendulum):

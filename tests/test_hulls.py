@@ -11,8 +11,8 @@ import yaml
 import urdf_files
 from command_line import invoked
 from drake_safety.evaluation.stills import StillCamera
-from drake_safety.robots.robot_template import write_robot
-from drake_safety.robots.urdf_survey import Survey
+from drake_safety.importing.robot_template import write_robot
+from drake_safety.importing.urdf_survey import Survey
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.scenario_check import check_scenario

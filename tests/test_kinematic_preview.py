@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import null_space
 
-from drake_safety.control.kinematic_preview import KinematicPreview, chain_joints
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.whole_body_model import PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import task_errors
+from drake_safety.diagrams.reaching.kinematic_preview import KinematicPreview, chain_joints
 from drake_safety.robots.robot_model import load_robot_file
 from legged_robots import edited, robot_kinematics, robot_model, write_porter
 

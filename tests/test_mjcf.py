@@ -13,8 +13,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from command_line import invoked
 from drake_safety.extras import MissingExtraError
-from drake_safety.robots.mjcf import is_mjcf, mjcf_to_urdf
-from drake_safety.robots.robot_template import write_robot
+from drake_safety.importing.mjcf import is_mjcf, mjcf_to_urdf
+from drake_safety.importing.robot_template import write_robot
 from drake_safety.simulation.scenario_check import check_scenario
 
 SHELL = """v 250 0 0\nv 0 80 0\nv 0 0 50\nv -250 -80 -50

@@ -10,9 +10,9 @@ from pydrake.systems.analysis import Simulator
 import reaching_loops
 from balancing_loops import scenario_of
 from drake_safety import load_scenario, run_episode, run_episodes
+from drake_safety.diagrams.balancing.throws import Violations
 from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.simulation.throws import Violations
 from legged_robots import robot_kinematics
 
 MUJOCO = PlantVariation(engine="mujoco")

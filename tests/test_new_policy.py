@@ -7,15 +7,15 @@ import yaml
 from typer.testing import CliRunner
 
 from drake_safety.cli import make_app
-from drake_safety.control.policy import PolicyParameters
-from drake_safety.control.policy_network import (
+from drake_safety.files.schema import load_typed
+from drake_safety.importing.policy_template import PolicyTemplate, survey_policy
+from drake_safety.policies.policy import PolicyParameters
+from drake_safety.policies.policy_network import (
     PolicyMetadata,
     PolicyNetwork,
     load_network,
     read_metadata,
 )
-from drake_safety.control.policy_template import PolicyTemplate, survey_policy
-from drake_safety.files.schema import load_typed
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.scenario_check import check_scenario
 from legged_robots import write_hexapod

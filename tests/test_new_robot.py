@@ -10,7 +10,7 @@ import yaml
 from pydrake.systems.analysis import Simulator
 
 from command_line import invoked
-from drake_safety.robots.robot_template import write_robot
+from drake_safety.importing.robot_template import write_robot
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.scenario_check import check_scenario
 from legged_robots import edited, write_hexapod, write_porter

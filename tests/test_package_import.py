@@ -30,7 +30,7 @@ def test_a_checkout_needs_no_installation():
     # Without the finder that an editable install, be it of another checkout, has left behind.
     code = (
         "import sys; sys.meta_path[:] = [f for f in sys.meta_path if 'ditable' not in repr(f)]; "
-        "import drake_safety.models as m, drake_safety.diagrams.pendulum as d; "
+        "import drake_safety.models as m, drake_safety.diagrams.pendulum.task as d; "
         "print(m.__file__, d.__file__)"
     )
     done = subprocess.run(

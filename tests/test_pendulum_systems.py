@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from drake_safety.diagrams.pendulum import (
+from drake_safety.diagrams.pendulum.task import (
     PendulumController,
     PendulumObserver,
     PendulumParameters,

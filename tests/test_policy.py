@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from pydrake.math import RotationMatrix
 
-from drake_safety.control.policy import (
+from drake_safety.extras import MissingExtraError
+from drake_safety.policies.policy import (
     CommandLimits,
     GaitClock,
     ObservationTerm,
@@ -24,14 +25,13 @@ from drake_safety.control.policy import (
     observation_term,
     with_policy,
 )
-from drake_safety.control.policy_network import (
+from drake_safety.policies.policy_network import (
     PolicyNetwork,
     load_network,
     network_files,
     read_metadata,
     waited,
 )
-from drake_safety.extras import MissingExtraError
 from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern
 from policy_networks import save_network, save_onnx, save_script
 

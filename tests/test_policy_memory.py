@@ -11,8 +11,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from cart_episodes import assert_identical
 from drake_safety import load_scenario, run_episode, run_episodes
-from drake_safety.control.policy_network import load_network
 from drake_safety.learning.segments import Episodes
+from drake_safety.policies.policy_network import load_network
 from drake_safety.simulation.feedback import AddFeedbackRecorder, pair_windows, window_start
 from policy_networks import TERMS, new, recurrent_module, save_network, save_onnx, save_script
 from system_doubles import Bench, controller

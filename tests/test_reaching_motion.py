@@ -3,9 +3,9 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
-from drake_safety.control.kinematic_preview import chain_joints
+from drake_safety.diagrams.reaching.kinematic_preview import chain_joints
+from drake_safety.diagrams.reaching.sampling import PostureSampling
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
-from drake_safety.simulation.reaching_sampling import PostureSampling
 from reaching_loops import (
     EASY,
     atlas,

@@ -10,8 +10,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
 from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose
 from drake_safety.control.mirror import Mirror
-from drake_safety.control.reaching_safe_set import ReachingLimits, ReachingSafeSet
 from drake_safety.control.whole_body_model import WholeBodyModel
+from drake_safety.diagrams.reaching.safe_set import ReachingLimits, ReachingSafeSet
 from drake_safety.plants.obstacles import Clearance, Obstacle
 from drake_safety.robots.robot_model import load_robot_file
 from legged_robots import edited, robot_kinematics, robot_model, write_porter

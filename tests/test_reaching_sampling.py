@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_safety.simulation.reaching_sampling import (
+from drake_safety.diagrams.reaching.sampling import (
     Detours,
     FairTargets,
     PostureSampling,

@@ -5,12 +5,12 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.diagrams.balancing.sampling import calm_start
+from drake_safety.diagrams.balancing.throws import Violations
 from drake_safety.extras import MissingExtraError
 from drake_safety.models import load_robot, robot_names
-from drake_safety.simulation.sampling import calm_start
 from drake_safety.simulation.scenario import load_scenario, scenario_names
 from drake_safety.simulation.scenario_check import check_scenario
-from drake_safety.simulation.throws import Violations
 
 OF_THE_EXTRA = [
     name

@@ -4,7 +4,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES
-from drake_safety.simulation.sampling import (
+from drake_safety.diagrams.balancing.sampling import (
     PushSampling,
     StartSampling,
     calm_start,

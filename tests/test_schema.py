@@ -4,17 +4,17 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from drake_safety.control.policy import PolicyParameters
-from drake_safety.diagrams.balancing_parameters import BalancingParameters
-from drake_safety.diagrams.pendulum import PendulumParameters
-from drake_safety.diagrams.reaching_parameters import ReachingParameters
-from drake_safety.diagrams.walking_parameters import WalkingParameters
+from drake_safety.diagrams.balancing.parameters import BalancingParameters
+from drake_safety.diagrams.pendulum.task import PendulumParameters
+from drake_safety.diagrams.reaching.parameters import ReachingParameters
+from drake_safety.diagrams.walking.parameters import WalkingParameters
 from drake_safety.files.reading import parse_yaml
 from drake_safety.files.schema import load_typed, load_typed_file
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.calibration import Calibration
 from drake_safety.logs.log_map import LogMap
 from drake_safety.logs.sequences import SequenceMap
+from drake_safety.policies.policy import PolicyParameters
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import RobotModel
 from drake_safety.robots.shift import Fault

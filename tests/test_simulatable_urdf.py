@@ -11,12 +11,12 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_safety.importing.simulatable_urdf import simulatable_copy
+from drake_safety.importing.urdf_copy import read_drives
 from drake_safety.plants.obstacles import Obstacle, add_obstacles
 from drake_safety.robots.meshes import check_meshes, mesh_points
 from drake_safety.robots.robot import add_robot
 from drake_safety.robots.robot_model import RobotModel
-from drake_safety.robots.simulatable_urdf import simulatable_copy
-from drake_safety.robots.urdf_copy import read_drives
 from urdf_files import GOOD, LINK, TETRAHEDRON, mesh, stl, written
 
 VTK = (

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import yaml
 
+from drake_safety.importing.standing_posture import solve_standing_posture
+from drake_safety.importing.urdf_survey import Survey
 from drake_safety.models import robot_files
-from drake_safety.robots.standing_posture import solve_standing_posture
-from drake_safety.robots.urdf_survey import Survey
 from legged_robots import write_biped, write_hexapod, write_porter
 
 WRITERS = {"hexapod": write_hexapod, "biped": write_biped, "porter": write_porter}

@@ -12,15 +12,19 @@ import system_block
 from drake_safety import load_assessment
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
-from drake_safety.control.walking_safe_set import WalkingLimits, WalkingSafeSet
-from drake_safety.diagrams.pendulum import PendulumController, PendulumObserver, PendulumParameters
+from drake_safety.diagrams.pendulum.task import (
+    PendulumController,
+    PendulumObserver,
+    PendulumParameters,
+)
+from drake_safety.diagrams.walking.safe_set import WalkingLimits, WalkingSafeSet
 from drake_safety.robots.robot import ObservationNoise
 from drake_safety.robots.shift import Fault
 from drake_safety.systems.assessor_inputs import AssessorInputs
-from drake_safety.systems.belief_evaluator import BeliefEvaluator
 from drake_safety.systems.change_monitor import ChangeMonitor
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
+from drake_safety.systems.monitored_assessor import MonitoredSafetyAssessor
 from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
 from drake_safety.systems.recovery_switch import RecoverySwitch
@@ -66,13 +70,13 @@ CASES = {
         "stance_pose? 3 -> desired_output 3 < *, desired_output_rate 3 < *, "
         "desired_preview 21, desired_outlook 15",
     ),
-    "BeliefEvaluator": (
-        lambda: BeliefEvaluator(AssessmentDouble(), **PERIOD),
+    "SafetyAssessor": (
+        lambda: SafetyAssessor(AssessmentDouble(), **PERIOD),
         f"state 2, desired_preview 6, features 3, margins 2, alarm 1 -> {BELIEF.format(2)} < alarm",
     ),
     "ChangeMonitor": (lambda: ChangeMonitor(LEARNED), f"{SEEN}, hold? 1 -> {ALARM}"),
-    "SafetyAssessor": (
-        lambda: SafetyAssessor(LEARNED),
+    "MonitoredSafetyAssessor": (
+        lambda: MonitoredSafetyAssessor(LEARNED),
         f"{SEEN}, margins {N_C}, hold? 1 -> {BELIEF.format(N_C)}, {ALARM}",
     ),
     "CommandGuard": (
@@ -231,7 +235,7 @@ INNER = {
 SYMBOLS = {
     "SensorFaults": {"n": 2},
     "TrajectoryPlanner": {"n_z": 3, "H": 7, "M": 5},
-    "BeliefEvaluator": {"n_s": 2, "n_z": 3, "H": 2, "n_f": 3, "n_c": 2},
+    "SafetyAssessor": {"n_s": 2, "n_z": 3, "H": 2, "n_f": 3, "n_c": 2},
     "CommandGuard": {"n_s": 1, "n_z": 3, "H": 4, "M": 3, "n_f": 3},
     "FeedbackRecorder": {
         "n_s": 1,
@@ -248,7 +252,7 @@ SYMBOLS = {
     "AssessorInputs": {"M": 2, "n_m": 1},
 }
 LEARNED_SIZES = {"n_s": N_S, "n_w": N_S, "n_z": 3, "H": N_P // 3, "n_f": N_F, "n_c": N_C}
-SYMBOLS |= {"ChangeMonitor": LEARNED_SIZES, "SafetyAssessor": LEARNED_SIZES}
+SYMBOLS |= {"ChangeMonitor": LEARNED_SIZES, "MonitoredSafetyAssessor": LEARNED_SIZES}
 
 
 def symbols(key):
@@ -319,7 +323,7 @@ NOT_FINITE = {
     ("AssessorInputs laikago", "plant_state"): {"state": np.nan, "margins": -np.inf},
     ("PlanFeatures laikago", "plant_state"): {"features": np.nan},
     ("PlanFeatures laikago", "desired_preview"): {"features": np.nan},
-    ("BeliefEvaluator", "state"): {"belief": [0.0, 0.0, 1.0], "safety_probability": 0.0},
+    ("SafetyAssessor", "state"): {"belief": [0.0, 0.0, 1.0], "safety_probability": 0.0},
     ("CommandGuard", "command"): {"desired_output": 0.0, "is_changed": 1.0},
 }
 
@@ -369,7 +373,7 @@ def test_a_base_without_orientation_is_unknown_and_outside_the_safe_set(
 @pytest.mark.parametrize(
     ("key", "port", "value", "tick_s"),
     [
-        ("BeliefEvaluator", "state", [0.5, 0.0], 0.01),
+        ("SafetyAssessor", "state", [0.5, 0.0], 0.01),
         ("CommandGuard", "command", [0.5, 0.0, 0.0], 0.1),
         ("PolicyController", "command", [0.2, 0.4, 0.0], 0.02),
         ("PendulumController", "plant_state", [0.02, 0.0], 0.01),

@@ -6,9 +6,9 @@ import pytest
 from pydrake.math import RotationMatrix
 
 from drake_safety.control.observation import quaternion_of
+from drake_safety.diagrams.balancing.throws import VIOLATIONS, run_throw, run_throws
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.scenario import load_scenario
-from drake_safety.simulation.throws import VIOLATIONS, run_throw, run_throws
 
 HARD = Throw(time_s=0.3, mass_kg=3.0, speed_m_s=8.0, direction_rad=math.pi / 2)
 SOFT = Throw(time_s=0.3, mass_kg=2.0, speed_m_s=2.5, direction_rad=math.pi / 2)

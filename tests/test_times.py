@@ -7,16 +7,16 @@ import pytest
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_safety import load_assessment, load_scenario
-from drake_safety.control.policy import GaitClock
 from drake_safety.control.recovery_step import RecoveryStepParameters
-from drake_safety.diagrams.pendulum import PendulumController, PendulumParameters
+from drake_safety.diagrams.pendulum.task import PendulumController, PendulumParameters
 from drake_safety.plants.balls import Throw
+from drake_safety.policies.policy import GaitClock
 from drake_safety.simulation.motion import simulate
 from drake_safety.simulation.recording import record_episodes
 from drake_safety.simulation.rollouts import run_motions
-from drake_safety.systems.belief_evaluator import BeliefEvaluator
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
+from drake_safety.systems.monitored_assessor import MonitoredSafetyAssessor
 from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
 from drake_safety.systems.recovery_switch import RecoverySwitch
@@ -62,8 +62,11 @@ def recorder(watch_period_s):
 
 
 TAKES = {  # Name of the time, whether it may be zero, and what takes it.
-    "evaluator": ("period_s", lambda **t: BeliefEvaluator(AssessmentDouble(), **t)),
-    "assessor": ("period_s", lambda **t: SafetyAssessor(load_assessment("laikago_balancing"), **t)),
+    "evaluator": ("period_s", lambda **t: SafetyAssessor(AssessmentDouble(), **t)),
+    "assessor": (
+        "period_s",
+        lambda **t: MonitoredSafetyAssessor(load_assessment("laikago_balancing"), **t),
+    ),
     "guard": ("period_s", lambda **t: guard(SlowIsSafe(), **t)),
     "guard's offset": ("offset_s", lambda **t: guard(SlowIsSafe(), **t)),
     "trigger": ("period_s", lambda **t: RecoveryTrigger(**t)),

@@ -5,7 +5,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.robots.urdf_copy import FIXED_MIMIC, read_urdf
+from drake_safety.importing.urdf_copy import FIXED_MIMIC, read_urdf
 from urdf_files import GOOD, LINK, mesh, stl, written
 
 RED = '<material name="red"><color rgba="1 0 0 1"/></material>'

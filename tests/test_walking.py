@@ -9,7 +9,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety import load_scenario, run_episode
 from drake_safety.control.observation import heading_velocity, walking_state
-from drake_safety.diagrams.walking_parameters import CommandSampling, WalkingRecovery, profile
+from drake_safety.diagrams.walking.parameters import CommandSampling, WalkingRecovery, profile
 from drake_safety.simulation.contract import check_contract
 from drake_safety.simulation.rollouts import episode_rng
 

@@ -5,9 +5,9 @@ import pytest
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.assessments import load_assessment
+from drake_safety.diagrams.balancing.throws import VIOLATIONS, run_throw
 from drake_safety.plants.balls import Throw
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.simulation.throws import VIOLATIONS, run_throw
 
 pytestmark = pytest.mark.slow
 

@@ -16,6 +16,11 @@ from typer import Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
+from drake_safety.diagrams.balancing.throw_study import (
+    PAPER_THRESHOLD,
+    TriggerRule,
+    evaluate_throws,
+)
 from drake_safety.evaluation import monitor_study, shift_study
 from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.episode_study import evaluate_episodes, evaluate_plans
@@ -27,7 +32,6 @@ from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.evaluation.shift_study import Judge, JudgedShift, MotionSet
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
 from drake_safety.evaluation.tables import Table
-from drake_safety.evaluation.throw_study import PAPER_THRESHOLD, TriggerRule, evaluate_throws
 from drake_safety.evaluation.verdict_tables import verdict_tables
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment

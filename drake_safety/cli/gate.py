@@ -20,7 +20,6 @@ from typer import Argument, Exit, Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
-from drake_safety.control.policy_network import network_kinds
 from drake_safety.evaluation.failure_rate import estimate_failure_rate
 from drake_safety.evaluation.figure_style import save, spoken
 from drake_safety.evaluation.gate_figure import gate_figure
@@ -41,6 +40,7 @@ from drake_safety.files.atomic import write_file
 from drake_safety.files.reading import parse_yaml
 from drake_safety.learning.seeds import GATE, RATE
 from drake_safety.live.following_camera import follow
+from drake_safety.policies.policy_network import network_kinds
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import load_scenario
 

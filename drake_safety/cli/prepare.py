@@ -11,12 +11,12 @@ from typer import Argument, Exit, Option
 from drake_safety.assessments import assessed_scenarios
 from drake_safety.cli import console
 from drake_safety.cli.training_folder import MODES, load_assessment
-from drake_safety.control.policy_template import survey_policy
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.robot_figure import robot_figure
 from drake_safety.extras import MissingExtraError
+from drake_safety.importing.policy_template import survey_policy
+from drake_safety.importing.robot_template import write_robot
 from drake_safety.learning.seeds import DEMONSTRATION
-from drake_safety.robots.robot_template import write_robot
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import load_scenario, scenario_names

@@ -19,6 +19,7 @@ from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.ask import judge_target, parse_target, print_verdict
 from drake_safety.cli.training_folder import MODES
+from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.path_figure import path_figure
 from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
@@ -39,7 +40,6 @@ from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.motion import Motion, simulate
 from drake_safety.simulation.rollouts import episode_rng, run_to_goal
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.throws import run_throw
 
 _WITH_BALLS_S = 5.0  # Duration of a run with balls.
 _AFTER_EPISODE_S = 1.0  # Beyond an episode, to show whether the robot stays at the target.

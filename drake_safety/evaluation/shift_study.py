@@ -69,7 +69,7 @@ def motions_of(episodes: Episodes) -> list[Episode]:
 
 
 def assessment_judge(assessment: SafetyAssessment) -> Judge:
-    """Γ as a :class:`SafetyAssessor` with the port ``margins`` gives it, without the monitor."""
+    """Γ as a :class:`SafetyAssessor` with the port ``margins`` computes it."""
     probability_of = assessment_scorer("gamma", assessment).probability
 
     def judge(*rows: np.ndarray) -> np.ndarray:

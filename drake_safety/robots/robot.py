@@ -34,11 +34,11 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import Context
 
 from drake_safety.files.schema import NotNegative, Positive, Triple, schema
+from drake_safety.importing.urdf_copy import FIXED_MIMIC, read_urdf
 from drake_safety.robots.meshes import check_meshes
 from drake_safety.robots.model_files import model_file, package_parser
 from drake_safety.robots.robot_model import CollisionShape, RobotModel, by_pattern
 from drake_safety.robots.shift import JointShift, Shift
-from drake_safety.robots.urdf_copy import FIXED_MIMIC, read_urdf
 
 _T = TypeVar("_T")
 

@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import RECORDED
-from drake_safety.systems.safety_assessor import AddSafetyAssessor, SafetyAssessor
+from drake_safety.systems.monitored_assessor import AddSafetyAssessor, MonitoredSafetyAssessor
 
 REQUIRED_PORTS = (*RECORDED, "safe")
 """Output ports of every task."""
@@ -138,7 +138,7 @@ class ClosedLoop(Diagram):
         period_s: float,
         margins: OutputPort | None = None,
         hold: OutputPort | None = None,
-    ) -> SafetyAssessor | None:
+    ) -> MonitoredSafetyAssessor | None:
         """Exports output ports by name; adds an assessor and its ports, if there is an assessment.
 
         The names of the ports' entries must have been set. The scenario says what an alarm of the
@@ -148,7 +148,7 @@ class ClosedLoop(Diagram):
             period_s: Time between two evaluations of the assessment [s].
             margins: Those by which the assessor sees that the safe set was left; by default the
                 exported ones.
-            hold: See :func:`~drake_safety.systems.safety_assessor.AddSafetyAssessor`.
+            hold: See :func:`~drake_safety.systems.monitored_assessor.AddSafetyAssessor`.
         """
         for name, port in ports.items():
             builder.ExportOutput(port, name)

@@ -25,8 +25,8 @@ from drake_safety.simulation.observers import Observers, add_faults, combined
 from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.assessor_inputs import AssessorInputs
+from drake_safety.systems.monitored_assessor import MonitoredSafetyAssessor
 from drake_safety.systems.push_source import PushSource
-from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet
 
 UPDATE_TICK = 0.25
@@ -226,7 +226,7 @@ class LeggedLoop(PlannedLoop):
 
     def export(
         self, builder: DiagramBuilder, ports: Mapping[str, OutputPort], **options: Any
-    ) -> SafetyAssessor | None:
+    ) -> MonitoredSafetyAssessor | None:
         """Exports ports, and those of the robot; see :meth:`PlannedLoop.export`."""
         of_robot = {
             "state": self._seen["state"],

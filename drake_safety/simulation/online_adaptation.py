@@ -16,7 +16,7 @@ from drake_safety.learning.feedback import EpisodePair
 from drake_safety.simulation.feedback import pair_windows
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
-from drake_safety.systems.safety_assessor import SafetyAssessor
+from drake_safety.systems.monitored_assessor import MonitoredSafetyAssessor
 
 _KEPT_UPDATES = 8
 _KEPT_MOTION_S = 600.0
@@ -50,7 +50,7 @@ class OnlineAdaptation:
         scenario: Scenario,
         prior: SafetyAssessment,
         recorder: FeedbackRecorder,
-        assessor: SafetyAssessor,
+        assessor: MonitoredSafetyAssessor,
         *,
         method: str | None = None,
         capacity: int = 400,

@@ -14,8 +14,8 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
+from drake_safety.systems.monitored_assessor import MonitoredSafetyAssessor
 from drake_safety.systems.plan_features import PlanFeatures
-from drake_safety.systems.safety_assessor import SafetyAssessor
 from drake_safety.systems.safety_monitor import FeaturedSafeSet, SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner
 
@@ -95,7 +95,7 @@ class PlannedLoop(ClosedLoop):
 
     def export(
         self, builder: DiagramBuilder, ports: Mapping[str, OutputPort], **options: Any
-    ) -> SafetyAssessor | None:
+    ) -> MonitoredSafetyAssessor | None:
         """Exports ports, and those of planner and monitor; see :meth:`ClosedLoop.export`."""
         ports = {
             "true_state": ports["state"],

@@ -25,7 +25,7 @@ from drake_safety.simulation.closed_loop import REQUIRED_PORTS, port_sizes
 from drake_safety.simulation.motion import simulate
 from drake_safety.simulation.rollouts import collect_episodes, episode_rng, seed_random_sources
 from drake_safety.simulation.worker_processes import MadeOnce, Progress, Sent
-from drake_safety.systems.safety_assessor import warn_of_sampled_ports
+from drake_safety.systems.monitored_assessor import warn_of_sampled_ports
 
 _LOGGER = logging.getLogger("drake_safety")
 _OPTIONAL_PORTS = ("true_state", "desired_output", "features", "safe")

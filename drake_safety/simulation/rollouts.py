@@ -47,7 +47,7 @@ from drake_safety.simulation.hidden_state import difference
 from drake_safety.simulation.motion import Motion, simulate
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import BATCH_SIZE, MadeOnce, Progress, map_items
-from drake_safety.systems.safety_assessor import leaf_systems
+from drake_safety.systems.monitored_assessor import leaf_systems
 
 MOTION_PIECE_S = 60.0
 """Duration of one undisturbed motion [s]."""

@@ -25,7 +25,7 @@ from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.robots.robot_size import overlaid
 from drake_safety.simulation.closed_loop import ClosedLoop, Purpose, check_ports
-from drake_safety.systems.safety_assessor import OnAlarm
+from drake_safety.systems.monitored_assessor import OnAlarm
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat

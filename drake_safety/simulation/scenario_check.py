@@ -17,16 +17,10 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
-from drake_safety.control.policy_network import network_kinds
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
 from drake_safety.files.progress import StageProgress, ignore
-from drake_safety.learning.causes import describe_margin, is_outside
-from drake_safety.learning.segments import DIVERGED
-from drake_safety.models import load_robot, robot_files
-from drake_safety.robots.model_files import model_file
-from drake_safety.robots.robot_model import RobotModel, by_pattern
-from drake_safety.robots.urdf_copy import read_urdf
-from drake_safety.robots.urdf_survey import (
+from drake_safety.importing.urdf_copy import read_urdf
+from drake_safety.importing.urdf_survey import (
     WITHOUT_STOPS_RAD,
     Limb,
     Survey,
@@ -34,6 +28,12 @@ from drake_safety.robots.urdf_survey import (
     odd_inertias,
     odd_limits,
 )
+from drake_safety.learning.causes import describe_margin, is_outside
+from drake_safety.learning.segments import DIVERGED
+from drake_safety.models import load_robot, robot_files
+from drake_safety.policies.policy_network import network_kinds
+from drake_safety.robots.model_files import model_file
+from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.simulation.capabilities import FollowsCommands, HasBall
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_safety.control.kinematics import RobotKinematics, is_state
-from drake_safety.control.policy import Policy
+from drake_safety.policies.policy import Policy
 from drake_safety.systems.periodic_update import declare_update
 
 ACTING, HELD = 0.0, 1.0

@@ -1,27 +1,26 @@
-"""SafetyAssessor: a fitted assessment with its monitor, as a diagram."""
+"""SafetyAssessor: a fitted assessment as a system."""
 
 from __future__ import annotations
 
-import logging
-import math
-from collections.abc import Iterable, Iterator
-from typing import Literal, get_args
+from typing import Any
 
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.systems.belief_evaluator import BeliefEvaluator
-from drake_safety.systems.change_monitor import ChangeMonitor
+from drake_safety.learning.beliefs import EMPTY, empty
+from drake_safety.learning.causes import is_on, is_outside, violated
+from drake_safety.learning.novelty import Novelty
+from drake_safety.learning.prediction import Correction
+from drake_safety.learning.segments import floats
+from drake_safety.systems.periodic_update import declare_update
 
-OnAlarm = Literal["unknown", "report"]
-"""What an alarm does: every belief is unknown, or only the port ``alarm`` says so."""
-ON_ALARM = get_args(OnAlarm)
-_LOGGER = logging.getLogger("drake_safety")
+_LARGEST_NOVELTY = 1e6
 
 
-class SafetyAssessor(Diagram):
-    """Γ in a diagram: a :class:`BeliefEvaluator` and a :class:`ChangeMonitor`, connected.
+class SafetyAssessor(LeafSystem):
+    """Evaluates Γ on the measured state and the upcoming desired trajectory.
 
     .. pydrake_system::
 
@@ -30,8 +29,8 @@ class SafetyAssessor(Diagram):
         - state: n_s
         - desired_preview: H n_z
         - features: n_f (read in the sharpened mode only)
-        - margins: n_c
-        - hold: 1 (optional)
+        - margins: n_c (with ``checks_margins``)
+        - alarm: 1 (with ``heeds_alarm``)
         output_ports:
         - safety_probability: 1
         - belief: 3
@@ -43,178 +42,169 @@ class SafetyAssessor(Diagram):
         - belief_without_alarm: 3
         - fall_probability: 1
         - learned: abstract
-        - alarm: 1
-        - levels: n_w
-        - alarm_cause: abstract
-        - judged_share: 1
 
-    The ports are those of its two systems.
+    Γ is evaluated every ``period_s`` and held, so no output but ``learned`` has direct feedthrough.
+    ``belief`` is (safe, unsafe, don't know), and its first entry the paper's Γ.
+    ``safety_probability`` is the probability of staying safe, by the maps' heads with the
+    correction from feedback; the paper's mode has no heads, and it is the belief's first entry. It
+    is 0 where the belief is "don't know". ``novelty`` is the distance of the inputs from those of
+    training, novel above 1. ``fall_probability`` is 1 for inputs that are not finite, and NaN for
+    an assessment that has learned no falls. The belief of inputs that are novel or not finite is
+    (0, 0, 1), and so is the belief before the first evaluation, and every belief while ``alarm`` is
+    above 0.5, as that of a :class:`~drake_safety.systems.change_monitor.ChangeMonitor`, or not
+    finite. While one of ``margins``, those of the measured state, is negative or not finite, no
+    belief is safe: its mass for "safe" counts as unsafe by the first constraint that is not finite,
+    else the most violated one. The beliefs of the grid, the correction and the novelty are
+    parameters of the Context: :meth:`adopt` replaces them by those of an adapted assessment,
+    between simulations and during them. ``probability_without_alarm`` and ``belief_without_alarm``
+    are what they are without an alarm, for a recovery. ``learned`` has all three, with empty
+    beliefs during an alarm, for a
+    :class:`~drake_safety.diagrams.walking.command_guard.CommandGuard`. The embedding is immutable.
 
     Args:
-        period_s: Time between two evaluations [s]; the step of the training episodes by default.
-        checks_margins: Whether nothing is safe outside the safe set; otherwise there is no port
-            ``margins``.
-        on_alarm: What an alarm of the monitor does, one of ``ON_ALARM``; None for no monitor, and
-            none of its ports.
+        period_s: Time between two evaluations [s].
+        checks_margins: Whether no belief is safe outside the safe set.
+        heeds_alarm: Whether every belief is unknown during an alarm.
     """
 
     def __init__(
         self,
         assessment: SafetyAssessment,
         *,
-        period_s: float | None = None,
+        period_s: float,
         checks_margins: bool = True,
-        on_alarm: str | None = "unknown",
+        heeds_alarm: bool = True,
     ):
         super().__init__()
-        if on_alarm not in (*ON_ALARM, None):
-            raise ValueError(
-                f"safety assessor: on_alarm is {on_alarm!r}, expected one of {list(ON_ALARM)} or "
-                "None for no monitor"
-            )
-        builder = DiagramBuilder()
-        self.evaluator: BeliefEvaluator = builder.AddNamedSystem(
-            "belief_evaluator",
-            BeliefEvaluator(
-                assessment,
-                period_s=assessment.info_.step_s if period_s is None else period_s,
-                checks_margins=checks_margins,
-                heeds_alarm=on_alarm == "unknown",
-            ),
+        info = assessment.info_
+        self._assessment = assessment
+        self._shape = assessment.beliefs_.shape
+        # A diagram without features has no port to connect.
+        self.reads_features = assessment.uses_features and bool(info.feature_names)
+        n_c = len(info.constraint_names)
+        self._belief_index = self.DeclareNumericParameter(
+            BasicVector(np.asarray(assessment.beliefs_, dtype=float).ravel())
         )
-        self.monitor: ChangeMonitor | None = None
-        inputs = ["state", "desired_preview", "features"]
-        for name in [*inputs, "margins"] if checks_margins else inputs:
-            builder.ExportInput(self.evaluator.GetInputPort(name), name)
-        if on_alarm is not None:
-            self.monitor = builder.AddNamedSystem("change_monitor", ChangeMonitor(assessment))
-            for name in inputs:
-                builder.ConnectInput(name, self.monitor.GetInputPort(name))
-            builder.ExportInput(self.monitor.GetInputPort("hold"), "hold")
-        if self.monitor is not None and on_alarm == "unknown":
-            builder.Connect(
-                self.monitor.GetOutputPort("alarm"), self.evaluator.GetInputPort("alarm")
+        self._learned = self.DeclareAbstractParameter(Value(_learned(assessment)))
+        self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
+        self._preview_port = self.DeclareVectorInputPort(
+            "desired_preview", info.horizon * len(info.output_names)
+        )
+        self._features_port = self.DeclareVectorInputPort("features", len(info.feature_names))
+        self._margins_port = self._alarm_port = None
+        if checks_margins:
+            self._margins_port = self.DeclareVectorInputPort("margins", n_c)
+        if heeds_alarm:
+            self._alarm_port = self.DeclareVectorInputPort("alarm", 1)
+        sizes = {
+            "safety_probability": 1,
+            "belief": 3,
+            "cause_probability": n_c,
+            "embedding": 2,
+            "predicted_margins": n_c,
+            "novelty": 1,
+            "probability_without_alarm": 1,
+            "belief_without_alarm": 3,
+            "fall_probability": 1,
+        }
+        first = np.concatenate(
+            [EMPTY if "belief" in name else np.zeros(size) for name, size in sizes.items()]
+        )
+        first[-1] = np.nan  # The probability of a fall.
+        state = self._state = self.DeclareDiscreteState(first)
+        declare_update(self, self._update, self._update, period_s, 0.0)
+        start = 0
+        for name, size in sizes.items():
+            rows = slice(start, start + size)
+            start += size
+            self.DeclareVectorOutputPort(
+                name,
+                BasicVector(size),
+                lambda context, output, rows=rows: output.SetFromVector(
+                    context.get_discrete_state(self._state).get_value()[rows]
+                ),
+                {self.discrete_state_ticket(state)},
             )
-        for system in filter(None, (self.evaluator, self.monitor)):
-            for i in range(system.num_output_ports()):
-                port = system.get_output_port(i)
-                builder.ExportOutput(port, port.get_name())
-        builder.BuildInto(self)
+        ports = filter(None, [self._alarm_port])
+        self.DeclareAbstractOutputPort(
+            "learned",
+            lambda: Value[object]({}),
+            lambda context, output: output.set_value(self._present(context)),
+            {self.all_parameters_ticket(), *(self.input_port_ticket(p.get_index()) for p in ports)},
+        )
 
-    def connect_recovery(self, builder: DiagramBuilder, recovery: System) -> None:
-        """Connects a `RecoveryTrigger` or `RecoverySwitch`, which heeds no alarm of the monitor.
+    def get_beliefs(self, context: Context) -> np.ndarray:
+        """Returns the beliefs in a Context, shaped as the assessment's ``beliefs_``."""
+        return context.get_numeric_parameter(self._belief_index).get_value().reshape(self._shape)
 
-        An alarm says that Γ cannot be relied on, not that the robot falls: while it lasts, recovery
-        steps by what Γ says all the same, neither for ever nor never.
-        """
-        for of_recovery, own in {"safety_probability": "probability", "belief": "belief"}.items():
-            port = self.GetOutputPort(f"{own}_without_alarm")
-            builder.Connect(port, recovery.GetInputPort(of_recovery))
+    def set_beliefs(self, context: Context, beliefs: np.ndarray) -> None:
+        """Replaces the beliefs of every cell."""
+        beliefs = floats(beliefs)
+        if beliefs.shape != self._shape:
+            raise ValueError(
+                f"safety assessor: beliefs must have shape {self._shape}; got {beliefs.shape}"
+            )
+        if not np.isfinite(beliefs).all():
+            raise ValueError("safety assessor: beliefs must be finite numbers; got NaN or inf")
+        context.get_mutable_numeric_parameter(self._belief_index).SetFromVector(beliefs.ravel())
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
-        """Takes over what an assessment adapted from this system's own has learned.
-
-        The monitor begins anew: its alarm was about the robot before the adaptation.
-
-        Raises:
-            ValueError: The adapted assessment has other maps.
-        """
-        self.evaluator.adopt(self.GetMutableSubsystemContext(self.evaluator, context), adapted)
-        if self.monitor is not None:
-            own_context = self.GetMutableSubsystemContext(self.monitor, context)
-            self.monitor.adopt(own_context, adapted)
-            self.monitor.reset(own_context)
-
-
-def AddSafetyAssessor(
-    builder: DiagramBuilder,
-    assessment: SafetyAssessment,
-    *,
-    state: OutputPort,
-    desired_preview: OutputPort,
-    margins: OutputPort | None,
-    features: OutputPort | None = None,
-    hold: OutputPort | None = None,
-    period_s: float | None = None,
-    on_alarm: str | None = "unknown",
-) -> SafetyAssessor:
-    """Adds a :class:`SafetyAssessor` named ``safety_assessor`` to a diagram, and connects it.
-
-    It warns of plants whose ports show the next state to what updates at the same time, and of a
-    monitor that never alarms.
-
-    Args:
-        state: Port of the state, as in the training episodes.
-        desired_preview: Port of the desired preview, as in the training episodes.
-        margins: Port of the measured state's margins; None if nothing checks them.
-        features: Port of the features, in the order of the assessment's ``feature_names``, such as
-            that of :class:`~drake_safety.systems.assessor_inputs.AssessorInputs`; not needed if the
-            assessment reads none.
-        hold: Port that is 1 while a disturbance acts that is known, such as a recovery step: the
-            monitor waits then.
-
-    Raises:
-        ValueError: The assessment reads features and there is no port for them, or a port has
-            another size than in the training episodes.
-    """
-    assessor = SafetyAssessor(
-        assessment, period_s=period_s, checks_margins=margins is not None, on_alarm=on_alarm
-    )
-    given = {
-        "state": state,
-        "desired_preview": desired_preview,
-        "features": features,
-        "margins": margins,
-        "hold": hold,
-    }
-    ports = {name: port for name, port in given.items() if port is not None}
-    is_read = assessor.evaluator.reads_features or (
-        assessor.monitor is not None and assessor.monitor.reads_features
-    )
-    if is_read and features is None:
-        raise ValueError(
-            "AddSafetyAssessor: the assessment was fitted with features "
-            f"{assessment.info_.feature_names}; give the port that carries them"
-        )
-    for name, port in ports.items():
-        if port.size() != (size := assessor.GetInputPort(name).size()):
+        """Takes over what an assessment adapted from this system's own has learned."""
+        if adapted.embedding_ is not self._assessment.embedding_ and not (
+            adapted.embedding_.is_same(self._assessment.embedding_)
+        ):
             raise ValueError(
-                f"AddSafetyAssessor: port '{port.get_name()}' for {name} has size {port.size()}; "
-                f"the assessment was fitted with {size}{_lacking(name, port, assessment)}"
+                "safety assessor: the assessment to adopt has other maps; build the diagram anew"
             )
-    warn_of_sampled_ports("AddSafetyAssessor", builder.GetSystems())
-    if on_alarm is not None and math.isinf(assessment.detector_.alarm_level):
-        _LOGGER.warning("AddSafetyAssessor: %s", assessment.detector_.describe())
-    builder.AddNamedSystem("safety_assessor", assessor)
-    for name, port in ports.items():
-        builder.Connect(port, assessor.GetInputPort(name))
-    return assessor
+        self.set_beliefs(context, adapted.beliefs_)
+        context.get_mutable_abstract_parameter(self._learned).set_value(_learned(adapted))
+
+    def _is_alarmed(self, context: Context) -> bool:
+        return self._alarm_port is not None and is_on(self._alarm_port.Eval(context)[0])
+
+    def _beliefs_now(self, context: Context) -> dict[str, Any]:
+        """What has been learned, as arguments of a prediction."""
+        correction, novelty = context.get_abstract_parameter(self._learned).get_value()
+        beliefs = self.get_beliefs(context)
+        return {"beliefs": beliefs, "correction": correction, "novelty": novelty}
+
+    def _present(self, context: Context) -> dict[str, Any]:
+        """The same; during an alarm all beliefs are empty."""
+        none = {"beliefs": empty(self._shape[:-1], self._shape[-1] - 3)}
+        return self._beliefs_now(context) | (none if self._is_alarmed(context) else {})
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        prediction = self._assessment.predict_one(
+            self._state_port.Eval(context),
+            self._preview_port.Eval(context),
+            self._features_port.Eval(context) if self.reads_features else None,
+            **self._beliefs_now(context),
+        )
+        if self._margins_port is not None:
+            margins = self._margins_port.Eval(context)
+            if is_outside(margins):
+                prediction = prediction.outside(violated(margins))
+        without_alarm = prediction
+        if self._is_alarmed(context):
+            prediction = prediction.unknown()
+        # In the order of the ports.
+        discrete_state.set_value(
+            self._state,
+            np.concatenate(
+                [
+                    (prediction.probability,),
+                    prediction.belief,
+                    prediction.cause_probability,
+                    prediction.embedding,
+                    prediction.predicted_margins,
+                    (min(prediction.novelty, _LARGEST_NOVELTY),),
+                    (without_alarm.probability,),
+                    without_alarm.belief,
+                    (prediction.fall_probability,),
+                ]
+            ),
+        )
 
 
-def leaf_systems(systems: Iterable[System]) -> Iterator[System]:
-    """The systems, with those of diagrams in their place."""
-    for one in systems:
-        yield from leaf_systems(one.GetSystems()) if isinstance(one, Diagram) else [one]
-
-
-def warn_of_sampled_ports(who: str, systems: Iterable[System]) -> None:
-    """Logs which plants show the next state to what updates at the same time."""
-    for one in leaf_systems(systems):
-        if isinstance(one, MultibodyPlant) and one.has_sampled_output_ports():
-            _LOGGER.warning(
-                "%s: plant '%s' steps before what updates at the same time, so that "
-                "Γ sees a later state than in its episodes; make it by AddMultibodyPlant with "
-                "MultibodyPlantConfig(use_sampled_output_ports=False)",
-                who,
-                one.get_name(),
-            )
-
-
-def _lacking(name: str, port: OutputPort, assessment: SafetyAssessment) -> str:
-    """Says which features a system that lists the names of its own lacks."""
-    own = getattr(port.get_system(), "feature_names", None)
-    if name != "features" or own is None:
-        return ""
-    return (
-        f", of which it lacks {[one for one in assessment.info_.feature_names if one not in own]}"
-    )
+def _learned(assessment: SafetyAssessment) -> tuple[Correction, Novelty]:
+    return assessment.correction_, assessment.novelty_

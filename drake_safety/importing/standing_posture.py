@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from pydrake.math import RotationMatrix
 
-from drake_safety.robots.urdf_survey import Limb, Survey
+from drake_safety.importing.urdf_survey import Limb, Survey
 
 # Hip height / leg length.
 _SHARES = (0.8, 0.75, 0.85, 0.7, 0.65, 0.9, 0.6, 0.55, 0.5, 0.45, 0.4, 0.95)

@@ -10,16 +10,16 @@ from typing import Any
 
 import yaml
 
-from drake_safety.control.foreign_policy import converted_policy
-from drake_safety.control.policy import registered_terms
-from drake_safety.control.policy_network import (
+from drake_safety.files.atomic import write_file
+from drake_safety.files.reading import yaml_text
+from drake_safety.importing.foreign_policy import converted_policy
+from drake_safety.policies.policy import registered_terms
+from drake_safety.policies.policy_network import (
     PolicyNetwork,
     load_network,
     network_files,
     network_kinds,
 )
-from drake_safety.files.atomic import write_file
-from drake_safety.files.reading import yaml_text
 from drake_safety.robots.robot_model import as_pattern
 
 

@@ -12,27 +12,27 @@ from pydrake.systems.primitives import MatrixGain, PortSwitch
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
-from drake_safety.control.policy import (
+from drake_safety.diagrams.walking.command_guard import CommandGuard
+from drake_safety.diagrams.walking.parameters import WalkingParameters, profile
+from drake_safety.diagrams.walking.safe_set import WalkingSafeSet
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.segments import Episode
+from drake_safety.models import load_robot
+from drake_safety.plants.physics import Scene
+from drake_safety.plants.pushes import Push
+from drake_safety.policies.policy import (
     Policy,
     load_policy,
     network_file,
     read_policy_file,
     with_policy,
 )
-from drake_safety.control.policy_network import network_files
-from drake_safety.control.walking_safe_set import WalkingSafeSet
-from drake_safety.diagrams.walking_parameters import WalkingParameters, profile
-from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.segments import Episode
-from drake_safety.models import load_robot
-from drake_safety.plants.physics import Scene
-from drake_safety.plants.pushes import Push
+from drake_safety.policies.policy_network import network_files
 from drake_safety.simulation.capabilities import GoalWords
 from drake_safety.simulation.closed_loop import Purpose
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.systems.command_guard import CommandGuard
 from drake_safety.systems.policy_controller import PolicyController
 from drake_safety.systems.recovery_trigger import RecoveryTrigger
 

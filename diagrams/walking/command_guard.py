@@ -10,8 +10,8 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_safety.control.policy import CommandLimits
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.policies.policy import CommandLimits
 from drake_safety.systems.periodic_update import declare_update
 
 _SHARES = np.linspace(0.0, 1.0, 6)  # Of each entry of the asked command.
@@ -41,7 +41,7 @@ class CommandGuard(LeafSystem):
     none is accepted, the one with the largest probability. A command is accepted if its probability
     reaches the threshold. ``safety_probability`` is that of the asked command. All outputs are
     discrete states, and preview and outlook hold the command. ``learned``, that of a
-    :class:`~drake_safety.systems.belief_evaluator.BeliefEvaluator`, replaces the beliefs of the
+    :class:`~drake_safety.systems.safety_assessor.SafetyAssessor`, replaces the beliefs of the
     assessment. Whether the guard acts is a parameter of the Context; one that does not passes on
     everything.
 

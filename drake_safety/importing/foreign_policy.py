@@ -11,10 +11,10 @@ from typing import Annotated, Any
 import yaml
 from pydantic import Field, FiniteFloat
 
-from drake_safety.control.policy import PolicyParameters, registered_terms
-from drake_safety.control.policy_network import TERM_NAMES, limit, load_network
 from drake_safety.files.reading import YamlLoader, parse_yaml, reading
 from drake_safety.files.schema import Pair, load_typed
+from drake_safety.policies.policy import PolicyParameters, registered_terms
+from drake_safety.policies.policy_network import TERM_NAMES, limit, load_network
 from drake_safety.robots.robot_model import by_pattern
 
 _EXPORTED = ("policy.onnx", "../exported/policy.onnx", "policy.pt", "../exported/policy.pt")

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS
 from drake_safety.control.mirror import Mirror
-from drake_safety.control.reaching_safe_set import ReachingSafeSet
+from drake_safety.diagrams.reaching.safe_set import ReachingSafeSet
 from drake_safety.files.schema import Interval, NotNegative, Pair, ShareBelowOne, Triple, schema
 
 _MAX_TRIES = 100

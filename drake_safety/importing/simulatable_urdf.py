@@ -19,15 +19,7 @@ import numpy as np
 
 from drake_safety.extras import MissingExtraError
 from drake_safety.files.reading import is_number
-from drake_safety.robots.meshes import (
-    SHOWN_FORMATS,
-    check_meshes,
-    convex_hull,
-    mesh_points,
-    shown_mesh,
-)
-from drake_safety.robots.model_files import model_file
-from drake_safety.robots.urdf_copy import (
+from drake_safety.importing.urdf_copy import (
     FIXED_MIMIC,
     UrdfCopy,
     as_number,
@@ -37,6 +29,14 @@ from drake_safety.robots.urdf_copy import (
     read_urdf,
     remove,
 )
+from drake_safety.robots.meshes import (
+    SHOWN_FORMATS,
+    check_meshes,
+    convex_hull,
+    mesh_points,
+    shown_mesh,
+)
+from drake_safety.robots.model_files import model_file
 
 if TYPE_CHECKING:
     import trimesh

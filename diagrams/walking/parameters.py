@@ -7,10 +7,10 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.policy import CommandLimits
-from drake_safety.control.walking_safe_set import WalkingLimits
+from drake_safety.diagrams.walking.safe_set import WalkingLimits
 from drake_safety.files.schema import Bounds, Count, NotNegative, Positive, Share, Triple, schema
 from drake_safety.plants.pushes import Push, RandomPushes
+from drake_safety.policies.policy import CommandLimits
 from drake_safety.simulation.legged_loop import View
 
 _RAMP_S = 0.1  # From one command to the next.

@@ -8,7 +8,6 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from drake_safety.control.kinematic_preview import KinematicPreview, chain_joints
 from drake_safety.control.kinematics import (
     NUM_BASE_POSITIONS,
     NUM_BASE_VELOCITIES,
@@ -24,6 +23,7 @@ from drake_safety.control.safe_sets import (
     support_margin,
 )
 from drake_safety.control.whole_body_model import WholeBodyModel
+from drake_safety.diagrams.reaching.kinematic_preview import KinematicPreview, chain_joints
 from drake_safety.files.schema import NotNegative, schema
 from drake_safety.learning.inputs import is_rate
 from drake_safety.plants.obstacles import Clearance

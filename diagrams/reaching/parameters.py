@@ -3,17 +3,17 @@
 from dataclasses import field
 from typing import ClassVar
 
-from drake_safety.control.reaching_safe_set import ReachingLimits
-from drake_safety.files.schema import Positive, Triple, schema
-from drake_safety.plants.obstacles import Obstacle
-from drake_safety.plants.pushes import Push, RandomPushes
-from drake_safety.simulation.legged_loop import View
-from drake_safety.simulation.reaching_sampling import (
+from drake_safety.diagrams.reaching.safe_set import ReachingLimits
+from drake_safety.diagrams.reaching.sampling import (
     Detours,
     FairTargets,
     PostureSampling,
     TargetSampling,
 )
+from drake_safety.files.schema import Positive, Triple, schema
+from drake_safety.plants.obstacles import Obstacle
+from drake_safety.plants.pushes import Push, RandomPushes
+from drake_safety.simulation.legged_loop import View
 
 
 @schema(kw_only=True)

@@ -10,14 +10,14 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.safe_sets import BalanceSafeSet
-from drake_safety.diagrams.balancing_parameters import BalancingParameters
+from drake_safety.diagrams.balancing.parameters import BalancingParameters
+from drake_safety.diagrams.balancing.sampling import calm_start, undisturbed_start
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.physics import ENGINES_WITH_BALLS, Scene
 from drake_safety.simulation.closed_loop import Purpose
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
-from drake_safety.simulation.sampling import calm_start, undisturbed_start
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
 from drake_safety.systems.recovery_switch import RecoverySwitch

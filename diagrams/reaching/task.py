@@ -14,8 +14,8 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import fit_stance, planar_pose
 from drake_safety.control.mirror import Mirror
-from drake_safety.control.reaching_safe_set import ReachingSafeSet
-from drake_safety.diagrams.reaching_parameters import ReachingParameters
+from drake_safety.diagrams.reaching.parameters import ReachingParameters
+from drake_safety.diagrams.reaching.safe_set import ReachingSafeSet
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episode
 from drake_safety.plants.obstacles import Clearance

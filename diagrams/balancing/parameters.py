@@ -9,6 +9,7 @@ import numpy as np
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits
+from drake_safety.diagrams.balancing.sampling import PushSampling, StartSampling
 from drake_safety.files.schema import NotNegative, Positive, schema
 from drake_safety.models import load_robot
 from drake_safety.plants.balls import Throw
@@ -19,7 +20,6 @@ from drake_safety.robots.robot_size import (
     overlaid,
     scaled_defaults,
 )
-from drake_safety.simulation.sampling import PushSampling, StartSampling
 
 
 @schema(kw_only=True)

@@ -12,7 +12,6 @@ from pydrake.math import RotationMatrix
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.observation import quaternion_of
-from drake_safety.control.policy_network import PolicyNetwork, load_network, waited
 from drake_safety.files.schema import (
     Count,
     NotNegative,
@@ -23,6 +22,7 @@ from drake_safety.files.schema import (
     load_typed_file,
     schema,
 )
+from drake_safety.policies.policy_network import PolicyNetwork, load_network, waited
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import JointGains, RobotModel, as_pattern, by_pattern
 

@@ -15,14 +15,12 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_safety.files.reading import yaml_text
-from drake_safety.robots.meshes import above
-from drake_safety.robots.mjcf import ModelFacts, is_mjcf, mjcf_to_urdf
-from drake_safety.robots.robot_model import as_pattern, load_robot_file
-from drake_safety.robots.scenario_template import TASKS, Sizes, scenario_yaml
-from drake_safety.robots.simulatable_urdf import simulatable_copy
-from drake_safety.robots.standing_posture import standing_posture
-from drake_safety.robots.urdf_copy import UrdfCopy, joint_elements
-from drake_safety.robots.urdf_survey import (
+from drake_safety.importing.mjcf import ModelFacts, is_mjcf, mjcf_to_urdf
+from drake_safety.importing.scenario_template import TASKS, Sizes, scenario_yaml
+from drake_safety.importing.simulatable_urdf import simulatable_copy
+from drake_safety.importing.standing_posture import standing_posture
+from drake_safety.importing.urdf_copy import UrdfCopy, joint_elements
+from drake_safety.importing.urdf_survey import (
     WITHOUT_STOPS_RAD,
     Limb,
     Survey,
@@ -37,6 +35,8 @@ from drake_safety.robots.urdf_survey import (
     require_shapes,
     upright_base,
 )
+from drake_safety.robots.meshes import above
+from drake_safety.robots.robot_model import as_pattern, load_robot_file
 
 # Servo gains in proportion to mass times height, from `BALANCING_REFERENCE`.
 _STIFFNESS = 28.0  # [1/s² · N·m/(rad kg m)]

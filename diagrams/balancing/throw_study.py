@@ -9,13 +9,13 @@ from functools import partial
 
 import numpy as np
 
+from drake_safety.diagrams.balancing.throws import VIOLATIONS, run_throws, trigger_time
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.files.progress import StageProgress
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.throws import VIOLATIONS, run_throws, trigger_time
 
 PAPER_THRESHOLD = 0.6
 """Γ_thre of the paper, on b_safe, the probability in the paper's mode."""

@@ -21,9 +21,9 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context, DiagramBuilder
 
+from drake_safety.importing.urdf_copy import JointDrives, UrdfCopy
 from drake_safety.robots.model_files import package_parser
 from drake_safety.robots.robot_size import GRAVITY_M_S2
-from drake_safety.robots.urdf_copy import JointDrives, UrdfCopy
 
 WITHOUT_STOPS_RAD = 4 * math.pi
 """Range of a joint from which it may turn a wheel."""

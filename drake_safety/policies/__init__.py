@@ -1,0 +1,1 @@
+"""Walking policies: `policy.yaml`, observation terms, networks and their memory."""

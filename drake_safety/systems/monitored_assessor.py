@@ -1,0 +1,220 @@
+"""MonitoredSafetyAssessor: a fitted assessment with its monitor, as a diagram."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterable, Iterator
+from typing import Literal, get_args
+
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
+
+from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.systems.change_monitor import ChangeMonitor
+from drake_safety.systems.safety_assessor import SafetyAssessor
+
+OnAlarm = Literal["unknown", "report"]
+"""What an alarm does: every belief is unknown, or only the port ``alarm`` says so."""
+ON_ALARM = get_args(OnAlarm)
+_LOGGER = logging.getLogger("drake_safety")
+
+
+class MonitoredSafetyAssessor(Diagram):
+    """Γ in a diagram: a :class:`SafetyAssessor` and a :class:`ChangeMonitor`, connected.
+
+    .. pydrake_system::
+
+        name: MonitoredSafetyAssessor
+        input_ports:
+        - state: n_s
+        - desired_preview: H n_z
+        - features: n_f (read in the sharpened mode only)
+        - margins: n_c
+        - hold: 1 (optional)
+        output_ports:
+        - safety_probability: 1
+        - belief: 3
+        - cause_probability: n_c
+        - embedding: 2
+        - predicted_margins: n_c
+        - novelty: 1
+        - probability_without_alarm: 1
+        - belief_without_alarm: 3
+        - fall_probability: 1
+        - learned: abstract
+        - alarm: 1
+        - levels: n_w
+        - alarm_cause: abstract
+        - judged_share: 1
+
+    The ports are those of its two systems.
+
+    Args:
+        period_s: Time between two evaluations [s]; the step of the training episodes by default.
+        checks_margins: Whether nothing is safe outside the safe set; otherwise there is no port
+            ``margins``.
+        on_alarm: What an alarm of the monitor does, one of ``ON_ALARM``; None for no monitor, and
+            none of its ports.
+    """
+
+    def __init__(
+        self,
+        assessment: SafetyAssessment,
+        *,
+        period_s: float | None = None,
+        checks_margins: bool = True,
+        on_alarm: str | None = "unknown",
+    ):
+        super().__init__()
+        if on_alarm not in (*ON_ALARM, None):
+            raise ValueError(
+                f"safety assessor: on_alarm is {on_alarm!r}, expected one of {list(ON_ALARM)} or "
+                "None for no monitor"
+            )
+        builder = DiagramBuilder()
+        self.evaluator: SafetyAssessor = builder.AddNamedSystem(
+            "safety_assessor",
+            SafetyAssessor(
+                assessment,
+                period_s=assessment.info_.step_s if period_s is None else period_s,
+                checks_margins=checks_margins,
+                heeds_alarm=on_alarm == "unknown",
+            ),
+        )
+        self.monitor: ChangeMonitor | None = None
+        inputs = ["state", "desired_preview", "features"]
+        for name in [*inputs, "margins"] if checks_margins else inputs:
+            builder.ExportInput(self.evaluator.GetInputPort(name), name)
+        if on_alarm is not None:
+            self.monitor = builder.AddNamedSystem("change_monitor", ChangeMonitor(assessment))
+            for name in inputs:
+                builder.ConnectInput(name, self.monitor.GetInputPort(name))
+            builder.ExportInput(self.monitor.GetInputPort("hold"), "hold")
+        if self.monitor is not None and on_alarm == "unknown":
+            builder.Connect(
+                self.monitor.GetOutputPort("alarm"), self.evaluator.GetInputPort("alarm")
+            )
+        for system in filter(None, (self.evaluator, self.monitor)):
+            for i in range(system.num_output_ports()):
+                port = system.get_output_port(i)
+                builder.ExportOutput(port, port.get_name())
+        builder.BuildInto(self)
+
+    def connect_recovery(self, builder: DiagramBuilder, recovery: System) -> None:
+        """Connects a `RecoveryTrigger` or `RecoverySwitch`, which heeds no alarm of the monitor.
+
+        An alarm says that Γ cannot be relied on, not that the robot falls: while it lasts, recovery
+        steps by what Γ says all the same, neither for ever nor never.
+        """
+        for of_recovery, own in {"safety_probability": "probability", "belief": "belief"}.items():
+            port = self.GetOutputPort(f"{own}_without_alarm")
+            builder.Connect(port, recovery.GetInputPort(of_recovery))
+
+    def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
+        """Takes over what an assessment adapted from this system's own has learned.
+
+        The monitor begins anew: its alarm was about the robot before the adaptation.
+
+        Raises:
+            ValueError: The adapted assessment has other maps.
+        """
+        self.evaluator.adopt(self.GetMutableSubsystemContext(self.evaluator, context), adapted)
+        if self.monitor is not None:
+            own_context = self.GetMutableSubsystemContext(self.monitor, context)
+            self.monitor.adopt(own_context, adapted)
+            self.monitor.reset(own_context)
+
+
+def AddSafetyAssessor(
+    builder: DiagramBuilder,
+    assessment: SafetyAssessment,
+    *,
+    state: OutputPort,
+    desired_preview: OutputPort,
+    margins: OutputPort | None,
+    features: OutputPort | None = None,
+    hold: OutputPort | None = None,
+    period_s: float | None = None,
+    on_alarm: str | None = "unknown",
+) -> MonitoredSafetyAssessor:
+    """Adds a :class:`MonitoredSafetyAssessor` named ``safety_assessor``, and connects it.
+
+    It warns of plants whose ports show the next state to what updates at the same time, and of a
+    monitor that never alarms.
+
+    Args:
+        state: Port of the state, as in the training episodes.
+        desired_preview: Port of the desired preview, as in the training episodes.
+        margins: Port of the measured state's margins; None if nothing checks them.
+        features: Port of the features, in the order of the assessment's ``feature_names``, such as
+            that of :class:`~drake_safety.systems.assessor_inputs.AssessorInputs`; not needed if the
+            assessment reads none.
+        hold: Port that is 1 while a disturbance acts that is known, such as a recovery step: the
+            monitor waits then.
+
+    Raises:
+        ValueError: The assessment reads features and there is no port for them, or a port has
+            another size than in the training episodes.
+    """
+    assessor = MonitoredSafetyAssessor(
+        assessment, period_s=period_s, checks_margins=margins is not None, on_alarm=on_alarm
+    )
+    given = {
+        "state": state,
+        "desired_preview": desired_preview,
+        "features": features,
+        "margins": margins,
+        "hold": hold,
+    }
+    ports = {name: port for name, port in given.items() if port is not None}
+    is_read = assessor.evaluator.reads_features or (
+        assessor.monitor is not None and assessor.monitor.reads_features
+    )
+    if is_read and features is None:
+        raise ValueError(
+            "AddSafetyAssessor: the assessment was fitted with features "
+            f"{assessment.info_.feature_names}; give the port that carries them"
+        )
+    for name, port in ports.items():
+        if port.size() != (size := assessor.GetInputPort(name).size()):
+            raise ValueError(
+                f"AddSafetyAssessor: port '{port.get_name()}' for {name} has size {port.size()}; "
+                f"the assessment was fitted with {size}{_lacking(name, port, assessment)}"
+            )
+    warn_of_sampled_ports("AddSafetyAssessor", builder.GetSystems())
+    if on_alarm is not None and math.isinf(assessment.detector_.alarm_level):
+        _LOGGER.warning("AddSafetyAssessor: %s", assessment.detector_.describe())
+    builder.AddNamedSystem("safety_assessor", assessor)
+    for name, port in ports.items():
+        builder.Connect(port, assessor.GetInputPort(name))
+    return assessor
+
+
+def leaf_systems(systems: Iterable[System]) -> Iterator[System]:
+    """The systems, with those of diagrams in their place."""
+    for one in systems:
+        yield from leaf_systems(one.GetSystems()) if isinstance(one, Diagram) else [one]
+
+
+def warn_of_sampled_ports(who: str, systems: Iterable[System]) -> None:
+    """Logs which plants show the next state to what updates at the same time."""
+    for one in leaf_systems(systems):
+        if isinstance(one, MultibodyPlant) and one.has_sampled_output_ports():
+            _LOGGER.warning(
+                "%s: plant '%s' steps before what updates at the same time, so that "
+                "Γ sees a later state than in its episodes; make it by AddMultibodyPlant with "
+                "MultibodyPlantConfig(use_sampled_output_ports=False)",
+                who,
+                one.get_name(),
+            )
+
+
+def _lacking(name: str, port: OutputPort, assessment: SafetyAssessment) -> str:
+    """Says which features a system that lists the names of its own lacks."""
+    own = getattr(port.get_system(), "feature_names", None)
+    if name != "features" or own is None:
+        return ""
+    return (
+        f", of which it lacks {[one for one in assessment.info_.feature_names if one not in own]}"
+    )

@@ -1,0 +1,125 @@
+import copy
+import dataclasses
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from drake_safety import (
+    AddSafetyAssessor,
+    AssessmentParameters,
+    MonitoredSafetyAssessor,
+    SafetyAssessment,
+    load_assessment,
+)
+from gliding_task import evaluated
+from lip_assessments import QUICK, worse
+from lip_episodes import STEP_S, make_episodes
+
+pytestmark = pytest.mark.train
+
+INPUTS = ("state", "desired_preview", "features", "margins")
+NUM_FROZEN = 200
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    return make_episodes(240, noise=0.002)
+
+
+@pytest.fixture(scope="module")
+def assessment(episodes):
+    parameters = AssessmentParameters(**{**QUICK, "epochs": 1})
+    found = SafetyAssessment(parameters).fit(episodes)
+    found.detector_ = dataclasses.replace(found.detector_, alarm_level=1.0)
+    return found
+
+
+@pytest.fixture
+def inputs(episodes):
+    safe = next(one for one in episodes if one.is_safe)
+    return {name: getattr(safe, name)[0] for name in INPUTS}
+
+
+def added(assessment, inputs, **options):
+    """An assessor in a diagram, connected by one call, and a simulator."""
+    builder = DiagramBuilder()
+    ports = {
+        name: None
+        if numbers is None
+        else builder.AddNamedSystem(name, ConstantVectorSource(numbers)).get_output_port()
+        for name, numbers in inputs.items()
+    }
+    assessor = AddSafetyAssessor(builder, assessment, **ports, **options)
+    simulator = Simulator(builder.Build())
+    return assessor, simulator, assessor.GetMyContextFromRoot(simulator.get_context())
+
+
+@pytest.mark.parametrize("level", [1.0, np.inf])
+def test_it_warns_of_a_monitor_that_never_alarms(assessment, inputs, caplog, level):
+    found = copy.copy(assessment)
+    found.detector_ = dataclasses.replace(assessment.detector_, alarm_level=level)
+    added(found, inputs, on_alarm=None)
+    assert "never alarms" not in caplog.text
+    added(found, inputs)
+    assert ("AddSafetyAssessor: monitor: " in caplog.text) == np.isinf(level)
+
+
+def test_one_call_adds_gamma_the_monitor_and_the_check_of_the_margins(assessment, inputs):
+    assessor, simulator, context = added(assessment, inputs)
+    simulator.Initialize()
+    expected = assessment.predict_one(*(inputs[name] for name in INPUTS[:3]))
+    np.testing.assert_array_equal(evaluated(assessor, context, "belief"), expected.belief)
+    assert evaluated(assessor, context, "alarm") == 0.0
+    simulator.AdvanceTo(NUM_FROZEN * STEP_S)
+    # The inputs do not change at all, as those of a frozen sensor.
+    assert evaluated(assessor, context, "alarm_cause") == "inputs frozen"
+    np.testing.assert_array_equal(evaluated(assessor, context, "belief"), [0.0, 0.0, 1.0])
+    outside, simulator, context = added(assessment, {**inputs, "margins": -inputs["margins"]})
+    simulator.Initialize()
+    assert evaluated(outside, context, "belief")[0] == 0.0
+
+
+def test_less_is_said_by_an_argument(assessment, inputs):
+    assessor, simulator, context = added(assessment, inputs, on_alarm="report")
+    simulator.AdvanceTo(NUM_FROZEN * STEP_S)
+    assert evaluated(assessor, context, "alarm") == 1.0
+    assert evaluated(assessor, context, "belief")[2] < 1.0
+    without, simulator, context = added(assessment, {**inputs, "margins": None}, on_alarm=None)
+    assert without.monitor is None
+    assert not without.HasOutputPort("alarm")
+    assert not without.HasInputPort("margins")
+    simulator.AdvanceTo(STEP_S)
+    assert evaluated(without, context, "belief")[2] < 1.0
+    with pytest.raises(ValueError, match=r"on_alarm is 'stop', expected one of .* or None"):
+        MonitoredSafetyAssessor(assessment, on_alarm="stop")
+
+
+def test_the_margins_are_not_left_out_by_mistake(assessment, inputs):
+    with pytest.raises(TypeError, match="margins"):
+        added(assessment, {name: inputs[name] for name in INPUTS[:3]})
+    with pytest.raises(ValueError, match="was fitted with features"):
+        added(assessment, {name: inputs[name] for name in INPUTS if name != "features"})
+    with pytest.raises(ValueError, match=r"port 'y0' for state has size 1; .* fitted with 6"):
+        added(assessment, {**inputs, "state": np.zeros(1)})
+    # In the paper's mode Γ reads no features, but its monitor may.
+    paper = load_assessment("laikago_balancing", "paper")
+    sizes = len(paper.info_.state_names), 3 * paper.info_.horizon
+    given = {"state": np.zeros(sizes[0]), "desired_preview": np.zeros(sizes[1]), "margins": None}
+    with pytest.raises(ValueError, match="was fitted with features"):
+        added(paper, given)
+    assert added(paper, given, on_alarm=None)[0].monitor is None
+
+
+def test_it_adopts_what_an_adapted_assessment_has_learned_and_the_alarm_ends(assessment, inputs):
+    adapted = assessment.adapt(worse())
+    assessor, simulator, context = added(assessment, inputs)
+    simulator.AdvanceTo(NUM_FROZEN * STEP_S)
+    assert evaluated(assessor, context, "alarm") == 1.0
+    assessor.adopt(assessor.GetMyMutableContextFromRoot(simulator.get_mutable_context()), adapted)
+    assert evaluated(assessor, context, "alarm") == 0.0
+    simulator.AdvanceTo((NUM_FROZEN + 1) * STEP_S)
+    expected = adapted.predict_one(*(inputs[name] for name in INPUTS[:3]))
+    np.testing.assert_array_equal(evaluated(assessor, context, "belief"), expected.belief)
