@@ -34,13 +34,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="Segments for DTW and t-SNE beside their peers, which need 5 minutes and 1.5 GB for "
         "10000; 2000 by default.",
     )
-    group.addoption(
-        "--reference-episodes",
-        type=int,
-        default=10,
-        help="Episodes that are simulated again in finer steps, some 4 CPU seconds each; 10 by "
-        "default.",
-    )
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -9,9 +9,6 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from pydrake.systems.framework import Context, LeafSystem
-
 
 def alternate(
     benchmark: Any,  # pytest-benchmark has no types.
@@ -42,31 +39,6 @@ def alternate(
         function()
     benchmark.pedantic(measure, args=(ours, our_s), setup=measure_peers, rounds=rounds)
     return min(our_s), {name: min(seconds) for name, seconds in peer_s.items()}
-
-
-def tick_costs_us(
-    controller: LeafSystem, context: Context, inputs: Mapping[str, np.ndarray], output: str
-) -> np.ndarray:
-    """CPU time of every tick of a controller alone, (ticks,): inputs set, then output evaluated.
-
-    Args:
-        controller: Has one periodic discrete update.
-        context: Its own; advanced by the ticks.
-        inputs: Rows by input port, (ticks, size).
-        output: The port of its command.
-    """
-    ports = {controller.GetInputPort(name): rows for name, rows in inputs.items()}
-    command = controller.GetOutputPort(output)
-    costs = []
-    for tick in range(len(next(iter(inputs.values())))):
-        for port, rows in ports.items():
-            port.FixValue(context, rows[tick])
-        started = time.process_time()
-        context.SetDiscreteState(controller.EvalUniquePeriodicDiscreteUpdate(context))
-        value = command.Eval(context)
-        costs.append(1e6 * (time.process_time() - started))
-        assert np.any(value)
-    return np.array(costs)
 
 
 def in_fresh_process(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -25,7 +25,6 @@ from drake_safety.learning.segments import Episodes
 from drake_safety.learning.trained_maps import Embedding
 from drake_safety.systems.change_monitor import ChangeMonitor
 from drake_safety.systems.safety_assessor import SafetyAssessor
-from studies.baselines import DirectClassifier
 
 INPUT_NAMES = ("state", "desired_preview", "features")
 PERIOD_S = 0.01
@@ -216,35 +215,4 @@ def test_novelty_and_monitor_beside_an_evaluation(
         at_most=0.75 * peers["Γ in a diagram"],
         peers=peers,
         note=f"{len(detector.columns)} inputs, {len(detector.watched)} states",
-    )
-
-
-@pytest.mark.benchmark(timer=time.process_time)
-def test_one_prediction_beside_gradient_boosting(
-    benchmark: Any, report: Callable[..., None], scenario: Scenario, episodes: Episodes
-) -> None:
-    gamma = SafetyAssessment(copy.deepcopy(scenario.assessment)).fit(episodes[:NUM_EPISODES])
-    trees = gamma.trees_
-    assert trees is not None
-    row = gamma.novelty_.training.mean[None]
-    boosting = DirectClassifier("gradient_boosting", shortest=gamma.settings.shortest)
-    boosting.fit(episodes)  # All: the cost grows with the number of trees.
-    inputs = [getattr(episodes[0], name)[0] for name in INPUT_NAMES]
-    x = np.concatenate(inputs)[None].astype(np.float32)
-    cost_s, peers_s = alternate(
-        benchmark,
-        repeat(lambda: gamma.predict_one(*inputs)),
-        {
-            "its trees": repeat(lambda: trees.evaluate(row)),
-            "gradient boosting": repeat(lambda: boosting.model_.predict_proba(x)),
-        },
-        rounds=3,
-    )
-    report(
-        "Γ, one prediction",
-        per_update_us(cost_s),
-        "us CPU",
-        at_most=MAX_US,
-        peers={name: per_update_us(seconds) for name, seconds in peers_s.items()},
-        note=f"{x.size} inputs, {len(trees)} trees, boosting of {len(episodes)} episodes",
     )

@@ -59,9 +59,6 @@ def learn(num_episodes=1000, *, num_workers=None, **parameters):
 
 
 def main(num_episodes=1000, **options):
-    from drake_safety.evaluation.figure_style import save
-    from drake_safety.evaluation.truth_figure import truth_figure
-
     assessment = learn(num_episodes, **options)
     fresh = fly(num_episodes // 4, seed=1, num_workers=options.get("num_workers"))
     starts = [(one.state[0], one.desired_preview[0]) for one in fresh]
@@ -70,9 +67,6 @@ def main(num_episodes=1000, **options):
     print(f"{assessment}; of {len(fresh)} fresh flights {is_safe.sum()} stay safe.")
     for what, rows in ("stay safe", is_safe), ("do not", ~is_safe):
         print(f"Γ before those that {what}: {gamma[rows].mean():.2f} in the mean")
-    labels = "vertical speed [m/s]", "height [m]"
-    save(truth_figure(assessment, fresh, "state_8", "state_2", labels=labels), "quadrotor")
-    print("quadrotor.png: Γ of each start over height and vertical speed, beside what came of it")
 
 
 if __name__ == "__main__":

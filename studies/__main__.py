@@ -7,21 +7,12 @@ from collections.abc import Callable
 import typer
 
 from drake_safety.cli import run_app
-from studies.ablation import ablate
 from studies.adaptation import adaptation
-from studies.anomalies import anomalies
-from studies.bench import bench
-from studies.converged import converged
 from studies.evaluate import evaluate
 from studies.figures import figures
 from studies.gate import gate
 from studies.monitor import monitor
-from studies.planning import plan_study
-from studies.promises import promises
 from studies.publish import readme, ship, store
-from studies.readings import readings
-from studies.scale import scale
-from studies.truth import truth
 from studies.walking import walking
 
 app = typer.Typer(
@@ -32,10 +23,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
-    *(evaluate, promises, gate),
-    *(ablate, plan_study, monitor, anomalies, adaptation, readings, converged, scale),
-    *(truth, walking),
-    *(figures, bench, store, readme, ship),
+    *(evaluate, adaptation, gate, monitor, walking),
+    *(figures, store, readme, ship),
 )
 for _command in _COMMANDS:
     app.command()(_command)

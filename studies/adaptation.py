@@ -16,7 +16,6 @@ from drake_safety.cli.console import (
     AssessmentOption,
     ScenarioArgument,
     WorkersOption,
-    say,
 )
 from drake_safety.cli.training_folder import (
     MODES,
@@ -24,7 +23,6 @@ from drake_safety.cli.training_folder import (
     assessment_folder,
     episodes_folder,
 )
-from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import Prediction, SafetyAssessment
@@ -37,7 +35,6 @@ from drake_safety.learning.segments import Episode, Episodes, Segments, split
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.worker_processes import map_items
-from studies.adaptation_figure import adaptation_figure
 from studies.baselines import DirectClassifier
 from studies.harness import ReleaseOption, open_study
 
@@ -80,12 +77,11 @@ def adaptation(
 ) -> None:
     """Evaluate Γ before and after feedback of a simulated plant, on independent pools.
 
-    Episodes are shared with `drake-safety adapt`; study.json, its plot and the map before and after
-    feedback are written to ASSESSMENT/adapted-VARIATION.
+    Episodes are shared with `drake-safety adapt`; study.json and its plot are written to
+    ASSESSMENT/adapted-VARIATION.
     """
     learned = assessment_folder(load_scenario(scenario), assessment)
     folder = adapted_folder(learned.out, variation)
-    pictures = []
     with open_study(
         "study",
         scenario,
@@ -119,17 +115,12 @@ def adaptation(
             if mode == MODES[0] and scratch:
                 nominal = load_episodes(episodes_folder(learned.path))
                 study.add("boosting", boosting_estimates(nominal, judged, stages))
-            if len(sets[0]) >= prior.parameters.adaptation.update_interval:
-                picture = adaptation_figure(prior, sets[0])
-                pictures += save(picture, folder / f"adaptation_{mode}")
         study.entries |= {
             "variation": variation,
             "pools": pools,
             "feedback_sets": [len(one) for one in sets],
             "differing_pairs": [sum(pair.differs for pair in one) for one in sets],
         }
-    for path in pictures:
-        say("picture", path)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,6 @@ import yaml
 from jinja2 import Environment, FileSystemLoader
 
 from drake_safety.evaluation.figure_style import label_of
-from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.shift_study import CONFIDENT
 from drake_safety.evaluation.tables import Column, Row, Table
@@ -26,15 +25,16 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import use_of
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.scenario import Scenario
-from studies.plans import SAFE_RECALL, UNSAFE_RECALL
 
 RESULTS_FOLDER = Path("docs/results")
 EVALUATION_FILE, CARD_FILE = "evaluation.json", "README.md"
 """Of a shipped folder."""
 _TEMPLATES = Path(__file__).with_name("templates")
-_KINDS = "results|summary|readings|converged|shifts|monitor|anomalies|walking"
+_KINDS = "results|summary|monitor|walking"
 _OPEN = rf"<!-- (?P<kind>{_KINDS}): (?P<name>[\w-]+) -->\n"
 _BLOCK = re.compile(rf"(?P<start>{_OPEN}).*?(?P<end><!-- end -->)", re.DOTALL)
+SAFE_RECALL, UNSAFE_RECALL = 0.952, 0.987
+"""The paper's recalls on 1000 random targets."""
 _MODES = re.compile(r"^(sharpened|paper)\b")
 _FORMATS = {
     "share": {},
@@ -60,7 +60,7 @@ def render(kind: str, results: Results, **more: Any) -> str:
         loader=FileSystemLoader(_TEMPLATES), trim_blocks=True, lstrip_blocks=True
     )
     environment.filters |= {name: _column("", "", name).text for name in _FORMATS}
-    environment.filters |= {"gain": _gain, "markdown": markdown, "narrow": narrow}
+    environment.filters |= {"markdown": markdown, "narrow": narrow}
     environment.filters |= {"today": partial(today, results), "origin": origin}
     environment.globals |= {
         "r": results,
@@ -83,7 +83,10 @@ def origin(seed: int) -> str:
 
 
 def today(results: Results, command: str) -> str:
-    """A stored command by its present name: the studies evaluate beside baselines."""
+    """A stored command by its present name and options."""
+    command = re.sub(r" --other-hand \d+", "", command)
+    if " --shifts " in command:
+        return command.replace("python -m studies ", "drake-safety ")
     is_beside = any(row.method == "gradient_boosting" for row in results.values())
     old = "drake-safety evaluate "
     return command.replace(old, "python -m studies evaluate ") if is_beside else command
@@ -138,12 +141,6 @@ def narrow(table: Table, keys: Sequence[str]) -> Table:
 def _with_columns(table: Table, shown: Sequence[int]) -> Table:
     rows = [replace(row, estimates=[row.estimates[i] for i in shown]) for row in table.rows]
     return replace(table, columns=[table.columns[i] for i in shown], rows=rows)
-
-
-def _gain(loss: Estimate) -> str:
-    """Minus a loss, in points of percent."""
-    value, low, high = (f"{0.0 - 100.0 * x:+.1f}" for x in (loss.value, loss.high, loss.low))
-    return f"{value} ({low} to {high})"
 
 
 def generate(text: str, folder: Path = RESULTS_FOLDER) -> str:

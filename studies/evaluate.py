@@ -1,7 +1,7 @@
 """``python -m studies evaluate``: `drake-safety evaluate` beside baselines, with what docs show.
 
-Its ``evaluation.json`` has what `drake-safety evaluate` writes and, besides, baseline classifiers,
-inverse kinematics, the other hand, and alarms on throws.
+Its ``evaluation.json`` has what `drake-safety evaluate` writes and, besides, baseline classifiers
+and alarms on throws.
 """
 
 from __future__ import annotations
@@ -34,11 +34,10 @@ from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
-from drake_safety.learning.seeds import EVALUATION, RELEASE, SHIFTS
+from drake_safety.learning.seeds import EVALUATION, RELEASE
 from drake_safety.simulation.capabilities import (
     CanFall,
     HasBall,
-    HasGoals,
     require,
 )
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -53,9 +52,6 @@ from studies.alarms import (
 )
 from studies.baselines import classifier_differences, classifier_scorers
 from studies.harness import CalibrationOption, EpisodesOption, ReleaseOption
-from studies.plans import Plans, Rule, evaluate_plans, plans_of, reachability_rule, scorer_rule
-from studies.reachability import BASELINES, Reachability
-from studies.shifts import add_all_shifts
 from studies.throws import classifier_rules
 
 _CLASSIFIER_SEEDS = (0, 1, 2)
@@ -72,12 +68,6 @@ def evaluate(
     calibration_throws: Annotated[
         int, typer.Option(help="Other throws, for thresholds of the classifiers.", min=1)
     ] = 200,
-    other_hand: Annotated[
-        int, typer.Option(help="Targets: number mirrored to the other hand.", min=0)
-    ] = 0,
-    shifts: Annotated[
-        int, typer.Option(help="Motions of each shift, instead of all else.", min=0)
-    ] = 0,
     seed: Annotated[int | None, typer.Option(help="First of the seeds.")] = None,
     release: ReleaseOption = False,
     out: Annotated[Path | None, typer.Option(help="Folder; ASSESSMENT's by default.")] = None,
@@ -87,20 +77,13 @@ def evaluate(
     """Evaluate Γ beside baselines, trained on the same episodes, for README and docs."""
     loaded, folder = load_scenario(scenario), out or assessment
     check_writable(assessment, folder)
-    block = SHIFTS if shifts else EVALUATION
-    first = (block.first if seed is None else seed) + RELEASE * release
-    if shifts:
-        with evaluating(
-            loaded, assessment, folder, block, first, workers, program=_PROGRAM
-        ) as evaluation:
-            add_all_shifts(evaluation, shifts, episodes)
-        return
+    first = (EVALUATION.first if seed is None else seed) + RELEASE * release
     loop = loaded.make_loop()
     if throws:
         require(loop, HasBall)
     training = load_episodes(episodes_folder(assessment))
     with evaluating(
-        loaded, assessment, folder, block, first, workers, _tables, _PROGRAM
+        loaded, assessment, folder, EVALUATION, first, workers, _tables, _PROGRAM
     ) as evaluation:
         evaluation.entries["calibration_episodes"] = calibration_episodes
         test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
@@ -111,11 +94,7 @@ def evaluate(
         )
         of_first_seed = trained[:: len(_CLASSIFIER_SEEDS)]
         classifiers = [replace(one, name=one.name.rpartition("_")[0]) for one in of_first_seed]
-        if isinstance(loop, HasGoals):
-            sets = plans_of(loop, other), plans_of(loop, test)
-            _add_plans(evaluation, loop, classifiers, *sets, other_hand)
-        else:
-            add_verdicts(evaluation, [*evaluation.scorers, *classifiers], other, test)
+        add_verdicts(evaluation, [*evaluation.scorers, *classifiers], other, test)
         evaluation.add(classifier_differences(evaluation.scorers[0], trained, test))
         add_reliability(evaluation, test)
         if throws:
@@ -125,42 +104,6 @@ def evaluate(
 def _tables(results: Results) -> list[Table]:
     alarms = verdict_table(results, "monitoring", corner="alarm", kind=ALARMS)
     return [*verdict_tables(results), *([alarms] if alarms.rows else [])]
-
-
-def _add_plans(
-    evaluation: Evaluation,
-    loop: ClosedLoop,
-    classifiers: Sequence[Scorer],
-    calibration: Plans,
-    test: Plans,
-    num_other: int,
-) -> None:
-    """Verdicts on all, fair and mirrored targets."""
-    scenario, gamma = evaluation.scenario, evaluation.assessments["sharpened"]
-    sets = {"plans": test}
-    if num_other:
-        mirror = getattr(loop, "mirror_options", {})
-        if not mirror:
-            raise ValueError("--other-hand: the task has no other hand")
-        # The same random draws, mirrored.
-        episodes = evaluation.fresh("fresh targets, other hand", num_other, "evaluation", **mirror)
-        mirrored = scenario.make_loop(**scenario.options_for("evaluation"), **mirror)
-        sets["plans.other_hand"] = plans_of(mirrored, episodes)
-    rules: dict[str, Rule] = {
-        one.name: scorer_rule(one) for one in (*evaluation.scorers, *classifiers)
-    }
-    thresholds = evaluation.plan_thresholds
-    hands = [plans.hand for plans in sets.values() if plans.hand is not None]
-    if hands:
-        robot = loop.robot
-        for name, is_free in BASELINES.items():
-            reach = {hand: Reachability(robot, hand, is_base_free=is_free) for hand in hands}
-            rules[name] = reachability_rule(reach)
-            thresholds[name] = 0.5
-    found, _ = evaluate_plans(
-        rules, thresholds, gamma, calibration, sets, [key for key in sets if key != "plans"]
-    )
-    evaluation.add(found)
 
 
 def _add_throws(

@@ -35,10 +35,10 @@ from studies.documents import CARD_FILE, EVALUATION_FILE, card_text, generate
 NUM_EPISODES = 6
 """Number of fresh episodes whose verdicts are stored."""
 # Stored beside the evaluation.
-_STUDIES = ("readings", "converged", "shifts", "monitor", "anomalies", "walking")
+_STUDIES = ("shifts", "monitor", "walking")
 DOCUMENTS = [
     Path("README.md"),
-    *(Path("docs") / f"{name}.md" for name in ("results", "paper", "shifts", "walking")),
+    *(Path("docs") / f"{name}.md" for name in ("results", "shifts", "walking")),
 ]
 _HASHES, _VERDICTS = "assessment_sha256", "first_episodes"
 _TOLERANCE = 1e-3  # Of Γ; above differences between processors, below those of assessments.

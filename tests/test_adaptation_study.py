@@ -14,7 +14,6 @@ from studies.adaptation import (
     scores,
     train_baselines,
 )
-from studies.adaptation_figure import adaptation_figure
 
 pytestmark = pytest.mark.train
 
@@ -55,11 +54,6 @@ def test_too_few_episodes_give_no_baseline(assessment):
     assert list(baselines) == ["scratch 40"]
     assert baselines["scratch 40"].parameters == assessment.parameters
     np.testing.assert_array_equal(baselines["scratch 40"].correction_.change, 0.0)
-
-
-def test_a_map_needs_the_feedback_of_an_update(assessment):
-    with pytest.raises(ValueError, match="fewer than the 40 of update 1"):
-        adaptation_figure(assessment, worse()[:39])
 
 
 def test_pools_differ(assessment, judged):

@@ -1,11 +1,7 @@
 import json
-import sys
 from pathlib import Path
 
 import pytest
-
-from studies.__main__ import main
-from studies.bench import read_run, run_text
 
 pytest_plugins = ["pytester"]
 
@@ -38,19 +34,6 @@ def run_benchmarks(pytester, monkeypatch):
     return run
 
 
-def run_of(*figures, cpu="Some CPU"):
-    machine = {"cpu": {"brand_raw": cpu, "count": 2}, "python_version": "3.11.7"}
-    machine["packages"] = {"drake": "1.0"}
-    commit = {"id": "0123456789abcdef", "dirty": False}
-    rows = [{"limit": "", "verdict": "", "note": "", "peers": {}} | one for one in figures]
-    return {
-        "machine_info": machine,
-        "commit_info": commit,
-        "datetime": "2030-01-02T03:04:05+00:00",
-        "figures": rows,
-    }
-
-
 @pytest.mark.train
 def test_one_table_says_values_limits_verdicts_and_peers_and_where_it_is_stored(run_benchmarks):
     result, file = run_benchmarks(THREE)
@@ -75,7 +58,6 @@ def test_one_table_says_values_limits_verdicts_and_peers_and_where_it_is_stored(
     row |= {"peers": {"solver alone": 4.0}, "note": "7 joints", "limit": "<= 2.5", "verdict": "OK"}
     assert tick == row
     assert speed_up["verdict"] == "UNDER THE LIMIT" and memory["verdict"] == ""
-    assert read_run(file) == content
 
 
 @pytest.mark.train
@@ -88,29 +70,3 @@ def test_a_value_that_is_no_number_is_within_no_limit_and_a_name_is_taken_once(r
     result, _ = run_benchmarks(f"{body}    report('at_most', 2.0, 's')\n")
     result.assert_outcomes(failed=1)
     assert "there is a figure 'at_most' already" in result.stdout.str()
-
-
-def test_a_run_is_printed_as_markdown_with_its_machine(tmp_path, monkeypatch, capsys):
-    row = {"name": "tick", "unit": "us", "value": 10.0, "peers": {"solver": 20.0}, "note": "n"}
-    content = run_of(row | {"limit": "<= 12", "verdict": "OK"})
-    file = tmp_path / "bench.json"
-    file.write_text(json.dumps(content))
-    monkeypatch.setattr(sys, "argv", ["studies", "bench", str(file)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code in (0, None)
-    printed = capsys.readouterr().out
-    assert run_text(content) in printed
-    assert "| tick | 10 us | <= 12 | OK | solver 20 | n |" in printed
-    assert "2030-01-02, commit 0123456789, Some CPU (2 cores), Python 3.11.7, drake 1.0." in printed
-
-
-DAMAGED = json.dumps(run_of({"name": "tick", "value": 1.0}))
-
-
-@pytest.mark.parametrize("text", ["{}", '{"figures": 1}', "[]", "{", DAMAGED])
-def test_a_file_that_is_no_run_is_refused_by_name(tmp_path, text):
-    file = tmp_path / "other.json"
-    file.write_text(text)
-    with pytest.raises(ValueError, match=r"other\.json"):
-        read_run(file)

@@ -396,7 +396,7 @@ def test_a_strangers_scenario_is_checked_without_running_its_code(tmp_path, monk
         load_scenario(file)
     code = next(f for f in check_scenario("pendulum", num_episodes=0) if f.item == "code")
     assert "drake_safety.diagrams.pendulum:Pendulum" in code.message
-    assert code.message.endswith("pendulum.py")
+    assert code.message.endswith("pendulum/task.py")
 
 
 @pytest.mark.parametrize(
