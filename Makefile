@@ -52,6 +52,7 @@ lint: $(DEVELOPED) ## Check style, format and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy drake_safety studies
+	$(BIN)/lint-imports
 
 bench: $(DEVELOPED) ## Measure costs beside limits and other libraries: a table, and runs/bench.json
 	mkdir -p $(dir $(BENCH))

@@ -18,7 +18,7 @@ import system_block
 
 ROOT = Path(__file__).resolve().parents[1]
 SYSTEMS = sorted((ROOT / "drake_safety" / "systems").glob("*.py"))
-TASKS = sorted((ROOT / "diagrams").glob("*/*.py"))
+COMMAND_GUARD = ROOT / "diagrams" / "walking" / "command_guard.py"
 
 DOCSTRING = """Adds two numbers.
 
@@ -84,7 +84,9 @@ def test_every_port_that_a_docstring_lists_is_declared_in_its_module(path):
 
 def test_every_port_has_a_meaning_and_every_meaning_a_port():
     nodes = [
-        node for path in (*SYSTEMS, *TASKS) for node in ast.parse(path.read_text("utf-8")).body
+        node
+        for path in (*SYSTEMS, COMMAND_GUARD)
+        for node in ast.parse(path.read_text("utf-8")).body
     ]
     docs = [ast.get_docstring(node) or "" for node in nodes if isinstance(node, ast.ClassDef)]
     blocks = [block for block in map(system_block.parse_block, docs) if block]
