@@ -9,7 +9,6 @@ from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import run_episode
-from studies.truth import agreement, simulate_truth
 
 
 @pytest.fixture(scope="module")
@@ -92,14 +91,15 @@ def test_what_a_pendulum_cannot_have_is_refused(scenario):
 
 
 @pytest.mark.train
-def test_gamma_finds_the_true_safe_set_from_few_episodes(scenario):
-    episodes = run_episodes(scenario, 160, num_workers=1)
+def test_gamma_finds_the_true_safe_set_from_few_episodes(scenario, loop):
     parameters = replace(scenario.assessment, ensemble_size=1, perplexity=20.0)
-    gamma = SafetyAssessment(parameters).fit(episodes)
-    truth = simulate_truth(scenario, "hold", 9, num_workers=1)
-    found = agreement(truth.is_safe, truth.safety_probability(gamma))
-    assert 0.2 < truth.is_safe.mean() < 0.8
-    assert found.intersection_over_union >= 0.75
-    assert found.band <= 0.26
+    gamma = SafetyAssessment(parameters).fit(run_episodes(scenario, 160, num_workers=1))
+    angles, rates = np.linspace(-0.5, 0.5, 9), np.linspace(-1.5, 1.5, 9)
+    motions = [run_episode(loop, start=start(loop, a, r)) for a in angles for r in rates]
+    is_safe = np.array([motion.is_safe for motion in motions])
+    rows = [(one.state[0], one.desired_preview[0], one.features[0]) for one in motions]
+    is_accepted = np.array([gamma.predict_one(*row).probability >= 0.5 for row in rows])
+    assert 0.2 < is_safe.mean() < 0.8
+    assert np.sum(is_safe & is_accepted) / np.sum(is_safe | is_accepted) >= 0.75
     # The pendulum is the same in the mirror, and so is what becomes of it.
-    np.testing.assert_array_equal(truth.is_safe, truth.is_safe[::-1, ::-1])
+    np.testing.assert_array_equal(is_safe, is_safe[::-1])

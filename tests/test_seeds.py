@@ -16,12 +16,14 @@ from drake_safety.learning.feedback import pair_episodes
 from drake_safety.learning.seeds import (
     ADAPTATION,
     BLOCKS,
+    CALIBRATION,
     DEMONSTRATION,
     FRESH_MOTION,
     GATE,
     NOT_DRAWN,
     RELEASE,
     SHIFTS,
+    TRAINING,
     UsedEpisodes,
     check_unused,
     use_of,
@@ -30,8 +32,6 @@ from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.feedback import run_pairs
 from lip_episodes import make_episodes
 from studies.__main__ import app as studies
-from studies.ablation import ablate
-from studies.planning import plan_study
 
 
 def default_seed(function):
@@ -96,8 +96,9 @@ def test_every_study_with_seeds_has_those_of_the_release():
 
 
 def test_every_command_takes_its_default_seed_from_the_table():
-    commands = (train.train, ablate, calibrate.calibrate, plan_study, adapt.adapt)
-    assert [default_seed(command) for command in commands] == [block.first for block in BLOCKS[:5]]
+    commands = (train.train, calibrate.calibrate, adapt.adapt)
+    blocks = (TRAINING, CALIBRATION, ADAPTATION)
+    assert [default_seed(command) for command in commands] == [block.first for block in blocks]
     # The default of `evaluate` is that of what it evaluates.
     assert default_seed(evaluate.evaluate) is None
     shown = [default_seed(command) for command in (run.run, play.play, prepare.check)]

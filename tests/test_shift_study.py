@@ -1,17 +1,24 @@
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pydrake.math import RotationMatrix
 
-from drake_safety import AssessmentParameters, SafetyAssessment, load_assessment, load_scenario
+from drake_safety import (
+    AssessmentParameters,
+    SafetyAssessment,
+    inputs_at,
+    load_assessment,
+    load_scenario,
+)
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.shift_study import (
     CONFIDENT,
     JudgedShift,
-    assessment_judge,
     motions_of,
     shift_estimates,
     shifts_figure,
@@ -19,17 +26,8 @@ from drake_safety.evaluation.shift_study import (
 )
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
 from drake_safety.robots.robot_model import as_pattern
-from lip_assessments import QUICK, calibration
+from lip_assessments import QUICK
 from lip_episodes import make_episodes
-from studies.shifts import (
-    POSTURES,
-    STARTS,
-    baseline_estimates,
-    detector_judges,
-    junk,
-    run_changed_starts,
-    without_novelty,
-)
 
 
 @pytest.fixture(scope="module")
@@ -69,9 +67,6 @@ def judged(motions, **others):
     return JudgedShift({"gamma": told} | others, motions)
 
 
-PROMISE = calibration(miss_rate=0.1, threshold=0.6, unsafe_below=0.4)
-
-
 def test_a_confident_error_is_a_row_called_safe_in_a_motion_that_ends_unsafely():
     motions = [
         motion(10, 0.95, is_unsafe=True),  # sure and wrong
@@ -85,73 +80,6 @@ def test_a_confident_error_is_a_row_called_safe_in_a_motion_that_ends_unsafely()
     assert found["gamma.unknown"].value == pytest.approx(0.4)
     assert found["unsafe"].value == 0.75
     assert found["gamma.confident_error"].n == 4
-    beside = baseline_estimates(shift, PROMISE)
-    assert beside["gamma.first.confident_error"].value == 0.25
-    # Of three unsafe plans, two have at least the promise's threshold.
-    assert beside["missed"].value == pytest.approx(2 / 3)
-
-
-def test_the_ranking_is_that_of_all_rows_and_of_those_that_gamma_knows():
-    # The only known safe motion lies above both unsafe ones; the unknown ones are safe.
-    motions = [
-        motion(4, 0.8, is_unsafe=False),
-        *(motion(2, -1.0, is_unsafe=False) for _ in range(2)),
-        *(motion(4, 0.5, is_unsafe=True) for _ in range(2)),
-    ]
-
-    def other(state, preview, features, is_outside):
-        return np.where(state[:, 0] < 0.0, 0.9, 1.0 - state[:, 0])
-
-    shift = judged(motions, other=other)
-    found = shift_estimates(shift) | baseline_estimates(shift)
-    assert found["gamma.known_auc"].value == 1.0
-    assert found["gamma.auc"].value == pytest.approx(0.5)
-    assert found["other.known_auc"].value == 0.0
-    assert found["other.auc"].value == pytest.approx(0.5)
-
-
-@pytest.mark.train
-def test_outside_the_safe_set_gamma_is_not_safe_but_the_grid_alone_may_be(assessment, nominal):
-    rows = nominal[0]
-    given = (rows.state, rows.desired_preview, rows.features)
-    outside = np.ones(len(rows.state), dtype=bool)
-    judged_outside = assessment_judge(assessment)(*given, outside)
-    assert (judged_outside == 0.0).any() and not np.nan_to_num(judged_outside).any()
-    alone = without_novelty(assessment)
-    np.testing.assert_array_equal(alone(*given, outside), alone(*given, ~outside))
-
-
-@pytest.mark.train
-def test_junk_is_dont_know_and_keeps_what_it_says_it_keeps(assessment, nominal):
-    found = {name: motions for name, (_, motions) in junk(nominal[:20], seed=3).items()}
-    others = {f"{what} of another row" for what in ("state", "plan", "features")}
-    assert set(found) == {"columns shuffled", "gaussian", *others}
-    plain = np.concatenate([one.state for one in nominal[:20]])
-    shuffled = np.concatenate([one.state for one in found["columns shuffled"]])
-    np.testing.assert_array_equal(np.sort(shuffled, axis=0), np.sort(plain, axis=0))
-    kept = np.concatenate([one.state for one in found["plan of another row"]])
-    np.testing.assert_array_equal(kept, plain)
-    # Noise makes every row unique: none is taken from its own motion.
-    for own, changed in zip(nominal[:20], found["state of another row"], strict=True):
-        assert not np.isin(changed.state[:, 0], own.state[:, 0]).any()
-    judges = {"gamma": assessment_judge(assessment)}
-    result = shift_estimates(JudgedShift(judges, found["columns shuffled"]))
-    assert result["gamma.unknown"].value > 0.9
-    assert result["gamma.confident_error"].value < 0.05
-
-
-@pytest.mark.train
-def test_published_detectors_refuse_about_as_many_safe_episodes(assessment, training, nominal):
-    judges = detector_judges(assessment, training)
-    assert set(judges) == {"isolation_forest", "deep_knn"}
-    plain = without_novelty(assessment)
-    for judge in judges.values():
-        unknown = []
-        for one in nominal:
-            if one.is_safe:
-                given = rows_of(one)
-                unknown.append(np.any(np.isnan(judge(*given)) & ~np.isnan(plain(*given))))
-        assert np.mean(unknown) < 0.2
 
 
 def test_the_catalogue_is_scaled_to_the_robot():
@@ -170,7 +98,6 @@ def test_the_catalogue_is_scaled_to_the_robot():
     own = load_scenario("pendulum")
     shifts = plant_shifts(own, own.make_loop())
     assert list(shifts) == [f"variation {n}" for n in own.variations if n != "nominal"]
-    assert run_changed_starts(own, 2, seed=1) == {}
 
 
 NAMES = ["friction+10%", "collision (arm)", "v1.heavy", "../up", "größe $a_1$ $", "0.5", "a%2Eb"]
@@ -227,14 +154,11 @@ def test_the_loaded_joint_may_have_no_motor_or_no_limit(monkeypatch, limit):
         assert other != pattern
 
 
-def test_postures_and_falls_are_never_called_safe():
-    scenario, gamma = load_scenario("laikago_balancing"), load_assessment("laikago_balancing")
-    sets = run_changed_starts(scenario, 6, seed=77, num_workers=1)
-    assert {*STARTS, *POSTURES} <= set(sets)
-    judge = assessment_judge(gamma)
-    for name, (kind, motions) in sets.items():
-        for one in motions if kind == "posture" else ():
-            probability = judge(*rows_of(one))
-            assert np.nan_to_num(probability).max() < CONFIDENT, name
-            if name in POSTURES:
-                assert np.isnan(probability).all(), name
+@pytest.mark.parametrize(("roll_rad", "height"), [(0.0, 1.5), (0.5 * math.pi, 0.3), (math.pi, 0.3)])
+def test_a_robot_that_is_lifted_or_lies_is_dont_know(roll_rad, height):
+    loop = load_scenario("laikago_balancing").make_loop()
+    start = loop.standing_start()
+    q = start.q.copy()
+    q[:4], q[6] = RotationMatrix.MakeXRotation(roll_rad).ToQuaternion().wxyz(), height * q[6]
+    inputs = inputs_at(loop, replace(start, q=q))
+    assert load_assessment("laikago_balancing").predict_one(*inputs).belief[2] == 1.0

@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 
+from drake_safety.diagrams.balancing import throw_study
 from drake_safety.diagrams.balancing.throw_study import TriggerRule, evaluate_throws
 from drake_safety.diagrams.balancing.throws import VIOLATIONS
-from drake_safety.evaluation import throw_study
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.simulation.motion import Motion
 from studies.throws import choose_threshold, classifier_rules
