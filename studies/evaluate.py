@@ -117,7 +117,6 @@ def _add_throws(
         evaluation.scenario,
         list(range(num_calibration)),
         seed=evaluation.seeds["disturbance thresholds"],
-        variation=_PLANT,
         num_workers=evaluation.workers,
         progress=partial(evaluation.stages, "calibration throws"),
     )

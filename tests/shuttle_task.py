@@ -10,7 +10,6 @@ from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.plants.pushes import Push
-from drake_safety.simulation.capabilities import is_in_box
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario, parse_scenario
@@ -18,7 +17,6 @@ from gliding_task import declare_outputs
 
 SIDES = {"left": 1.0, "right": -1.0}
 BOX = np.array([[0.6, -0.3, 0.2], [1.4, 1.4, 1.0]])
-FAIR_X_M = 0.8
 FAILING_Z_M = 0.9
 PERIOD_S = 0.01
 NO_PUSH = [0.0, 0.0, 0.0, 0.0, 0.0]
@@ -85,7 +83,6 @@ class Shuttling(ClosedLoop):
     hand = None
     named_targets: ClassVar[dict] = {}
     pushes: ClassVar[dict] = {}
-    plan_variety = "the task decides how fast it goes"
 
     def __init__(
         self, scenario, variation="nominal", *, assessment=None, meshcat=None, side="left"
@@ -110,14 +107,6 @@ class Shuttling(ClosedLoop):
     @property
     def target_box(self):
         return self._of_this_side(BOX)
-
-    @property
-    def fair_box(self):
-        return self._of_this_side(np.array([[FAIR_X_M, *BOX[0, 1:]], BOX[1]]))
-
-    @property
-    def mirror_options(self):
-        return {"side": "right" if self.side == "left" else "left"}
 
     def reset(self, context, rng, goal=None):
         start = self.shuttle.reflect * rng.uniform(-0.1, 0.1, 3)
@@ -147,27 +136,10 @@ class Shuttling(ClosedLoop):
         force = [*rng.uniform(-2, 12, 2), 0.0]
         return Push(force_n=force, time_s=0.1 * int(rng.integers(1, 4)), duration_s=0.1)
 
-    def candidate_plans(self, context, rng, num_plans):
-        """Velocities: the one that it has, and slower ones that lead less far."""
-        state = self._state_vector(context)
-        shares = rng.uniform(0.3, 1.0, num_plans - 1)
-        return [state[3:].copy(), *(share * state[3:] for share in shares)]
-
-    def set_plan(self, context, plan):
-        shuttle_context = self.shuttle.GetMyMutableContextFromRoot(context)
-        shuttle_context.SetDiscreteState(np.append(self._state_vector(context)[:3], plan))
-
-    def _state_vector(self, context):
-        shuttle_context = self.shuttle.GetMyContextFromRoot(context)
-        return shuttle_context.get_discrete_state_vector().get_value()
-
     def goal_of(self, episode):
         position, velocity = np.split(episode.state[0], 2)
         goal = position + self.scenario.episode_duration_s * velocity
         return self.shuttle.reflect * goal
-
-    def is_fair(self, episode):
-        return is_in_box(self.goal_of(episode), self.fair_box)
 
 
 SCENARIO = """

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from drake_safety import check_contract, load_scenario
-from drake_safety.simulation import capabilities
 from drake_safety.simulation.capabilities import (
     CanBePushed,
     CanFall,
@@ -13,7 +12,6 @@ from drake_safety.simulation.capabilities import (
     HasBall,
     HasGoals,
     MovesUndisturbed,
-    OffersPlans,
     require,
 )
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
@@ -22,10 +20,10 @@ from gliding_task import Gliding, gliding
 from shuttle_task import Shuttling, shuttling
 
 OF_LEGS = {CanFall, CanStartAnywhere, MovesUndisturbed}
-ASKED = (HasGoals, HasBall, CanBePushed, FollowsCommands, OffersPlans, *OF_LEGS)
+ASKED = (HasGoals, HasBall, CanBePushed, FollowsCommands, *OF_LEGS)
 HAS = {
-    "laikago_balancing": {HasBall, OffersPlans, *OF_LEGS},
-    "atlas_reaching": {HasGoals, CanBePushed, OffersPlans, *OF_LEGS},
+    "laikago_balancing": {HasBall, *OF_LEGS},
+    "atlas_reaching": {HasGoals, CanBePushed, *OF_LEGS},
     "go2_walking": {HasGoals, CanBePushed, FollowsCommands, *OF_LEGS},
     "pendulum": {CanStartAnywhere},
 }
@@ -55,7 +53,7 @@ def test_the_safe_set_is_sampled_by_the_control_period_unless_the_task_has_anoth
 
 def test_a_task_is_asked_for_what_it_has_and_is_handed_back():
     loop = Shuttling(shuttling())
-    for capability in (HasGoals, CanBePushed, OffersPlans, CanFall):
+    for capability in (HasGoals, CanBePushed, CanFall):
         assert require(loop, capability) is loop
 
 
@@ -87,19 +85,3 @@ def test_a_task_that_says_nothing_of_itself_has_the_plain_answers():
     for purpose in ("evaluation", "paper", "pairs"):
         assert loop.scenario.options_for(purpose, "actual") == {}
     assert run_episode(loop).num_controller_failures == 0
-
-
-def test_without_a_word_of_its_own_all_of_a_tasks_targets_are_fair():
-    loop = load_scenario("go2_walking").make_loop()
-    np.testing.assert_array_equal(capabilities.fair_box(loop), loop.target_box)
-    assert capabilities.is_fair(loop, None)
-
-
-def test_a_goal_outside_the_fair_box_is_not_fair():
-    loop = Shuttling(shuttling())
-    for index in range(12):
-        episode = run_episode(loop, index)
-        low, high = loop.fair_box
-        goal = loop.goal_of(episode)
-        is_inside = bool(np.all((low <= goal) & (goal <= high)))
-        assert capabilities.is_fair(loop, episode) == is_inside

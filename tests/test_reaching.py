@@ -238,7 +238,6 @@ def test_a_robot_without_a_mirror_has_one_hand_to_reach_with(tmp_path):
     edited(tmp_path / "robot.yaml", mirror={})
     scenario = load_scenario(path)
     assert scenario.make_loop().hand == "left"
-    assert scenario.make_loop().mirror_options == {}
     with pytest.raises(ValueError, match=r"mirror pairs joint .* which is not its reflection"):
         scenario.make_loop(hand="right")
 

@@ -19,10 +19,6 @@ def first_row(loop, context):
     return Episode(index=0, time_s=np.zeros(1), is_safe=True, cause="", **rows)
 
 
-def clearance_of(loop, episode):
-    return episode.features[0, loop.feature_names.index("plan_clearance")]
-
-
 @pytest.mark.parametrize(
     "make",
     [lambda robot=robot, hand=hand: LOOPS[robot](hand=hand) for robot in LOOPS for hand in HANDS]
@@ -98,76 +94,7 @@ def test_a_push_is_over_when_what_is_learned_from_begins(tmp_path):
     assert all(e.time_s[e.first_step] >= 0.1 + 0.2 for e in pushed if e.is_safe)
 
 
-def path_of(loop, context):
-    """Where the hand shall be at the start, half-way and at the end, in the world, (3, 3)."""
-    end_s, points = loop.scenario.parameters.plan_duration_s, []
-    for time_s in (0.0, 0.5 * end_s, end_s):
-        later = context.Clone()
-        later.SetTime(time_s)
-        points.append(evaluated(loop, later, "desired_output"))
-    return np.array(points)
-
-
-def test_plans_to_choose_from_lead_to_the_same_goal_and_make_detours_as_drawn(tmp_path):
-    loop = exploring(tmp_path, exploring=False)
-    context = started(loop, 1)
-    start, middle, end = path_of(loop, context)
-    plans = loop.candidate_plans(context, np.random.default_rng(0), 5)
-    middles = []
-    for plan in plans:
-        loop.set_plan(context, plan)
-        path = path_of(loop, context)
-        np.testing.assert_allclose(path[[0, 2]], [start, end], atol=1e-9)
-        middles.append(path[1])
-    np.testing.assert_allclose(middles[0], middle, atol=1e-9)
-    detours = np.array(middles[1:]) - middle
-    assert len(np.unique(detours, axis=0)) == 4
-    assert np.all(
-        (detours >= np.array([-0.05, -0.1, 0.0]) - 1e-6) & (detours <= [0.0 + 1e-6, 0.1, 0.1])
-    )
-
-
-def test_where_training_makes_no_detours_there_is_no_plan_to_choose():
-    loop = porter()
-    assert len(loop.candidate_plans(started(loop), np.random.default_rng(0), 5)) == 1
-
-
-@pytest.mark.parametrize("robot", LOOPS)
-@pytest.mark.parametrize("hand", HANDS)
-def test_fair_is_a_goal_in_the_box_whose_plan_is_clear_of_obstacles(robot, hand):
-    loop = LOOPS[robot](hand=hand)
-    low, high = loop.fair_box
-    verdicts = []
-    for seed in range(60):
-        episode = first_row(loop, started(loop, seed))
-        goal = loop.goal_of(episode)
-        is_inside = bool(np.all((goal >= low) & (goal <= high)))
-        clearance = clearance_of(loop, episode)
-        # The features see the plan at other instants: within millimetres they may disagree.
-        if abs(clearance) > 0.01:
-            assert loop.is_fair(episode) == (is_inside and clearance > 0)
-            verdicts.append(loop.is_fair(episode))
-    assert any(verdicts)
-
-
-@pytest.mark.parametrize("hand", HANDS)
-def test_a_plan_into_an_obstacle_is_not_fair_though_its_goal_is_in_the_box(hand, tmp_path):
-    bounds = {"x_m": [0.15, 0.5], "z_m": [0.5, 0.8]}
-    scenario = load_scenario(porting(tmp_path, parameters={"fair": bounds}))
-    loop = scenario.make_loop(hand=hand)
-    side = [1.0, 1.0 if hand == "left" else -1.0, 1.0]
-    clear, blocked = (first_row(loop, started(loop, 0, goal * side)) for goal in (EASY, IN_A_BOARD))
-    low, high = loop.fair_box
-    assert np.all((loop.goal_of(blocked) >= low) & (loop.goal_of(blocked) <= high))
-    assert loop.is_fair(clear)
-    assert not loop.is_fair(blocked)
-
-
-@pytest.mark.parametrize("robot", LOOPS)
-def test_each_hand_names_the_other_as_its_image_and_the_boxes_are_mirrored(robot):
-    left, right = (LOOPS[robot](hand=hand) for hand in HANDS)
-    assert left.mirror_options == {"hand": "right"}
-    assert right.mirror_options == {"hand": "left"}
-    mirror = Mirror(left.kinematics)
-    image = np.sort(mirror.points(left.fair_box), axis=0)
-    np.testing.assert_array_equal(right.fair_box, image)
+def test_the_boxes_of_targets_of_both_hands_are_mirrored():
+    left, right = (porter(hand=hand) for hand in HANDS)
+    image = np.sort(Mirror(left.kinematics).points(left.target_box), axis=0)
+    np.testing.assert_array_equal(right.target_box, image)

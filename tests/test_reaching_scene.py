@@ -102,5 +102,4 @@ def test_what_is_seen_or_asked_for_does_not_decide_what_episodes_are():
     scenario.parameters.decorations = []
     scenario.parameters.assessment_period_s = 0.5
     scenario.parameters.view.room = 3.0
-    scenario.parameters.fair.x_m = [0.4, 0.5]
     assert scenario.simulation_hash() == before

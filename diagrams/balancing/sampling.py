@@ -20,13 +20,16 @@ from drake_safety.plants.balls import Throw
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.systems.trajectory_planner import interpolate
 
+_RESTS_S = (0.2, 1.0)  # Shortest and longest rest between two undisturbed motions.
+_USUAL_SHARE = 0.5  # Share of the range of training's plans in which undisturbed ones end.
+
 
 @schema(kw_only=True)
 class StartSampling:
     """Random initial states and plans. Offsets are half-widths about the standing posture."""
 
     foot_offset_m: float = 0.02
-    """Of every contact point, along x and along y."""
+    """Offset of every contact point, along x and along y."""
     base_offset_m: Pair[FiniteFloat] = field(default_factory=lambda: [0.08, 0.05])
     """Along x and along y of the stance frame."""
     base_height_m: Bounds[FiniteFloat] = field(default_factory=lambda: [0.36, 0.45])
@@ -34,7 +37,7 @@ class StartSampling:
     tilt_rad: float = 0.1
     """Half-width of roll, pitch and yaw, each."""
     velocity_std_m_s: Triple = field(default_factory=lambda: [0.5, 0.35, 0.1])
-    """Of the base, along x, y and z."""
+    """Standard deviation of the base's velocity along x, y and z."""
     angular_velocity_std_rad_s: float = 0.4
     joint_std_rad: float = 0.02
     tracking_offset_m: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
@@ -49,12 +52,11 @@ class StartSampling:
 
     def sample(self, kinematics: RobotKinematics, rng: np.random.Generator) -> EpisodeStart:
         """Samples a start with a moving base within the ranges and the feet at rest."""
-        xy = rng.uniform(-1, 1, (kinematics.num_contacts, 2)) * self.foot_offset_m
-        p_WC = np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])
+        p_WC = _contacts(kinematics, rng, self.foot_offset_m)
         X_WS = planar_pose(fit_stance(p_WC, kinematics.nominal_contacts))
         start = np.append(
             kinematics.nominal_base_offset + rng.uniform(-1, 1, 2) * self.base_offset_m,
-            _between(rng, self.base_height_m),
+            rng.uniform(*self.base_height_m),
         )
         rotation = RollPitchYaw(rng.uniform(-1, 1, 3) * self.tilt_rad)
         error = np.asarray(self.tracking_offset_m)
@@ -66,11 +68,10 @@ class StartSampling:
         offsets = rng.normal(size=kinematics.num_joints) * self.joint_std_rad
         goal = np.append(
             kinematics.nominal_base_offset + rng.uniform(-1, 1, 2) * self.target_offset_m,
-            _between(rng, self.target_height_m),
+            rng.uniform(*self.target_height_m),
         )
-        plan = interpolate(start, goal, _between(rng, self.plan_duration_s))
-        V_WB = np.concatenate([w_WB, v_WB])
-        return _start(kinematics, X_WB, p_WC, plan, V_WB, joint_offsets=offsets)
+        plan = interpolate(start, goal, rng.uniform(*self.plan_duration_s))
+        return _start(kinematics, X_WB, p_WC, plan, np.concatenate([w_WB, v_WB]), offsets)
 
 
 @schema(kw_only=True)
@@ -94,8 +95,8 @@ class PushSampling:
         """Samples a ball from any horizontal direction."""
         return Throw(
             time_s=time_s,
-            mass_kg=_between(rng, self.mass_kg),
-            speed_m_s=_between(rng, self.speed_m_s),
+            mass_kg=rng.uniform(*self.mass_kg),
+            speed_m_s=rng.uniform(*self.speed_m_s),
             direction_rad=rng.uniform(-math.pi, math.pi),
             offset_m=rng.uniform(-self.offset_m, self.offset_m),
             height_m=rng.uniform(-self.height_m, self.height_m),
@@ -115,23 +116,19 @@ def calm_start(
     Args:
         half_widths_m: Half-widths of the plan's start and goal, about the stance, (2,) [m].
         plan_duration_s: Shortest and longest duration of the plan [s].
+        elapsed_s: Time since the plan began [s].
     """
     half = np.array([*half_widths_m, 0.0])
     nominal = np.array([*kinematics.nominal_base_offset, kinematics.standing_height])
     start = nominal + rng.uniform(-half, half)
     goal = nominal + rng.uniform(-half, half)
-    duration_s = _between(rng, plan_duration_s)
+    duration_s = rng.uniform(*plan_duration_s)
     plan = interpolate(start, goal, duration_s, start_time_s=-elapsed_s)
-    p_WC = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
-    X_WB = RigidTransform(plan.value(0.0).ravel())
     V_WB = np.zeros(NUM_BASE_VELOCITIES)
     if elapsed_s < duration_s:
         V_WB[3:] = plan.MakeDerivative().value(0.0).ravel()
-    return _start(kinematics, X_WB, p_WC, plan, V_WB)
-
-
-_RESTS_S = (0.2, 1.0)  # Shortest and longest rest between two motions.
-_USUAL_SHARE = 0.5  # Of the range of training's plans.
+    p_WC = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
+    return _start(kinematics, RigidTransform(plan.value(0.0).ravel()), p_WC, plan, V_WB)
 
 
 def undisturbed_start(
@@ -144,42 +141,42 @@ def undisturbed_start(
 
     Their ends are within half of the range of training's plans, most of which are then safe.
     """
-    xy = rng.uniform(-1, 1, (kinematics.num_contacts, 2)) * sampling.foot_offset_m
-    p_WC = np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])
+    p_WC = _contacts(kinematics, rng, sampling.foot_offset_m)
     low, high = sampling.target_height_m
     middle = np.array([*kinematics.nominal_base_offset, 0.5 * (low + high)])
     half = _USUAL_SHARE * np.array([*sampling.target_offset_m, 0.5 * (high - low)])
     point = np.array([*kinematics.nominal_base_offset, kinematics.standing_height])
-    time_s = rng.uniform(*_RESTS_S)
-    pieces = [_rest(point, 0.0, time_s)]
     X_WB = planar_pose(fit_stance(p_WC, kinematics.nominal_contacts)) @ RigidTransform(point)
-    while time_s < duration_s:
+    plan = _rest(point, 0.0, rng.uniform(*_RESTS_S))
+    while (time_s := plan.end_time()) < duration_s:
         goal = middle + rng.uniform(-half, half)
-        pieces.append(interpolate(point, goal, _between(rng, sampling.plan_duration_s), time_s))
-        time_s = pieces[-1].end_time()
-        rest_s = rng.uniform(*_RESTS_S)
-        pieces.append(_rest(goal, time_s, time_s + rest_s))
-        point, time_s = goal, time_s + rest_s
-    plan = pieces[0]
-    for piece in pieces[1:]:
-        plan.ConcatenateInTime(piece)
-    return _start(kinematics, X_WB, p_WC, plan)
+        motion = interpolate(point, goal, rng.uniform(*sampling.plan_duration_s), time_s)
+        plan.ConcatenateInTime(motion)
+        plan.ConcatenateInTime(_rest(goal, motion.end_time(), rng.uniform(*_RESTS_S)))
+        point = goal
+    return _start(kinematics, X_WB, p_WC, plan, np.zeros(NUM_BASE_VELOCITIES))
 
 
-def _rest(point: np.ndarray, start_s: float, end_s: float) -> PiecewisePolynomial:
-    return PiecewisePolynomial.ZeroOrderHold([start_s, end_s], np.stack([point, point], axis=1))
+def _rest(point: np.ndarray, start_s: float, duration_s: float) -> PiecewisePolynomial:
+    times = [start_s, start_s + duration_s]
+    return PiecewisePolynomial.ZeroOrderHold(times, np.stack([point, point], axis=1))
+
+
+def _contacts(
+    kinematics: RobotKinematics, rng: np.random.Generator, offset_m: float
+) -> np.ndarray:
+    """Contact points on the ground near those of the standing posture, (n_p, 3) [m]."""
+    xy = rng.uniform(-1, 1, (kinematics.num_contacts, 2)) * offset_m
+    return np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])
 
 
 def resting_feet(
     kinematics: RobotKinematics, X_WB: RigidTransform, joints: np.ndarray, V_WB: np.ndarray
 ) -> np.ndarray:
-    """Velocities with a moving base and the feet at rest: 0 = J_b V_WB + J_j dq.
+    """Velocities (n_v,) with a moving base and the feet at rest: 0 = J_b V_WB + J_j dq.
 
-    Args:
-        V_WB: Spatial velocity of the base, angular first, (6,) [rad/s, m/s].
-
-    Returns:
-        The velocities, (n_v,); joints that move no foot are at rest.
+    V_WB is the base's spatial velocity, angular first, (6,) [rad/s, m/s]. Joints that move no foot
+    are at rest.
     """
     J = kinematics.contact_jacobian(kinematics.positions_at(X_WB, joints))
     J_base, J_joints = np.split(J, [NUM_BASE_VELOCITIES], axis=1)
@@ -192,20 +189,12 @@ def _start(
     X_WB: RigidTransform,
     p_WC: np.ndarray,
     plan: PiecewisePolynomial,
-    V_WB: np.ndarray | None = None,
-    *,
+    V_WB: np.ndarray,
     joint_offsets: np.ndarray | float = 0.0,
 ) -> EpisodeStart:
-    """A start on given contacts, by default at rest."""
+    """A start on given contacts."""
     joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
-    v = np.zeros(kinematics.num_velocities)
-    if V_WB is not None:
-        v = resting_feet(kinematics, X_WB, joints, V_WB)
+    v = resting_feet(kinematics, X_WB, joints, V_WB)
     joints = np.clip(joints + joint_offsets, *kinematics.position_limits.T)
     q = kinematics.positions_at(X_WB, joints)
     return EpisodeStart(q=q, v=v, plan=plan, foot_positions=p_WC)
-
-
-def _between(rng: np.random.Generator, bounds: list[float]) -> float:
-    low, high = bounds
-    return rng.uniform(low, high)

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.safe_sets import BalanceSafeSet
 from drake_safety.diagrams.balancing.parameters import BalancingParameters
@@ -21,7 +20,6 @@ from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
 from drake_safety.systems.recovery_switch import RecoverySwitch
-from drake_safety.systems.trajectory_planner import interpolate
 
 _NUM_OUTLOOK = 5  # Samples of the plan from now to its end, for the features.
 _LATEST_HIT_S = 1.5  # Latest time of an initial impact in the undisturbed motion.
@@ -41,7 +39,6 @@ class Balancing(LeggedLoop):
     """
 
     Parameters = BalancingParameters
-    plan_variety = "its parameter 'start' bounds the final heights and durations of plans"
 
     def __init__(
         self,
@@ -55,24 +52,28 @@ class Balancing(LeggedLoop):
     ):
         super().__init__(scenario, variation, assessment)
         recovery = assessment is not None if recovery is None else recovery
-        parameters = scenario.parameters
+        parameters, kinematics = scenario.parameters, self.kinematics
+        period_s = scenario.control_period_s
         self._control_offset_s = 3 * self.tick_s  # After assessor, trigger and step planner.
         builder = DiagramBuilder()
-
         has_ball = parameters.push.share > 0 if ball is None else ball
         physics = self._add_robot(builder, Scene(has_ball=has_ball), servos=True, meshcat=meshcat)
         self.ball = physics.ball
-        kinematics = self.kinematics
         measured = self._add_observers(builder)
         planner = self._add_planner(
             builder, outlook_s=scenario.episode_duration_s, num_outlook=_NUM_OUTLOOK
         )
+        controller = self._controller = builder.AddNamedSystem(
+            "inverse_kinematics_controller",
+            InverseKinematicsController(
+                kinematics, period_s=period_s, offset_s=self._control_offset_s
+            ),
+        )
         names = ("desired_output", "desired_preview", "desired_outlook")
         desired = {name: planner.GetOutputPort(name) for name in names}
-
-        self._recovery_switch = recovery_active = None
+        self._recovery_switch = switch = None
         if recovery:
-            switch = builder.AddNamedSystem(
+            self._recovery_switch = switch = builder.AddNamedSystem(
                 "recovery_switch",
                 RecoverySwitch(
                     kinematics,
@@ -80,46 +81,31 @@ class Balancing(LeggedLoop):
                     threshold=parameters.recovery.threshold,
                     persistence_s=parameters.recovery.persistence_s,
                     initial_uncertainty=scenario.assessment.initial_uncertainty,
-                    period_s=scenario.control_period_s,
+                    period_s=period_s,
                     offset_s=self.tick_s,
                     horizon=scenario.assessment.horizon,
                     num_outlook=_NUM_OUTLOOK,
                 ),
             )
-            self._recovery_switch = switch
             builder.Connect(measured, switch.GetInputPort("plant_state"))
             for name, port in desired.items():
                 builder.Connect(port, switch.GetInputPort(f"nominal_{name}"))
-            builder.Connect(
-                switch.GetOutputPort("stance_pose"), planner.GetInputPort("stance_pose")
-            )
             desired = {name: switch.GetOutputPort(name) for name in names}
-            recovery_active = switch.GetOutputPort("recovery_active")
-            builder.ExportOutput(recovery_active, "recovery_active")
-
-        controller = builder.AddNamedSystem(
-            "inverse_kinematics_controller",
-            InverseKinematicsController(
-                kinematics,
-                period_s=scenario.control_period_s,
-                offset_s=self._control_offset_s,
-            ),
-        )
-        self._controller = controller
-        builder.Connect(measured, controller.GetInputPort("plant_state"))
-        builder.Connect(desired["desired_output"], controller.GetInputPort("desired_output"))
-        if recovery:
+            stance_pose = switch.GetOutputPort("stance_pose")
+            builder.Connect(stance_pose, planner.GetInputPort("stance_pose"))
             for name in ("desired_foot_positions", "desired_yaw"):
                 builder.Connect(switch.GetOutputPort(name), controller.GetInputPort(name))
-        command = self._servo_command(builder, controller.GetOutputPort("desired_joint_state"))
-        physics.connect_servos(builder, kinematics.joint_names, command)
-
-        safe_set = BalanceSafeSet(kinematics, parameters.safe_set)
+            builder.ExportOutput(switch.GetOutputPort("recovery_active"), "recovery_active")
+        builder.Connect(measured, controller.GetInputPort("plant_state"))
+        builder.Connect(desired["desired_output"], controller.GetInputPort("desired_output"))
+        joint_state = controller.GetOutputPort("desired_joint_state")
+        received = self._servo_command(builder, joint_state)
+        physics.connect_servos(builder, kinematics.joint_names, received)
         self._watch(
             builder,
-            safe_set,
+            BalanceSafeSet(kinematics, parameters.safe_set),
             outlook=desired.pop("desired_outlook"),
-            command=controller.GetOutputPort("desired_joint_state"),
+            command=joint_state,
             has_gravity=True,
         )
         self.monitored = {"features": self.feature_names[-kinematics.num_joints :]}
@@ -127,52 +113,40 @@ class Balancing(LeggedLoop):
             builder,
             desired,
             period_s=parameters.recovery.assessment_period_s,
-            hold=recovery_active,
+            hold=switch and switch.GetOutputPort("recovery_active"),
         )
-        if assessor is not None and recovery:
+        if switch is not None and assessor is not None:
             assessor.connect_recovery(builder, switch)
-        elif recovery:
+        elif switch is not None:
             builder.ExportInput(switch.GetInputPort("safety_probability"), "safety_probability")
         builder.BuildInto(self)
 
     @classmethod
     def options_for(cls, purpose: Purpose, scenario: Scenario, variation: str) -> dict[str, Any]:
         """Removes the ball for the paper's mode, or if not both engines of a pair support it."""
-        if purpose == "paper":
-            # "We also add a random offset to the initial state to simulate the disturbances".
-            return {"ball": False}
-        if purpose == "pairs" and scenario.variation(variation).engine not in ENGINES_WITH_BALLS:
+        # "We also add a random offset to the initial state to simulate the disturbances" (paper).
+        is_without_ball = scenario.variation(variation).engine not in ENGINES_WITH_BALLS
+        if purpose == "paper" or (purpose == "pairs" and is_without_ball):
             return {"ball": False}
         return {}
 
     def reset(self, context: Context, rng: np.random.Generator) -> int:
         """Samples an initial state and a plan; some episodes begin with the impact of a ball."""
         parameters = self.scenario.parameters
-        is_push = self.ball is not None and rng.random() < parameters.push.share
-        if not is_push:
+        if self.ball is None or rng.random() >= parameters.push.share:
             self._begin(context, rng, parameters.start.sample(self.kinematics, rng))
             return 0
         # The impact is at any time of an undisturbed motion, not only at its start.
-        self._start_calm(context, rng, elapsed_s=rng.uniform(0.0, _LATEST_HIT_S))
+        self.reset_calm(context, rng, elapsed_s=rng.uniform(0.0, _LATEST_HIT_S))
         # The impact is up to one assessment step before the first row after it.
         lead_s = rng.uniform(0.0, 1.0) * self.scenario.step_s
         self.throw_ball(context, parameters.push.sample(rng, lead_s), lead_s)
         return 1
 
-    def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
-        """Samples an undisturbed motion near the stance, for throws."""
-        self._start_calm(context, rng, elapsed_s=0.0)
-
-    def reset_undisturbed(
-        self, context: Context, rng: np.random.Generator, duration_s: float
+    def reset_calm(
+        self, context: Context, rng: np.random.Generator, elapsed_s: float = 0.0
     ) -> None:
-        """Samples base motions about the stance, one after another, with rests between them."""
-        parameters = self.scenario.parameters
-        start = undisturbed_start(self.kinematics, rng, parameters.start, duration_s)
-        self._begin(context, rng, start)
-
-    def _start_calm(self, context: Context, rng: np.random.Generator, elapsed_s: float) -> None:
-        """Starts ``elapsed_s`` [s] into an undisturbed motion, without tracking error."""
+        """Samples an undisturbed motion near the stance, for throws, which began before [s]."""
         parameters = self.scenario.parameters
         start = calm_start(
             self.kinematics,
@@ -183,17 +157,18 @@ class Balancing(LeggedLoop):
         )
         self._begin(context, rng, start)
 
+    def reset_undisturbed(
+        self, context: Context, rng: np.random.Generator, duration_s: float
+    ) -> None:
+        """Samples base motions about the stance, one after another, with rests between them."""
+        sampling = self.scenario.parameters.start
+        self._begin(context, rng, undisturbed_start(self.kinematics, rng, sampling, duration_s))
+
     def start_of(self, context: Context) -> EpisodeStart:
         """State, plan and foot positions of a Context, as a start."""
         controller_context = self._controller.GetMyContextFromRoot(context)
         feet = self._controller.foot_positions(controller_context).copy()
         return replace(super().start_of(context), foot_positions=feet)
-
-    def set_plan(self, context: Context, plan: PiecewisePolynomial) -> None:
-        """Sets the plan and keeps the state; see `PlannedLoop.set_plan`."""
-        super().set_plan(context, plan)
-        if context.get_time() == 0.0:  # Nothing was commanded yet.
-            self.start_control(context)
 
     def start_control(self, context: Context) -> None:
         """Sets the command for the present state and plan; see `LeggedLoop`."""
@@ -215,37 +190,12 @@ class Balancing(LeggedLoop):
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:
         super()._set_state(context, start)
-        p_WC = start.feet(self.kinematics)
-        self._controller.set_foot_positions(
-            self._controller.GetMyMutableContextFromRoot(context), p_WC
-        )
+        p_WC, controller = start.feet(self.kinematics), self._controller
+        controller.set_foot_positions(controller.GetMyMutableContextFromRoot(context), p_WC)
         if self._recovery_switch is not None:
-            step_planner = self._recovery_switch.step_planner
-            step_planner.set_stance(
-                step_planner.GetMyMutableContextFromRoot(context), p_WC, self._stance_of(start)
-            )
-
-    def candidate_plans(
-        self, context: Context, rng: np.random.Generator, num_plans: int
-    ) -> list[PiecewisePolynomial]:
-        """Plans to the same horizontal point with other final heights and durations.
-
-        Both are drawn as in training. A plan that has begun is not changed.
-        """
-        planned = self._plan_of(context)
-        if planned.start_time() < context.get_time():
-            return [planned]
-        sampling = self.scenario.parameters.start
-        start, goal = (
-            planned.value(time).ravel() for time in (planned.start_time(), planned.end_time())
-        )
-        plans = [planned]
-        for _ in range(num_plans - 1):
-            height_m = rng.uniform(*sampling.target_height_m)
-            duration_s = rng.uniform(*sampling.plan_duration_s)
-            end = np.append(goal[:2], height_m)
-            plans.append(interpolate(start, end, duration_s, planned.start_time()))
-        return plans
+            planner = self._recovery_switch.step_planner
+            own_context = planner.GetMyMutableContextFromRoot(context)
+            planner.set_stance(own_context, p_WC, self._stance_of(start))
 
     def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
         """Samples a ball with its impact at ``time_s`` [s]."""

@@ -58,8 +58,8 @@ def evaluate_throws(
     "Don't know" triggers when it has lasted ``persistence_s``. Returns the estimates by dotted key,
     and the throws without recovery.
     """
-    throw = partial(run_throws, scenario, seed=seed, variation="actual", num_workers=num_workers)
-    logs = throw(list(range(num_throws)), progress=partial(progress, "throws, balancing alone"))
+    throw = partial(run_throws, scenario, seed=seed, num_workers=num_workers)
+    logs = throw(range(num_throws), progress=partial(progress, "throws, balancing alone"))
     triggers = {
         rule.scorer.name: [
             trigger_time(log, log_probability(log, rule.scorer, persistence_s), rule.threshold)
@@ -70,31 +70,27 @@ def evaluate_throws(
     # Rules often trigger at the same instant: each distinct recovery is simulated once.
     pairs = {pair for times in triggers.values() for pair in enumerate(times)}
     wanted = sorted(pair for pair in pairs if not math.isnan(pair[1]))
-    again = throw(
+    recoveries = throw(
         [index for index, _ in wanted],
         trigger_times_s=[time_s for _, time_s in wanted],
         progress=partial(progress, "throws, with recovery"),
     )
-    simulated = dict(zip(wanted, again, strict=True))
-    estimates = _estimates_without_recovery(logs)
-    for rule in rules:
-        times = triggers[rule.scorer.name]
-        recovered = {i: simulated[i, t] for i, t in enumerate(times) if not math.isnan(t)}
-        found = _rule_estimates(logs, np.array(times), recovered)
-        found["threshold"] = Estimate.exact(rule.threshold, len(logs))
-        estimates |= {f"throws.{rule.scorer.name}.{key}": one for key, one in found.items()}
-    return estimates, logs
-
-
-def _estimates_without_recovery(logs: Sequence[Motion]) -> dict[str, Estimate]:
+    simulated = dict(zip(wanted, recoveries, strict=True))
     leave_s = np.array([log.leave_time_s - log.push_time_s for log in logs if log.has_left])
     fall_s = np.array([log.fall_time_s - log.push_time_s for log in logs if log.has_fallen])
-    return {
+    estimates = {
         "throws.falls_without_recovery": proportion(len(fall_s), len(logs)),
         "throws.leaves_safe_set_without_recovery": proportion(len(leave_s), len(logs)),
         "throws.impact_to_leaving_s": median(leave_s),
         "throws.impact_to_fall_s": median(fall_s),
     }
+    for rule in rules:
+        times = triggers[rule.scorer.name]
+        recovered = {i: simulated[i, t] for i, t in enumerate(times) if not math.isnan(t)}
+        of_rule = _rule_estimates(logs, np.array(times), recovered)
+        of_rule["threshold"] = Estimate.exact(rule.threshold, len(logs))
+        estimates |= {f"throws.{rule.scorer.name}.{key}": e for key, e in of_rule.items()}
+    return estimates, logs
 
 
 def _rule_estimates(
@@ -102,25 +98,25 @@ def _rule_estimates(
 ) -> dict[str, Estimate]:
     """Estimates of a rule from its trigger times (N,), NaN for never, and its recoveries."""
     times = np.where(np.isnan(times), np.inf, times)
-    touch = np.array([log.push_time_s for log in logs])
+    impact = np.array([log.push_time_s for log in logs])
     fall = np.array([log.fall_time_s for log in logs])
-    falls, is_early = np.isfinite(fall), times < touch - 1e-9
+    falls, is_early = np.isfinite(fall), times < impact - 1e-9
     in_time = falls & (times < fall)
-    after_touch = in_time & ~is_early
-    calm = np.array([not log.has_left for log in logs])
-    false = calm & np.isfinite(times)
+    after_impact = in_time & ~is_early
+    stays = np.array([not log.has_left for log in logs])
+    false = stays & np.isfinite(times)
     fallen = [recovered.get(i, log).has_fallen for i, log in enumerate(logs)]
     successes = [log for log in recovered.values() if not log.has_fallen]
 
-    def share(counted: np.ndarray, of: np.ndarray) -> Estimate:
-        return proportion(int(counted.sum()), int(of.sum()))
+    def share(counted: np.ndarray, among: np.ndarray) -> Estimate:
+        return proportion(int(counted.sum()), int(among.sum()))
 
     estimates = {
         "falls_with_recovery": proportion(sum(fallen), len(logs)),
-        "false_triggers": share(false, calm),
+        "false_triggers": share(false, stays),
         "triggers_before_impact": proportion(int(is_early.sum()), len(logs)),
         "falls_missed": share(falls & ~in_time, falls),
-        "trigger_after_impact_s": median(times[after_touch] - touch[after_touch]),
+        "trigger_after_impact_s": median(times[after_impact] - impact[after_impact]),
         "trigger_before_fall_s": median(fall[in_time] - times[in_time]),
         "false_triggers_that_fall": share(false & fallen, false),
         "settled": proportion(

@@ -8,8 +8,10 @@ again, from the same seed, with the trigger at the time found.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -40,9 +42,6 @@ class Violations:
     - ``joint_position``: a joint more than 0.02 rad beyond a stop;
     - ``joint_velocity``: a joint faster than its limit;
     - ``joint_effort``: the actuation of a joint above its limit.
-
-    Args:
-        loop: A closed loop with a ``plant``, a ``robot_instance`` and ``kinematics``.
     """
 
     _POSITION_SLACK_RAD = 0.02
@@ -55,42 +54,36 @@ class Violations:
                 "throws: contacts and efforts are read from Drake's plant; variation "
                 f"'{loop.variation}' is simulated by engine '{engine}'"
             )
-        self._loop = loop
-        plant = loop.plant
-        self._bodies = set(plant.GetBodyIndices(loop.robot_instance))
-        self._position_limits = loop.kinematics.position_limits
-        self._velocity_limits = loop.kinematics.velocity_limits
-        # The plant reports the net actuation of the joint for each of its actuators.
-        actuators = [
-            plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(loop.robot_instance)
-        ]
-        joint_limits: dict[str, float] = {}
+        self._plant, self._instance = plant, instance = loop.plant, loop.robot_instance
+        self._kinematics = loop.kinematics
+        self._bodies = set(plant.GetBodyIndices(instance))
+        actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]
+        limits: Counter[str] = Counter()
         for actuator in actuators:
-            name = actuator.joint().name()
-            joint_limits[name] = joint_limits.get(name, 0.0) + actuator.effort_limit()
-        self._effort_limits = np.array([joint_limits[a.joint().name()] for a in actuators])
+            limits[actuator.joint().name()] += actuator.effort_limit()
+        # The plant reports the net actuation of the joint for each of its actuators.
+        self._effort_limits = np.array([limits[one.joint().name()] for one in actuators])
 
     def __call__(self, context: Context) -> list[bool]:
         """Whether the state of a root Context has each violation."""
-        plant, instance = self._loop.plant, self._loop.robot_instance
+        plant, instance = self._plant, self._instance
         plant_context = plant.GetMyContextFromRoot(context)
         contacts = plant.get_contact_results_output_port().Eval(plant_context)
         infos = map(contacts.point_pair_contact_info, range(contacts.num_point_pair_contacts()))
         legs_collide = any(
-            info.bodyA_index() in self._bodies
-            and info.bodyB_index() in self._bodies
+            {info.bodyA_index(), info.bodyB_index()} <= self._bodies
             and info.point_pair().depth > self._PENETRATION_M
             for info in infos
         )
         q = plant.GetPositions(plant_context, instance)[NUM_BASE_POSITIONS:]
         v = plant.GetVelocities(plant_context, instance)[NUM_BASE_VELOCITIES:]
-        lowest, highest = self._position_limits.T
-        beyond = np.maximum(lowest - q, q - highest).max()
         effort = plant.get_net_actuation_output_port(instance).Eval(plant_context)
+        lowest, highest = self._kinematics.position_limits.T
+        beyond = np.maximum(lowest - q, q - highest).max()
         return [
             legs_collide,
             bool(beyond > self._POSITION_SLACK_RAD),
-            bool(np.any(np.abs(v) > self._velocity_limits)),
+            bool(np.any(np.abs(v) > self._kinematics.velocity_limits)),
             bool(np.any(np.abs(effort) > self._effort_limits + 1e-6)),
         ]
 
@@ -121,8 +114,7 @@ def run_throw(
 
     Raises:
         ValueError: The task has no balls, or the plant another engine than Drake.
-        EpisodeError: A ball misses the robot or the loop was built without one, a system of the
-            loop raised an error, or the simulation failed.
+        EpisodeError: A ball misses the robot, or the simulation failed.
     """
     thrown = require(loop, HasBall)
     if throws is None:
@@ -132,7 +124,6 @@ def run_throw(
     impact_s = min((throw.time_s for throw in throws), default=math.inf)
     if duration_s is None:
         duration_s = _AFTER_S + (impact_s if throws else _LATEST_S)
-    recovery = filter(loop.HasOutputPort, ["recovery_active"])
     violations, rows = Violations(loop), []
 
     def set_probability(context: Context, value: float) -> None:
@@ -143,12 +134,11 @@ def run_throw(
         thrown.reset_calm(context, episode_rng(seed, index))
         set_probability(context, 1.0)
 
-    def release(throw: Throw) -> tuple[float, Callable[[Context], object]]:
+    events: list[tuple[float, Callable[[Context], object]]] = []
+    for throw in throws:
         release_s = max(throw.time_s - _FLIGHT_S, 0.0)
         lead_s = throw.time_s - release_s
-        return release_s, lambda context: thrown.throw_ball(context, throw, lead_s)
-
-    events = [release(throw) for throw in throws]
+        events.append((release_s, partial(thrown.throw_ball, throw=throw, lead_s=lead_s)))
     if not math.isnan(trigger_time_s):
         # One low value suffices: the trigger latches.
         low_s = 2.0 * loop.scenario.control_period_s
@@ -157,7 +147,7 @@ def run_throw(
     motion = simulate(
         loop,
         start,
-        (*_PORTS, *ports, *recovery),
+        (*_PORTS, *ports, *filter(loop.HasOutputPort, ["recovery_active"])),
         duration_s=duration_s,
         events=events,
         each_row=lambda context, time_s: rows.append(violations(context)),
@@ -172,21 +162,20 @@ def run_throw(
 
 def run_throws(
     scenario: Scenario,
-    indices: list[int],
+    indices: Sequence[int],
     *,
     seed: int,
-    variation: str = "actual",
     trigger_times_s: Sequence[float] | None = None,
     num_workers: int | None = None,
     progress: Progress | bool | None = None,
 ) -> list[Motion]:
-    """Throws a set of balls, in worker processes.
+    """Throws a set of balls at the actual plant, in worker processes.
 
     Args:
         trigger_times_s: Times of the triggers [s]; by default there is no recovery.
     """
     times = [math.nan] * len(indices) if trigger_times_s is None else trigger_times_s
-    make = worker_loop(scenario, variation, ball=True, recovery=trigger_times_s is not None)
+    make = worker_loop(scenario, "actual", ball=True, recovery=trigger_times_s is not None)
 
     def throw(item: tuple[int, tuple[int, float]]) -> tuple[int, Motion]:
         place, (index, trigger_time_s) = item
@@ -199,7 +188,7 @@ def run_throws(
         progress=progress,
         stage="throws",
     )
-    return [log for _, log in sorted(logs, key=lambda found: found[0])]
+    return [log for _, log in sorted(logs, key=itemgetter(0))]
 
 
 def trigger_time(log: Motion, probability: np.ndarray, threshold: float) -> float:

@@ -6,7 +6,6 @@ from typing import ClassVar
 from drake_safety.diagrams.reaching.safe_set import ReachingLimits
 from drake_safety.diagrams.reaching.sampling import (
     Detours,
-    FairTargets,
     PostureSampling,
     TargetSampling,
 )
@@ -22,7 +21,6 @@ class ReachingParameters:
 
     online: ClassVar = (
         "decorations",
-        "fair",
         "named_targets",
         "pushes",
         "assessment_period_s",
@@ -44,7 +42,6 @@ class ReachingParameters:
     random_pushes: RandomPushes = field(default_factory=RandomPushes)
     """Initial pushes of training episodes."""
     detours: Detours = field(default_factory=Detours)
-    fair: FairTargets = field(default_factory=FairTargets)
     obstacles: list[Obstacle] = field(default_factory=list)
     decorations: list[Obstacle] = field(default_factory=list)
     """Models without collision geometry, for visualisation."""

@@ -23,9 +23,9 @@ class PostureSampling:
     base_lowering_m: NotNegative = 0.08
     """Largest lowering of the base."""
     tilt_rad: NotNegative = 0.03
-    """Of roll, pitch and yaw of the base, each."""
+    """Half-width of roll, pitch and yaw of the base, each."""
     joint_offset_rad: NotNegative = 0.1
-    """Of every joint that is not of a leg."""
+    """Offset of every joint that is not of a leg."""
     clearance_m: NotNegative = 0.02
     """Least distance of the arms to an obstacle."""
     joint_margin_rad: NotNegative = 0.0
@@ -38,18 +38,19 @@ class PostureSampling:
     def sample(
         self, safe_set: ReachingSafeSet, rng: np.random.Generator, mirror: Mirror | None = None
     ) -> np.ndarray:
-        """Samples positions in the safe set with the feet of the standing posture, (n_q,).
+        """Samples positions (n_q,) in the safe set with the feet of the standing posture.
 
-        Args:
-            mirror: If given, the posture is mirrored: that of the other hand's episode.
+        With ``mirror`` the posture is mirrored: that of the other hand's episode.
         """
         kinematics = safe_set.kinematics
-        robot = kinematics.robot
-        legs = {name for foot in robot.feet.values() for name in foot.joints}
+        legs = {name for foot in kinematics.robot.feet.values() for name in foot.joints}
         is_free = np.array([name not in legs for name in kinematics.joint_names])
         standing = kinematics.standing_positions()
         p_WC = kinematics.contact_positions(standing)
         v = np.zeros(kinematics.num_velocities)
+        least = np.zeros(len(safe_set.names))
+        least[safe_set.names.index("collision")] = self.clearance_m
+        least[safe_set.names.index("joint_limits")] = self.joint_margin_rad
         for _ in range(_MAX_TRIES):
             joints = kinematics.posture + is_free * self.joint_offset_rad * rng.uniform(
                 -1, 1, kinematics.num_joints
@@ -64,14 +65,11 @@ class PostureSampling:
             if mirror is not None:
                 q, _ = mirror.plant_state(q, v, np.zeros(3))
             margins = safe_set.margins(q, v)
-            clearance = margins[safe_set.names.index("collision")]
-            stops = margins[safe_set.names.index("joint_limits")]
-            is_clear = clearance >= self.clearance_m and stops >= self.joint_margin_rad
-            if is_clear and margins.min() > 0:
+            if margins.min() > 0 and np.all(margins >= least):
                 return q
         raise RuntimeError(
-            f"reaching: none of {_MAX_TRIES} random postures of robot '{robot.name}' is in "
-            f"the safe set with a clearance of {self.clearance_m} m and "
+            f"reaching: none of {_MAX_TRIES} random postures of robot '{kinematics.robot.name}' is "
+            f"in the safe set with a clearance of {self.clearance_m} m and "
             f"{self.joint_margin_rad} rad off the joints' stops: narrow 'start'"
         )
 
@@ -91,25 +89,8 @@ class TargetSampling:
 
 
 @schema(kw_only=True)
-class FairTargets:
-    """The part of the target box without trivially safe or unsafe targets, in the world [m].
-
-    Bounds default to those of the target box.
-    """
-
-    x_m: Interval | None = None
-    y_m: Interval | None = None
-    z_m: Interval | None = None
-
-    def box(self, target: TargetSampling) -> np.ndarray:
-        """Lowest and highest corner, (2, 3) [m]."""
-        bounds = [getattr(self, name) or getattr(target, name) for name in ("x_m", "y_m", "z_m")]
-        return np.array(bounds, dtype=float).T
-
-
-@schema(kw_only=True)
 class Detours:
-    """Plans that deviate from the straight line, so that Γ can select among them.
+    """Random detours of the plans of training episodes.
 
     A detour is the offset of the plan's middle from that of the straight line, in the stance frame
     of the trained hand [m]: x forwards, y to the left, z up.
@@ -128,10 +109,4 @@ class Detours:
 
     def sample(self, rng: np.random.Generator) -> np.ndarray | None:
         """Samples the detour of an episode, (3,) [m]; None for the straight line."""
-        if rng.random() >= self.share:
-            return None
-        return self.draw(rng)
-
-    def draw(self, rng: np.random.Generator) -> np.ndarray:
-        """Samples a detour, regardless of the share, (3,) [m]."""
-        return rng.uniform(self.lowest_m, self.highest_m)
+        return None if rng.random() >= self.share else rng.uniform(self.lowest_m, self.highest_m)

@@ -22,12 +22,11 @@ from drake_safety.plants.obstacles import Clearance
 from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
 from drake_safety.robots.model_files import model_file
-from drake_safety.simulation.capabilities import is_in_box
 from drake_safety.simulation.closed_loop import Purpose
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.systems.trajectory_planner import interpolate, plan_shape, points_of_plan
+from drake_safety.systems.trajectory_planner import interpolate, plan_shape
 from drake_safety.systems.whole_body_controller import WholeBodyController
 
 _USUAL_SHARES = (0.1, 0.5)  # Of the way to a target, in undisturbed motion.
@@ -52,7 +51,6 @@ class Reaching(LeggedLoop):
     """
 
     Parameters = ReachingParameters
-    plan_variety = "its parameter 'detours' bounds the detours of plans, in training too"
 
     def __init__(
         self,
@@ -65,8 +63,7 @@ class Reaching(LeggedLoop):
         exploring: bool = True,
     ):
         super().__init__(scenario, variation, assessment)
-        parameters = scenario.parameters
-        robot, kinematics = self.robot, self.kinematics
+        parameters, robot, kinematics = scenario.parameters, self.robot, self.kinematics
         if not robot.reaching_frames:
             raise ValueError(f"robot '{robot.name}' has no reaching frames, so it cannot reach")
         self._is_exploring = exploring
@@ -76,27 +73,21 @@ class Reaching(LeggedLoop):
         self.named_targets, self.pushes = parameters.named_targets, parameters.pushes
         self.view = parameters.view if self.mirror is None else parameters.view.mirrored()
         builder = DiagramBuilder()
-
         scene = Scene(obstacles=parameters.obstacles, decorations=parameters.decorations)
         physics = self._add_robot(builder, scene, servos=False, meshcat=meshcat)
         measured = self._add_observers(builder, hand=self.hand, mirror=self.mirror)
         planner = self._add_planner(
             builder, outlook_s=parameters.plan_duration_s, num_outlook=_NUM_OUTLOOK
         )
-        desired_preview = planner.GetOutputPort("desired_preview")
+        preview = planner.GetOutputPort("desired_preview")
         if self.mirror is not None:
-            reflection = builder.AddNamedSystem(
-                "preview_reflection",
-                MatrixGain(
-                    D=np.kron(
-                        np.eye(scenario.assessment.horizon), np.diag(self.mirror.points(np.ones(3)))
-                    )
-                ),
+            reflection = np.tile(self.mirror.points(np.ones(3)), scenario.assessment.horizon)
+            reflected = builder.AddNamedSystem(
+                "preview_reflection", MatrixGain(D=np.diag(reflection))
             )
-            builder.Connect(desired_preview, reflection.get_input_port())
-            desired_preview = reflection.get_output_port()
-
-        controller = builder.AddNamedSystem(
+            builder.Connect(preview, reflected.get_input_port())
+            preview = reflected.get_output_port()
+        controller = self._controller = builder.AddNamedSystem(
             "whole_body_controller",
             WholeBodyController(
                 kinematics,
@@ -106,27 +97,24 @@ class Reaching(LeggedLoop):
                 offset_s=2 * self.tick_s,  # After the update of the noise.
             ),
         )
-        self._controller = controller
         self._connect_controller(builder, controller, measured)
         actuators = map(self.plant.get_joint_actuator, self.plant.GetJointActuatorIndices())
-        torques = self._as_received(
-            builder,
-            controller.GetOutputPort("actuation"),
-            [one.name() for one in actuators if one.model_instance() == self.robot_instance],
-        )
+        names = [one.name() for one in actuators if one.model_instance() == self.robot_instance]
+        torques = self._as_received(builder, controller.GetOutputPort("actuation"), names)
         physics.connect_torques(builder, torques)
         self._add_push_source(builder)
-
-        clearance = Clearance(robot, parameters.obstacles, range_m=parameters.clearance_range_m)
         self.safe_set = ReachingSafeSet(
-            controller.model, clearance, parameters.safe_set, is_mirrored=self.mirror is not None
+            controller.model,
+            Clearance(robot, parameters.obstacles, range_m=parameters.clearance_range_m),
+            parameters.safe_set,
+            is_mirrored=self.mirror is not None,
         )
         self.angular_constraints = self.safe_set.angular_names
         outlook = planner.GetOutputPort("desired_outlook")
         self._watch(builder, self.safe_set, outlook=outlook, has_gravity=True)
         self.monitored = {"features": []}  # Its controller follows the preview.
         ports = {
-            "desired_preview": desired_preview,
+            "desired_preview": preview,
             "solver_status": controller.GetOutputPort("solver_status"),
             "num_controller_failures": controller.GetOutputPort("num_failures"),
         }
@@ -144,12 +132,6 @@ class Reaching(LeggedLoop):
         """Lowest and highest corner of the targets of this hand in the world, (2, 3) [m]."""
         return np.sort(self._reflected(self.scenario.parameters.target.box), axis=0)
 
-    @property
-    def fair_box(self) -> np.ndarray:
-        """Lowest and highest corner of this hand's fair targets in the world, (2, 3) [m]."""
-        parameters = self.scenario.parameters
-        return np.sort(self._reflected(parameters.fair.box(parameters.target)), axis=0)
-
     @classmethod
     def options_for(cls, purpose: Purpose, scenario: Scenario, variation: str) -> dict[str, Any]:
         """Straight plans without pushes for evaluation and the paper's mode."""
@@ -157,14 +139,6 @@ class Reaching(LeggedLoop):
         # "We do not sample an offset and do not add it to the initial state since we do not
         # consider disturbances here."
         return {} if purpose == "pairs" else {"exploring": False}
-
-    @property
-    def mirror_options(self) -> dict[str, str]:
-        """The option of the other hand; empty if the robot is not symmetric or has none."""
-        try:
-            return {"hand": Mirror(self.kinematics).hand(self.hand)}
-        except ValueError:
-            return {}
 
     def _mirror_to(self, trained_hand: str) -> Mirror | None:
         """The reflection to the trained hand's side; None for the trained hand."""
@@ -189,24 +163,13 @@ class Reaching(LeggedLoop):
 
     def goal_of(self, episode: Episode) -> np.ndarray:
         """The target of an episode in the world, (3,) [m], up to errors of the feet's placement."""
-        return self._shape_of_plan(episode)[1]
-
-    def is_fair(self, episode: Episode) -> bool:
-        """Whether the target is in the fair box, and the plan crosses no obstacle."""
-        path = points_of_plan(self._shape_of_plan(episode), _NUM_OUTLOOK)
-        radius_m = self.robot.reaching_frame(self.hand).radius_m
-        is_clear = self.safe_set.clearance.of_points(path, radius_m).min() > 0
-        return bool(is_clear) and is_in_box(self.goal_of(episode), self.fair_box)
-
-    def _shape_of_plan(self, episode: Episode) -> np.ndarray:
-        """Start, goal and detour of the hand's motion in the world, (3, 3) [m]."""
         # The preview has no noise, but it may end before the motion does.
         preview = episode.desired_preview[0].reshape(-1, 3)
         duration_s = self.scenario.parameters.plan_duration_s
-        shape = self._reflected(plan_shape(preview, self.scenario.preview_step_s, duration_s))
+        goal = self._reflected(plan_shape(preview, self.scenario.preview_step_s, duration_s)[1])
         # An episode begins on the feet of the standing posture.
-        shape[:2, :2] -= self.kinematics.nominal_base_offset
-        return shape
+        goal[:2] -= self.kinematics.nominal_base_offset
+        return goal
 
     def reset(
         self, context: Context, rng: np.random.Generator, goal: np.ndarray | None = None
@@ -230,9 +193,7 @@ class Reaching(LeggedLoop):
             if self._is_exploring:
                 push = parameters.random_pushes.sample(rng, self.robot.base)
                 detour = parameters.detours.sample(rng)
-        if detour is not None:
-            detour = self._reflected(detour)
-        self._set(context, q, goal, detour)
+        self._set(context, q, goal, None if detour is None else self._reflected(detour))
         self._observers.reseed(context, noise_rng)
         if push is None:
             return 0
@@ -245,21 +206,6 @@ class Reaching(LeggedLoop):
         push = self.scenario.parameters.random_pushes.draw(rng, self.robot.base)
         return self._reflected_push(push)
 
-    def candidate_plans(
-        self, context: Context, rng: np.random.Generator, num_plans: int
-    ) -> list[PiecewisePolynomial]:
-        """Returns the present plan, and plans with detours from the distribution of training."""
-        planned, detours = self._plan_of(context), self.scenario.parameters.detours
-        if not detours.share or planned.start_time() < context.get_time():
-            return [planned]
-        start, end = planned.start_time(), planned.end_time()
-        ends = [planned.value(time).ravel() for time in (start, end)]
-        plans = [planned]
-        for _ in range(num_plans - 1):
-            detour = self._reflected(detours.draw(rng))
-            plans.append(interpolate(*ends, end - start, start, detour=detour))
-        return plans
-
     def reset_undisturbed(
         self, context: Context, rng: np.random.Generator, duration_s: float
     ) -> None:
@@ -267,22 +213,19 @@ class Reaching(LeggedLoop):
 
         They end before half of the way, so that most of them are safe.
         """
-        parameters = self.scenario.parameters
-        q = parameters.start.sample(self.safe_set, rng, self.mirror)
-        box = np.sort(self._reflected(parameters.target.box), axis=0)
+        piece_s = self.scenario.parameters.plan_duration_s
+        q = self.scenario.parameters.start.sample(self.safe_set, rng, self.mirror)
         self._set(context, q, self._output_of(q))
-        first = self._plan_of(context)
-        home, piece_s = first.value(0.0).ravel(), parameters.plan_duration_s
-        plan, stance = None, self._stance_in_world(q)
+        plan, X_SW = self._plan_of(context), self._stance_in_world(q).inverse()
+        home, pieces = plan.value(0.0).ravel(), []
         for i in range(math.ceil(duration_s / (2.0 * piece_s))):
-            target = stance.inverse() @ rng.uniform(*box)
+            target = X_SW @ rng.uniform(*self.target_box)
             goal = home + rng.uniform(*_USUAL_SHARES) * (target - home)
-            for k, ends in enumerate(((home, goal), (goal, home))):
-                piece = interpolate(*ends, piece_s, (2 * i + k) * piece_s)
-                if plan is None:
-                    plan = piece
-                else:
-                    plan.ConcatenateInTime(piece)
+            pieces.append(interpolate(home, goal, piece_s, 2 * i * piece_s))
+            pieces.append(interpolate(goal, home, piece_s, (2 * i + 1) * piece_s))
+        plan = pieces[0]
+        for piece in pieces[1:]:
+            plan.ConcatenateInTime(piece)
         self.set_plan(context, plan)
         self._observers.reseed(context, rng)
 

@@ -1,6 +1,7 @@
 """Walking: a legged robot follows velocity commands by a trained policy."""
 
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import MatrixGain, PortSwitch
+from pydrake.systems.primitives import Gain, PortSwitch
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
@@ -109,9 +110,9 @@ class Walking(LeggedLoop):
         desired = {name: planner.GetOutputPort(name) for name in names}
         standing = self if starts_of is None else self._rehearsing()
         safe_set = WalkingSafeSet(standing.kinematics, parameters.safe_set)
-        guard_system = None
+        self._guard: CommandGuard | None = None
         if guard and assessment is not None:
-            guard_system = builder.AddNamedSystem(
+            self._guard = builder.AddNamedSystem(
                 "command_guard",
                 CommandGuard(
                     assessment,
@@ -123,11 +124,9 @@ class Walking(LeggedLoop):
                     num_outlook=_NUM_OUTLOOK,
                 ),
             )
-            builder.Connect(desired["desired_output"], guard_system.GetInputPort("command"))
-            desired = {name: guard_system.GetOutputPort(name) for name in names}
-        self._guard = guard_system
-        command = desired["desired_output"]
-        trigger = None
+            builder.Connect(desired["desired_output"], self._guard.GetInputPort("command"))
+            desired = {name: self._guard.GetOutputPort(name) for name in names}
+        trigger, command = None, desired["desired_output"]
         if recovery:
             trigger, command = self._add_recovery(builder, command)
         controller = self._controller = builder.AddNamedSystem(
@@ -152,13 +151,14 @@ class Walking(LeggedLoop):
             "controller_memory": controller.GetOutputPort("memory"),
             "num_controller_failures": controller.GetOutputPort("num_failures"),
         }
-        if guard_system is not None:
-            ports["guard_active"] = guard_system.GetOutputPort("is_changed")
+        if self._guard is not None:
+            ports["guard_active"] = self._guard.GetOutputPort("is_changed")
             for name in ("state", "features"):
-                builder.Connect(self._seen[name], guard_system.GetInputPort(name))
+                builder.Connect(self._seen[name], self._guard.GetInputPort(name))
         assessor = self.export(builder, ports, period_s=parameters.assessment_period_s)
-        if guard_system is not None and assessor is not None:
-            builder.Connect(assessor.GetOutputPort("learned"), guard_system.GetInputPort("learned"))
+        if self._guard is not None and assessor is not None:
+            learned = assessor.GetOutputPort("learned")
+            builder.Connect(learned, self._guard.GetInputPort("learned"))
         if trigger is not None and assessor is not None:
             assessor.connect_recovery(builder, trigger)
         elif trigger is not None:
@@ -170,7 +170,6 @@ class Walking(LeggedLoop):
             "states": [name for name in self.state_names if name != _POSITION],
             "features": [name for name in self.memory_features if name != _UNCOMMANDED],
         }
-        self._settled: EpisodeStart | None = None
         builder.BuildInto(self)
 
     def _add_recovery(
@@ -190,12 +189,11 @@ class Walking(LeggedLoop):
         )
         builder.ExportOutput(trigger.GetOutputPort("recovery_active"), "recovery_active")
         share = recovery.slower_share if recovery.branch == "slower" else 0.0
-        slower = builder.AddNamedSystem("slower_command", MatrixGain(share * np.eye(3)))
-        builder.Connect(nominal, slower.get_input_port())
+        slower = builder.AddNamedSystem("slower_command", Gain(share, nominal.size()))
         switch = builder.AddNamedSystem("command_switch", PortSwitch(nominal.size()))
-        builder.Connect(
-            trigger.GetOutputPort("port_selector"), switch.get_port_selector_input_port()
-        )
+        builder.Connect(nominal, slower.get_input_port())
+        selector = switch.get_port_selector_input_port()
+        builder.Connect(trigger.GetOutputPort("port_selector"), selector)
         builder.Connect(nominal, switch.DeclareInputPort("nominal"))
         builder.Connect(slower.get_output_port(), switch.DeclareInputPort("recovery"))
         return trigger, switch.GetOutputPort("value")
@@ -262,18 +260,18 @@ class Walking(LeggedLoop):
         if goal is not None:
             plan = self.command_plan(goal)
         start = starter.standing_start() if is_standing else self.rehearse(before, walked_s)
-        q, v = start.q, start.v
         if is_offset and self._is_disturbed:
-            v = sampling.offset_velocities(v, offset_rng)
-            q = self._above_ground(sampling.offset_positions(q, offset_rng))
-        self._begin(context, rng, replace(start, q=q, v=v, plan=plan))
+            v = sampling.offset_velocities(start.v, offset_rng)
+            q = self._above_ground(sampling.offset_positions(start.q, offset_rng))
+            start = replace(start, q=q, v=v)
+        self._begin(context, rng, replace(start, plan=plan))
         return 0
 
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
         """Starts where the policy has settled at a command of zero, with a constant command."""
-        start = replace(self.settled_start(), plan=self.command_plan(goal))
+        start = replace(self._settled_start, plan=self.command_plan(goal))
         self._begin(context, rng, start, is_silent=True)
 
     def reset_undisturbed(
@@ -285,7 +283,7 @@ class Walking(LeggedLoop):
             commands.append(self.usual_command(rng))
             changes.append(changes[-1] + rng.uniform(*_HELD_S))
         plan = profile(commands, changes[:-1], duration_s)
-        self.reset_to(context, rng, replace(self.settled_start(), plan=plan))
+        self.reset_to(context, rng, replace(self._settled_start, plan=plan))
 
     def usual_command(self, rng: np.random.Generator) -> np.ndarray:
         """Samples a command inside the policy's ranges, some of them zero, (3,) [m/s, rad/s]."""
@@ -318,17 +316,14 @@ class Walking(LeggedLoop):
 
     def start_of(self, context: Context) -> EpisodeStart:
         """State, plan and the controller's memory in a Context, as a start."""
-        own_context = self._controller.GetMyContextFromRoot(context)
-        return replace(
-            super().start_of(context), controller_state=self._controller.state_of(own_context)
-        )
+        memory = self._controller.state_of(self._controller.GetMyContextFromRoot(context))
+        return replace(super().start_of(context), controller_state=memory)
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:
         super()._set_state(context, start)
         if start.controller_state is not None:
-            self._controller.set_state(
-                self._controller.GetMyMutableContextFromRoot(context), start.controller_state
-            )
+            own_context = self._controller.GetMyMutableContextFromRoot(context)
+            self._controller.set_state(own_context, start.controller_state)
 
     def rehearse(self, command: np.ndarray, duration_s: float) -> EpisodeStart:
         """Walks undisturbed from the standing posture, by the nominal robot.
@@ -341,14 +336,13 @@ class Walking(LeggedLoop):
         Raises:
             ValueError: The policy that walks remembers other things than this one.
         """
-        other = self._rehearsing()
+        other, period_s = self._rehearsing(), self.policy.parameters.period_s
         if _remembered(other.policy) != _remembered(self.policy):
             raise ValueError(
                 "walking: a policy cannot take over in mid-stride from one with other observations "
                 "or joints, nor a recurrent one: begin all episodes at rest, "
                 "parameters.start.standing_share: 1"
             )
-        period_s = self.policy.parameters.period_s
         simulator = Simulator(other)
         context = simulator.get_mutable_context()
         other.remove_visuals(context)
@@ -368,11 +362,10 @@ class Walking(LeggedLoop):
             self._rehearsal = type(self)(self._starts_of or self.scenario)
         return self._rehearsal
 
-    def settled_start(self) -> EpisodeStart:
+    @cached_property
+    def _settled_start(self) -> EpisodeStart:
         """A start where the policy has stood for a second, with a command of zero."""
-        if self._settled is None:
-            self._settled = self.rehearse(np.zeros(3), _SETTLING_S)
-        return self._settled
+        return self.rehearse(np.zeros(3), _SETTLING_S)
 
     def standing_start(self) -> EpisodeStart:
         """A start at rest in the standing posture, with a command of zero."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -164,25 +164,6 @@ class FollowsCommands(Protocol):
 
 
 @runtime_checkable
-class OffersPlans(Protocol):
-    """There are several plans to choose from in a state."""
-
-    plan_variety: str
-
-    def candidate_plans(
-        self, context: Context, rng: np.random.Generator, num_plans: int
-    ) -> list[Any]:
-        """Samples plans from the state of a Context, within the distribution of training.
-
-        Returns:
-            At most ``num_plans`` arguments for :meth:`set_plan`; the first is the present plan.
-        """
-
-    def set_plan(self, context: Context, plan: Any) -> None:
-        """Sets one of :meth:`candidate_plans` and keeps the state."""
-
-
-@runtime_checkable
 class CanStartAnywhere(Protocol):
     """Episodes can begin with a given state and plan."""
 
@@ -208,7 +189,6 @@ _DESCRIPTIONS: dict[type, str] = {
     CanFall: "a fall",
     CanBePushed: "pushes on its robot",
     FollowsCommands: "commands that change while it moves",
-    OffersPlans: "plans to choose from",
     CanStartAnywhere: "episodes from a given start",
 }
 """Descriptions for messages."""
@@ -230,16 +210,6 @@ def goal_words(loop: HasGoals) -> GoalWords:
     """What the goals of a loop are called: its ``goal_words``, if it has some."""
     words = GoalWords() if loop.hand is None else GoalWords(subject=f"the {loop.hand} hand")
     return getattr(loop, "goal_words", words)
-
-
-def fair_box(loop: HasGoals) -> np.ndarray:
-    """The part of a loop's target box without trivial goals, (2, 3) [m]: its ``fair_box``."""
-    return getattr(loop, "fair_box", loop.target_box)
-
-
-def is_fair(loop: HasGoals, episode: Episode) -> bool:
-    """Whether the verdict on an episode's goal is not trivial: by ``is_fair`` of the loop."""
-    return getattr(loop, "is_fair", lambda _: True)(episode)
 
 
 def is_in_box(goal: np.ndarray, box: np.ndarray) -> bool:

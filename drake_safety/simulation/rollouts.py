@@ -37,7 +37,6 @@ from drake_safety.simulation.capabilities import (
     CanStartAnywhere,
     HasGoals,
     MovesUndisturbed,
-    OffersPlans,
     require,
 )
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -117,7 +116,6 @@ def run_episode(
     goal: np.ndarray | None = None,
     is_standing: bool = False,
     start: EpisodeStart | None = None,
-    plan: Any = None,
     at_start: Callable[[Context], object] = lambda context: None,
     until_fall: bool = False,
     **options: Any,
@@ -131,7 +129,6 @@ def run_episode(
             goal.
         start: Initial state and plan, in place of random ones. The noise is that of the seed and
             the index.
-        plan: Replaces the initial plan: one of the loop's ``candidate_plans``.
         at_start: Called with the root Context at the start.
         until_fall: Whether it goes on for a second after it leaves the safe set, and only a fall is
             an unsafe end; of a :class:`CanFall`.
@@ -164,8 +161,6 @@ def run_episode(
             require(loop, HasGoals).reset_standing(context, goal, rng)
         else:
             first_step = require(loop, HasGoals).reset(context, rng, goal)
-        if plan is not None:
-            require(loop, OffersPlans).set_plan(context, plan)
         at_start(context)
         return first_step
 

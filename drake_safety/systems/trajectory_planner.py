@@ -56,11 +56,6 @@ def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndar
     return shape
 
 
-def points_of_plan(shape: np.ndarray, num_points: int) -> np.ndarray:
-    """Points of a plan (3, n_z) at equal intervals of its progress s, (M, n_z) [m]."""
-    return _shares(np.linspace(0, 1, num_points)) @ shape
-
-
 def _shares(progress: np.ndarray) -> np.ndarray:
     """Shares of start, goal and detour in a plan's points, (M, 3); see ``interpolate``."""
     return np.stack([1 - progress, progress, 4 * progress * (1 - progress)], axis=1)
