@@ -9,7 +9,6 @@ from drake_safety.systems.trajectory_planner import (
     TrajectoryPlanner,
     interpolate,
     plan_shape,
-    points_of_plan,
 )
 from gliding_task import evaluated
 
@@ -163,10 +162,3 @@ def test_a_preview_of_another_frame_is_the_shape_of_that_frame():
     np.testing.assert_allclose(turned[:2], shape[:2] @ turn.T + [1, 2, 3], atol=1e-9)
     # A detour is a direction: it turns and does not move.
     np.testing.assert_allclose(turned[2], shape[2] @ turn.T, atol=1e-9)
-
-
-def test_points_of_a_shape_begin_at_its_start_pass_by_its_detour_and_end_at_its_goal():
-    points = points_of_plan(np.array([START, GOAL, DETOUR]), 5)
-    np.testing.assert_allclose(points[[0, -1]], [START, GOAL], atol=1e-12)
-    np.testing.assert_allclose(points[2], 0.5 * (START + GOAL) + DETOUR, atol=1e-12)
-    np.testing.assert_allclose(points[1], 0.75 * START + 0.25 * GOAL + 0.75 * DETOUR, atol=1e-12)
