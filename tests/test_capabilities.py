@@ -1,6 +1,5 @@
 from dataclasses import fields
 
-import numpy as np
 import pytest
 
 from drake_safety import check_contract, load_scenario

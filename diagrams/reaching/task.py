@@ -10,7 +10,6 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
-from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import fit_stance, planar_pose
 from drake_safety.control.mirror import Mirror
