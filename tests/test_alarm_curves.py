@@ -59,7 +59,7 @@ def test_a_fall_is_announced_by_a_row_between_the_push_and_0_2_s_before_the_fall
     np.testing.assert_array_equal(found.share_costs("without_fall"), [0, 1, 1, math.inf])
 
 
-def test_who_leaves_the_safe_set_and_does_not_fall_counts_only_among_those_that_do_not_fall():
+def test_a_motion_that_leaves_without_a_fall_counts_as_not_fallen():
     falls = motion([1, 0.2, 1, 1, 1], push_s=0.1, leave_s=0.3, fall_s=0.4)
     leaves = motion([1, 0.1, 1], push_s=0.1, leave_s=0.1)
     found = watched([falls, leaves, motion([1, 0.3], push_s=0.1)])

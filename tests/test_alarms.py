@@ -52,7 +52,7 @@ def figures_of(motions, num_rows=1):
     return {key.removeprefix("monitoring."): estimate.value for key, estimate in found.items()}
 
 
-def test_what_is_noticed_is_noticed_between_push_and_leaving_and_all_else_is_false():
+def test_an_alarm_between_push_and_leaving_is_a_detection_and_any_other_is_false():
     found = figures_of(TEST)
     # The first two in time, the third too late but before the fall, the fourth only too early.
     assert found["sharpened.detected"] == 2 / 4
@@ -80,7 +80,7 @@ def test_an_alarm_of_two_rows_comes_a_row_later_and_ignores_a_single_one():
     assert [found[key] * 3 * 3.6 / 3600 for found in (one, two)] == pytest.approx([2, 1])
 
 
-def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
+def test_thresholds_give_all_methods_the_same_rate_of_false_alarms():
     lowest = np.array([lowest_value(motion, motion["state"][:, 0]) for motion in CALM])
     for share, count in ((0.0, 0), (0.05, 1), (0.25, 5), (0.26, 5)):
         threshold = equal_share_threshold(lowest, share)
@@ -91,7 +91,7 @@ def test_everyone_may_give_as_many_false_alarms_on_the_calibration_motions():
         equal_share_threshold(np.array([]), 0.1)
 
 
-def test_who_does_not_know_cries():
+def test_an_unknown_row_is_an_alarm():
     motion = motion_of(0, {2.0: np.nan})
     value = motion["state"][:, 0]
     assert first_alarm(motion, value, -1e9) == 2.0
@@ -100,7 +100,7 @@ def test_who_does_not_know_cries():
     assert first_alarm(motion_of(0, {}), np.ones(37), 1.0) == math.inf
 
 
-def test_of_a_motion_that_leaves_only_what_is_between_push_and_leaving_counts():
+def test_rows_outside_push_and_leaving_do_not_count_in_a_motion_that_leaves():
     motion = motion_of(0, {0.2: 0.0, 0.4: 0.8, 1.3: 0.5, 1.4: 0.1}, leaves=True)
     assert lowest_value(motion, motion["state"][:, 0]) == 0.5
     at_once = motion_of(0, {1.4: 0.1}, leaves=True, push_time_s=1.4)
@@ -118,7 +118,7 @@ def test_tilt_is_the_angle_to_the_vertical_whatever_the_yaw():
     assert np.isnan(tilt(np.full((1, 3), np.nan))).all()
 
 
-def test_what_an_engineer_would_watch_is_found_by_name():
+def test_threshold_alarms_watch_tilt_and_margins_by_name():
     names = ["edge", "tracking_error_x", "tracking_error_y"]
     alarms = threshold_alarms(
         ["rotation_x", "rotation_y", "rotation_z"], names, {"support_margin": "edge"}

@@ -35,7 +35,7 @@ def predict(classifier, segments):
     return classifier.predict_unsafe(segments.state, segments.desired_preview, segments.features)
 
 
-def test_it_tells_unsafe_from_safe_segments_of_episodes_it_has_not_seen(classifier, fresh):
+def test_a_classifier_ranks_unsafe_segments_of_fresh_episodes_above_safe_ones(classifier, fresh):
     probability, label = predict(classifier, fresh), fresh.is_unsafe
     assert np.all((probability >= 0.0) & (probability <= 1.0))
     assert area_under_curve(probability, label) > 0.9
@@ -51,7 +51,7 @@ def test_an_input_that_is_not_finite_is_unknown_and_disturbs_no_other(classifier
     np.testing.assert_allclose(probability[[0, 1, 3, 5]], expected[[0, 1, 3, 5]], rtol=1e-9)
 
 
-def test_without_features_it_sees_the_papers_input(training, fresh):
+def test_a_classifier_without_features_has_the_papers_input(training, fresh):
     blind = DirectClassifier("gradient_boosting", uses_features=False).fit(training)
     other = fresh.take(np.arange(9))
     expected = predict(blind, other)
@@ -59,7 +59,7 @@ def test_without_features_it_sees_the_papers_input(training, fresh):
     np.testing.assert_array_equal(predict(blind, other), expected)
 
 
-def test_the_episodes_that_decide_when_to_stop_are_held_out_whole(training):
+def test_early_stopping_holds_out_whole_episodes(training):
     segments = split(training, stride=1, discount=1.0)
     is_held_out = DirectClassifier("mlp")._held_out(segments)
     held_out = np.unique(segments.episode[is_held_out])
@@ -69,7 +69,7 @@ def test_the_episodes_that_decide_when_to_stop_are_held_out_whole(training):
         assert share / len(np.unique(segments.episode[is_class])) == pytest.approx(0.1, abs=0.02)
 
 
-def test_who_learns_from_short_segments_has_seen_how_safe_episodes_end(fresh):
+def test_short_segments_teach_the_ends_of_safe_episodes(fresh):
     episodes = make_episodes(40, seed=3, noise=0.05)
     reports = []
     whole, other = classifier_scorers(episodes, lambda *report: reports.append(report))

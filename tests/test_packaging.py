@@ -153,9 +153,8 @@ print(*(name for name in {1} if importlib.util.find_spec(name)))
 ABSENT = [*{name for extra in MODULES.values() for name in extra}, "numba", "statsmodels"]
 
 
-@pytest.mark.parametrize("scenario", ["laikago_balancing", "atlas_reaching"])
-def test_a_loop_with_an_assessment_runs_in_the_light_install(light_environment, scenario):
-    code = LOOP.format(scenario, ABSENT)
+def test_a_loop_with_an_assessment_runs_in_the_light_install(light_environment):
+    code = LOOP.format("laikago_balancing", ABSENT)
     printed = run(light_environment / "bin" / "python", "-c", code, cwd="/")
     probability, *found = printed.splitlines()
     assert 0.0 <= float(probability) <= 1.0
@@ -286,35 +285,3 @@ def test_the_installed_package_imports_from_the_root_folder(clean_environment):
     # No trace of the checkout: __path__ has the one entry inside the environment.
     assert all(Path(name).is_relative_to(clean_environment) for name in [*files, path])
     assert version == PROJECT["version"]
-
-
-def test_inside_a_checkout_the_library_and_the_models_are_both_the_checkouts(clean_environment):
-    code = "import drake_safety as s, drake_safety.models as m; print(s.__file__, m.__file__)"
-    # `python -c` puts the working folder first on the path, before the installed wheel.
-    files = run(clean_environment / "bin" / "python", "-c", code, cwd=ROOT).split()
-    assert files == [str(ROOT / "drake_safety/__init__.py"), str(ROOT / "models/__init__.py")]
-
-
-@pytest.mark.parametrize(
-    ("code", "files", "more"),
-    [
-        ("assessments import *; print(*assessed_scenarios())", "*/*.safetensors", {"pendulum"}),
-        (
-            "models import *; print(*(load_robot(n).name for n in robot_names()))",
-            "*/robot.yaml",
-            (),
-        ),
-    ],
-)
-def test_installed_assessments_and_robots_are_the_checkouts(clean_environment, code, files, more):
-    code = f"from drake_safety.{code}"
-    printed = run(clean_environment / "bin" / "python", "-c", code, cwd="/").split()
-    kept = {path.parent.name for path in (ROOT / code.split()[1].split(".")[1]).glob(files)}
-    assert printed == sorted({*kept, *more})
-
-
-def test_the_installed_command_lists_every_scenario(clean_environment):
-    scenarios = sorted(path.stem for path in (ROOT / "diagrams").glob("*.yaml"))
-    assert scenarios
-    printed = run(clean_environment / "bin" / "drake-safety", "scenarios", cwd="/")
-    assert [name for name in scenarios if name not in printed] == []

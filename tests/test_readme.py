@@ -108,7 +108,7 @@ def test_every_command_of_the_readme_of_the_command_line_page_and_of_the_cards_p
             group.commands[name].make_context(name, arguments)
 
 
-def test_the_makefile_has_every_target_of_the_readme_and_does_what_is_said_of_the_demo():
+def test_the_makefile_has_every_target_of_the_readme():
     targets = set(re.findall(r"^([a-z]+):.*## ", MAKEFILE, flags=re.MULTILINE))
     named = {call[0] for call in shell_commands("make")}
     assert {"demo", "test"} <= named <= targets

@@ -147,7 +147,7 @@ def test_a_moving_picture_stops_where_something_happens(standing_twice, tmp_path
     assert orange[stop].sum() > 100 > orange[0].sum()
 
 
-def test_the_first_disturbance_after_which_only_recovery_helps_is_shown(standing_twice):
+def test_the_picture_shows_the_first_disturbance_that_only_recovery_survives(standing_twice):
     loop, motion = standing_twice
     scenario, active = loop.scenario, np.zeros((26, 1))
     active[10:20] = 1.0
