@@ -170,5 +170,5 @@ def test_a_scenario_says_what_an_alarm_does(on_alarm):
     loop = scenario.make_loop("nominal", assessment=load_assessment("laikago_balancing"))
     assert loop.GetOutputPort("alarm").size() == 1
     assert loop.GetOutputPort("levels").size() == len(loop.state_names)
-    evaluator = loop.GetSubsystemByName("safety_assessor").evaluator
-    assert evaluator.HasInputPort("alarm") == (on_alarm == "unknown")
+    assessor = loop.GetSubsystemByName("safety_assessor").assessor
+    assert assessor.HasInputPort("alarm") == (on_alarm == "unknown")

@@ -90,8 +90,8 @@ def test_a_guard_judges_by_what_the_evaluator_has_adopted_and_during_an_alarm_by
         adapted.beliefs_ = empty(assessment.beliefs_.shape[:-1], assessment.beliefs_.shape[-1] - 3)
         assessor.adopt(assessor.GetMyMutableContextFromRoot(context), adapted)
     else:
-        port = assessor.evaluator.GetInputPort("alarm")
-        port.FixValue(assessor.evaluator.GetMyMutableContextFromRoot(context), [1.0])
+        port = assessor.assessor.GetInputPort("alarm")
+        port.FixValue(assessor.assessor.GetMyMutableContextFromRoot(context), [1.0])
     simulator.AdvanceTo(0.12)
     assert loop.GetOutputPort("safety_probability").Eval(context) == 0.0
     assert probability() == 0.0

@@ -178,6 +178,6 @@ def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterw
     assert len(online.adapted) == len(online.feedback) // 2 > 0
     expected = adapt(online.feedback[: 2 * len(online.adapted)])
     np.testing.assert_array_equal(online.adapted[-1].beliefs_, expected.beliefs_)
-    context = assessor.evaluator.GetMyContextFromRoot(root)
-    np.testing.assert_array_equal(assessor.evaluator.get_beliefs(context), expected.beliefs_)
+    context = assessor.assessor.GetMyContextFromRoot(root)
+    np.testing.assert_array_equal(assessor.assessor.get_beliefs(context), expected.beliefs_)
     assert not np.array_equal(expected.beliefs_, prior.beliefs_)

@@ -111,7 +111,7 @@ def test_what_was_learned_of_other_maps_and_beliefs_of_another_shape_are_refused
     _, bench = running()
     with pytest.raises(ValueError, match="has other maps"):
         bench.system.adopt(bench.context, AssessmentDouble())
-    with pytest.raises(ValueError, match=r"must have shape \(1, 6, 5\); got \(6, 5\)"):
+    with pytest.raises(ValueError, match=r"of shape \(1, 6, 5\); got"):
         bench.system.set_beliefs(bench.context, np.zeros((6, 5)))
 
 
@@ -180,7 +180,7 @@ def test_what_is_not_finite_is_not_known_and_may_fall(entry):
     bench = Bench(evaluator, **given)
     if entry == "beliefs":
         beliefs = np.full_like(assessment.beliefs_, np.nan)
-        with pytest.raises(ValueError, match="beliefs must be finite"):
+        with pytest.raises(ValueError, match="must be finite numbers"):
             evaluator.set_beliefs(bench.context, beliefs)
         bench.context.get_mutable_numeric_parameter(0).SetFromVector(beliefs.ravel())
     bench.begin()

@@ -40,10 +40,6 @@ class Recording:
     def __deepcopy__(self, memo: dict[int, Any]) -> Recording:
         return self
 
-    def closed(self) -> Recording:
-        """The recording without its open window."""
-        return replace(self, rows=(), times_s=(), start={})
-
 
 class FeedbackRecorder(LeafSystem):
     """Records windows of a running robot's motion; the label of each is how it ended.
@@ -69,11 +65,12 @@ class FeedbackRecorder(LeafSystem):
     A row is recorded every ``info.step_s``. A window ends safe after ``num_steps`` steps, and the
     next one begins with its last row. It ends unsafe as soon as ``safe``, sampled every
     ``watch_period_s``, is below one, and the next one begins when it is one again. When time
-    jumps, as at a reset, the open window is dropped. The windows, at most the newest 400, are state
-    of the Context; :meth:`take_windows` removes them. ``true_state`` defaults to ``state``, as on a
-    robot. A window with a row at which ``recovery_active`` is not zero is dropped: its twin has no
-    recovery. ``plant_state`` and ``controller_memory`` of its first row are those from which a twin
-    begins.
+    jumps, as at a reset, the open window is dropped. So is a window with a row at which
+    ``recovery_active`` is not zero, since its twin has no recovery. The finished windows, at most
+    the newest 400, are state of the Context; :meth:`take_windows` removes them.
+
+    ``true_state`` defaults to ``state``, as on a robot. ``plant_state`` and ``controller_memory``
+    of a window's first row are where its twin begins.
 
     Args:
         num_steps: Steps of a safe window.
@@ -110,19 +107,19 @@ class FeedbackRecorder(LeafSystem):
             "safe": 1,
             "plant_state": plant_state_size,
         }
-        self._ports = {name: self.DeclareVectorInputPort(name, n) for name, n in sizes.items()}
-        self._start_ports = [self._ports["plant_state"]]
+        self._start_ports = ["plant_state"]
         if controller_memory_size:
-            port = self.DeclareVectorInputPort("controller_memory", controller_memory_size)
-            self._start_ports.append(port)
-        self._recovery_port = self.DeclareVectorInputPort("recovery_active", 1)
+            sizes["controller_memory"] = controller_memory_size
+            self._start_ports.append("controller_memory")
+        sizes["recovery_active"] = 1
+        self._ports = {name: self.DeclareVectorInputPort(name, n) for name, n in sizes.items()}
         # A latch: when the safe set was left since the last row, and the margins at that time.
         self._closed_latch = np.append(-np.inf, np.zeros(num_margins))
         self.DeclareDiscreteState(self._closed_latch)
         self._index = self.DeclareAbstractState(Value(Recording()))
         self.DeclarePeriodicDiscreteUpdateEvent(watch_period_s, 0.0, self._watch)
         self.DeclarePeriodicUnrestrictedUpdateEvent(info.step_s, 0.0, self._record)
-        self.DeclareVectorOutputPort("num_finished", BasicVector(1), self._calc_num_finished)
+        self.DeclareVectorOutputPort("num_finished", 1, self._calc_num_finished)
 
     def recording(self, context: Context) -> Recording:
         """Returns the recorder's state in a Context."""
@@ -137,43 +134,41 @@ class FeedbackRecorder(LeafSystem):
     def _calc_num_finished(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector([self.recording(context).num_finished])
 
+    def _is_safe(self, context: Context) -> bool:
+        return bool(self._ports["safe"].Eval(context)[0] >= 1.0)
+
     def _watch(self, context: Context, discrete_state: DiscreteValues) -> None:
         latch = context.get_discrete_state_vector().get_value()
-        if latch[0] == -np.inf and not self._ports["safe"].Eval(context)[0] >= 1.0:
+        if latch[0] == -np.inf and not self._is_safe(context):
             margins = self._ports["margins"].Eval(context)
             discrete_state.set_value(np.append(context.get_time(), margins))
 
-    def _row(self, context: Context) -> tuple[np.ndarray, ...]:
+    def _record(self, context: Context, state: State) -> None:
+        recording, time_s = self.recording(context), context.get_time()
         ports = dict(self._ports)
         if not ports["true_state"].HasValue(context):
             ports["true_state"] = ports["state"]
-        return tuple(ports[name].Eval(context).copy() for name in RECORDED)
-
-    def _record(self, context: Context, state: State) -> None:
-        recording = self.recording(context)
-        time_s = context.get_time()
-        latch = context.get_discrete_state_vector().get_value()
+        row = tuple(ports[name].Eval(context).copy() for name in RECORDED)
+        left_s, *left_margins = context.get_discrete_state_vector().get_value()
         # A latch of before a jump in time says nothing.
-        was_left = 0.0 <= time_s - latch[0] <= 1.01 * self.info.step_s
-        has_left = was_left or not self._ports["safe"].Eval(context)[0] >= 1.0
+        was_left = 0.0 <= time_s - left_s <= 1.01 * self.info.step_s
+        if was_left:
+            row = (*row[:-1], np.minimum(row[-1], left_margins))
+        has_left = was_left or not self._is_safe(context)
+        without_open = Recording(windows=recording.windows, num_finished=recording.num_finished)
         if recording.times_s:
             lapse_s = time_s - recording.times_s[-1]
             if abs(lapse_s - self.info.step_s) > 0.01 * self.info.step_s:
-                recording = recording.closed()
-        row = self._row(context)
-        if self._recovery_port.HasValue(context) and self._recovery_port.Eval(context)[0] != 0.0:
-            recording = recording.closed()
-        elif has_left:
-            if recording.rows:
-                if was_left:
-                    margins = np.minimum(row[-1], latch[1:])
-                    row = (*row[:-1], margins)
-                recording = self._finished(self._extended(context, recording, row), is_safe=False)
-            recording = recording.closed()
-        else:
+                recording = without_open
+        recovery = ports["recovery_active"]
+        if recovery.HasValue(context) and recovery.Eval(context)[0] != 0.0:
+            recording = without_open
+        elif recording.rows or not has_left:
             recording = self._extended(context, recording, row)
-            if len(recording.rows) == self._num_steps + 1:
-                recording = self._finished(recording, is_safe=True).closed()
+            is_full = len(recording.rows) == self._num_steps + 1
+            if has_left or is_full:
+                recording = self._finished(recording, is_safe=not has_left)
+            if is_full and not has_left:
                 recording = self._extended(context, recording, row)
         state.get_mutable_discrete_state().set_value(self._closed_latch)
         state.get_mutable_abstract_state(int(self._index)).set_value(recording)
@@ -183,13 +178,9 @@ class FeedbackRecorder(LeafSystem):
     ) -> Recording:
         start = recording.start
         if not recording.rows:
-            start = {port.get_name(): port.Eval(context).copy() for port in self._start_ports}
-        return replace(
-            recording,
-            rows=(*recording.rows, row),
-            times_s=(*recording.times_s, context.get_time()),
-            start=start,
-        )
+            start = {name: self._ports[name].Eval(context).copy() for name in self._start_ports}
+        rows, times_s = (*recording.rows, row), (*recording.times_s, context.get_time())
+        return replace(recording, rows=rows, times_s=times_s, start=start)
 
     def _finished(self, recording: Recording, *, is_safe: bool) -> Recording:
         columns = [np.array(column) for column in zip(*recording.rows, strict=True)]
@@ -204,7 +195,7 @@ class FeedbackRecorder(LeafSystem):
         )
         Episodes(self.info, [episode])  # Checks the shapes.
         window = RecordedWindow(
-            episode=episode, start_time_s=float(times_s[0]), **dict(recording.start)
+            episode=episode, start_time_s=float(times_s[0]), **recording.start
         )
         windows = (*recording.windows, window)[-_MOST_WINDOWS:]
-        return replace(recording, windows=windows, num_finished=recording.num_finished + 1)
+        return Recording(windows=windows, num_finished=recording.num_finished + 1)

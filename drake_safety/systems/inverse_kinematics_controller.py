@@ -29,15 +29,15 @@ class InverseKinematicsController(LeafSystem):
         output_ports:
         - desired_joint_state: 2 n_j
 
-    The command is a discrete state, so the output has no direct feedthrough. Base yaw is
-    ``desired_yaw``, or that of the planar fit of the feet if this is not connected. The joint
-    servos are the plant's implicit ones (q̇ of the command is the rate of the set point). The
-    static offset τ/k_p is added to their set points, with τ from the model's weight distributed
-    over the feet on the ground; it removes the sag of a servo of finite stiffness. Commands
-    respect the joint limits, and set points move at most at 0.7 of the joints' speed limits.
+    The command is a discrete state, so the output has no direct feedthrough. It goes to the plant's
+    implicit joint servos; q̇ of the command is the rate of the set point. The static offset τ/k_p
+    is added to the set points, with τ from the model's weight distributed over the feet on the
+    ground: it removes the sag of a servo of finite stiffness. Commands respect the joint limits,
+    and set points move at most at 0.7 of the joints' speed limits.
 
     Without ``desired_foot_positions`` the feet are those of the first state that the controller
-    sees when a simulation is initialised, put on level ground.
+    sees when a simulation is initialised, put on level ground. Without ``desired_yaw`` the base's
+    yaw is that of the planar fit of the feet.
 
     Args:
         stiffness: Servo stiffness of every joint, (n_j,) [N·m/rad]; robot.yaml's by default.
@@ -53,30 +53,29 @@ class InverseKinematicsController(LeafSystem):
         offset_s: float = 0.0,
     ):
         super().__init__()
+        n_j = kinematics.num_joints
         if stiffness is None:
             gains = map(kinematics.robot.gains_of, kinematics.joint_names)
-            stiffness = np.array([0.0 if one is None else one.stiffness for one in gains])
+            stiffness = np.array([0.0 if gain is None else gain.stiffness for gain in gains])
         stiffness = np.asarray(stiffness, dtype=float)
-        if stiffness.shape != (kinematics.num_joints,) or not np.all(stiffness > 0):
+        if stiffness.shape != (n_j,) or not np.all(stiffness > 0):
             raise ValueError(
-                f"inverse kinematics controller: stiffness must be {kinematics.num_joints} "
-                f"positive numbers, in the order of {kinematics.joint_names}; got {stiffness}"
+                f"inverse kinematics controller: stiffness must be {n_j} positive numbers, in the "
+                f"order of {kinematics.joint_names}; got {stiffness}"
             )
         self._kinematics = kinematics
         self._stiffness = stiffness
         self._rate_limit = _RATE_SHARE * kinematics.velocity_limits
         self._lowest_rate = -self._rate_limit
         self._period_s = period_s
-        n_j = kinematics.num_joints
         self._limits = np.ascontiguousarray(kinematics.position_limits.T)
+        n_p = 3 * kinematics.num_contacts
         # Looking up ports by name in every update would cost more than evaluating them.
         self._state_port = self.DeclareVectorInputPort("plant_state", kinematics.num_states)
         self._desired_port = self.DeclareVectorInputPort("desired_output", 3)
-        self._feet_port = self.DeclareVectorInputPort(
-            "desired_foot_positions", 3 * kinematics.num_contacts
-        )
+        self._feet_port = self.DeclareVectorInputPort("desired_foot_positions", n_p)
         self._yaw_port = self.DeclareVectorInputPort("desired_yaw", 1)
-        self._feet = self.DeclareDiscreteState(np.full(3 * kinematics.num_contacts, np.nan))
+        self._feet = self.DeclareDiscreteState(np.full(n_p, np.nan))
         self._set_point = self.DeclareDiscreteState(n_j)  # Of the joints, without the offset.
         self._command = self.DeclareDiscreteState(2 * n_j)  # Positions with it, and rates.
         declare_update(self, self._update, self._initialize, period_s, offset_s)
@@ -94,9 +93,18 @@ class InverseKinematicsController(LeafSystem):
             feet = context.get_discrete_state(self._feet).value()
         return feet.reshape(-1, 3)
 
+    def start(self, context: Context) -> None:
+        """Sets the command for the present inputs, as the start of a simulation does."""
+        self._initialize(context, context.get_mutable_discrete_state())
+
+    def update(self, context: Context) -> None:
+        """Updates the command for the present inputs, as a simulation does every period."""
+        self._update(context, context.get_mutable_discrete_state())
+
     def _solve(
         self, context: Context, p_WC: np.ndarray, guess: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
+        """Returns joint positions and the torques of the weight, (n_j,) each."""
         kinematics = self._kinematics
         if self._yaw_port.HasValue(context):
             half_yaw = 0.5 * self._yaw_port.Eval(context)[0]
@@ -110,20 +118,7 @@ class InverseKinematicsController(LeafSystem):
         joints, J = solve_from(kinematics, q, p_WC)
         q[n_b:] = joints
         is_stance = p_WC[:, 2] - kinematics.foot_radii <= _LIFTED_M
-        torques = kinematics.gravity_torques(q, is_stance, J)
-        return joints, torques
-
-    def _add_offset(self, joints: np.ndarray, torques: np.ndarray) -> np.ndarray:
-        lowest, highest = self._limits
-        return np.minimum(np.maximum(joints + torques / self._stiffness, lowest), highest)
-
-    def start(self, context: Context) -> None:
-        """Sets the command for the present inputs, as the start of a simulation does."""
-        self._initialize(context, context.get_mutable_discrete_state())
-
-    def update(self, context: Context) -> None:
-        """Updates the command for the present inputs, as a simulation does every period."""
-        self._update(context, context.get_mutable_discrete_state())
+        return joints, kinematics.gravity_torques(q, is_stance, J)
 
     def _initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
         q = self._state_port.Eval(context)[: self._kinematics.num_positions]
@@ -132,9 +127,7 @@ class InverseKinematicsController(LeafSystem):
             p_WC = self._kinematics.planted_contacts(q)
             discrete_state.set_value(self._feet, p_WC.ravel())
         joints, torques = self._solve(context, p_WC, q[NUM_BASE_POSITIONS:])
-        command = np.concatenate([self._add_offset(joints, torques), np.zeros_like(joints)])
-        discrete_state.set_value(self._set_point, joints)
-        discrete_state.set_value(self._command, command)
+        self._command_joints(discrete_state, joints, torques, np.zeros_like(joints))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         previous = context.get_discrete_state(self._set_point).get_value()
@@ -144,7 +137,16 @@ class InverseKinematicsController(LeafSystem):
         desired, torques = self._solve(context, self.foot_positions(context), guess)
         rate = (desired - previous) / self._period_s
         rate = np.minimum(np.maximum(rate, self._lowest_rate), self._rate_limit)
-        joints = previous + self._period_s * rate
-        command = np.concatenate([self._add_offset(joints, torques), rate])
+        self._command_joints(discrete_state, previous + self._period_s * rate, torques, rate)
+
+    def _command_joints(
+        self,
+        discrete_state: DiscreteValues,
+        joints: np.ndarray,
+        torques: np.ndarray,
+        rate: np.ndarray,
+    ) -> None:
+        lowest, highest = self._limits
+        positions = np.minimum(np.maximum(joints + torques / self._stiffness, lowest), highest)
         discrete_state.set_value(self._set_point, joints)
-        discrete_state.set_value(self._command, command)
+        discrete_state.set_value(self._command, np.concatenate([positions, rate]))

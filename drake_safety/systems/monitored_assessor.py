@@ -15,8 +15,7 @@ from drake_safety.systems.change_monitor import ChangeMonitor
 from drake_safety.systems.safety_assessor import SafetyAssessor
 
 OnAlarm = Literal["unknown", "report"]
-"""What an alarm does: every belief is unknown, or only the port ``alarm`` says so."""
-ON_ALARM = get_args(OnAlarm)
+"""Effect of an alarm: every belief is unknown, or only the port ``alarm`` reports it."""
 _LOGGER = logging.getLogger("drake_safety")
 
 
@@ -52,10 +51,13 @@ class MonitoredSafetyAssessor(Diagram):
 
     Args:
         period_s: Time between two evaluations [s]; the step of the training episodes by default.
-        checks_margins: Whether nothing is safe outside the safe set; otherwise there is no port
-            ``margins``.
-        on_alarm: What an alarm of the monitor does, one of ``ON_ALARM``; None for no monitor, and
-            none of its ports.
+        checks_margins: Whether a state outside the safe set is always unsafe; otherwise there is no
+            port ``margins``.
+        on_alarm: Effect of the monitor's alarm, an `OnAlarm`; None for no monitor and no ports of
+            one.
+
+    Attributes:
+        assessor, monitor: Its two systems.
     """
 
     def __init__(
@@ -67,13 +69,13 @@ class MonitoredSafetyAssessor(Diagram):
         on_alarm: str | None = "unknown",
     ):
         super().__init__()
-        if on_alarm not in (*ON_ALARM, None):
+        if on_alarm not in (*get_args(OnAlarm), None):
             raise ValueError(
-                f"safety assessor: on_alarm is {on_alarm!r}, expected one of {list(ON_ALARM)} or "
-                "None for no monitor"
+                f"safety assessor: on_alarm is {on_alarm!r}, expected one of "
+                f"{list(get_args(OnAlarm))} or None for no monitor"
             )
         builder = DiagramBuilder()
-        self.evaluator: SafetyAssessor = builder.AddNamedSystem(
+        self.assessor = builder.AddNamedSystem(
             "safety_assessor",
             SafetyAssessor(
                 assessment,
@@ -85,41 +87,42 @@ class MonitoredSafetyAssessor(Diagram):
         self.monitor: ChangeMonitor | None = None
         inputs = ["state", "desired_preview", "features"]
         for name in [*inputs, "margins"] if checks_margins else inputs:
-            builder.ExportInput(self.evaluator.GetInputPort(name), name)
+            builder.ExportInput(self.assessor.GetInputPort(name), name)
         if on_alarm is not None:
             self.monitor = builder.AddNamedSystem("change_monitor", ChangeMonitor(assessment))
             for name in inputs:
                 builder.ConnectInput(name, self.monitor.GetInputPort(name))
             builder.ExportInput(self.monitor.GetInputPort("hold"), "hold")
-        if self.monitor is not None and on_alarm == "unknown":
-            builder.Connect(
-                self.monitor.GetOutputPort("alarm"), self.evaluator.GetInputPort("alarm")
-            )
-        for system in filter(None, (self.evaluator, self.monitor)):
+            if on_alarm == "unknown":
+                alarm = self.monitor.GetOutputPort("alarm")
+                builder.Connect(alarm, self.assessor.GetInputPort("alarm"))
+        for system in filter(None, (self.assessor, self.monitor)):
             for i in range(system.num_output_ports()):
                 port = system.get_output_port(i)
                 builder.ExportOutput(port, port.get_name())
         builder.BuildInto(self)
 
+    @property
+    def reads_features(self) -> bool:
+        """Whether one of its systems reads the features."""
+        return any(system.reads_features for system in (self.assessor, self.monitor) if system)
+
     def connect_recovery(self, builder: DiagramBuilder, recovery: System) -> None:
         """Connects a `RecoveryTrigger` or `RecoverySwitch`, which heeds no alarm of the monitor.
 
-        An alarm says that Γ cannot be relied on, not that the robot falls: while it lasts, recovery
-        steps by what Γ says all the same, neither for ever nor never.
+        An alarm says that Γ cannot be relied on, not that the robot falls: during one, recovery
+        still follows Γ.
         """
-        for of_recovery, own in {"safety_probability": "probability", "belief": "belief"}.items():
-            port = self.GetOutputPort(f"{own}_without_alarm")
-            builder.Connect(port, recovery.GetInputPort(of_recovery))
+        for name, port in (("safety_probability", "probability"), ("belief", "belief")):
+            output = self.GetOutputPort(f"{port}_without_alarm")
+            builder.Connect(output, recovery.GetInputPort(name))
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
         """Takes over what an assessment adapted from this system's own has learned.
 
         The monitor begins anew: its alarm was about the robot before the adaptation.
-
-        Raises:
-            ValueError: The adapted assessment has other maps.
         """
-        self.evaluator.adopt(self.GetMutableSubsystemContext(self.evaluator, context), adapted)
+        self.assessor.adopt(self.GetMutableSubsystemContext(self.assessor, context), adapted)
         if self.monitor is not None:
             own_context = self.GetMutableSubsystemContext(self.monitor, context)
             self.monitor.adopt(own_context, adapted)
@@ -150,16 +153,17 @@ def AddSafetyAssessor(
         features: Port of the features, in the order of the assessment's ``feature_names``, such as
             that of :class:`~drake_safety.systems.assessor_inputs.AssessorInputs`; not needed if the
             assessment reads none.
-        hold: Port that is 1 while a disturbance acts that is known, such as a recovery step: the
-            monitor waits then.
-
-    Raises:
-        ValueError: The assessment reads features and there is no port for them, or a port has
-            another size than in the training episodes.
+        hold: Port that is 1 while a known disturbance acts, such as a recovery step: the monitor
+            waits then.
     """
     assessor = MonitoredSafetyAssessor(
         assessment, period_s=period_s, checks_margins=margins is not None, on_alarm=on_alarm
     )
+    if assessor.reads_features and features is None:
+        raise ValueError(
+            "AddSafetyAssessor: the assessment was fitted with features "
+            f"{assessment.info_.feature_names}; give the port that carries them"
+        )
     given = {
         "state": state,
         "desired_preview": desired_preview,
@@ -168,19 +172,16 @@ def AddSafetyAssessor(
         "hold": hold,
     }
     ports = {name: port for name, port in given.items() if port is not None}
-    is_read = assessor.evaluator.reads_features or (
-        assessor.monitor is not None and assessor.monitor.reads_features
-    )
-    if is_read and features is None:
-        raise ValueError(
-            "AddSafetyAssessor: the assessment was fitted with features "
-            f"{assessment.info_.feature_names}; give the port that carries them"
-        )
     for name, port in ports.items():
         if port.size() != (size := assessor.GetInputPort(name).size()):
+            own_names = getattr(port.get_system(), "feature_names", None)
+            lacking = ""
+            if name == "features" and own_names is not None:
+                lacks = [name for name in assessment.info_.feature_names if name not in own_names]
+                lacking = f", of which it lacks {lacks}"
             raise ValueError(
                 f"AddSafetyAssessor: port '{port.get_name()}' for {name} has size {port.size()}; "
-                f"the assessment was fitted with {size}{_lacking(name, port, assessment)}"
+                f"the assessment was fitted with {size}{lacking}"
             )
     warn_of_sampled_ports("AddSafetyAssessor", builder.GetSystems())
     if on_alarm is not None and math.isinf(assessment.detector_.alarm_level):
@@ -192,29 +193,19 @@ def AddSafetyAssessor(
 
 
 def leaf_systems(systems: Iterable[System]) -> Iterator[System]:
-    """The systems, with those of diagrams in their place."""
-    for one in systems:
-        yield from leaf_systems(one.GetSystems()) if isinstance(one, Diagram) else [one]
+    """The systems, with each diagram replaced by its leaves."""
+    for system in systems:
+        yield from leaf_systems(system.GetSystems()) if isinstance(system, Diagram) else [system]
 
 
 def warn_of_sampled_ports(who: str, systems: Iterable[System]) -> None:
     """Logs which plants show the next state to what updates at the same time."""
-    for one in leaf_systems(systems):
-        if isinstance(one, MultibodyPlant) and one.has_sampled_output_ports():
+    for system in leaf_systems(systems):
+        if isinstance(system, MultibodyPlant) and system.has_sampled_output_ports():
             _LOGGER.warning(
                 "%s: plant '%s' steps before what updates at the same time, so that "
                 "Γ sees a later state than in its episodes; make it by AddMultibodyPlant with "
                 "MultibodyPlantConfig(use_sampled_output_ports=False)",
                 who,
-                one.get_name(),
+                system.get_name(),
             )
-
-
-def _lacking(name: str, port: OutputPort, assessment: SafetyAssessment) -> str:
-    """Says which features a system that lists the names of its own lacks."""
-    own = getattr(port.get_system(), "feature_names", None)
-    if name != "features" or own is None:
-        return ""
-    return (
-        f", of which it lacks {[one for one in assessment.info_.feature_names if one not in own]}"
-    )

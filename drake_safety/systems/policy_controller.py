@@ -42,15 +42,15 @@ class PolicyController(LeafSystem):
         super().__init__()
         self.policy = policy
         self._n_q = kinematics.num_positions
-        n_a, n_p, n_j = len(policy.joints), len(policy.initial_phases), kinematics.num_joints
+        phases = policy.initial_phases
+        self._num_actions, self._num_phases = len(policy.joints), len(phases)
         self._state_port = self.DeclareVectorInputPort("plant_state", kinematics.num_states)
         self._command_port = self.DeclareVectorInputPort("command", 3)
-        standing = np.concatenate([policy.default_positions, np.zeros(n_j)])
+        standing = np.append(policy.default_positions, np.zeros(kinematics.num_joints))
+        still = [np.zeros(self._num_actions + 1), np.sin(phases), np.cos(phases), np.zeros(3)]
         self._set_point = self.DeclareDiscreteState(standing)
-        phases = policy.initial_phases
-        memory = np.concatenate([np.zeros(n_a), [0.0], np.sin(phases), np.cos(phases), np.zeros(3)])
-        self._action = self.DeclareDiscreteState(memory)
-        self._phases = self.DeclareDiscreteState(phases if n_p else np.zeros(1))
+        self._action = self.DeclareDiscreteState(np.concatenate(still))
+        self._phases = self.DeclareDiscreteState(phases if self._num_phases else np.zeros(1))
         self._applied = self.DeclareDiscreteState(3)
         self._history = self.DeclareDiscreteState(np.full(sum(policy.sizes), np.nan))
         self._memory = self.DeclareDiscreteState(policy.network.initial_memory)
@@ -59,19 +59,17 @@ class PolicyController(LeafSystem):
         self.action_names = [
             *(f"action_{name}" for name in policy.joint_names),
             "action_change",
-            *(f"{wave}_phase_{i}" for wave in ("sin", "cos") for i in range(n_p)),
+            *(f"{wave}_phase_{i}" for wave in ("sin", "cos") for i in range(self._num_phases)),
             *(f"applied_command_{axis}" for axis in ("forward", "left", "yaw")),
         ]
-        self._num_actions, self._num_phases = n_a, n_p
         declare_update(self, self._update, None, policy.parameters.period_s, offset_s)
         self.DeclareStateOutputPort("desired_joint_state", self._set_point)
         self.DeclareStateOutputPort("action_state", self._action)
         self.DeclareStateOutputPort("status", self._status)
         self.DeclareStateOutputPort("num_failures", self._num_failures)
-        size = len(self.state_of(self.CreateDefaultContext()))
         self.DeclareVectorOutputPort(
             "memory",
-            size,
+            len(self.state_of(self.CreateDefaultContext())),
             lambda context, output: output.SetFromVector(self.state_of(context)),
             {self.all_state_ticket()},
         )
@@ -89,35 +87,34 @@ class PolicyController(LeafSystem):
             context.SetDiscreteState(i, value)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        policy, n_a = self.policy, self._num_actions
-        action = context.get_discrete_state(self._action).get_value()[:n_a]
-        phases = context.get_discrete_state(self._phases).get_value()[: self._num_phases]
-        applied = context.get_discrete_state(self._applied).get_value()
-        wanted = self._command_port.Eval(context)
-        plant_state = self._state_port.Eval(context)
-        new, status = action, HELD
-        q, v = plant_state[: self._n_q], plant_state[self._n_q :]
-        if is_state(q, v, wanted):
-            applied = policy.next_command(applied, wanted)
-            seen = policy.see(q, v, applied, action, phases)
-            history = context.get_discrete_state(self._history).get_value()
-            observation = policy.observe(seen, history)
-            memory = context.get_discrete_state(self._memory).get_value()
-            found, memory = policy.act(observation, memory)
-            if np.isfinite(found).all() and np.isfinite(memory).all():
-                new, status = found, ACTING
+        policy, values = self.policy, context.get_discrete_state()
+        action = values.get_value(self._action)[: self._num_actions]
+        phases = values.get_value(self._phases)[: self._num_phases]
+        applied = values.get_value(self._applied)
+        command = self._command_port.Eval(context)
+        q, v = np.split(self._state_port.Eval(context), [self._n_q])
+        next_action, status = action, HELD
+        if is_state(q, v, command):
+            applied = policy.next_command(applied, command)
+            terms = policy.see(q, v, applied, action, phases)
+            observation = policy.observe(terms, values.get_value(self._history))
+            proposed, memory = policy.act(observation, values.get_value(self._memory))
+            if np.isfinite(proposed).all() and np.isfinite(memory).all():
+                next_action, status = proposed, ACTING
                 discrete_state.set_value(self._history, observation)
                 discrete_state.set_value(self._memory, memory)
         phases = policy.next_phases(phases, applied)
         set_point = np.zeros(2 * len(policy.default_positions))
-        set_point[: len(set_point) // 2] = policy.targets(new)
-        change = float(np.abs(new - action).max())
-        memory = np.concatenate([new, [change], np.sin(phases), np.cos(phases), applied])
+        set_point[: len(set_point) // 2] = policy.targets(next_action)
+        change = float(np.abs(next_action - action).max())
+        waves = np.sin(phases), np.cos(phases)
         discrete_state.set_value(self._set_point, set_point)
-        discrete_state.set_value(self._action, memory)
+        discrete_state.set_value(
+            self._action, np.concatenate([next_action, [change], *waves, applied])
+        )
         if self._num_phases:
             discrete_state.set_value(self._phases, phases)
         discrete_state.set_value(self._applied, applied)
         discrete_state.set_value(self._status, [status])
-        failures = context.get_discrete_state(self._num_failures).get_value()
+        failures = values.get_value(self._num_failures)
         discrete_state.set_value(self._num_failures, failures + (status == HELD))

@@ -52,10 +52,8 @@ class PushSource(LeafSystem):
                 f"push: robot '{self._robot_name}' has no body '{push.body}'; its bodies are "
                 f"{list(self._bodies)}"
             )
-        index = float(int(self._bodies[push.body].index()))
-        context.get_mutable_numeric_parameter(self._parameter).SetFromVector(
-            [index, *push.force_n, push.time_s, push.duration_s]
-        )
+        values = [self._bodies[push.body].index(), *push.force_n, push.time_s, push.duration_s]
+        context.get_mutable_numeric_parameter(self._parameter).SetFromVector(values)
 
     def push(self, context: Context) -> np.ndarray:
         """Index of the body, force [N], start and duration [s] of the push, (6,)."""

@@ -71,7 +71,7 @@ class RecoverySwitch(Diagram):
                 offset_s=offset_s,
             ),
         )
-        self.step_planner = builder.AddNamedSystem(
+        planner = self.step_planner = builder.AddNamedSystem(
             "recovery_step_planner",
             RecoveryStepPlanner(
                 kinematics,
@@ -82,35 +82,31 @@ class RecoverySwitch(Diagram):
                 num_outlook=num_outlook,
             ),
         )
-        planner = self.step_planner
-        builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
-        builder.ExportInput(trigger.GetInputPort("belief"), "belief")
-        builder.ExportInput(planner.GetInputPort("plant_state"), "plant_state")
-        builder.ExportInput(
-            planner.GetInputPort("nominal_desired_output"), "nominal_desired_output"
-        )
-        builder.Connect(
-            trigger.GetOutputPort("recovery_active"), planner.GetInputPort("recovery_active")
-        )
-        builder.Connect(
-            planner.GetOutputPort("recovery_done"), trigger.GetInputPort("recovery_done")
-        )
-        for nominal_name, name, size in (
-            ("nominal_desired_output", "desired_output", 3),
-            ("nominal_desired_preview", "desired_preview", 3 * horizon),
-            ("nominal_desired_outlook", "desired_outlook", 3 * num_outlook),
+        for source, sink, name in (
+            (trigger, planner, "recovery_active"),
+            (planner, trigger, "recovery_done"),
         ):
+            builder.Connect(source.GetOutputPort(name), sink.GetInputPort(name))
+        for system, name in (
+            (trigger, "safety_probability"),
+            (trigger, "belief"),
+            (planner, "plant_state"),
+            (planner, "nominal_desired_output"),
+        ):
+            builder.ExportInput(system.GetInputPort(name), name)
+        sizes = {"output": 3, "preview": 3 * horizon, "outlook": 3 * num_outlook}
+        for part, size in sizes.items():
+            name = f"desired_{part}"
             switch = builder.AddNamedSystem(f"{name}_switch", PortSwitch(size))
             builder.Connect(
                 trigger.GetOutputPort("port_selector"), switch.get_port_selector_input_port()
             )
             nominal = switch.DeclareInputPort("nominal")
-            recovery = switch.DeclareInputPort("recovery")
-            if name == "desired_output":
-                builder.ConnectInput(nominal_name, nominal)
+            if part == "output":
+                builder.ConnectInput(f"nominal_{name}", nominal)
             else:
-                builder.ExportInput(nominal, nominal_name)
-            builder.Connect(planner.GetOutputPort(name), recovery)
+                builder.ExportInput(nominal, f"nominal_{name}")
+            builder.Connect(planner.GetOutputPort(name), switch.DeclareInputPort("recovery"))
             builder.ExportOutput(switch.GetOutputPort("value"), name)
         for name in ("desired_foot_positions", "desired_yaw", "stance_pose"):
             builder.ExportOutput(planner.GetOutputPort(name), name)

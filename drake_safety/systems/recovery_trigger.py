@@ -28,15 +28,15 @@ class RecoveryTrigger(LeafSystem):
 
     The trigger latches: once active it stays active until ``recovery_done`` is 1. A probability
     that is not finite activates it, such as 1 minus ``fall_probability`` where no falls were
-    learned. ``belief`` (3,) tells a low probability from one that is 0 because the
-    belief is "don't know": meanwhile it must have been below Γ_thre for ``persistence_s``. An
-    impact makes a single input unlike those of training. ``port_selector`` drives a PortSwitch
-    whose ports were declared ``nominal`` first, ``recovery`` second.
+    learned. ``belief`` tells a low probability from one that is 0 because the belief is "don't
+    know", as after an impact, which makes a single input unlike those of training. Then the
+    probability must have been below Γ_thre for ``persistence_s``. ``port_selector`` drives a
+    PortSwitch whose ports were declared ``nominal`` first, ``recovery`` second.
 
     Args:
         threshold: Γ_thre in [0, 1]; the paper's value is 0.6, of the belief's first entry.
-        persistence_s: Time for which the probability must have been below Γ_thre while the belief
-            is "don't know" [s]; none by default, as in the paper.
+        persistence_s: Time that a belief of "don't know" must last to activate it [s]; none by
+            default, as in the paper.
         initial_uncertainty: μ_ini of the assessment, which says what is "don't know"; see
             :func:`~drake_safety.learning.prediction.is_unknown`.
     """
@@ -51,12 +51,13 @@ class RecoveryTrigger(LeafSystem):
         offset_s: float = 0.0,
     ):
         super().__init__()
-        who = "recovery trigger"
-        shares = {"threshold": threshold, "initial_uncertainty": initial_uncertainty}
-        for name, value in shares.items():
-            if not 0 <= value <= 1:
-                raise ValueError(f"{who}: {name} must be in [0, 1]; got {value}")
-        check_times(who, or_zero=["persistence_s"], period_s=period_s, persistence_s=persistence_s)
+        if not (0 <= threshold <= 1 and 0 <= initial_uncertainty <= 1):
+            raise ValueError(
+                "recovery trigger: threshold and initial_uncertainty must be in [0, 1]; got "
+                f"{threshold}, {initial_uncertainty}"
+            )
+        check_times("recovery trigger", or_zero=["persistence_s"], persistence_s=persistence_s)
+        declare_update(self, self._update, None, period_s, offset_s)
         self.threshold = threshold
         self._initial_uncertainty = initial_uncertainty
         self._num_waited = math.ceil(persistence_s / period_s - 1e-6)
@@ -65,11 +66,12 @@ class RecoveryTrigger(LeafSystem):
         self._done_port = self.DeclareVectorInputPort("recovery_done", 1)
         self._active = self.DeclareDiscreteState(1)
         self._num_below = self.DeclareDiscreteState(1)  # Updates below Γ_thre, up to now.
-        declare_update(self, self._update, None, period_s, offset_s)
         self.DeclareAbstractOutputPort(
             "port_selector",
             lambda: Value(InputPortIndex(1)),
-            self._calc_selector,
+            lambda context, output: output.set_value(
+                InputPortIndex(2 if self._is_active(context) else 1)
+            ),
             {self.discrete_state_ticket(self._active)},
         )
         self.DeclareStateOutputPort("recovery_active", self._active)
@@ -78,21 +80,18 @@ class RecoveryTrigger(LeafSystem):
         return bool(context.get_discrete_state(self._active).GetAtIndex(0) > 0)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        num_below = 0.0
         if self._is_active(context):
             done = self._done_port
-            active = not (done.HasValue(context) and 0 < done.Eval(context)[0] < math.inf)
-            num_below = 0.0
+            is_active = not (done.HasValue(context) and 0 < done.Eval(context)[0] < math.inf)
         else:
             is_below = not self.threshold <= self._probability_port.Eval(context)[0] < math.inf
-            num_below = context.get_discrete_state(self._num_below).GetAtIndex(0)
-            num_below = num_below + 1.0 if is_below else 0.0
+            if is_below:
+                num_below = context.get_discrete_state(self._num_below).GetAtIndex(0) + 1.0
             belief = self._belief_port
-            unknown = belief.HasValue(context) and is_unknown(
+            may_wait = belief.HasValue(context) and is_unknown(
                 belief.Eval(context), self._initial_uncertainty
             )
-            active = is_below and (not unknown or num_below > self._num_waited)
-        discrete_state.set_value(self._active, [float(active)])
+            is_active = is_below and (not may_wait or num_below > self._num_waited)
+        discrete_state.set_value(self._active, [float(is_active)])
         discrete_state.set_value(self._num_below, [num_below])
-
-    def _calc_selector(self, context: Context, output: Value) -> None:
-        output.set_value(InputPortIndex(2 if self._is_active(context) else 1))

@@ -19,7 +19,6 @@ class SafeSet(Protocol):
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Signed margins (n_c,) of a state, negative where violated."""
-        ...
 
 
 class FeaturedSafeSet(SafeSet, Protocol):
@@ -29,7 +28,6 @@ class FeaturedSafeSet(SafeSet, Protocol):
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
         """Features (n_f,) of a measured state and the preview (H, n_z)."""
-        ...
 
 
 def finite_margins(safe_set: SafeSet, q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -66,9 +64,9 @@ class SafetyMonitor(LeafSystem):
         )
         ticket = {self.input_port_ticket(self._state_port.get_index())}
         self._margins_port = self.DeclareVectorOutputPort(
-            "margins", BasicVector(len(self.constraint_names)), self._calc_margins, ticket
+            "margins", len(self.constraint_names), self._calc_margins, ticket
         )
-        self.DeclareVectorOutputPort("safe", BasicVector(1), self._calc_safe, ticket)
+        self.DeclareVectorOutputPort("safe", 1, self._calc_safe, ticket)
 
     def _calc_margins(self, context: Context, output: BasicVector) -> None:
         q, v = np.split(self._state_port.Eval(context), [self._n_q])

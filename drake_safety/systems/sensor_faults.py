@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_safety.files.reading import did_you_mean
 from drake_safety.files.schema import check_times
 from drake_safety.robots.shift import Fault
 
@@ -28,16 +27,12 @@ class SensorFaults(LeafSystem):
 
     :class:`~drake_safety.robots.shift.Fault` lists the kinds. Without faults, and before they
     start, the output has the input's bits. Delays, ``half_rate`` and ``freeze`` hold samples, which
-    are taken at multiples of the period like those of Drake's discrete systems: at a sample, a
-    delay's output is the input of ``value / period_s`` samples ago. Until the first sample is that
-    old, it is the first sample. All memory is discrete state; the seed of noise is a parameter.
+    are taken at multiples of the period like those of Drake's discrete systems. At a sample, a
+    delay's output is the input of ``value / period_s`` samples ago, or the first sample until that
+    is so old. All memory is discrete state; the seed of noise is a parameter.
 
     Args:
         period_s: Sampling period of noise and of faults that hold samples [s].
-
-    Raises:
-        ValueError: No entry has a fault's name, a swap is not of two entries, or a delay is not a
-            multiple of the period: between samples nothing is known of the signal.
     """
 
     def __init__(
@@ -60,7 +55,7 @@ class SensorFaults(LeafSystem):
         if any(num_held for num_held, _ in self._shapes):
             self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
         self._seed = self.DeclareNumericParameter(BasicVector([0.0]))
-        self.DeclareVectorOutputPort("output", BasicVector(len(names)), self._calc_output)
+        self.DeclareVectorOutputPort("output", len(names), self._calc_output)
 
     def set_seed(self, context: Context, seed: int) -> None:
         """Sets the seed of the noise in this system's Context; it is 0 by default."""
@@ -70,11 +65,10 @@ class SensorFaults(LeafSystem):
         if fault.kind != "delay":
             return int(fault.kind in ("half_rate", "freeze"))
         periods = (fault.value or 0.0) / self._period_s
-        if abs(periods - round(periods)) > 1e-6:
-            lower, upper = (n * self._period_s for n in (int(periods), int(periods) + 1))
+        if abs(periods - round(periods)) > 1e-6:  # Between samples nothing is known of the signal.
             raise ValueError(
-                f"sensor faults: a delay must be a multiple of the period {self._period_s:g} s, "
-                f"such as {lower:g} or {upper:g}; got {fault.value:g}"
+                f"sensor faults: a delay must be a multiple of the period {self._period_s:g} s; "
+                f"got {fault.value:g}"
             )
         return round(periods)
 
@@ -99,7 +93,8 @@ class SensorFaults(LeafSystem):
         return signals
 
     def _faulty(self, context: Context, index: int, x: np.ndarray, elapsed_s: float) -> np.ndarray:
-        fault, value = self._faults[index][0], self._faults[index][0].value or 0.0
+        fault = self._faults[index][0]
+        value = fault.value or 0.0
         match fault.kind:
             case "bias":
                 return x + value
@@ -116,18 +111,12 @@ class SensorFaults(LeafSystem):
                 # A generator a sample, so that the noise needs no state.
                 rng = np.random.default_rng([seed, index, self._num_samples(context) + 1])
                 return x + value * rng.standard_normal(len(x))
-        held = self._held(context, index)
-        if not len(held) or np.isnan(held).any() or self._renews(context, fault):
+        held, num_samples = self._held(context, index), self._num_samples(context)
+        if not len(held) or np.isnan(held).any():
             return x
-        return held[-1]
-
-    def _renews(self, context: Context, fault: Fault) -> bool:
-        """Whether a sensor of half the rate is sampled now."""
-        if fault.kind != "half_rate":
-            return False
-        num_samples = self._num_samples(context)
         since_s = context.get_time() - self._offset_s - num_samples * self._period_s
-        return num_samples % 2 == 0 and since_s < _TOLERANCE_S
+        is_sampled = num_samples % 2 == 0 and since_s < _TOLERANCE_S
+        return x if fault.kind == "half_rate" and is_sampled else held[-1]
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         now = context.get_time() + _TOLERANCE_S
@@ -149,16 +138,13 @@ class SensorFaults(LeafSystem):
 
 
 def _indices(fault: Fault, names: list[str]) -> list[int]:
+    def matching(entry: str) -> set[int]:
+        return {i for i, name in enumerate(names) if entry == name or re.fullmatch(entry, name)}
+
     for entry in fault.entries:
-        if not any(entry == name or re.fullmatch(entry, name) for name in names):
-            raise ValueError(
-                f"sensor faults: no entry '{entry}'{did_you_mean(entry, names)}; they are {names}"
-            )
-    indices = [
-        i
-        for i, name in enumerate(names)
-        if any(entry == name or re.fullmatch(entry, name) for entry in fault.entries)
-    ]
+        if not matching(entry):
+            raise ValueError(f"sensor faults: no entry '{entry}'; they are {names}")
+    indices = sorted(set().union(*map(matching, fault.entries)))
     if fault.kind == "swap" and len(indices) != 2:
         raise ValueError(
             f"sensor faults: a swap is of two entries; {fault.entries} are "

@@ -43,9 +43,6 @@ class StateObserver(LeafSystem):
         mirror: If given, the state s_k is that of the robot's mirror image.
         is_walking: Whether s_k is :func:`~drake_safety.control.observation.walking_state`, and z_k
             the velocity (v_x, v_y, ω_z) in the heading frame [m/s, rad/s].
-
-    Raises:
-        ValueError: The robot has no such reaching frame.
     """
 
     def __init__(
@@ -71,10 +68,10 @@ class StateObserver(LeafSystem):
         self._state_port = self.DeclareVectorInputPort("plant_state", n_x)
         self._noise_port = self.DeclareVectorInputPort("noise", 2 * kinematics.num_velocities)
         self._measured_port = self.DeclareVectorOutputPort(
-            "measured_plant_state", BasicVector(n_x), self._calc_measured
+            "measured_plant_state", n_x, self._calc_measured
         )
-        self.DeclareVectorOutputPort("state", BasicVector(len(self.state_names)), self._calc_state)
-        self.DeclareVectorOutputPort("output", BasicVector(3), self._calc_output)
+        self.DeclareVectorOutputPort("state", len(self.state_names), self._calc_state)
+        self.DeclareVectorOutputPort("output", 3, self._calc_output)
 
     def _calc_measured(self, context: Context, output: BasicVector) -> None:
         state = self._state_port.Eval(context)

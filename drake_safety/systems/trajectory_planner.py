@@ -49,9 +49,9 @@ def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndar
         duration_s: Duration of the whole plan [s].
     """
     check_times("plan", step_s=step_s)
-    seen_s = step_s * np.arange(len(preview))
+    times_s = step_s * np.arange(len(preview))
     motion = interpolate(np.zeros(1), np.ones(1), duration_s)
-    progress = motion.vector_values(seen_s.tolist()).ravel()
+    progress = motion.vector_values(times_s.tolist()).ravel()
     shape, *_ = np.linalg.lstsq(_shares(progress), preview, rcond=None)
     return shape
 
@@ -83,10 +83,10 @@ class TrajectoryPlanner(LeafSystem):
         - desired_outlook: M n_z
 
     The plan is a trajectory of 3-D positions in the stance frame S, and a parameter of the Context
-    (:meth:`set_plan`); without one, evaluation is an error. ``desired_output`` and its rate are in
-    the world; ``desired_preview`` is z*_{k:k+H}, row-major in time, in S, so that it does not
-    depend on the robot's position. ``desired_outlook`` has M samples at equal intervals from now to
-    ``outlook_s`` ahead, in S. Before its start and after its end the plan is constant. The stance
+    (:meth:`set_plan`); without one, evaluation is an error. Before its start and after its end it
+    is constant. ``desired_output`` and its rate are in the world. ``desired_preview``, z*_{k:k+H},
+    is in S, row-major in time, so that it does not depend on the robot's position. So is
+    ``desired_outlook``, M samples at equal intervals from now to ``outlook_s`` ahead. The stance
     pose [x, y, yaw] is the input if it is connected, else a parameter.
 
     Args:
@@ -95,10 +95,6 @@ class TrajectoryPlanner(LeafSystem):
         outlook_s: Duration of the outlook [s]; that of the preview by default.
         num_outlook: M, samples of the outlook.
         plan: The plan of a default Context, (n_z, 1) [m].
-
-    Raises:
-        ValueError: Horizon, step or number of samples of the outlook is too small, or the plan's
-            size is not n_z.
     """
 
     def __init__(
@@ -111,31 +107,30 @@ class TrajectoryPlanner(LeafSystem):
         plan: PiecewisePolynomial | None = None,
     ):
         super().__init__()
-        if not (horizon >= 1 and step_s > 0):
+        if not (horizon >= 1 and num_outlook >= 2):
             raise ValueError(
-                f"planner: horizon and step_s must be positive; got {horizon}, {step_s}"
+                f"planner: horizon must be positive, and num_outlook at least 2; got {horizon}, "
+                f"{num_outlook}"
             )
-        if num_outlook < 2:
-            raise ValueError(f"planner: num_outlook must be at least 2; got {num_outlook}")
         outlook_s = step_s * (horizon - 1) if outlook_s is None else outlook_s
         check_times("planner", or_zero=["outlook_s"], step_s=step_s, outlook_s=outlook_s)
-        no_plan = None, None
-        self._plan_index = self.DeclareAbstractParameter(
-            Value(no_plan if plan is None else self._with_rate(plan))
-        )
+        plan_and_rate = (None, None) if plan is None else self._with_rate(plan)
+        self._plan_index = self.DeclareAbstractParameter(Value(plan_and_rate))
         self._stance_index = self.DeclareNumericParameter(BasicVector(np.zeros(3)))
         self._stance_port = self.DeclareVectorInputPort("stance_pose", 3)
-        self.DeclareVectorOutputPort("desired_output", BasicVector(3), self._calc_output)
-        self.DeclareVectorOutputPort("desired_output_rate", BasicVector(3), self._calc_rate)
+        self.DeclareVectorOutputPort("desired_output", 3, self._calc_output)
+        self.DeclareVectorOutputPort("desired_output_rate", 3, self._calc_rate)
         for name, offsets in (
             ("desired_preview", step_s * np.arange(horizon)),
             ("desired_outlook", np.linspace(0.0, outlook_s, num_outlook)),
         ):
             self.DeclareVectorOutputPort(
                 name,
-                BasicVector(3 * len(offsets)),
-                lambda context, output, offsets=offsets: self._calc_samples(
-                    context, output, offsets
+                3 * len(offsets),
+                lambda context, output, offsets=offsets: output.SetFromVector(
+                    self.get_plan(context)
+                    .vector_values(context.get_time() + offsets)
+                    .ravel(order="F")
                 ),
                 {self.time_ticket(), self.all_parameters_ticket()},
             )
@@ -148,9 +143,6 @@ class TrajectoryPlanner(LeafSystem):
         Args:
             plan: Positions in the stance frame over simulation time, (n_z, 1) [m].
             stance_pose: [x, y, yaw] (3,) [m, rad]; unchanged by default.
-
-        Raises:
-            ValueError: The plan's size is not n_z.
         """
         value = context.get_mutable_abstract_parameter(self._plan_index)
         value.set_value(self._with_rate(plan))
@@ -198,7 +190,3 @@ class TrajectoryPlanner(LeafSystem):
             rate = derivative.value(time)
         yaw = self._stance_pose(context)[2]
         output.SetFromVector(to_world(np.array([0.0, 0.0, yaw]), rate.T).ravel())
-
-    def _calc_samples(self, context: Context, output: BasicVector, offsets: np.ndarray) -> None:
-        times = context.get_time() + offsets
-        output.SetFromVector(self.get_plan(context).vector_values(times).ravel(order="F"))

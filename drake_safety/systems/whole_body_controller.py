@@ -34,13 +34,14 @@ class WholeBodyController(LeafSystem):
         - num_failures: 1
 
     ``desired_output`` is the set point of the hand, or of the centre of mass for a controller
-    without a hand, in the world [m], and ``desired_output_rate`` its rate [m/s]; while they are
+    without a hand, in the world [m], and ``desired_output_rate`` its rate [m/s]. While they are
     not connected, the set point is that of :meth:`set_reference`, at rest. The command is a
-    discrete state, so the outputs have no direct feedthrough. ``solver_status`` is 0 if the last
-    program was solved, negative if it was not (daqp's exit flag: -1 infeasible, -4 too many
-    iterations) and ``NOT_FINITE`` if its inputs were not finite; the last command is then held,
-    initially zero torque.
-    ``num_failures`` counts the updates since the initialisation whose status was not 0.
+    discrete state, so the outputs have no direct feedthrough.
+
+    ``solver_status`` is 0 if the last program was solved, negative if it was not (daqp's exit flag:
+    -1 infeasible, -4 too many iterations) and ``NOT_FINITE`` if its inputs were not finite. The
+    last command is then held, initially zero torque. ``num_failures`` counts the updates since the
+    initialisation whose status was not 0.
 
     Args:
         hand: Name of the reaching frame that follows ``desired_output``; None when none does.
@@ -48,9 +49,6 @@ class WholeBodyController(LeafSystem):
             :func:`~drake_safety.robots.robot.actuation_matrix`; the joints' own order by
             default.
         offset_s: Time of the first update, after those of its inputs [s].
-
-    Raises:
-        ValueError: The robot has no such hand, or the matrix is of another size.
     """
 
     def __init__(
@@ -82,18 +80,14 @@ class WholeBodyController(LeafSystem):
         self._reference_index = self.DeclareAbstractParameter(Value(standing))
         self._actuation = self.DeclareDiscreteState(len(matrix))  # Torques of the actuators.
         self._status = self.DeclareDiscreteState(1)
-        self._num_failures = self.DeclareDiscreteState(1)  # Since the initialisation.
+        self._num_failures = self.DeclareDiscreteState(1)
         declare_update(self, self._update, self._initialize, period_s, offset_s)
         self.DeclareStateOutputPort("actuation", self._actuation)
         self.DeclareStateOutputPort("solver_status", self._status)
         self.DeclareStateOutputPort("num_failures", self._num_failures)
 
     def set_reference(self, context: Context, reference: WholeBodyReference) -> None:
-        """Sets stance, centre of mass, orientations and posture, such as ``model.reference(q)``.
-
-        Raises:
-            ValueError: A part of the reference does not fit the robot.
-        """
+        """Sets stance, centre of mass, orientations and posture, such as ``model.reference(q)``."""
         self.model.check_reference(reference)
         parameter = context.get_mutable_abstract_parameter(self._reference_index)
         parameter.set_value(copy.deepcopy(reference))
