@@ -194,8 +194,6 @@ class FeedbackRecorder(LeafSystem):
             cause="" if is_safe else self.info.constraint_names[violated(arrays["margins"][-1])],
         )
         Episodes(self.info, [episode])  # Checks the shapes.
-        window = RecordedWindow(
-            episode=episode, start_time_s=float(times_s[0]), **recording.start
-        )
+        window = RecordedWindow(episode=episode, start_time_s=float(times_s[0]), **recording.start)
         windows = (*recording.windows, window)[-_MOST_WINDOWS:]
         return Recording(windows=windows, num_finished=recording.num_finished + 1)
