@@ -24,6 +24,7 @@ from drake_safety.cli.training_folder import (
     episodes_folder,
 )
 from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
+from drake_safety.evaluation.results import Key
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import Prediction, SafetyAssessment
 from drake_safety.learning.assessment_parameters import AssessmentParameters
@@ -90,9 +91,9 @@ def adaptation(
         release=release,
         workers=workers,
         out=folder,
-        plotted=lambda row: (
-            row.metric in ("brier", "auc", "unsafe_recall")
-            and row.set in ("sharpened.calibrated", "paper.grid")
+        plotted=lambda key: (
+            key[0] in ("sharpened.calibrated", "paper.grid")
+            and key[2] in ("brier", "auc", "unsafe_recall")
         ),
     ) as study:
         loaded, stages = study.scenario, study.stages
@@ -111,10 +112,10 @@ def adaptation(
                 Pool(feedback=one, test=TestSet.of(episodes, prior.settings.shortest))
                 for one, episodes in zip(sets, fresh, strict=True)
             ]
-            study.add(mode, pool_estimates(prior, judged, baselines=baselines, progress=stages))
+            study.rows |= pool_estimates(prior, judged, baselines=baselines, progress=stages)
             if mode == MODES[0] and scratch:
                 nominal = load_episodes(episodes_folder(learned.path))
-                study.add("boosting", boosting_estimates(nominal, judged, stages))
+                study.rows |= boosting_estimates(nominal, judged, stages)
         study.entries |= {
             "variation": variation,
             "pools": pools,
@@ -202,7 +203,7 @@ def pool_estimates(
     sizes: Sequence[int] = SIZES,
     baselines: Mapping[str, SafetyAssessment] | None = None,
     progress: StageProgress | None = None,
-) -> dict[str, Estimate]:
+) -> dict[Key, Estimate]:
     """Evaluates an assessment before and after feedback, on independent pools.
 
     Orders of one pool would vary less than other feedback of the same robot does.
@@ -239,19 +240,21 @@ def pool_estimates(
                 progress(stage, i * len(sizes) + k + 1, len(pools) * len(sizes))
     num_test = sum(len(pool.test.episodes) for pool in pools)
     everything = [one for pool in pools for one in pool.feedback]
-    estimates = {"gap": proportion(sum(one.differs for one in everything), len(everything))}
+    gap = proportion(sum(one.differs for one in everything), len(everything))
+    mode = assessment.parameters.mode
+    estimates: dict[Key, Estimate] = {(mode, "", "gap"): gap}
     for form in found["prior"][0]:
         for who, of_pools in found.items():
             for metric in of_pools[0][form]:
                 values = [one[form][metric] for one in of_pools]
-                estimates[f"{form}.{who}.{metric}"] = Estimate(
+                estimates[f"{mode}.{form}", who, metric] = Estimate(
                     float(np.mean(values)), min(values), max(values), num_test
                 )
         brier = {who: np.array([p[form]["brier"] for p in ps]) for who, ps in found.items()}
         before = brier["prior"]
         for who in (f"adapted {size}" for size in sizes):
             won = proportion(int(np.sum(brier[who] < before)), len(pools))
-            estimates[f"{form}.{who}.pools_won"] = won
+            estimates[f"{mode}.{form}", who, "pools_won"] = won
     return estimates
 
 
@@ -260,7 +263,7 @@ def boosting_estimates(
     pools: Sequence[Pool],
     progress: StageProgress,
     sizes: Sequence[int] = _BOOSTED_SIZES,
-) -> dict[str, Estimate]:
+) -> dict[Key, Estimate]:
     """Gradient boosting before feedback, on the feedback alone, and on it and the training.
 
     Returns:
@@ -285,7 +288,7 @@ def boosting_estimates(
             found.setdefault(who, []).append(_metrics(unsafe, segments.is_unsafe))
     num_test = sum(len(pool.test.episodes) for pool in pools)
     return {
-        f"{who}.{metric}": Estimate(
+        ("boosting", who, metric): Estimate(
             float(np.mean(values)), float(min(values)), float(max(values)), num_test
         )
         for who, of_pools in found.items()

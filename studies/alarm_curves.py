@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 
 from drake_safety.evaluation import figure_style as style
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, rate_per_hour
+from drake_safety.evaluation.results import Key
 from drake_safety.simulation.motion import Motion
 from studies.alarms import Alarm, equal_share_threshold
 
@@ -156,7 +157,7 @@ def _values(alarm: Alarm, motion: Motion) -> np.ndarray:
 
 def equal_cost_estimates(
     watched: Mapping[str, Sequence[Watched]], ours: Sequence[str], rivals: Sequence[str]
-) -> dict[str, Estimate]:
+) -> dict[Key, Estimate]:
     """Shares of falls announced at equal cost, their differences, and false alarms an hour.
 
     Intervals are over pushed motions, those of differences paired.
@@ -167,7 +168,7 @@ def equal_cost_estimates(
         ours: The methods that are compared.
         rivals: Those they are compared with.
     """
-    estimates: dict[str, Estimate] = {}
+    estimates: dict[Key, Estimate] = {}
     for cost in COSTS:
         for share in SHARES:
             at = f"at_{100 * share:.0f}"
@@ -177,17 +178,21 @@ def equal_cost_estimates(
             }
             for name, seeds in watched.items():
                 each = statistics[name]
-                key = f"alarm.{cost}.{name}"
-                estimates[f"{key}.announced_{at}"] = _over_motions(seeds[0], each)
+                key = f"alarm.{cost}", name
+                estimates[*key, f"announced_{at}"] = _over_motions(seeds[0], each)
                 counts = [one.num_false_alarms(one.threshold(cost, share)) for one in seeds]
-                estimates[f"{key}.false_alarms_per_hour_{at}"] = rate_per_hour(
+                estimates[*key, f"false_alarms_per_hour_{at}"] = rate_per_hour(
                     float(np.mean(counts)), seeds[0].undisturbed_s, seeds[0].num_undisturbed
                 )
                 for i, one in enumerate(each if len(each) > 1 else ()):
-                    estimates[f"{key}_{i}.announced_{at}"] = _over_motions(seeds[0], [one])
+                    estimates[key[0], f"{name}_{i}", f"announced_{at}"] = _over_motions(
+                        seeds[0], [one]
+                    )
             for own, rival in itertools.product(ours, rivals):
-                key = f"alarm.{cost}.{own}_minus_{rival}.announced_{at}"
-                estimates[key] = _over_motions(watched[own][0], statistics[own], statistics[rival])
+                key = f"alarm.{cost}", f"{own}_minus_{rival}"
+                estimates[*key, f"announced_{at}"] = _over_motions(
+                    watched[own][0], statistics[own], statistics[rival]
+                )
     return estimates
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, auc, median, proportion, rate_per_hour
+from drake_safety.evaluation.results import Key
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.evaluation.tables import Column
@@ -169,7 +170,7 @@ def evaluate_alarms(
     *,
     false_alarm_share: float = FALSE_ALARM_SHARE,
     num_rows: int = NUM_ROWS,
-) -> dict[str, Estimate]:
+) -> dict[Key, Estimate]:
     """Compares alarms at the same share of false alarms on calibration motions.
 
     Motions that leave the safe set before the push are left out.
@@ -188,8 +189,8 @@ def evaluate_alarms(
     left = [motion for motion in judged if motion.has_left]
     until_s = np.array([motion.leave_time_s - motion.push_time_s for motion in left])
     estimates = {
-        "monitoring.motions.leave_safe_set": proportion(len(left), len(judged)),
-        "monitoring.motions.push_to_leaving_s": median(until_s),
+        ("monitoring", "motions", "leave_safe_set"): proportion(len(left), len(judged)),
+        ("monitoring", "motions", "push_to_leaving_s"): median(until_s),
     }
     for alarm in alarms:
         lowest = np.array([lowest_value(m, persisting(alarm.value(m), num_rows)) for m in calm])
@@ -199,7 +200,7 @@ def evaluate_alarms(
         found = _alarm_estimates(judged, values, threshold)
         found["auc"] = auc(score, is_unsafe, index)
         found["threshold"] = Estimate.exact(threshold, len(calm))
-        estimates |= {f"monitoring.{alarm.name}.{key}": estimate for key, estimate in found.items()}
+        estimates |= {("monitoring", alarm.name, key): one for key, one in found.items()}
     return estimates
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, area_under_curve, mean
+from drake_safety.evaluation.results import Key
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.seeds import UsedEpisodes
@@ -233,7 +234,7 @@ def _mean_of(statistics: Sequence[Callable[[np.ndarray], float]], weight: np.nda
 
 def classifier_differences(
     gamma: Scorer, classifiers: Sequence[Scorer], test: Episodes
-) -> dict[str, Estimate]:
+) -> dict[Key, Estimate]:
     """Γ minus the classifiers of each kind, on every row and on the first rows of fresh episodes.
 
     The AUC and the Brier score of a kind are means over its seeds; intervals are of paired
@@ -254,11 +255,11 @@ def classifier_differences(
         for kind in KINDS:
             others = [one[rows] for name, one in scores.items() if name.startswith(kind)]
             each = [auc_difference_of(own, other, label) for other in others]
-            found[f"difference.{place}.{kind}.auc"] = Bootstrap().over_episodes(
+            found[f"difference.{place}", kind, "auc"] = Bootstrap().over_episodes(
                 partial(_mean_of, each), episode
             )
             error = np.mean([(other - label) ** 2 for other in others], axis=0)
-            found[f"difference.{place}.{kind}.brier"] = mean(
+            found[f"difference.{place}", kind, "brier"] = mean(
                 (own - label) ** 2 - error, episode, bootstrap=Bootstrap()
             )
     return found

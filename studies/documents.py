@@ -65,7 +65,7 @@ def render(kind: str, results: Results, **more: Any) -> str:
     environment.globals |= {
         "r": results,
         "entries": results.entries,
-        "has": lambda prefix: any(key.startswith(prefix) for key in results),
+        "has": lambda *first: any(key[: len(first)] == first for key in results),
         "label_of": label_of,
         "table": lambda corner, rows, columns: _table(results, corner, rows, columns),
         "verdicts": lambda set, corner: verdict_table(results, set, corner=corner),
@@ -87,7 +87,7 @@ def today(results: Results, command: str) -> str:
     command = re.sub(r" --other-hand \d+", "", command)
     if " --shifts " in command:
         return command.replace("python -m studies ", "drake-safety ")
-    is_beside = any(row.method == "gradient_boosting" for row in results.values())
+    is_beside = any(method == "gradient_boosting" for _, method, _ in results)
     old = "drake-safety evaluate "
     return command.replace(old, "python -m studies evaluate ") if is_beside else command
 
@@ -99,7 +99,7 @@ def _column(key: str, title: str, format: str = "share") -> Column:
 def _table(
     results: Results,
     corner: str,
-    rows: Mapping[str, str | Sequence[str]],
+    rows: Mapping[str, tuple[str, str] | Sequence[tuple[str, str]]],
     columns: Sequence[tuple[str, ...]],
 ) -> str:
     """Markdown of a table; rows and columns without any result are left out.
@@ -112,9 +112,9 @@ def _table(
     """
     made = [_column(*column) for column in columns]
     cells = []
-    for label, prefixes in rows.items():
-        of_columns = [prefixes] * len(made) if isinstance(prefixes, str) else prefixes
-        keys = [f"{p}.{column.key}" for p, column in zip(of_columns, made, strict=True)]
+    for label, places in rows.items():
+        of_columns = [places] * len(made) if isinstance(places, tuple) else places
+        keys = [(*pair, column.key) for pair, column in zip(of_columns, made, strict=True)]
         if any(key in results for key in keys):
             cells.append(Row(label, label, [results.get(key) for key in keys]))
     shown = [i for i in range(len(made)) if any(row.estimates[i] for row in cells)]

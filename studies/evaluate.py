@@ -30,7 +30,7 @@ from drake_safety.cli.evaluate import (
 from drake_safety.cli.training_folder import check_writable, episodes_folder
 from drake_safety.diagrams.balancing.throws import run_throws
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.results import Key, Results
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
@@ -132,7 +132,7 @@ def _alarm_estimates(
     classifiers: Sequence[Scorer],
     calibration: Sequence[Motion],
     test: Sequence[Motion],
-) -> dict[str, Estimate]:
+) -> dict[Key, Estimate]:
     if all(motion.has_left for motion in calibration):
         return {}  # Thresholds need motions that stay safe.
     watched = loop.watched_features if isinstance(loop, CanFall) else {}

@@ -6,7 +6,6 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -60,12 +59,12 @@ def _shifts(name: str, folder: Path) -> Figure:
     """How often Γ is sure and wrong and says "don't know", and when the monitor alarms."""
     results = Results.read(_ROOT / f"docs/results/{name}.json")
     shown = ("gamma", "confident_error"), ("gamma", "unknown"), ("monitor", "delay_s")
-    rows = [
-        replace(row, set="", method=row.set.removeprefix("shifts."))
-        for method, metric in shown
-        for row in results.select(method=method, metric=metric)
-        if row.set.startswith("shifts.")
-    ]
+    rows = {
+        ("", set.removeprefix("shifts."), metric): results[set, method, metric]
+        for pair in shown
+        for set, method, metric in results
+        if (method, metric) == pair and set.startswith("shifts.")
+    }
     return interval_figure(rows)
 
 
@@ -73,7 +72,7 @@ def _adaptation_study(folder: Path) -> Figure:
     results = Results.read(_ROOT / "docs/results/adaptation/laikago-payload-pools.json")
     kinds = "sharpened.calibrated", "paper.grid"
     metrics = "brier", "auc", "unsafe_recall"
-    rows = [row for row in results.values() if row.set in kinds and row.metric in metrics]
+    rows = {k: one for k, one in results.items() if k[0] in kinds and k[2] in metrics}
     return interval_figure(rows)
 
 

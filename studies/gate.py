@@ -22,7 +22,7 @@ from drake_safety.cli.gate import changed_loop
 from drake_safety.evaluation.failure_rate import in_turns, strata_of, stratified_rate
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.paired_test import betting_log_e
-from drake_safety.evaluation.shifts import PlantShift, shifted_scenario
+from drake_safety.evaluation.shifts import shifted_scenario
 from drake_safety.learning.seeds import GATE
 from drake_safety.learning.segments import Episodes
 from drake_safety.robots.shift import JointShift, Shift
@@ -61,12 +61,14 @@ def gate(
         real = simulated(study, variation, 1.0, episodes)
         for effort in map(float, filter(None, efforts.split(","))):
             candidate = failures(simulated(study, variation, effort, episodes))
-            study.add(f"effort {effort:g}", rows(failures(real), candidate, replays))
+            found = rows(failures(real), candidate, replays)
+            study.rows |= {(f"effort {effort:g}", *key): one for key, one in found.items()}
         if shipped in assessed_scenarios():
             gamma = load_assessment(shipped)
             inputs = zip(*(one.first_inputs for one in real), strict=True)
             score = 1.0 - gamma.predict(*map(np.array, inputs)).probability
-            study.add("rate", rate_rows(score, failures(real), replays))
+            found = rate_rows(score, failures(real), replays)
+            study.rows |= {("rate", *key): one for key, one in found.items()}
 
 
 def simulated(study: Study, variation: str, effort: float, number: int) -> Episodes:
@@ -74,7 +76,7 @@ def simulated(study: Study, variation: str, effort: float, number: int) -> Episo
     shift = Shift(joints={".*": JointShift(effort_scale=effort)})
     plant = replace(study.scenario.variation(variation), shift=shift if effort < 1 else None)
     name = f"effort {effort:g}"
-    shifted = shifted_scenario(study.scenario, name, PlantShift(kind="plant", variation=plant))
+    shifted = shifted_scenario(study.scenario, name, plant)
     options = study.scenario.options_for("pairs", variation)
     return run_episodes(
         shifted,
@@ -93,7 +95,9 @@ def failures(episodes: Episodes) -> np.ndarray:
     return np.array([not one.is_safe for one in episodes], dtype=int)
 
 
-def rows(baseline: np.ndarray, candidate: np.ndarray, num_replays: int) -> dict[str, Estimate]:
+def rows(
+    baseline: np.ndarray, candidate: np.ndarray, num_replays: int
+) -> dict[tuple[str, str], Estimate]:
     """The rows of one candidate, from outcomes of pairs, (N,) of 0 and 1."""
     rng, size = np.random.default_rng(0), (num_replays, _LOOKS[-1])
     index, other = rng.integers(len(baseline), size=(2, *size))
@@ -101,25 +105,27 @@ def rows(baseline: np.ndarray, candidate: np.ndarray, num_replays: int) -> dict[
     swapped = apart[index] * rng.choice([-1, 1], size)
     either = first_looks(swapped, 0.0)
     found = {
-        "baseline.failures": proportion(int(baseline.sum()), len(baseline)),
-        "candidate.failures": proportion(int(candidate.sum()), len(candidate)),
-        "only one.failures": proportion(int(np.abs(apart).sum()), len(apart)),
-        "equal loops.false_worse": _share_known(either),
+        ("baseline", "failures"): proportion(int(baseline.sum()), len(baseline)),
+        ("candidate", "failures"): proportion(int(candidate.sum()), len(candidate)),
+        ("only one", "failures"): proportion(int(np.abs(apart).sum()), len(apart)),
+        ("equal loops", "false_worse"): _share_known(either),
     }
     for end, sign in {"low": 1, "high": -1}.items():
         known = first_looks(sign * apart[index], float(sign * apart.mean()))
-        found[f"{end} end.misses"] = _share_known(known)
+        found[f"{end} end", "misses"] = _share_known(known)
     alone = candidate[other] - baseline[index]
     for name, differences in {"paired": apart[index], "unpaired": alone}.items():
         known = first_looks(differences, 0.0)
-        found[f"{name}.pairs_until_worse"] = median(known)
-        found[f"{name}.power"] = _share_known(known)
+        found[name, "pairs_until_worse"] = median(known)
+        found[name, "power"] = _share_known(known)
     number = batch_size(float(baseline.mean()), float(candidate.mean()))
-    found["batch.pairs_until_worse"] = Estimate.exact(number, len(baseline))
+    found["batch", "pairs_until_worse"] = Estimate.exact(number, len(baseline))
     return found
 
 
-def rate_rows(score: np.ndarray, failed: np.ndarray, num_replays: int) -> dict[str, Estimate]:
+def rate_rows(
+    score: np.ndarray, failed: np.ndarray, num_replays: int
+) -> dict[tuple[str, str], Estimate]:
     """Rows of failure rates that are estimated with Γ's scores of real starts, (N,)."""
     rng, truth, found = np.random.default_rng(0), float(failed.mean()), []
     for _ in range(num_replays):
@@ -134,12 +140,12 @@ def rate_rows(score: np.ndarray, failed: np.ndarray, num_replays: int) -> dict[s
     error = values.std() / math.sqrt(num_replays)
     ratio = truth * (1.0 - truth) / _ROLLOUTS / values.var()
     return {
-        "real episodes.failures": proportion(int(failed.sum()), len(failed)),
-        "gamma.failures": Estimate(
+        ("real episodes", "failures"): proportion(int(failed.sum()), len(failed)),
+        ("gamma", "failures"): Estimate(
             values.mean(), values.mean() - 2 * error, values.mean() + 2 * error, num_replays
         ),
-        "gamma.misses": proportion(misses, num_replays),
-        "gamma.variance_ratio": Estimate.exact(ratio, num_replays),
+        ("gamma", "misses"): proportion(misses, num_replays),
+        ("gamma", "variance_ratio"): Estimate.exact(ratio, num_replays),
     }
 
 

@@ -24,7 +24,7 @@ from drake_safety.cli.training_folder import check_fresh, load_assessment, run_f
 from drake_safety.evaluation.figure_style import label_of, save, spoken
 from drake_safety.evaluation.interval_figure import interval_figure
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.results import Result, Results
+from drake_safety.evaluation.results import Key, Results
 from drake_safety.evaluation.tables import Column, Table, rows_of
 from drake_safety.files.atomic import replacing
 from drake_safety.files.progress import StageProgress
@@ -57,7 +57,7 @@ class Study:
         workers: Number of worker processes; None for one a core.
         stages: Shows progress.
         entries: What the file says besides rows.
-        rows: The rows, by set, method and metric: "segments.paper.auc".
+        rows: The rows, by set, method and metric.
     """
 
     name: str
@@ -67,11 +67,11 @@ class Study:
     workers: int | None
     stages: StageProgress
     entries: dict[str, Any] = field(default_factory=dict)
-    rows: dict[str, Estimate] = field(default_factory=dict)
+    rows: dict[Key, Estimate] = field(default_factory=dict)
 
-    def add(self, prefix: str, estimates: Mapping[str, Estimate]) -> None:
-        """Adds rows by the part of their keys after the prefix, which is set and method."""
-        self.rows |= {f"{prefix}.{metric}": one for metric, one in estimates.items()}
+    def add(self, set: str, method: str, estimates: Mapping[str, Estimate]) -> None:
+        """Adds the rows of a method by metric."""
+        self.rows |= {(set, method, metric): one for metric, one in estimates.items()}
 
     @property
     def seeds(self) -> dict[str, int]:
@@ -111,7 +111,7 @@ def open_study(
     release: bool = False,
     workers: int | None = None,
     out: Path | None = None,
-    plotted: Callable[[Result], bool] | None = None,
+    plotted: Callable[[Key], bool] | None = None,
 ) -> Iterator[Study]:
     """Runs a study in the block; afterwards its rows are written, printed and plotted.
 
@@ -123,7 +123,7 @@ def open_study(
         release: Whether `RELEASE` is added to it.
         workers: Number of worker processes; None for one a core.
         out: Folder of the files; that of the training by default.
-        plotted: Whether a row is in the plot; there is none by default.
+        plotted: Whether the row of a key is in the plot; there is none by default.
     """
     loaded, seed = load_scenario(scenario), seed + RELEASE * release
     with open_stages() as stages:
@@ -135,14 +135,16 @@ def open_study(
     file.parent.mkdir(parents=True, exist_ok=True)
     results = study.results()
     results.write(file)
-    for set_ in dict.fromkeys(row.set for row in results.values()):
-        rows = results.select(set=set_)
-        columns = [Column(key, spoken(key)) for key in dict.fromkeys(row.metric for row in rows)]
-        labels = {f"{set_}.{row.method}".strip("."): label_of(row.method) for row in rows}
+    for set_ in dict.fromkeys(key[0] for key in results):
+        keys = [key for key in results if key[0] == set_]
+        columns = [
+            Column(metric, spoken(metric)) for metric in dict.fromkeys(key[2] for key in keys)
+        ]
+        labels = {key[:2]: label_of(key[1]) for key in keys}
         table = Table(corner=set_, columns=columns, rows=rows_of(results, labels, columns))
         console.print(table.to_rich())
     say("figures", file)
-    drawn = list(filter(plotted, results.values())) if plotted else []
+    drawn = {key: one for key, one in results.items() if plotted and plotted(key)}
     for picture in save(interval_figure(drawn), file) if drawn else ():
         say("picture", picture)
 

@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption
 from drake_safety.cli.training_folder import fresh_episodes_folder
-from drake_safety.evaluation.monitor_study import (
+from drake_safety.evaluation.metrics import Estimate, proportion
+from drake_safety.evaluation.shift_study import (
+    Minute,
+    error_estimates,
     false_alarms,
+    last_rows,
     monitor_estimates,
     monitored,
     run_monitored,
+    safety_probability,
 )
-from drake_safety.evaluation.shift_study import assessment_judge
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
 from drake_safety.learning import calibration
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.causes import is_outside
 from drake_safety.learning.seeds import FRESH_MOTION, SHIFTS
+from drake_safety.learning.segments import Episode
 from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import Scenario
 from studies.harness import Arrays, ReleaseOption, fingerprint, kept, open_study
-
-_NOMINAL = "nominal"
 
 
 def monitor(
@@ -50,7 +56,7 @@ def monitor(
         work = {}
         for name, shift in shifts.items():
             options = {**loaded.options_for("evaluation"), **shift.options}
-            shifted = shifted_scenario(loaded, name, shift)
+            shifted = shifted_scenario(loaded, name, shift.variation)
             work[name.replace(" ", "_")] = (shifted, name, motions, seed, gamma, options)
         key = fingerprint(
             loaded.simulation_hash(), motions, seed, *map(str, gamma.detector_.limits.ravel())
@@ -63,7 +69,7 @@ def monitor(
             progress=partial(study.stages, "shifts"),
         )
         for name, arrays in found.items():
-            study.add(f"monitor.{name}", _plain(monitor_estimates(arrays, promise)))
+            study.add("monitor", name, _estimates(arrays, promise))
         if hours:
             usual = run_motions(
                 loaded,
@@ -74,15 +80,34 @@ def monitor(
                 progress=partial(study.stages, "hours of nominal motion"),
             )
             alarms = {"false_alarms_per_hour": false_alarms(usual, gamma.detector_)}
-            study.add(f"monitor.{_NOMINAL}", alarms)
+            study.add("monitor", "nominal", alarms)
         study.entries |= {
             "monitor": gamma.detector_.describe(),
             "kinds": {name.replace(" ", "_"): shift.kind for name, shift in shifts.items()},
         }
 
 
-def _plain(estimates: dict[str, Any]) -> dict[str, Any]:
-    return {name.removeprefix("monitor."): estimate for name, estimate in estimates.items()}
+def _estimates(arrays: Arrays, promise: calibration.Calibration | None) -> dict[str, Estimate]:
+    """What `evaluate --shifts` says of the monitor, and the same without it.
+
+    Of the motions that leave the safe set, "silent_missed" are those whose probability is never
+    below the threshold of a promise for motions; "missed" are those without an alarm until then.
+    """
+    fields = (arrays[name].tolist() for name in Minute._fields)
+    minutes = [Minute(*one) for one in zip(*fields, strict=True)]
+    silent = error_estimates([one.silent_error_s for one in minutes])
+    num_leaving = int(np.isfinite(arrays["leave_s"]).sum())
+    estimates = monitor_estimates(minutes) | {
+        "leaves": proportion(num_leaving, len(minutes)),
+        **{f"silent_{metric}": one for metric, one in silent.items()},
+    }
+    num_unsafe = int(np.isfinite(arrays["least"]).sum())
+    if promise is not None and num_unsafe:
+        is_missed = arrays["least"] >= promise.threshold
+        is_late = arrays["alarm_s"] > arrays["leave_s"]
+        estimates["silent_missed"] = proportion(int(is_missed.sum()), num_unsafe)
+        estimates["missed"] = proportion(int((is_missed & is_late).sum()), num_unsafe)
+    return estimates
 
 
 def _watched(
@@ -102,4 +127,16 @@ def _watched(
         options=options,
         num_workers=1,
     )
-    return monitored(motions, assessment, assessment_judge(assessment))
+    minutes = zip(*monitored(motions, assessment), strict=True)
+    arrays = dict(zip(Minute._fields, map(np.array, minutes), strict=True))
+    return arrays | {"least": np.array([_least(one, assessment) for one in motions])}
+
+
+def _least(motion: Episode, assessment: SafetyAssessment) -> float:
+    """The least probability inside the safe set before leaving it; NaN if it stays."""
+    if motion.is_safe:
+        return math.nan
+    every = max(1, round(assessment.info_.step_s / assessment.detector_.step_s))
+    rows = last_rows(motion, assessment, every)
+    rows = rows[~is_outside(motion.margins[rows])]
+    return float(min(np.nan_to_num(safety_probability(assessment, motion, rows)), default=0.0))

@@ -16,6 +16,7 @@ from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOp
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate, median, proportion
+from drake_safety.evaluation.results import Key
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
@@ -191,7 +192,7 @@ def _in_logits(scorer: Scorer) -> Alarm:
     return Alarm(name=alarm.name, value=value)
 
 
-def push_estimates(pushed: Sequence[Motion], push_s: float) -> dict[str, Estimate]:
+def push_estimates(pushed: Sequence[Motion], push_s: float) -> dict[Key, Estimate]:
     """Share of pushed motions with a fall, and its time after the push.
 
     Args:
@@ -202,25 +203,27 @@ def push_estimates(pushed: Sequence[Motion], push_s: float) -> dict[str, Estimat
     fallen = [motion for motion in judged if motion.has_fallen]
     until = np.array([motion.fall_time_s - motion.push_time_s for motion in fallen])
     return {
-        "pushes.fallen": proportion(len(fallen), len(judged)),
-        "pushes.push_to_fall_s": median(until),
-        "pushes.fallen_soon": proportion(int(np.sum(until < push_s + EARLY_S)), len(fallen)),
+        ("pushes", "", "fallen"): proportion(len(fallen), len(judged)),
+        ("pushes", "", "push_to_fall_s"): median(until),
+        ("pushes", "", "fallen_soon"): proportion(
+            int(np.sum(until < push_s + EARLY_S)), len(fallen)
+        ),
     }
 
 
-def tour_estimates(tours: Sequence[Motion]) -> dict[str, Estimate]:
+def tour_estimates(tours: Sequence[Motion]) -> dict[Key, Estimate]:
     """Share of undisturbed tours without a fall, and the hours of those that stay safe."""
     calm = [motion for motion in tours if not motion.has_left]
     hours = sum(float(motion.time_s[-1]) for motion in calm) / 3600.0
     return {
-        "tours.without_fall": proportion(sum(not m.has_fallen for m in tours), len(tours)),
-        "tours.hours": Estimate.exact(hours, len(calm)),
+        ("tours", "", "without_fall"): proportion(sum(not m.has_fallen for m in tours), len(tours)),
+        ("tours", "", "hours"): Estimate.exact(hours, len(calm)),
     }
 
 
 def recovery_estimates(
     branch: str, alone: Sequence[Motion], again: Sequence[Motion]
-) -> dict[str, Estimate]:
+) -> dict[Key, Estimate]:
     """Share of falls saved by a branch, and impact speeds of those that it does not save.
 
     Args:
@@ -230,9 +233,9 @@ def recovery_estimates(
     """
     not_saved = [(a, b) for a, b in zip(alone, again, strict=True) if b.has_fallen]
     return {
-        f"recovery.{branch}.saved": proportion(len(alone) - len(not_saved), len(alone)),
-        f"recovery.{branch}.impact_m_s": median(np.array([_impact(b) for _, b in not_saved])),
-        f"recovery.{branch}.impact_without_m_s": median(
+        ("recovery", branch, "saved"): proportion(len(alone) - len(not_saved), len(alone)),
+        ("recovery", branch, "impact_m_s"): median(np.array([_impact(b) for _, b in not_saved])),
+        ("recovery", branch, "impact_without_m_s"): median(
             np.array([_impact(a) for a, _ in not_saved])
         ),
     }
@@ -248,7 +251,7 @@ def guard_estimates(
     unguarded: Sequence[Motion],
     guarded: Sequence[Motion],
     inside: Sequence[Motion],
-) -> dict[str, Estimate]:
+) -> dict[Key, Estimate]:
     """Falls with and without the guard, and the share of time in which it changes a command.
 
     Args:
@@ -258,20 +261,24 @@ def guard_estimates(
     """
     kept = np.array([float(np.mean(motion["guard_active"] == 0)) for motion in inside])
     estimates = {
-        "guard.falls_without": proportion(sum(m.has_fallen for m in unguarded), len(unguarded)),
-        "guard.falls_with": proportion(sum(m.has_fallen for m in guarded), len(guarded)),
-        "guard.left_without": proportion(sum(m.has_left for m in unguarded), len(unguarded)),
-        "guard.left_with": proportion(sum(m.has_left for m in guarded), len(guarded)),
+        ("guard", "", "falls_without"): proportion(
+            sum(m.has_fallen for m in unguarded), len(unguarded)
+        ),
+        ("guard", "", "falls_with"): proportion(sum(m.has_fallen for m in guarded), len(guarded)),
+        ("guard", "", "left_without"): proportion(
+            sum(m.has_left for m in unguarded), len(unguarded)
+        ),
+        ("guard", "", "left_with"): proportion(sum(m.has_left for m in guarded), len(guarded)),
     }
     if len(inside):
         low, high = np.quantile(kept, [0.025, 0.975])
-        estimates["guard.unchanged_inside"] = Estimate(
+        estimates["guard", "", "unchanged_inside"] = Estimate(
             float(kept.mean()), float(low), float(high), len(inside)
         )
     return estimates
 
 
-def speed_estimates(ours: Sequence[Motion], theirs: Sequence[Motion]) -> dict[str, Estimate]:
+def speed_estimates(ours: Sequence[Motion], theirs: Sequence[Motion]) -> dict[Key, Estimate]:
     """Difference of mean planar velocities between two engines, over the same commands.
 
     Args:
@@ -284,4 +291,4 @@ def speed_estimates(ours: Sequence[Motion], theirs: Sequence[Motion]) -> dict[st
         if not (a.has_fallen or b.has_fallen):
             pairs.append((a["output"][:rows].mean(axis=0), b["output"][:rows].mean(axis=0)))
     difference = np.array([np.linalg.norm((a - b)[:2]) for a, b in pairs])
-    return {"speed.difference_to_mujoco_m_s": median(difference)}
+    return {("speed", "", "difference_to_mujoco_m_s"): median(difference)}

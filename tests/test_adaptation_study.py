@@ -62,18 +62,19 @@ def test_pools_differ(assessment, judged):
     found = pool_estimates(
         assessment, pools, sizes=(10, 30, 40), baselines={"other": assessment.adapt(worse())}
     )
-    assert not any("adapted 40" in key for key in found)
-    estimate = found["calibrated.adapted 30.brier"]
+    assert not any(method == "adapted 40" for _, method, _ in found)
+    form = f"{assessment.parameters.mode}.calibrated"
+    estimate = found[form, "adapted 30", "brier"]
     by_hand = [
         scores(assessment.adapt(pool.feedback[:30]), pool.test)["calibrated"]["brier"]
         for pool in pools
     ]
     assert (estimate.low, estimate.high) == (min(by_hand), max(by_hand))
     before = [scores(assessment, pool.test)["calibrated"]["brier"] for pool in pools]
-    won = found["calibrated.adapted 30.pools_won"]
+    won = found[form, "adapted 30", "pools_won"]
     assert won.value == np.mean(np.array(by_hand) < before)
     differing = sum(one.differs for pool in pools for one in pool.feedback)
-    assert found["gap"].value == pytest.approx(differing / 70)
+    assert found[assessment.parameters.mode, "", "gap"].value == pytest.approx(differing / 70)
     with pytest.raises(ValueError, match="only 30 pairs of episodes"):
         pool_estimates(assessment, pools, sizes=(41,))
 
@@ -82,8 +83,10 @@ def test_boosting_learns_from_the_feedback_too(judged):
     nominal, pairs = make_episodes(60, seed=12, noise=0.002), worse()
     pools = [Pool(feedback=pairs, test=judged), Pool(feedback=pairs[::-1], test=judged)]
     found = boosting_estimates(nominal, pools, lambda *report: None, sizes=(30, 80))
-    assert {key.partition(".")[0] for key in found} == {"prior", "alone 30", "refitted 30"}
-    prior, alone, refitted = (found[f"{who}.auc"] for who in ("prior", "alone 30", "refitted 30"))
+    assert {method for _, method, _ in found} == {"prior", "alone 30", "refitted 30"}
+    prior, alone, refitted = (
+        found["boosting", who, "auc"] for who in ("prior", "alone 30", "refitted 30")
+    )
     # Without feedback both pools are judged alike; a third of the feedback contradicts the test.
     assert prior.low == prior.high > 0.7
     assert alone.low < alone.high < prior.low

@@ -294,7 +294,7 @@ def test_without_a_calibrated_threshold_the_default_is_taken_and_said_to_be_one(
 
 def test_a_threshold_beside_the_assessment_is_not_believed(call, folder):
     forged = Estimate.exact(-5.0, 100)
-    Results({"plans.sharpened.threshold": forged}).write(folder / "evaluation.json")
+    Results({("plans", "sharpened", "threshold"): forged}).write(folder / "evaluation.json")
     code, told = call("ask", SCENARIO, "--assessment", folder, "--target", *FAR)
     assert code == 1
     assert "unsafe" in told

@@ -98,12 +98,14 @@ def test_gamma_is_compared_with_the_mean_over_the_seeds_of_each_kind():
     gamma, worse = scorer("sharpened", 1.0), [scorer(f"mlp_{i}", 0.1 * i) for i in range(3)]
     equal = [scorer(f"gradient_boosting_{i}", 1.0) for i in range(3)]
     found = classifier_differences(gamma, [*equal, *worse], test)
-    assert {key.split(".")[1] for key in found} == {"rows", "first"}
-    same = found["difference.rows.gradient_boosting.auc"]
+    assert {key[0] for key in found} == {"difference.rows", "difference.first"}
+    same = found["difference.rows", "gradient_boosting", "auc"]
     assert (same.value, same.low, same.high, same.n) == (0.0, 0.0, 0.0, 60)
-    assert found["difference.first.gradient_boosting.brier"].value == pytest.approx(0.0, abs=1e-12)
+    assert found["difference.first", "gradient_boosting", "brier"].value == pytest.approx(
+        0.0, abs=1e-12
+    )
     each = [classifier_differences(gamma, [*equal, one], test) for one in worse]
-    for key in ("difference.rows.mlp.auc", "difference.first.mlp.brier"):
+    for key in (("difference.rows", "mlp", "auc"), ("difference.first", "mlp", "brier")):
         assert found[key].value == pytest.approx(np.mean([one[key].value for one in each]))
 
 

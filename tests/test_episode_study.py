@@ -9,6 +9,7 @@ from drake_safety.evaluation.episode_study import (
 )
 from drake_safety.evaluation.metrics import area_under_curve
 from drake_safety.evaluation.scorers import Scorer
+from drake_safety.learning.segments import split
 from lip_episodes import SUPPORT, make_episodes
 
 
@@ -30,57 +31,52 @@ def fresh():
 
 
 @pytest.fixture(scope="module")
-def study(fresh):
-    return evaluate_episodes(SCORERS, make_episodes(30, seed=2), fresh)
+def calibration():
+    return make_episodes(30, seed=2)
 
 
-def test_the_scores_are_those_the_figures_come_from(study):
-    estimates, scores, segments = study
-    for name, score in scores.items():
-        assert estimates[f"segments.{name}.auc"].value == area_under_curve(
-            score, segments.is_unsafe
-        )
-    assert estimates["segments.blind.auc"].value == 0.5
-    assert list(scores) == [scorer.name for scorer in SCORERS]
-
-
-def test_at_planning_time_every_episode_counts_once(study, fresh):
-    estimates, *_ = study
-    recalls = [estimates[f"episodes.sharpened.{key}"] for key in ("safe_recall", "unsafe_recall")]
+def test_every_segment_counts_and_at_planning_time_every_episode_once(fresh, calibration):
+    estimates = evaluate_episodes(SCORERS, calibration, fresh)
+    segments = split(fresh, stride=1, discount=1.0)
+    area = area_under_curve(SCORERS[0].unsafe_score(segments), segments.is_unsafe)
+    assert estimates["segments", "sharpened", "auc"].value == area
+    assert estimates["segments", "blind", "auc"].value == 0.5
+    recalls = [estimates["episodes", "sharpened", f"{kind}_recall"] for kind in ("safe", "unsafe")]
     assert [estimate.n for estimate in recalls] == [fresh.num_safe, fresh.num_unsafe]
-    share = estimates["episodes.share_unsafe"]
+    share = estimates["episodes", "", "share_unsafe"]
     assert share.value == fresh.num_unsafe / len(fresh)
 
 
-def test_thresholds_come_from_the_calibration_set_alone(study, fresh):
-    calibration = make_episodes(30, seed=2)
-    estimates, *_ = evaluate_episodes(SCORERS, calibration, calibration)
-    again, *_ = evaluate_episodes(SCORERS, fresh, calibration)
-    name = "segments.sharpened"
-    assert estimates[f"{name}.auc"] == again[f"{name}.auc"]
+def test_thresholds_come_from_the_calibration_set_alone(fresh, calibration):
+    estimates = evaluate_episodes(SCORERS, calibration, calibration)
+    again = evaluate_episodes(SCORERS, fresh, calibration)
+    where = "segments", "sharpened"
+    assert estimates[*where, "auc"] == again[*where, "auc"]
     # No other threshold is better on the set that it was chosen on.
     best, other = (
-        found[f"{name}.safe_recall"].value + found[f"{name}.unsafe_recall"].value
+        found[*where, "safe_recall"].value + found[*where, "unsafe_recall"].value
         for found in (estimates, again)
     )
     assert best >= other
 
 
-def test_plans_are_judged_once_by_a_stored_threshold_or_one_of_the_calibration_set(fresh):
-    calibration = make_episodes(30, seed=2)
-    found, scores, first = evaluate_plans(SCORERS, calibration, fresh, {"blind": 0.4})
-    assert first.is_first.all() and len(first) == len(fresh)
-    assert found["plans.blind.threshold"].value == 0.6
-    assert found["plans.blind.unsafe_recall"].value == 1.0
-    limit = 1.0 - found["plans.sharpened.threshold"].value
-    unsafe = scores["sharpened"][first.is_unsafe]
-    assert found["plans.sharpened.unsafe_recall"].value == np.mean(unsafe > limit)
-    assert found["plans.sharpened.unsafe_recall"].n == fresh.num_unsafe
+def test_plans_are_judged_once_by_a_stored_threshold_or_one_of_the_calibration_set(
+    fresh, calibration
+):
+    found = evaluate_plans(SCORERS, calibration, fresh, {"blind": 0.4})
+    assert found["plans", "blind", "threshold"].value == 0.6
+    assert found["plans", "blind", "unsafe_recall"].value == 1.0
+    limit = 1.0 - found["plans", "sharpened", "threshold"].value
+    segments = split(fresh, stride=1, discount=1.0, shortest=1)
+    first = segments.take(segments.is_first)
+    unsafe = SCORERS[0].unsafe_score(first)[first.is_unsafe]
+    assert found["plans", "sharpened", "unsafe_recall"].value == np.mean(unsafe > limit)
+    assert found["plans", "sharpened", "unsafe_recall"].n == fresh.num_unsafe
     # The lowest calibration score of an unsafe plan, as so few allow no miss.
-    assert found["plans.promised_unsafe_recall"].value < PROMISED_UNSAFE_RECALL
-    shares = [one.value for key, one in found.items() if key.startswith("plans.outcomes.")]
+    assert found["plans", "", "promised_unsafe_recall"].value < PROMISED_UNSAFE_RECALL
+    shares = [one.value for key, one in found.items() if key[1] == "outcomes"]
     assert sum(shares) == pytest.approx(1.0)
-    assert found["plans.outcomes.safe"].value == fresh.num_safe / len(fresh)
+    assert found["plans", "outcomes", "safe"].value == fresh.num_safe / len(fresh)
 
 
 def test_a_promise_needs_unsafe_plans_and_is_what_their_number_allows(caplog):

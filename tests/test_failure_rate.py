@@ -157,7 +157,7 @@ def test_the_command_prints_the_rate_and_the_failures(monkeypatch, capsys, tmp_p
     assert call(monkeypatch, "rate", file, *options, "--out", tmp_path / "out") == 0
     printed = capsys.readouterr().out
     results = Results.read(tmp_path / "out/rate.json")
-    rate, entries = results["failure_rate"], results.entries
+    rate, entries = results["", "", "failure_rate"], results.entries
     assert rate.n == 40
     assert 0.0 < rate.low < rate.value < rate.high < 1.0
     assert f"{100 * rate.value:.2f} % (" in printed

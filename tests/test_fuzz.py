@@ -83,7 +83,7 @@ def formats(tmp_path_factory):
     found["obj"] = *[folder / "a.obj"] * 2, check_meshes
     (folder / "a.obj").write_text(TETRAHEDRON)
     evaluation = folder / "evaluation.json"
-    judged = {"a.b": proportion(5, 10), "c": Estimate.exact(math.nan, 0)}
+    judged = {("a", "", "b"): proportion(5, 10), ("", "", "c"): Estimate.exact(math.nan, 0)}
     Results(judged, {"command": "c", "seed": 1}).write(evaluation)
     found["evaluation"] = evaluation, evaluation, Results.read
     shipped = shipped_folder("laikago_balancing") / "paper.safetensors"

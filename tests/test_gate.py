@@ -593,13 +593,12 @@ def test_the_study_counts_wrong_verdicts_and_the_pairs_until_a_right_one():
     baseline = rng.random(400) < 0.3
     candidate = baseline | (rng.random(400) < 0.1)
     found = study.rows(baseline.astype(int), candidate.astype(int), 100)
-    assert found["candidate.failures"].value - found["baseline.failures"].value == pytest.approx(
-        found["only one.failures"].value
-    )
-    for key in ("equal loops.false_worse", "low end.misses", "high end.misses"):
+    failed = [found[name, "failures"].value for name in ("baseline", "candidate", "only one")]
+    assert failed[1] - failed[0] == pytest.approx(failed[2])
+    for key in (("equal loops", "false_worse"), ("low end", "misses"), ("high end", "misses")):
         assert found[key].value <= 0.08
-    assert found["paired.power"].value == 1.0
-    pairs = [found[f"{name}.pairs_until_worse"].value for name in ("paired", "batch", "unpaired")]
+    assert found["paired", "power"].value == 1.0
+    pairs = [found[name, "pairs_until_worse"].value for name in ("paired", "batch", "unpaired")]
     assert 2 * pairs[0] < min(pairs[1:])
     # By the usual formula for two shares.
     assert (study.batch_size(0.01, 0.02), study.batch_size(0.05, 0.1)) == (2529, 474)

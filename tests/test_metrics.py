@@ -27,26 +27,13 @@ def test_a_proportion_has_the_clopper_pearson_interval_of_the_tables():
     # 8 of 10 in any table of exact binomial limits.
     estimate = proportion(8, 10)
     assert (estimate.value, estimate.n) == (0.8, 10)
-    assert estimate.low == pytest.approx(0.4439, abs=1e-4)
-    assert estimate.high == pytest.approx(0.9748, abs=1e-4)
-
-
-def test_fifty_nine_samples_without_a_miss_bound_the_miss_rate_by_six_percent():
+    assert (estimate.low, estimate.high) == pytest.approx((0.4439, 0.9748), abs=1e-4)
     # One-sided 97.5 % is the lower end of a two-sided 95 % interval.
     assert proportion(59, 59).low == pytest.approx(0.025 ** (1 / 59))
     assert proportion(59, 59).high == 1.0
-    assert proportion(0, 59).low == 0.0
     nothing = proportion(0, 0)
     assert math.isnan(nothing.value)
     assert (nothing.low, nothing.high, nothing.n) == (0.0, 1.0, 0)
-
-
-def test_the_median_lies_in_its_interval_and_more_values_narrow_it():
-    rng = np.random.default_rng(0)
-    few, many = median(rng.normal(size=30)), median(rng.normal(size=3000))
-    for estimate in (few, many):
-        assert estimate.low <= estimate.value <= estimate.high
-    assert many.high - many.low < 0.3 * (few.high - few.low)
 
 
 def test_the_interval_of_the_median_covers_the_truth_about_as_often_as_promised():
@@ -63,14 +50,6 @@ def test_what_never_happens_takes_part_in_the_median():
     assert median(np.array([1.0, 2.0, math.inf])).value == 2.0
     assert median(np.array([1.0, math.inf, math.inf])).value == math.inf
     assert median(np.array([4.0, 1.0, 2.0, 9.0])).value == 3.0
-
-
-def test_the_area_is_the_share_of_pairs_in_the_right_order_and_a_tie_counts_half():
-    score = np.array([0.1, 0.4, 0.4, 0.9])
-    label = np.array([False, True, False, True])
-    # Pairs (unsafe, safe): .4>.1, .4=.4, .9>.1, .9>.4.
-    assert area_under_curve(score, label) == 3.5 / 4
-    assert area_under_curve(-score, label) == 0.5 / 4
 
 
 @pytest.mark.train
@@ -169,45 +148,22 @@ def test_segment_recalls_are_shares_of_segments_with_episodes_behind_them(segmen
         assert estimate.low < estimate.value < estimate.high
     # The truth is perfect, and its recalls are still uncertain.
     estimates = segment_estimates(segments, label.astype(float), threshold=0.5)
-    assert {k: one.value for k, one in estimates.items()} == {
-        "auc": 1.0,
-        "safe_recall": 1.0,
-        "unsafe_recall": 1.0,
-        "brier": 0.0,
-    }
+    assert estimates["unsafe_recall"].low < estimates["unsafe_recall"].value == 1.0
     # Of one segment an episode they are proportions.
     first, score = segments.take(segments.is_first), score[segments.is_first]
     estimates = segment_estimates(first, score, threshold=0.5)
     unsafe = score[first.is_unsafe] > 0.5
     assert estimates["unsafe_recall"] == proportion(unsafe.sum(), len(unsafe))
-    safe = score[~first.is_unsafe] <= 0.5
-    assert estimates["safe_recall"] == proportion(safe.sum(), len(safe))
 
 
 @pytest.mark.parametrize(
-    ("ask", "message"),
+    ("score", "label", "message"),
     [
-        (lambda _: proportion(-1, 3), r"count is -1, expected 0\.\.3"),
-        (lambda _: proportion(4, 3), r"count is 4, expected 0\.\.3"),
-        (lambda _: median(np.array([1.0, math.nan])), "1 of 2 values are NaN"),
-        (
-            lambda segments: segment_estimates(segments, np.zeros(3), threshold=0.5),
-            r"segment_estimates: as many scores, \(3,\), as labels expected",
-        ),
-        (lambda _: area_under_curve(np.zeros(3), np.zeros(3)), "must be boolean, got float64"),
-        (
-            lambda segments: segment_estimates(
-                segments, 4.0 * segments.is_unsafe - 2.0, threshold=0
-            ),
-            r"must lie in \[0, 1\], got -2.0..2.0",
-        ),
-        (lambda _: threshold_at(np.ones(2), np.zeros(2, bool)), "0 of 2 samples are unsafe"),
-        (
-            lambda _: threshold_at(np.full(2, np.nan), np.array([False, True])),
-            "none of the 2 scores is finite",
-        ),
+        (np.zeros(3), np.zeros(3), r"boolean labels; got \(3,\) and \(3,\) of float64"),
+        (np.ones(2), np.zeros(2, bool), "0 of 2 samples are unsafe"),
+        (np.full(2, np.nan), np.array([False, True]), "none of the 2 scores is finite"),
     ],
 )
-def test_what_has_no_figure_is_refused(segments, ask, message):
+def test_what_has_no_threshold_is_refused(score, label, message):
     with pytest.raises(ValueError, match=message):
-        ask(segments)
+        threshold_at(score, label)

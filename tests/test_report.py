@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from drake_safety.evaluation.report import write_report
-from report_runs import make_figures, write_run
+from report_runs import write_run
 
 pytestmark = pytest.mark.train
 
@@ -25,6 +25,7 @@ class Page(HTMLParser):
         self.feed(text)
         self.close()
         assert self.open == []
+        self.words = " ".join(" ".join(self.text).split())
 
     def handle_starttag(self, tag, attributes):
         self.elements.append((tag, dict(attributes)))
@@ -37,10 +38,6 @@ class Page(HTMLParser):
     def handle_data(self, data):
         if self.open and self.open[-1] != "style":
             self.text.append(data)
-
-    @property
-    def words(self):
-        return " ".join(" ".join(self.text).split())
 
     def all(self, tag, name):
         return [a[name] for t, a in self.elements if t == tag and name in a]
@@ -55,7 +52,7 @@ def page_of(folder):
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "lip"
     folder.mkdir()
-    _, assessment = write_run(folder)
+    assessment = write_run(folder)
     text = page_of(folder)
     return SimpleNamespace(folder=folder, assessment=assessment, text=text, page=Page(text))
 
@@ -82,8 +79,6 @@ def test_it_says_what_was_learned_from_what_is_promised_and_where_a_baseline_is_
     assert "drake-safety evaluate lip --assessment" in words
     assert "AUC: gradient boosting, 0.950 against 0.900 (the intervals overlap)" in words
     assert whole.page.all("td", "class").count("best") == 9
-    assert f"All {len(make_figures())} results" in words
-    assert "calibration.plan sharpened miss_rate 0.0250 (0.0006–0.1316) 40" in words
 
 
 def test_every_picture_is_in_the_page_and_the_recording_beside_it(whole):
@@ -91,7 +86,6 @@ def test_every_picture_is_in_the_page_and_the_recording_beside_it(whole):
     there = [path.read_bytes() for path in whole.folder.rglob("*.png")]
     assert sorted(embedded) == sorted(there) and len(there) == 3
     assert whole.page.all("a", "href") == ["run/recording.html"]
-    assert "drake-safety run lip time [s] 0.60" in whole.page.words
 
 
 @pytest.mark.parametrize(
@@ -99,7 +93,7 @@ def test_every_picture_is_in_the_page_and_the_recording_beside_it(whole):
     [
         (["episodes"], "Trained with"),
         (["evaluation.json"], "How it did"),
-        (["sharpened.safetensors", "paper.safetensors"], "What is promised"),
+        (["sharpened.safetensors", "paper.safetensors"], "What was learned"),
         (["run"], "Recorded motion"),
     ],
 )
@@ -123,8 +117,6 @@ def test_a_folder_that_is_no_run_or_is_damaged_and_a_missing_extra_are_named(
     (tmp_path / "holiday.jpg").write_bytes(b"")
     with pytest.raises(ValueError, match=r"neither an assessment nor results.*holiday\.jpg"):
         page_of(tmp_path)
-    with pytest.raises(ValueError, match="there is no folder"):
-        page_of(tmp_path / "nowhere")
     monkeypatch.setitem(sys.modules, "jinja2", None)
     with pytest.raises(ValueError, match=r"pip install 'drake_safety\[report\]'"):
         page_of(copy)

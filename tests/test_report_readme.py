@@ -91,9 +91,9 @@ def test_a_text_that_cannot_be_filled_in_is_refused(tmp_path, text, message):
 
 
 def test_verdicts_on_targets_stand_beside_the_papers_own(tmp_path):
-    estimates = {"plans.outcomes.safe": proportion(20, 50)}
+    estimates = {("plans", "outcomes", "safe"): proportion(20, 50)}
     for column in ("safe_recall", "unsafe_recall", "auc"):
-        estimates[f"plans.sharpened.{column}"] = proportion(19, 20)
+        estimates["plans", "sharpened", column] = proportion(19, 20)
     text = filled(tmp_path, estimates)
     assert "| *the paper's own* | *0.952* | *0.987* | |" in text
     assert "of which 40.0 % (26.4–54.8) are safe" in text

@@ -1,85 +1,192 @@
+"""Shifts: the catalogue, Γ's confident errors, and the minutes that its monitor watches."""
+
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pydrake.math import RotationMatrix
 
-from drake_safety import (
-    AssessmentParameters,
-    SafetyAssessment,
-    inputs_at,
-    load_assessment,
-    load_scenario,
-)
+from cart_episodes import make_episode, make_info
+from drake_safety import AssessmentParameters, SafetyAssessment, load_assessment, load_scenario
+from drake_safety.evaluation import shift_study
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.shift_study import (
     CONFIDENT,
-    JudgedShift,
-    motions_of,
+    Minute,
+    false_alarms,
+    monitor_estimates,
+    monitored,
+    run_monitored,
+    safety_probability,
     shift_estimates,
     shifts_figure,
     shifts_tables,
 )
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
+from drake_safety.learning.change_detector import Alarm
+from drake_safety.learning.segments import Episodes
 from drake_safety.robots.robot_model import as_pattern
 from lip_assessments import QUICK
 from lip_episodes import make_episodes
+from studies.monitor import _estimates
+
+STEP_S = 0.5
 
 
-@pytest.fixture(scope="module")
-def training():
-    return make_episodes(240, noise=0.002)
+class Detector:
+    """Its level is the first state, and something more; an alarm lasts while it is above 1."""
+
+    step_s = STEP_S
+
+    def __init__(self, more=0.0):
+        self.more = more
+
+    def watch(self, motions):
+        levels = self.more + np.concatenate(motions)[:, :1]
+        ends = np.flatnonzero(np.diff(levels[:, 0] > 1.0, prepend=False, append=False))
+        return levels, [Alarm(*pair, "seen") for pair in ends.reshape(-1, 2).tolist()]
 
 
-@pytest.fixture(scope="module")
-def assessment(training):
-    return SafetyAssessment(AssessmentParameters(**QUICK)).fit(training)
+class Gamma:
+    """An assessment whose probability is the second state, above one "don't know"."""
+
+    used_ = ()
+    parameters = SimpleNamespace(initial_uncertainty=0.3)
+    settings = SimpleNamespace(uses_true_state=False)
+    detector_ = Detector()
+    info_ = SimpleNamespace(step_s=1.0, num_steps=5)
+
+    def predict(self, state, *others):
+        probability = state[:, 1]
+        known, unknown = (0.6, 0.1, 0.3), (0.2, 0.1, 0.7)
+        belief = np.where(probability[:, None] > 1.0, unknown, known)
+        return SimpleNamespace(probability=probability, belief=belief)
 
 
-@pytest.fixture(scope="module")
-def nominal():
-    return motions_of(make_episodes(80, seed=5, noise=0.002))
+UNKNOWN = 1.01
 
 
-def motion(num_rows, probability, *, is_unsafe):
-    """A motion whose state is the probability that the double below returns, negative for none."""
-    state = np.full((num_rows, 6), float(probability))
-    rows = {"desired_preview": np.zeros((num_rows, 30)), "features": np.zeros((num_rows, 5))}
-    return SimpleNamespace(
-        state=state, **rows, margins=np.ones((num_rows, 2)), is_safe=not is_unsafe
-    )
-
-
-def told(state, preview, features, is_outside):
-    return np.where(state[:, 0] < 0.0, np.nan, state[:, 0])
-
-
-def rows_of(motion):
-    is_outside = (motion.margins < 0.0).any(axis=1)
-    return motion.state, motion.desired_preview, motion.features, is_outside
-
-
-def judged(motions, **others):
-    return JudgedShift({"gamma": told} | others, motions)
+def motion(index, num_rows, *, probability=0.5, alarm=(), is_safe=True):
+    """A motion with an alarm at some rows, and of which Γ says a probability."""
+    state = np.full((num_rows, 3), probability)
+    state[:, 0] = 0.0
+    state[list(alarm), 0] = 2.0
+    ending = dict(is_safe=is_safe, cause="" if is_safe else "wall", first_step=0)
+    margins = np.ones((num_rows, 2))
+    info = make_info(step_s=STEP_S)
+    return make_episode(index, info, num_rows, state=state, margins=margins, **ending)
 
 
 def test_a_confident_error_is_a_row_called_safe_in_a_motion_that_ends_unsafely():
     motions = [
-        motion(10, 0.95, is_unsafe=True),  # sure and wrong
-        motion(20, 0.95, is_unsafe=False),
-        motion(30, CONFIDENT - 0.01, is_unsafe=True),
-        motion(40, -1.0, is_unsafe=True),  # don't know
+        motion(0, 10, probability=0.95, is_safe=False),  # Sure and wrong.
+        motion(1, 20, probability=0.95),
+        motion(2, 30, probability=CONFIDENT - 0.01, is_safe=False),
+        motion(3, 40, probability=UNKNOWN, is_safe=False),
     ]
-    shift = judged(motions)
-    found = shift_estimates(shift)
-    assert found["gamma.confident_error"].value == pytest.approx(0.1)
-    assert found["gamma.unknown"].value == pytest.approx(0.4)
-    assert found["unsafe"].value == 0.75
-    assert found["gamma.confident_error"].n == 4
+    found = shift_estimates({"gamma": Gamma()}, motions)
+    assert found["gamma", "confident_error"].value == pytest.approx(0.1)
+    assert found["gamma", "unknown"].value == pytest.approx(0.4)
+    assert found["", "unsafe"].value == 0.75
+    assert found["gamma", "confident_error"].n == 4
+    # "Don't know" is the least safe: of 20 safe rows, each is above 70 and equal to 10.
+    assert found["gamma", "auc"].value == pytest.approx((70 + 0.5 * 10) / 80)
+
+
+@pytest.mark.train
+def test_outside_the_safe_set_gamma_is_not_safe():
+    episodes = make_episodes(80, noise=0.002)
+    gamma = SafetyAssessment(AssessmentParameters(**QUICK)).fit(episodes)
+    one = make_episodes(1, seed=5, noise=0.002)[0]
+    one.margins[:] = -1.0
+    probability = safety_probability(gamma, one, slice(None))
+    assert (probability == 0.0).any() and not np.nan_to_num(probability).any()
+
+
+def test_a_minute_goes_on_with_the_next_motions_and_an_alarm_is_dont_know():
+    # Γ is asked every second row, and speaks of the next five seconds.
+    motions = [
+        motion(0, 20, probability=0.95, is_safe=False),
+        motion(1, 20, probability=0.95, alarm=[4]),
+        motion(2, 20, probability=CONFIDENT - 0.01, is_safe=False),
+        motion(3, 20, probability=0.95, is_safe=False, alarm=range(12, 16)),
+        motion(4, 20, probability=UNKNOWN, is_safe=False),
+    ]
+    found = monitored(motions, Gamma())
+    assert [one.alarm_s for one in found] == [12.0, 2.0, 16.0, 6.0, 22.0]
+    assert [one.leave_s for one in found] == [10.0, 20.0, 10.0, 10.0, 10.0]
+    # The first is wrong for 5 s, the fourth for 5 s with and 3 s without the alarm.
+    assert [one.silent_error_s[0] for one in found] == [5.0, 0.0, 0.0, 5.0, 0.0]
+    assert [one.error_s[0] for one in found] == [5.0, 0.0, 0.0, 3.0, 0.0]
+    assert [one.silent_error_s[1] for one in found] == [10.0] * 5
+    assert [one.error_s[1] for one in found] == [8.0] * 5
+    late = [motion(i, 100, is_safe=i != 1) for i in range(2)] + [motion(2, 100, alarm=[50])]
+    found = monitored(late, Gamma())
+    assert [one.alarm_s for one in found] == [math.inf, math.inf, 25.0]
+    assert [one.leave_s for one in found] == [math.inf, 50.0, math.inf]
+
+
+def test_estimates_are_of_all_minutes():
+    found = monitor_estimates(
+        [
+            Minute(30.0, 40.0, [6.0, 20.0], [6.0, 20.0]),
+            Minute(2.0, math.inf, [0.0, 0.0], [0.0, 4.0]),
+            Minute(1.0, math.inf, [0.0, 0.0], [0.0, 0.0]),
+            Minute(math.inf, math.inf, [0.0, 0.0], [0.0, 0.0]),
+        ]
+    )
+    assert found["alarmed"].value == 0.75
+    assert found["delay_s"].value == 30.0
+    assert found["delay_s"].low <= 2.0 and found["delay_s"].high == math.inf
+    assert found["delay_95_s"].value == math.inf
+    assert found["confident_error_10s"].value == pytest.approx(0.6 / 4)
+    assert found["confident_error_60s"].value == pytest.approx(20 / 60 / 4)
+    assert {one.n for one in found.values()} == {4}
+
+
+def test_a_promise_is_missed_where_neither_threshold_nor_alarm_announces_the_end():
+    arrays = {
+        "alarm_s": np.array([30.0, 2.0, 1.0, np.inf, 9.0]),
+        "leave_s": np.array([20.0, 4.0, 5.0, 60.0, 9.5]),
+        "error_s": np.zeros((5, 2)),
+        "silent_error_s": np.zeros((5, 2)),
+        "least": np.array([0.8, 0.7, 0.3, 0.3, np.nan]),
+    }
+    assert "missed" not in _estimates(arrays, None)
+    found = _estimates(arrays, SimpleNamespace(threshold=0.7))
+    assert (found["silent_missed"].value, found["missed"].value) == (0.5, 0.25)
+    assert (found["missed"].n, found["leaves"].value) == (4, 1.0)
+
+
+def test_false_alarms_are_those_of_undisturbed_motion():
+    motions = [
+        motion(0, 3600, alarm=[7]),
+        motion(1, 1800, alarm=[*range(50, 90), *range(200, 240)]),
+        motion(2, 1801, alarm=[1800], is_safe=False),  # As it leaves.
+    ]
+    found = false_alarms(Episodes(make_info(step_s=STEP_S), motions), Detector())
+    assert found.value == pytest.approx(3.0)
+    assert (found.low < 3.0 < found.high, found.n) == (True, 3)
+
+
+@pytest.mark.train
+def test_only_motions_without_an_alarm_are_simulated_to_the_end(monkeypatch):
+    monkeypatch.setattr(shift_study, "_FIRST_S", 0.4)
+    monkeypatch.setattr(shift_study, "SPANS_S", (0.5, 1.0))
+    scenario, gamma = load_scenario("laikago_balancing"), load_assessment("laikago_balancing")
+    quiet, alarmed = (
+        run_monitored(scenario, "payload", 2, 5, Detector(more), options={}, num_workers=1)
+        for more in (-10.0, 10.0)
+    )
+    assert [round(one.time_s[-1], 9) for one in quiet] == [1.0, 1.0]
+    assert [round(one.time_s[-1], 9) for one in alarmed] == [0.4, 0.4]
+    assert not np.array_equal(quiet[0].state, quiet[1].state)
+    for one, other in zip(quiet, alarmed, strict=True):
+        np.testing.assert_array_equal(one.state[: len(other.state)], other.state)
+        assert np.ptp(one.features, axis=0).any()
+    assert len(monitored(quiet, gamma)) == 2
 
 
 def test_the_catalogue_is_scaled_to_the_robot():
@@ -89,8 +196,7 @@ def test_the_catalogue_is_scaled_to_the_robot():
     mass_kg = shifts["payload"].variation.payload.mass_kg / 0.3
     assert math.isclose(force_n[1], 0.1 * 9.81 * mass_kg)
     assert {"slope", "hole", "weak_joint", "frozen", "variation actual"} <= set(shifts)
-    assert all(one.kind in ("plant", "sensor") for one in shifts.values())
-    shifted = shifted_scenario(scenario, "slope", shifts["slope"])
+    shifted = shifted_scenario(scenario, "slope", shifts["slope"].variation)
     assert "slope" in shifted.variations
     assert "slope" not in scenario.variations
     assert shifted.simulation_hash("slope") != scenario.simulation_hash("nominal")
@@ -110,15 +216,13 @@ def test_a_variation_may_have_any_name(tmp_path):
     shifts = plant_shifts(scenario, scenario.make_loop())
     found = {}
     for name in shifts:
-        found[f"shifts.{name}.unsafe"] = proportion(1, 2)
-        found[f"shifts.{name}.gamma.unknown"] = proportion(1, 4)
+        found[f"shifts.{name}", "", "unsafe"] = proportion(1, 2)
+        found[f"shifts.{name}", "gamma", "unknown"] = proportion(1, 4)
     Results(found).write(tmp_path / "shifts.json")
     read = Results.read(tmp_path / "shifts.json")
     (table,) = shifts_tables(read)
     assert [row.label for row in table.rows] == [f"variation {n}".replace("_", " ") for n in NAMES]
     assert all(None not in row.estimates for row in table.rows)
-    unknown = [row.set for row in read.select(method="gamma", metric="unknown")]
-    assert unknown == [f"shifts.{name}" for name in shifts]
     save(shifts_figure(found), tmp_path / "shifts")
 
 
@@ -152,13 +256,3 @@ def test_the_loaded_joint_may_have_no_motor_or_no_limit(monkeypatch, limit):
     else:
         (other,) = found["weak_joint"].variation.shift.joints
         assert other != pattern
-
-
-@pytest.mark.parametrize(("roll_rad", "height"), [(0.0, 1.5), (0.5 * math.pi, 0.3), (math.pi, 0.3)])
-def test_a_robot_that_is_lifted_or_lies_is_dont_know(roll_rad, height):
-    loop = load_scenario("laikago_balancing").make_loop()
-    start = loop.standing_start()
-    q = start.q.copy()
-    q[:4], q[6] = RotationMatrix.MakeXRotation(roll_rad).ToQuaternion().wxyz(), height * q[6]
-    inputs = inputs_at(loop, replace(start, q=q))
-    assert load_assessment("laikago_balancing").predict_one(*inputs).belief[2] == 1.0

@@ -56,13 +56,14 @@ def run(tmp_path_factory):
 def results_of(file, rows):
     """The results in a file: figures, each with an interval around it, if there is a sample."""
     found = Results.read(file)
-    for key in rows.split(", "):
-        assert math.isfinite(found[key].value), key
+    by_name = {".".join(filter(None, key)): row for key, row in found.items()}
+    for name in rows.split(", "):
+        assert math.isfinite(by_name[name].value), name
     for key, row in found.items():
         if math.isfinite(row.value):
             # Resampling raises a calibration error.
-            is_raised = row.metric == "expected_calibration_error"
-            is_never = row.metric.startswith("lead_to_") and math.isnan(row.low)
+            is_raised = key[2] == "expected_calibration_error"
+            is_never = key[2].startswith("lead_to_") and math.isnan(row.low)
             low = -math.inf if is_never else row.low  # JSON has no infinity.
             assert (0.0 if is_raised else low) <= row.value <= row.high, key
             assert low <= row.high, key
@@ -79,7 +80,7 @@ def test_a_study_of_a_run_writes_its_figures(monkeypatch, run, line):
     found = results_of(folder / f"{name}.json", rows)
     assert found.entries["command"].startswith(f"python -m studies {command} ")
     if name == "adapted-actual/study":
-        assert found["sharpened.calibrated.scratch 40.brier"].n == 40
+        assert found["sharpened.calibrated", "scratch 40", "brier"].n == 40
         assert found.entries["feedback_sets"] == [40, 40]
         assert (folder / f"{name}.png").is_file()
     if name == "evaluation":
@@ -190,15 +191,15 @@ def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypat
 
 
 def test_studies_are_stored_with_the_evaluation_of_their_run(monkeypatch, tmp_path):
-    Results({"plans.sharpened.auc": proportion(29, 30)}, {"command": "x"}).write(
+    Results({("plans", "sharpened", "auc"): proportion(29, 30)}, {"command": "x"}).write(
         tmp_path / "evaluation.json"
     )
-    row = {"monitor.nominal.alarmed": proportion(3, 4)}
+    row = {("monitor", "nominal", "alarmed"): proportion(3, 4)}
     Results(row, {"command": "y", "seed": 100}).write(tmp_path / "monitor.json")
     stored = tmp_path / "stored.json"
     assert study(monkeypatch, "store", "--assessment", tmp_path, "--out", stored) == 0
     found = Results.read(stored)
-    assert {"plans.sharpened.auc", "monitor.nominal.alarmed"} <= set(found)
+    assert {("plans", "sharpened", "auc"), ("monitor", "nominal", "alarmed")} <= set(found)
     assert found.entries["monitor"]["seed"] == 100
 
 

@@ -52,15 +52,15 @@ def test_a_study_says_whether_its_seeds_are_those_of_the_release(tmp_path):
 
 def test_rows_are_written_printed_and_plotted(tmp_path, capsys):
     with open_study(
-        "tried", "pendulum", tmp_path, out=tmp_path / "out", plotted=lambda row: row.metric == "auc"
+        "tried", "pendulum", tmp_path, out=tmp_path / "out", plotted=lambda key: key[2] == "auc"
     ) as study:
         study.entries["pairs"] = 3
-        study.add("segments.paper", {"auc": Estimate(0.5, 0.25, 0.75, 40)})
-        study.add("segments.sharpened", {"auc": Estimate(0.9, 0.8, 1.0, 40)})
-        study.rows["pushes.fallen"] = Estimate(0.125, 0.0, 0.5, 8)
+        study.add("segments", "paper", {"auc": Estimate(0.5, 0.25, 0.75, 40)})
+        study.add("segments", "sharpened", {"auc": Estimate(0.9, 0.8, 1.0, 40)})
+        study.rows["pushes", "", "fallen"] = Estimate(0.125, 0.0, 0.5, 8)
     found = Results.read(tmp_path / "out/tried.json")
     assert dict(found) == dict(study.results())
-    assert found["segments.paper.auc"].n == 40
+    assert found["segments", "paper", "auc"].n == 40
     assert found.entries["scenario"] == "pendulum" and found.entries["pairs"] == 3
     assert found.entries["command"].startswith("python -m studies")
     printed = capsys.readouterr().out
@@ -71,7 +71,7 @@ def test_rows_are_written_printed_and_plotted(tmp_path, capsys):
 
 def test_a_study_that_fails_writes_nothing_and_sizes_are_numbers_between_commas(tmp_path):
     with pytest.raises(RuntimeError), open_study("tried", "pendulum", tmp_path) as study:
-        study.rows["pushes.fallen"] = Estimate(0.125, 0.0, 0.5, 8)
+        study.rows["pushes", "", "fallen"] = Estimate(0.125, 0.0, 0.5, 8)
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
     assert (parse_sizes("512,1024"), parse_sizes("")) == ((512, 1024), ())

@@ -58,14 +58,14 @@ def test_a_rule_in_time_saves_every_throw_and_a_late_one_none(monkeypatch):
     rules = [rule("prompt", 0.6), rule("late", 0.6, delay_rows=10)]
     found, logs = evaluate_throws(None, rules, num_throws=9, seed=1, progress=print)
     assert [log.index for log in logs] == list(range(9))
-    assert found["throws.falls_without_recovery"].value == 3 / 9
-    assert found["throws.prompt.falls_with_recovery"].value == 0.0
-    assert found["throws.late.falls_with_recovery"].value == 3 / 9
-    assert found["throws.late.falls_missed"].value == 0.0
-    assert found["throws.prompt.false_triggers"].value == 0.0
-    assert found["throws.prompt.trigger_after_impact_s"].value == pytest.approx(0.0)
-    assert found["throws.late.trigger_after_impact_s"].value == pytest.approx(0.2)
-    assert found["throws.late.trigger_before_fall_s"].value == pytest.approx(0.3)
+    assert found["throws", "", "falls_without_recovery"].value == 3 / 9
+    assert found["throws", "prompt", "falls_with_recovery"].value == 0.0
+    assert found["throws", "late", "falls_with_recovery"].value == 3 / 9
+    assert found["throws", "late", "falls_missed"].value == 0.0
+    assert found["throws", "prompt", "false_triggers"].value == 0.0
+    assert found["throws", "prompt", "trigger_after_impact_s"].value == pytest.approx(0.0)
+    assert found["throws", "late", "trigger_after_impact_s"].value == pytest.approx(0.2)
+    assert found["throws", "late", "trigger_before_fall_s"].value == pytest.approx(0.3)
 
 
 def test_the_chosen_threshold_is_the_highest_with_few_enough_false_triggers():

@@ -37,29 +37,32 @@ def test_falls_and_their_times_are_those_of_motions_that_leave_after_the_push():
     before_push = motion([1, 1], push_s=0.5, leave_s=0.1, fall_s=0.1)
     pushed = [falls, falls, motion([1] * 6, push_s=0.1), before_push]
     found = push_estimates(pushed, push_s=0.2)
-    assert found["pushes.fallen"].value == pytest.approx(2 / 3)
-    assert found["pushes.push_to_fall_s"].value == pytest.approx(0.5)
-    assert found["pushes.fallen_soon"].value == 0.0
-    assert push_estimates(pushed, push_s=0.4)["pushes.fallen_soon"].value == 1.0
+    assert found["pushes", "", "fallen"].value == pytest.approx(2 / 3)
+    assert found["pushes", "", "push_to_fall_s"].value == pytest.approx(0.5)
+    assert found["pushes", "", "fallen_soon"].value == 0.0
+    assert push_estimates(pushed, push_s=0.4)["pushes", "", "fallen_soon"].value == 1.0
 
 
 def test_the_hours_of_tours_are_those_that_stay_safe():
     found = tour_estimates([motion([1] * 7), motion([1] * 3, leave_s=0.2, fall_s=0.2)])
-    assert found["tours.without_fall"].value == 0.5
-    assert found["tours.hours"].value == pytest.approx(0.6 / 3600)
+    assert found["tours", "", "without_fall"].value == 0.5
+    assert found["tours", "", "hours"].value == pytest.approx(0.6 / 3600)
 
 
 def test_guard_recovery_and_speeds_compare_the_same_motions():
     falls, stays = motion([1, 1], leave_s=0.1, fall_s=0.1, impact=3.0), motion([1, 1])
     softer = motion([1, 1], leave_s=0.1, fall_s=0.1, impact=2.0)
     guard = guard_estimates([falls, falls, stays], [stays, falls, stays], [motion([1], changed=1)])
-    assert (guard["guard.falls_without"].value, guard["guard.falls_with"].value) == (2 / 3, 1 / 3)
-    assert guard["guard.unchanged_inside"].value == 0.0
+    assert (guard["guard", "", "falls_without"].value, guard["guard", "", "falls_with"].value) == (
+        2 / 3,
+        1 / 3,
+    )
+    assert guard["guard", "", "unchanged_inside"].value == 0.0
     saved = recovery_estimates("slower", [falls, falls], [stays, softer])
-    assert saved["recovery.slower.saved"].value == 0.5
-    assert saved["recovery.slower.impact_m_s"].value == 2.0
-    assert saved["recovery.slower.impact_without_m_s"].value == 3.0
-    assert speed_estimates([stays], [stays])["speed.difference_to_mujoco_m_s"].value == 0.0
+    assert saved["recovery", "slower", "saved"].value == 0.5
+    assert saved["recovery", "slower", "impact_m_s"].value == 2.0
+    assert saved["recovery", "slower", "impact_without_m_s"].value == 3.0
+    assert speed_estimates([stays], [stays])["speed", "", "difference_to_mujoco_m_s"].value == 0.0
 
 
 def test_unusual_commands_are_past_the_ranges_and_usual_ones_inside():

@@ -11,6 +11,7 @@ import numpy as np
 
 from drake_safety.diagrams.balancing.throws import VIOLATIONS, run_throws, trigger_time
 from drake_safety.evaluation.metrics import Estimate, median, proportion
+from drake_safety.evaluation.results import Key
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.files.progress import StageProgress
@@ -52,7 +53,7 @@ def evaluate_throws(
     progress: StageProgress,
     persistence_s: float = 0.0,
     num_workers: int | None = None,
-) -> tuple[dict[str, Estimate], list[Motion]]:
+) -> tuple[dict[Key, Estimate], list[Motion]]:
     """Throws balls at the actual plant and compares the triggers of rules and their outcomes.
 
     "Don't know" triggers when it has lasted ``persistence_s``. Returns the estimates by dotted key,
@@ -79,17 +80,17 @@ def evaluate_throws(
     leave_s = np.array([log.leave_time_s - log.push_time_s for log in logs if log.has_left])
     fall_s = np.array([log.fall_time_s - log.push_time_s for log in logs if log.has_fallen])
     estimates = {
-        "throws.falls_without_recovery": proportion(len(fall_s), len(logs)),
-        "throws.leaves_safe_set_without_recovery": proportion(len(leave_s), len(logs)),
-        "throws.impact_to_leaving_s": median(leave_s),
-        "throws.impact_to_fall_s": median(fall_s),
+        ("throws", "", "falls_without_recovery"): proportion(len(fall_s), len(logs)),
+        ("throws", "", "leaves_safe_set_without_recovery"): proportion(len(leave_s), len(logs)),
+        ("throws", "", "impact_to_leaving_s"): median(leave_s),
+        ("throws", "", "impact_to_fall_s"): median(fall_s),
     }
     for rule in rules:
         times = triggers[rule.scorer.name]
         recovered = {i: simulated[i, t] for i, t in enumerate(times) if not math.isnan(t)}
         of_rule = _rule_estimates(logs, np.array(times), recovered)
         of_rule["threshold"] = Estimate.exact(rule.threshold, len(logs))
-        estimates |= {f"throws.{rule.scorer.name}.{key}": e for key, e in of_rule.items()}
+        estimates |= {("throws", rule.scorer.name, key): e for key, e in of_rule.items()}
     return estimates, logs
 
 

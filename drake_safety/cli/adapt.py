@@ -115,9 +115,9 @@ def adapt(
         "monitor": adapted[MODES[0]].detector_.describe(),
     }
     figures = {
-        f"held_out.{mode}.{key}": one
+        ("held_out", mode, metric): one
         for mode, found in judged.items()
-        for key, one in found.items()
+        for metric, one in found.items()
     }
     Results(figures, console.made_by(loaded.name) | entries).write(folder / "adaptation.json")
     _print_changes(loaded, adapted, gap, name)

@@ -21,24 +21,23 @@ from drake_safety.diagrams.balancing.throw_study import (
     TriggerRule,
     evaluate_throws,
 )
-from drake_safety.evaluation import monitor_study, shift_study
+from drake_safety.evaluation import shift_study
 from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.episode_study import evaluate_episodes, evaluate_plans
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
-from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.results import Key, Results
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
-from drake_safety.evaluation.shift_study import Judge, JudgedShift, MotionSet
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
 from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.verdict_tables import verdict_tables
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
-from drake_safety.learning.calibration import MOTION, PLAN, episode_scores
+from drake_safety.learning.calibration import PLAN, episode_scores
 from drake_safety.learning.seeds import EVALUATION, FRESH_MOTION, SHIFTS, SeedBlock, use_of
-from drake_safety.learning.segments import Episode, Episodes, Segments, split
+from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.capabilities import HasBall, HasGoals, require
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.rollouts import run_motions
@@ -55,7 +54,6 @@ class Evaluation:
     Attributes:
         assessments: Γ by mode.
         seeds: Seeds of fresh simulations by purpose.
-        estimates: By dotted key.
         entries: What the file says besides estimates.
     """
 
@@ -66,7 +64,7 @@ class Evaluation:
     seeds: Mapping[str, int]
     workers: int | None
     stages: StageProgress
-    estimates: dict[str, Estimate] = field(default_factory=dict)
+    estimates: dict[Key, Estimate] = field(default_factory=dict)
     entries: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -87,7 +85,7 @@ class Evaluation:
             self.scenario, self.run_folder, number, seed, progress, self.workers, **options
         )
 
-    def add(self, estimates: Mapping[str, Estimate], **figures: Figure) -> None:
+    def add(self, estimates: Mapping[Key, Estimate], **figures: Figure) -> None:
         """Adds results, and writes figures by name."""
         self.estimates |= estimates
         for name, figure in figures.items():
@@ -138,7 +136,7 @@ def evaluate(
         require(loop, HasBall, "evaluate: pass --throws 0")
     with evaluating(loaded, assessment, folder, block, seed, workers) as evaluation:
         if shifts:
-            add_shifts(evaluation, shifts, episodes)
+            _add_shifts(evaluation, shifts, episodes)
             return
         evaluation.entries["calibration_episodes"] = calibration_episodes
         test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
@@ -197,20 +195,15 @@ def evaluating(
 
 def add_verdicts(
     evaluation: Evaluation, scorers: Sequence[Scorer], calibration: Episodes, test: Episodes
-) -> tuple[dict[str, np.ndarray], Segments]:
-    """Evaluates scorers on fresh plans with a goal, else on every segment and first rows.
-
-    Returns:
-        Unsafe scores by scorer, (N,), and the N judged segments.
-    """
+) -> None:
+    """Evaluates scorers on fresh plans with a goal, else on every segment and first rows."""
     if isinstance(evaluation.scenario.make_loop(), HasGoals):
         thresholds = evaluation.plan_thresholds
-        found, scores, rows = evaluate_plans(scorers, calibration, test, thresholds)
+        found = evaluate_plans(scorers, calibration, test, thresholds)
     else:
-        found, scores, rows = evaluate_episodes(scorers, calibration, test)
+        found = evaluate_episodes(scorers, calibration, test)
     maps = {f"embedding_{m}": embedding_figure(g, test) for m, g in evaluation.assessments.items()}
     evaluation.add(found, **maps)
-    return scores, rows
 
 
 def add_reliability(evaluation: Evaluation, test: Episodes) -> None:
@@ -223,11 +216,11 @@ def add_reliability(evaluation: Evaluation, test: Episodes) -> None:
         first = curves[f"{mode}, first row"] = reliability(of_first, label, np.arange(len(label)))
         rows = reliability(score, segments.is_unsafe, segments.episode)
         curves[f"{mode}, every row"] = rows
-        found[f"calibration.{mode}.expected_calibration_error"] = first.error
-        found[f"calibration.rows.{mode}.expected_calibration_error"] = rows.error
+        found["calibration", mode, "expected_calibration_error"] = first.error
+        found["calibration.rows", mode, "expected_calibration_error"] = rows.error
         for kind, one in evaluation.assessments[mode].calibrations_.items():
             shares = verdict_shares(one, *episode_scores(segments, score, kind))
-            found |= {f"calibration.{kind}.{mode}.{what}": n for what, n in shares.items()}
+            found |= {(f"calibration.{kind}", mode, what): n for what, n in shares.items()}
     evaluation.add(found, reliability=reliability_figure(curves))
 
 
@@ -251,61 +244,42 @@ def add_throws(
     return logs
 
 
-def add_shifts(
-    evaluation: Evaluation,
-    num_motions: int,
-    num_nominal: int,
-    judges: Mapping[str, Judge] | None = None,
-    others: Callable[[Sequence[Episode]], Mapping[str, MotionSet]] = lambda nominal: {},
-    more: Callable[[JudgedShift], Mapping[str, Estimate]] = lambda judged: {},
-) -> None:
-    """Evaluates both modes, or other methods, on changed plants and faulty sensors.
-
-    Args:
-        num_motions: Motions of each shift.
-        num_nominal: Nominal motions, for false alarms.
-        judges: Methods; Γ, named "gamma", and the paper's mode by default.
-        others: Further sets, made of the nominal motions.
-        more: Further estimates of a shift.
-    """
-    assessments = evaluation.assessments
-    gamma = assessments[MODES[0]]
-    names = {"gamma" if mode == MODES[0] else mode: one for mode, one in assessments.items()}
-    judges = judges or {name: shift_study.assessment_judge(one) for name, one in names.items()}
+def _add_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> None:
+    """Evaluates both modes on changed plants and faulty sensors, and on nominal motions."""
     scenario, seed, stages = evaluation.scenario, evaluation.seeds["shifts"], evaluation.stages
-    folder, workers = evaluation.run_folder, evaluation.workers
+    workers, gamma = evaluation.workers, evaluation.assessments[MODES[0]]
+    names = {"gamma" if mode == MODES[0] else mode: g for mode, g in evaluation.assessments.items()}
     shifts = plant_shifts(scenario, scenario.make_loop())
-    nominal = shift_study.motions_of(evaluation.fresh("nominal motions", num_nominal, "shifts"))
-    promise = gamma.calibrations_.get(MOTION)
-    found: dict[str, Estimate] = {}
-    sets: dict[str, MotionSet] = {"nominal": ("nominal", nominal[:_MOST_JUDGED])}
+    nominal = evaluation.fresh("nominal motions", num_nominal, "shifts")
+    judged = shift_study.shift_estimates(names, nominal[:_MOST_JUDGED])
+    estimates = {("shifts.nominal", *key): one for key, one in judged.items()}
     for i, (name, shift) in enumerate(shifts.items()):
         stages("shifted motions", i, len(shifts))
-        shifted = shifted_scenario(scenario, name, shift)
+        shifted = shifted_scenario(scenario, name, shift.variation)
         options = {**scenario.options_for("evaluation"), **shift.options}
         episodes = folders.run_fresh_episodes(
-            shifted, folder, num_motions, seed, None, workers, name, **options
+            shifted, evaluation.run_folder, num_motions, seed, None, workers, name, **options
         )
-        sets[name] = (shift.kind, shift_study.motions_of(episodes))
-        motions = monitor_study.run_monitored(
+        judged = shift_study.shift_estimates(names, episodes)
+        motions = shift_study.run_monitored(
             shifted, name, num_motions, seed, gamma.detector_, options=options, num_workers=workers
         )
-        watched = monitor_study.monitored(motions, gamma, judges["gamma"])
-        of_monitor = monitor_study.monitor_estimates(watched, promise)
-        found |= {f"shifts.{name}.{key}": estimate for key, estimate in of_monitor.items()}
+        watched = shift_study.monitor_estimates(shift_study.monitored(motions, gamma))
+        judged |= {("monitor", metric): one for metric, one in watched.items()}
+        estimates |= {(f"shifts.{name}", *key): one for key, one in judged.items()}
     stages("shifted motions", len(shifts), len(shifts))
-    sets |= others(nominal[:num_motions])
-    found |= shift_study.evaluate_shifts(sets, judges, stages, more)
     fresh_seed = FRESH_MOTION.first_beside(seed)
     usual = run_motions(
         scenario,
         num_nominal * scenario.episode_duration_s,
         seed=fresh_seed,
         num_workers=workers,
-        path=folders.fresh_episodes_folder(folder, "motion", fresh_seed, {}),
+        path=folders.fresh_episodes_folder(evaluation.run_folder, "motion", fresh_seed, {}),
         progress=partial(stages, "undisturbed nominal motion"),
     )
-    key = "shifts.nominal.monitor.false_alarms_per_hour"
-    found[key] = monitor_study.false_alarms(usual, gamma.detector_)
-    evaluation.add(found, shifts=shift_study.shifts_figure(found))
-    evaluation.entries["kinds"] = {name: kind for name, (kind, _) in sets.items()}
+    alarms = shift_study.false_alarms(usual, gamma.detector_)
+    estimates["shifts.nominal", "monitor", "false_alarms_per_hour"] = alarms
+    evaluation.add(estimates, shifts=shift_study.shifts_figure(estimates))
+    evaluation.entries["kinds"] = {"nominal": "nominal"} | {
+        name: shift.kind for name, shift in shifts.items()
+    }

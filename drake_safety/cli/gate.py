@@ -34,7 +34,7 @@ from drake_safety.evaluation.loop_comparison import (
 )
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.outcomes import BELIEFS, UNSAFE, Outcome
-from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.results import Key, Results
 from drake_safety.evaluation.tables import Column
 from drake_safety.files.atomic import write_file
 from drake_safety.files.reading import parse_yaml
@@ -190,7 +190,13 @@ def rate(
     _show(f"{loaded.name}, {variation}: {metric}", _OF_RATE, [row])
     _show_episodes("Failures", found.failures, metric, loaded.make_loop(variation).output_names)
     entries = {"seed": seed, "metric": metric} | asdict(found)
-    _write(folder / "rate.json", Loop(loaded, variation), entries, failure_rate=found.rate)
+    estimates = {("", "", "failure_rate"): found.rate}
+    _write(
+        folder / "rate.json",
+        Loop(loaded, variation),
+        entries,
+        estimates,
+    )
 
 
 def changed_loop(scenario: str, changes: str) -> Loop:
@@ -261,7 +267,8 @@ def _report(
         f"{100 * one.worse_by:g} points"
     )
     candidates = {name: asdict(one) for name, one in found.items()}
-    _write(folder / "gate.json", first, {"seed": seed, "metric": metric, "candidates": candidates})
+    entries = {"seed": seed, "metric": metric, "candidates": candidates}
+    _write(folder / "gate.json", first, entries, {})
     for picture in save(gate_figure(found), folder / "gate"):
         console.say("picture", picture)
 
@@ -319,10 +326,12 @@ def _show(title: str, columns: Sequence[str], rows: Iterable[Iterable[object]]) 
         console.show(console.new_table(*columns, rows=cells, title=title))
 
 
-def _write(file: Path, loop: Loop, entries: dict[str, Any], **figures: Estimate) -> None:
+def _write(
+    file: Path, loop: Loop, entries: dict[str, Any], estimates: Mapping[Key, Estimate]
+) -> None:
     """Writes results."""
     made = console.made_by(loop.scenario.name) | {"variation": loop.variation}
-    Results(figures, made | entries).write(file)
+    Results(estimates, made | entries).write(file)
     console.say("figures", file)
 
 

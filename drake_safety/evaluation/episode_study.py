@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate, proportion, segment_estimates, threshold_at
-from drake_safety.evaluation.results import key_part
+from drake_safety.evaluation.results import Key
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.learning.calibration import episodes_needed, least_miss_rate, score_threshold
 from drake_safety.learning.seeds import check_unused
@@ -22,35 +22,29 @@ _LOGGER = logging.getLogger("drake_safety")
 
 def evaluate_episodes(
     scorers: Sequence[Scorer], calibration: Episodes, test: Episodes
-) -> tuple[dict[str, Estimate], dict[str, np.ndarray], Segments]:
+) -> dict[Key, Estimate]:
     """Evaluates scorers on fresh episodes, on every segment and at k = 0.
 
     Thresholds maximise the balanced accuracy on the calibration set, separately for all segments
-    and for k = 0. Returns the estimates by dotted key, the unsafe score of every test segment by
-    scorer, (N,) each, and the test segments.
+    and for k = 0.
     """
-    segments = split(test, stride=1, discount=1.0)
-    seen = split(calibration, stride=1, discount=1.0)
-    # Rows of the test set and of the calibration set, by prefix of the keys.
+    segments, others = (split(one, stride=1, discount=1.0) for one in (test, calibration))
     rows_of = {
-        "segments": (np.ones(len(segments), dtype=bool), np.ones(len(seen), dtype=bool)),
-        "episodes": (segments.is_first, seen.is_first),
-    }
-    estimates: dict[str, Estimate] = {}
-    scores = {}
+        "segments": (np.ones(len(segments), dtype=bool), np.ones(len(others), dtype=bool)),
+        "episodes": (segments.is_first, others.is_first),
+    }  # Of the test set and of the calibration set.
+    estimates: dict[Key, Estimate] = {}
     for scorer in scorers:
         check_unused(scorer.used, [calibration.info.seed, test.info.seed], f"'{scorer.name}'")
-        score, seen_score = scorer.unsafe_score(segments), scorer.unsafe_score(seen)
-        scores[scorer.name] = score
-        for kind, (rows, seen_rows) in rows_of.items():
-            threshold = threshold_at(seen_score[seen_rows], seen.is_unsafe[seen_rows])
-            found = segment_estimates(segments.take(rows), score[rows], threshold=threshold)
-            estimates |= {f"{kind}.{scorer.name}.{key}": one for key, one in found.items()}
-    estimates["episodes.share_unsafe"] = proportion(
-        test.num_unsafe, test.num_unsafe + test.num_safe
-    )
-    estimates["episodes.share_diverged"] = proportion(test.num_diverged, len(test))
-    return estimates, scores, segments
+        score, other_score = scorer.unsafe_score(segments), scorer.unsafe_score(others)
+        for kind, (rows, other_rows) in rows_of.items():
+            threshold = threshold_at(other_score[other_rows], others.is_unsafe[other_rows])
+            judged = segment_estimates(segments.take(rows), score[rows], threshold=threshold)
+            estimates |= {(kind, scorer.name, metric): one for metric, one in judged.items()}
+    num_judged = test.num_unsafe + test.num_safe
+    estimates["episodes", "", "share_unsafe"] = proportion(test.num_unsafe, num_judged)
+    estimates["episodes", "", "share_diverged"] = proportion(test.num_diverged, len(test))
+    return estimates
 
 
 def evaluate_plans(
@@ -58,37 +52,37 @@ def evaluate_plans(
     calibration: Episodes,
     test: Episodes,
     thresholds: Mapping[str, float],
-) -> tuple[dict[str, Estimate], dict[str, np.ndarray], Segments]:
+) -> dict[Key, Estimate]:
     """Evaluates verdicts on fresh plans with a goal, at k = 0, before anything moves.
 
     Thresholds that are not given are chosen on the calibration set: each accepts most while a
     future unsafe plan is refused with probability `PROMISED_UNSAFE_RECALL`, or what the number of
     unsafe calibration plans allows. Estimates give thresholds as Γ_thre.
-    Given ones are the unsafe score above which a plan is refused, by scorer. Returns what
-    :func:`evaluate_episodes` does, of the first segments, with the outcomes' shares.
+
+    Args:
+        thresholds: The unsafe score above which a plan is refused, by scorer.
     """
-    first, seen = first_segments(test), first_segments(calibration)
-    miss_rate = promised_miss_rate(seen.is_unsafe)
-    num_unsafe = int(seen.is_unsafe.sum())
-    estimates = {"plans.promised_unsafe_recall": Estimate.exact(1.0 - miss_rate, num_unsafe)}
-    scores = {}
+    first, others = _first_segments(test), _first_segments(calibration)
+    miss_rate = promised_miss_rate(others.is_unsafe)
+    num_unsafe = int(others.is_unsafe.sum())
+    promised = Estimate.exact(1.0 - miss_rate, num_unsafe)
+    estimates = {("plans", "", "promised_unsafe_recall"): promised}
     for scorer in scorers:
         check_unused(scorer.used, [calibration.info.seed, test.info.seed], f"'{scorer.name}'")
         threshold = thresholds.get(scorer.name)
         if threshold is None:
-            threshold = score_threshold(scorer.unsafe_score(seen), seen.is_unsafe, miss_rate)
-        score = scores[scorer.name] = scorer.unsafe_score(first)
-        found = segment_estimates(first, score, threshold=threshold)
-        found["threshold"] = Estimate.exact(1.0 - threshold, len(seen))
-        estimates |= {f"plans.{scorer.name}.{key}": one for key, one in found.items()}
+            threshold = score_threshold(scorer.unsafe_score(others), others.is_unsafe, miss_rate)
+        judged = segment_estimates(first, scorer.unsafe_score(first), threshold=threshold)
+        judged["threshold"] = Estimate.exact(1.0 - threshold, len(others))
+        estimates |= {("plans", scorer.name, metric): one for metric, one in judged.items()}
     causes = [episode.cause for episode in test]
     for name in ("", *test.info.constraint_names, DIVERGED):
         share = proportion(causes.count(name), len(causes))
-        estimates[f"plans.outcomes.{key_part(name) or 'safe'}"] = share
-    return estimates, scores, first
+        estimates["plans", "outcomes", name or "safe"] = share
+    return estimates
 
 
-def first_segments(episodes: Episodes) -> Segments:
+def _first_segments(episodes: Episodes) -> Segments:
     """The first segment of each episode, however early it ends; diverged ones have none."""
     segments = split(episodes, stride=episodes.info.horizon, discount=1.0, shortest=1)
     return segments.take(segments.is_first)

@@ -11,7 +11,6 @@ import os
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -123,8 +122,8 @@ def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:
 
 
 def spoken(name: str) -> str:
-    """A name, or part of a key, as readable text: `support_polygon` → support polygon."""
-    return unquote(name).replace("_", " ")
+    """A name as readable text: `support_polygon` → support polygon."""
+    return name.replace("_", " ")
 
 
 def label_of(key: str) -> str:

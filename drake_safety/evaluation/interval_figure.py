@@ -2,35 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from drake_safety.evaluation import figure_style as style
-from drake_safety.evaluation.results import Result
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.results import Key
 
 _MARKS = "osD^vP"
 
 
-def interval_figure(rows: Sequence[Result]) -> Figure:
+def interval_figure(estimates: Mapping[Key, Estimate]) -> Figure:
     """Plots a panel for each metric: methods below each other, sets side by side in colours."""
-    metrics, methods, sets = (
-        list(dict.fromkeys(getattr(row, name) for row in rows))
-        for name in ("metric", "method", "set")
-    )
+    sets, methods, metrics = ([*dict.fromkeys(names)] for names in zip(*estimates, strict=True))
     with style.drawing_style():
         height = 1.1 + 0.18 * len(methods) * (1 + len(sets))
         fig = style.new_figure(2.2 + 2.6 * len(metrics), height)
         panels = np.atleast_1d(fig.subplots(1, len(metrics), sharey=True))
         for axes, metric in zip(panels, metrics, strict=True):
             for i, name in enumerate(sets):
-                shown = [row for row in rows if row.metric == metric and row.set == name]
+                keys = [key for key in estimates if (key[0], key[2]) == (name, metric)]
+                shown = [estimates[key] for key in keys]
                 # NaN ends, such as those of a value without interval, draw no bar.
                 value, low, high = (
                     np.array([[r.value, r.low, r.high] for r in shown]).reshape(-1, 3).T
                 )
-                places = [methods.index(row.method) for row in shown]
+                places = [methods.index(method) for _, method, _ in keys]
                 axes.errorbar(
                     value,
                     np.array(places) + 0.7 * ((i + 0.5) / len(sets) - 0.5),

@@ -8,7 +8,7 @@ likely. A segment is classified unsafe when its score exceeds a threshold, as a 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -36,12 +36,6 @@ class Estimate:
         """A value without uncertainty, such as a threshold: both ends of the interval equal it."""
         return cls(value, value, value, n)
 
-    @classmethod
-    def of_row(cls, row: Sequence[float | int | None]) -> Estimate:
-        """The estimate of a stored row: value, low, high and n; None stands for NaN."""
-        value, low, high = (math.nan if end is None else float(end) for end in row[:3])
-        return cls(value, low, high, int(row[3] or 0))
-
 
 _CONFIDENCE = 0.95  # Of all intervals.
 _ENDS = [0.5 - 0.5 * _CONFIDENCE, 0.5 + 0.5 * _CONFIDENCE]
@@ -68,12 +62,8 @@ class Bootstrap:
             return Estimate.exact(math.nan, num_episodes)
         rng = np.random.default_rng(self.seed)
         shares = np.full(num_episodes, 1.0 / num_episodes)
-        drawn = np.array(
-            [
-                statistic(rng.multinomial(num_episodes, shares)[members])
-                for _ in range(self.num_resamples)
-            ]
-        )
+        weights = (rng.multinomial(num_episodes, shares) for _ in range(self.num_resamples))
+        drawn = np.array([statistic(one[members]) for one in weights])
         # A resample without one of the classes has no value.
         low, high = np.quantile(drawn[~np.isnan(drawn)], _ENDS)
         return Estimate(value, float(low), float(high), num_episodes)
@@ -97,8 +87,6 @@ def proportion(count: int, n: int) -> Estimate:
     """The share `count` of `n` independent samples, with its Clopper-Pearson interval."""
     from scipy.stats import binomtest
 
-    if not 0 <= count <= n:
-        raise ValueError(f"proportion: count is {count}, expected 0..{n}")
     if n == 0:
         return Estimate(value=math.nan, low=0.0, high=1.0, n=0)
     interval = binomtest(count, n).proportion_ci(_CONFIDENCE, method="exact")
@@ -110,8 +98,6 @@ def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> E
 
     Infinite values are allowed: a fall that never happens is later than any other.
     """
-    if np.isnan(values).any():
-        raise ValueError(f"median: {np.isnan(values).sum()} of {values.size} values are NaN")
     if values.size == 0:
         return Estimate.exact(math.nan, 0)
     return bootstrap.over_values(partial(np.median, axis=-1), np.sort(values))
@@ -148,7 +134,7 @@ def area_under_curve(
     """
     score, label = _checked("area_under_curve", unsafe_score, is_unsafe)
     weight = np.ones(len(score)) if weight is None else np.asarray(weight, dtype=float)
-    return _ranked_area(_ranks(score), label, weight)
+    return _ranked_area(np.unique(score, return_inverse=True)[1], label, weight)
 
 
 def auc(
@@ -163,7 +149,7 @@ def auc(
     If the scores of the classes do not overlap, the bootstrap has no spread and `low` is 1 as well.
     """
     score, label = _checked("auc", unsafe_score, is_unsafe)
-    rank = _ranks(score)
+    rank = np.unique(score, return_inverse=True)[1]
     return bootstrap.over_episodes(lambda weight: _ranked_area(rank, label, weight), episode)
 
 
@@ -208,14 +194,7 @@ def segment_estimates(
     unsafe above the threshold.
     """
     score, label = _checked("segment_estimates", unsafe_score, segments.is_unsafe)
-    episode = segments.episode
-
-    probability = np.where(np.isposinf(score), 1.0, score)
-    if not np.all((probability >= 0.0) & (probability <= 1.0)):
-        raise ValueError(
-            f"segment_estimates: probabilities must lie in [0, 1], got {probability.min()}.."
-            f"{probability.max()}"
-        )
+    episode, probability = segments.episode, np.minimum(score, 1.0)  # "Don't know" is infinite.
     return {
         "auc": auc(score, label, episode, bootstrap=bootstrap),
         "safe_recall": share((score <= threshold)[~label], episode[~label], bootstrap=bootstrap),
@@ -238,15 +217,14 @@ def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
     finite = np.unique(score[np.isfinite(score)])
     if finite.size == 0:
         raise ValueError(f"threshold_at: none of the {len(score)} scores is finite")
-    lowest = np.nextafter(finite[0], -math.inf)
     middle = 0.5 * (finite[:-1] + finite[1:])
     # Infinite scores stay above every threshold.
-    candidates = np.concatenate([[lowest], middle, [finite[-1]]])
-    share_below = [
+    candidates = np.array([np.nextafter(finite[0], -math.inf), *middle, finite[-1]])
+    safe_recall, miss_rate = (
         np.searchsorted(np.sort(one), candidates, side="right") / len(one)
         for one in (score[~label], score[label])
-    ]
-    balanced = 0.5 * (share_below[0] + 1.0 - share_below[1])
+    )
+    balanced = 0.5 * (safe_recall + 1.0 - miss_rate)
     best = np.flatnonzero(balanced >= balanced.max() - 1e-12)
     return float(candidates[best[(len(best) - 1) // 2]])
 
@@ -254,16 +232,14 @@ def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
 def _checked(
     who: str, unsafe_score: np.ndarray, is_unsafe: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Scores, infinite where they are NaN, and labels."""
     score, label = np.asarray(unsafe_score, dtype=float), np.asarray(is_unsafe)
-    if label.dtype != bool:
-        raise ValueError(f"{who}: labels must be boolean, got {label.dtype}")
-    if score.ndim != 1 or score.shape != label.shape:
-        raise ValueError(f"{who}: as many scores, {score.shape}, as labels expected, {label.shape}")
+    if label.dtype != bool or score.ndim != 1 or score.shape != label.shape:
+        raise ValueError(
+            f"{who}: expected as many scores as boolean labels; got {score.shape} and "
+            f"{label.shape} of {label.dtype}"
+        )
     return np.where(np.isnan(score), math.inf, score), label
-
-
-def _ranks(score: np.ndarray) -> np.ndarray:
-    return np.unique(score, return_inverse=True)[1]
 
 
 def _ranked_area(rank: np.ndarray, label: np.ndarray, weight: np.ndarray) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,23 +21,21 @@ def verdict_shares(
 ) -> dict[str, Estimate]:
     """Shares of the verdicts of stored thresholds on fresh episodes (N,).
 
-    Scores are 1 - probability. The shares are `promised_miss_rate`; `miss_rate` and
-    `unsafe_unknown`, shares of the unsafe episodes; `safe_recall`, `safe_unknown` and
-    `false_alarm_rate`, shares of the safe ones.
+    Scores are 1 - probability. `miss_rate` and `unsafe_unknown` are shares of the unsafe episodes,
+    `safe_recall`, `safe_unknown` and `false_alarm_rate` of the safe ones.
     """
-    verdict = calibration.verdicts(1.0 - np.asarray(unsafe_score, dtype=float))
-    label = np.asarray(is_unsafe, dtype=bool)
+    verdict = calibration.verdicts(1.0 - unsafe_score)
 
     def share_of(rows: np.ndarray, expected: str) -> Estimate:
         return proportion(int(np.sum(verdict[rows] == expected)), int(rows.sum()))
 
     return {
         "promised_miss_rate": Estimate.exact(calibration.miss_rate, calibration.num_unsafe),
-        "miss_rate": share_of(label, SAFE),
-        "unsafe_unknown": share_of(label, UNKNOWN),
-        "safe_recall": share_of(~label, SAFE),
-        "safe_unknown": share_of(~label, UNKNOWN),
-        "false_alarm_rate": share_of(~label, UNSAFE),
+        "miss_rate": share_of(is_unsafe, SAFE),
+        "unsafe_unknown": share_of(is_unsafe, UNKNOWN),
+        "safe_recall": share_of(~is_unsafe, SAFE),
+        "safe_unknown": share_of(~is_unsafe, UNKNOWN),
+        "false_alarm_rate": share_of(~is_unsafe, UNSAFE),
     }
 
 
@@ -62,29 +61,22 @@ def reliability(
     *,
     num_bins: int = 10,
 ) -> Reliability:
-    """Compares 1 - probability of rows, (N,), NaN counting as one, with outcomes of their episodes.
+    """Compares 1 - probability of rows, (N,), with outcomes of their episodes.
 
     There are fewer than ``num_bins`` bins if rows share probabilities.
     """
-    p = np.asarray(unsafe_probability, dtype=float)
-    p = np.where(np.isnan(p), 1.0, p)
-    label = np.asarray(is_unsafe, dtype=bool)
-    if p.size == 0 or not np.all((p >= 0.0) & (p <= 1.0)):
-        raise ValueError(
-            f"reliability: expected probabilities in [0, 1], got {p.size} of them"
-            + (f" in {p.min()}..{p.max()}" if p.size else "")
-        )
+    p = unsafe_probability
 
     def error(weight: np.ndarray) -> float:
         drawn = np.repeat(np.arange(len(p)), weight.astype(int))
         bins = _bins(p[drawn], num_bins)
-        distances = [abs(p[drawn[b]].mean() - label[drawn[b]].mean()) for b in bins]
+        distances = [abs(p[drawn[b]].mean() - is_unsafe[drawn[b]].mean()) for b in bins]
         return float([len(b) for b in bins] @ np.array(distances) / len(drawn))
 
     bins = _bins(p, num_bins)
     return Reliability(
         expected=np.array([p[b].mean() for b in bins]),
-        observed=[share(label[b], episode[b], bootstrap=_BOOTSTRAP) for b in bins],
+        observed=[share(is_unsafe[b], episode[b], bootstrap=_BOOTSTRAP) for b in bins],
         error=_BOOTSTRAP.over_episodes(error, episode),
     )
 
@@ -103,18 +95,12 @@ def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
         axes = fig.subplots()
         axes.axline((0, 0), slope=1, color=style.FAINT_INK, linewidth=0.8)
         axes.set_prop_cycle(color=style.SERIES_COLOURS, linestyle=style.SERIES_DASHES)
+        look: dict[str, Any] = {"marker": "o", "markersize": 5, "linewidth": 1.4, "elinewidth": 0.8}
         for name, one in curves.items():
             value, low, high = np.array([(s.value, s.low, s.high) for s in one.observed]).T
-            axes.errorbar(
-                one.expected,
-                value,
-                yerr=np.clip([value - low, high - value], 0.0, None),
-                marker="o",
-                markersize=5,
-                linewidth=1.4,
-                elinewidth=0.8,
-                label=f"{name}   {one.error.value:.3f}",
-            )
+            interval = np.clip([value - low, high - value], 0.0, None)
+            label = f"{name}   {one.error.value:.3f}"
+            axes.errorbar(one.expected, value, yerr=interval, label=label, **look)
         axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal", title="Reliability")
         axes.set_xlabel("predicted probability of an unsafe end")
         axes.set_ylabel("share of unsafe ends, 95 % intervals over episodes")

@@ -1,30 +1,24 @@
-"""The report of a run: what was judged and how, as one self-contained HTML page."""
+"""The report of a run: its tables and pictures as one self-contained HTML page."""
 
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 from drake_safety.evaluation.figure_style import label_of, spoken
 from drake_safety.evaluation.results import SCHEMA, Results
 from drake_safety.evaluation.shift_study import shifts_tables
-from drake_safety.evaluation.tables import Column
-from drake_safety.evaluation.verdict_tables import MEANINGS, set_title, verdict_tables
+from drake_safety.evaluation.verdict_tables import verdict_tables
 from drake_safety.extras import require_extra
 from drake_safety.files.atomic import write_file
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.simulation.dataset import read_info
 
-REPORT_FILE = "report.html"
-_NUMBER = Column("", "", digits=4)
-
 
 def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -> Path:
-    """Writes the page into the folder of a run, from what is there.
+    """Writes ``report.html`` into the folder of a run, from what is there.
 
     Assessments, results and pictures are those of `train`, `calibrate`, `evaluate`, `run` and
     `adapt`. Recordings are linked, all else is inside the page. The command of the training names
@@ -48,42 +42,27 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
             f"report: '{folder}' holds neither an assessment nor results, but {there}; "
             "`drake-safety train` and `evaluate` write them"
         )
-    infos = [assessment.info_ for assessment in assessments.values()]
-    tables = [(one, [*verdict_tables(one), *shifts_tables(one)]) for one in results]
-    columns = {one.key: one for _, found in tables for table in found for one in table.columns}
+    names = [one.info_.scenario for one in assessments.values()]
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"spoken": spoken, "label": label_of, "set_title": set_title}
+    environment.filters |= {"spoken": spoken, "label": label_of}
     text = files(__package__).joinpath("report.html.j2").read_text(encoding="utf-8")
+    # Folders of recorded motions, and pictures in none of them.
+    motions = {path.parent for path in folder.rglob("recording.html")}
     page = environment.from_string(text).render(
         folder=folder.resolve().name,
-        name=infos[0].scenario if infos else results[0].entries.get("scenario", folder.name),
+        name=names[0] if names else results[0].entries.get("scenario", folder.name),
         assessments=assessments,
         training=read_info(episodes)[1].get("command", "") if episodes.is_dir() else "",
-        results=tables,
-        meanings=[(columns[key].title, MEANINGS[key]) for key in columns if key in MEANINGS],
-        number=_NUMBER,
-        motions=_motions(folder),
+        results=[(one.entries, [*verdict_tables(one), *shifts_tables(one)]) for one in results],
+        motions=[(one.relative_to(folder).as_posix(), _pictures(one)) for one in sorted(motions)],
         pictures=_pictures(folder),
         versions=versions,
     )
-    file = folder / REPORT_FILE
+    file = folder / "report.html"
     write_file(file, page)
     return file
-
-
-def _motions(folder: Path) -> list[dict[str, Any]]:
-    """Folders of recorded motions: their events, as `run` writes them, pictures and recording."""
-    found = {path.parent for name in ("run.json", "recording.html") for path in folder.rglob(name)}
-    motions: list[dict[str, Any]] = []
-    for one in sorted(found):
-        motions.append({"name": one.relative_to(folder).as_posix(), "pictures": _pictures(one)})
-        if (events := one / "run.json").is_file():
-            motions[-1]["events"] = json.loads(events.read_text(encoding="utf-8"))
-        if (recording := one / "recording.html").is_file():
-            motions[-1]["recording"] = recording.relative_to(folder).as_posix()
-    return motions
 
 
 def _pictures(folder: Path) -> list[tuple[str, str]]:

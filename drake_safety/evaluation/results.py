@@ -5,101 +5,65 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.files.atomic import write_file
+from drake_safety.files.reading import reading
+from drake_safety.files.schema import load_typed
 
 SCHEMA = "drake_safety.results"
-SCHEMA_VERSION = 1
 _NUM_DIGITS = 6  # Significant digits in a file, more than any table shows.
-_DOT = re.compile(r"(?<!\d)\.|\.(?!\d)")  # A dot between digits belongs to a number.
-_DAMAGES = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError)
-_KEY = re.compile(r"[\w% -]+(\.[\w% -]+)*")
-_OTHER = re.compile(rf"[^\w .-]|{_DOT.pattern}")  # Characters that a part of a key does not have.
+
+Key = tuple[str, str, str]
+"""What was judged, such as "episodes"; what judged it, such as "sharpened", or "" for a figure of
+the set itself; and what was measured, such as "auc"."""
+_Number = float | None
 
 
-def key_part(name: str) -> str:
-    """Any name as one part of a key, as in an address: ``friction+10%`` → ``friction%2B10%25``."""
-    return _OTHER.sub(lambda one: "".join(f"%{byte:02X}" for byte in one[0].encode()), name)
+@dataclass
+class _File:
+    schema: Literal["drake_safety.results"]
+    schema_version: Literal[2]
+    entries: dict[str, Any]
+    rows: list[tuple[str, str, str, _Number, _Number, _Number, int]]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Result(Estimate):
-    """A row of the table: a figure with its interval.
+class Results(dict[Key, Estimate]):
+    """Estimates by set, method and metric, in their order, and what made them, as JSON types."""
 
-    Attributes:
-        set: What was judged, such as "episodes" or "plans.fair".
-        method: What judged it, such as "sharpened"; "" for a figure of the set itself.
-        metric: What was measured, such as "auc".
-    """
-
-    set: str
-    method: str
-    metric: str
-
-    @classmethod
-    def of(cls, key: str, estimate: Estimate) -> Result:
-        """The row with a key "set.method.metric", "set.metric" or "metric"; a set may have dots."""
-        if not _KEY.fullmatch(key):
-            raise ValueError(
-                f"a result has the key '{key[:80]}', expected letters, digits, spaces, '_', '%' "
-                "and '-' between dots"
-            )
-        *rest, metric = _DOT.split(key)
-        method = rest.pop() if len(rest) > 1 else ""
-        ends = estimate.value, estimate.low, estimate.high, estimate.n
-        return cls(*ends, set=".".join(rest), method=method, metric=metric)
-
-
-class Results(dict[str, Result]):
-    """Rows by key "set.method.metric", in their order, and what made them, as JSON types."""
-
-    def __init__(self, estimates: Mapping[str, Estimate], entries: Mapping[str, Any] | None = None):
-        super().__init__({key: Result.of(key, one) for key, one in estimates.items()})
+    def __init__(self, estimates: Mapping[Key, Estimate], entries: Mapping[str, Any] | None = None):
+        super().__init__(estimates)
         self.entries: dict[str, Any] = dict(entries or {})
-
-    def select(
-        self, *, set: str | None = None, method: str | None = None, metric: str | None = None
-    ) -> list[Result]:
-        """The rows of a set, a method and a metric; None takes all."""
-        wanted = {"set": set, "method": method, "metric": metric}
-        given = {name: value for name, value in wanted.items() if value is not None}
-        return [row for row in self.values() if given.items() <= vars(row).items()]
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Results:
         """Reads a file that `write` wrote."""
-        try:
-            content = json.loads(Path(path).read_text(encoding="utf-8"))
-            found = (content["schema"], content["schema_version"])
-            if found != (SCHEMA, SCHEMA_VERSION):
-                raise ValueError(f"schema and version are {found}")
-            figures = {key: Estimate.of_row(row) for key, row in content["figures"].items()}
-            return cls(figures, content["entries"])
-        except _DAMAGES as error:
-            raise ValueError(
-                f"{path} holds no results, expected '{SCHEMA}', version {SCHEMA_VERSION}: "
-                f"{type(error).__name__}: {str(error)[:200]}"
-            ) from error
+        with reading(Path(path)):
+            raw = json.loads(Path(path).read_text(encoding="utf-8"))
+            file = load_typed(_File, raw, f"{path} holds no results that can be read")
+        estimates = {}
+        for set, method, metric, *ends, n in file.rows:
+            value, low, high = (math.nan if end is None else end for end in ends)
+            estimates[set, method, metric] = Estimate(value, low, high, n)
+        return cls(estimates, file.entries)
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Writes a JSON file, a row a line: key, then value, ends of the interval and n.
+        """Writes a JSON file: set, method, metric, value, ends of its interval, and n of each row.
 
         Numbers have six significant digits; what is not finite becomes null.
         """
-        figures = ",\n".join(
-            f"    {json.dumps(key)}: "
-            f"{json.dumps([*map(_rounded, (row.value, row.low, row.high)), int(row.n)])}"
-            for key, row in self.items()
-        )
+        rows = [
+            [*key, *map(_rounded, (one.value, one.low, one.high)), int(one.n)]
+            for key, one in self.items()
+        ]
+        lines = ",\n".join(f"    {json.dumps(row, ensure_ascii=False)}" for row in rows)
         entries = json.dumps(self.entries, indent=2, ensure_ascii=False).replace("\n", "\n  ")
-        head = f'  "schema": "{SCHEMA}",\n  "schema_version": {SCHEMA_VERSION},\n'
-        text = f'{{\n{head}  "entries": {entries},\n  "figures": {{\n{figures}\n  }}\n}}\n'
+        head = f'  "schema": "{SCHEMA}",\n  "schema_version": 2,\n'
+        text = f'{{\n{head}  "entries": {entries},\n  "rows": [\n{lines}\n  ]\n}}\n'
         write_file(Path(path), text)
 
 

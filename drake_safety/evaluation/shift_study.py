@@ -1,49 +1,68 @@
-"""Γ under shifts: how often it says "don't know" or is sure and wrong, and when the monitor alarms.
+"""Γ and its monitor under shifts: "don't know", rows sure and wrong, alarms.
 
 A row is sure and wrong (a confident error) where it is called safe with at least 0.9, with a belief
-that is not "don't know", in a motion that ends unsafely. Figures "with monitor" count rows after
-its alarm as "don't know": so it is with ``on_alarm: unknown``, while with ``on_alarm: report`` the
-alarm changes no belief.
+that is not "don't know", in a motion that ends unsafely. Figures with monitor are of undisturbed
+motions that follow each other: when one leaves the safe set, the robot begins anew and the charts
+go on, as on a robot that is put on its feet. There a row counts if the motion leaves the safe set
+within an episode's duration, and rows during an alarm are "don't know", as with
+``on_alarm: unknown``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from drake_safety.evaluation.figure_style import spoken
 from drake_safety.evaluation.interval_figure import interval_figure
-from drake_safety.evaluation.metrics import Bootstrap, Estimate, auc, mean, proportion
-from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.metrics import (
+    Bootstrap,
+    Estimate,
+    auc,
+    mean,
+    proportion,
+    quantile,
+    rate_per_hour,
+)
+from drake_safety.evaluation.results import Key, Results
 from drake_safety.evaluation.scorers import assessment_scorer
-from drake_safety.evaluation.tables import Column, Table, rows_of
-from drake_safety.files.progress import StageProgress
+from drake_safety.evaluation.tables import Column, Row, Table
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.causes import is_outside
-from drake_safety.learning.segments import DIVERGED, RECORDED, Episode, Episodes
+from drake_safety.learning.change_detector import ChangeDetector, rows_of, usual_rows
+from drake_safety.learning.segments import DIVERGED, Episode, Episodes
+from drake_safety.simulation.rollouts import run_motion, worker_loop
+from drake_safety.simulation.scenario import Scenario
+from drake_safety.simulation.worker_processes import map_items
 
 SEEN = ("state", "desired_preview", "features")
 """Output ports that are inputs of assessor and monitor."""
 CONFIDENT = 0.9
 """Least safety probability of a confident verdict."""
 BOOTSTRAP = Bootstrap(num_resamples=200)
-_COLUMNS = (
-    Column("unsafe", "unsafe", "=%", digits=1),
-    Column("gamma.unknown", "don't know", "=%", digits=1),
-    Column("gamma.confident_error", "sure and wrong", "=%", digits=1),
-    Column("gamma.auc", "AUC", "="),
-    Column("paper.unknown", "paper: don't know", "=%", digits=1),
-    Column("paper.confident_error", "sure and wrong", "=%", digits=1),
-    Column("paper.auc", "AUC", "="),
-    Column("monitor.alarmed", "alarms", "=%", digits=0),
-    Column("monitor.delay_s", "after", "s", digits=1),
-    Column("monitor.delay_95_s", "95 %", "s", digits=1),
-    Column("monitor.confident_error_10s", "sure and wrong, 10 s with monitor", "=%", digits=1),
-    Column("monitor.confident_error_60s", "60 s", "=%", digits=1),
+SPANS_S = (10.0, 60.0)
+"""Times since a change over which confident errors are counted [s]."""
+_FIRST_S = 12.0  # Simulated of each motion; only those without an alarm go on.
+_UNKNOWN = Column("unknown", "don't know", "=%", digits=1)
+_ERROR, _AUC = (
+    Column("confident_error", "sure and wrong", "=%", digits=1),
+    Column("auc", "AUC", "="),
 )
+_COLUMNS = (
+    ("", Column("unsafe", "unsafe", "=%", digits=1)),
+    *(("gamma", one) for one in (_UNKNOWN, _ERROR, _AUC)),
+    ("paper", Column("unknown", "paper: don't know", "=%", digits=1)),
+    *(("paper", one) for one in (_ERROR, _AUC)),
+    ("monitor", Column("alarmed", "alarms", "=%", digits=0)),
+    ("monitor", Column("delay_s", "after", "s", digits=1)),
+    ("monitor", Column("delay_95_s", "95 %", "s", digits=1)),
+    ("monitor", Column("confident_error_10s", "sure and wrong, 10 s with monitor", "=%", digits=1)),
+    ("monitor", Column("confident_error_60s", "60 s", "=%", digits=1)),
+)  # By method.
 _MEANING = (
     'Shares of rows; sure and wrong: called safe with at least 0.9, not "don\'t know", in motions '
     'that end unsafely. AUC: of all rows, "don\'t know" the least safe. With monitor, motions '
@@ -52,116 +71,195 @@ _MEANING = (
 )
 
 
-MotionSet = tuple[str, list[Episode]]
-"""Kind of a shift, "nominal", "plant" or "sensor", and motions under it."""
-Judge = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""Maps N states, previews, features, and whether each row is outside the safe set, to safety
-probabilities (N,), NaN for "don't know"."""
+def safety_probability(
+    assessment: SafetyAssessment, episode: Episode, rows: np.ndarray | slice
+) -> np.ndarray:
+    """Γ of N rows as :class:`SafetyAssessor` with the port ``margins`` computes it, (N,).
 
-
-def motions_of(episodes: Episodes) -> list[Episode]:
-    """The rows of episodes from the first undisturbed one; those that diverged are left out."""
-    motions = []
-    for one in (one for one in episodes if one.cause != DIVERGED):
-        rows = {name: getattr(one, name)[one.first_step :] for name in ("time_s", *RECORDED)}
-        motions.append(replace(one, **rows, first_step=0))
-    return motions
-
-
-def assessment_judge(assessment: SafetyAssessment) -> Judge:
-    """Γ as a :class:`SafetyAssessor` with the port ``margins`` computes it."""
-    probability_of = assessment_scorer("gamma", assessment).probability
-
-    def judge(*rows: np.ndarray) -> np.ndarray:
-        *seen, is_outside = rows
-        probability = probability_of(*seen)
-        return np.where(is_outside & ~np.isnan(probability), 0.0, probability)
-
-    return judge
-
-
-class JudgedShift:
-    """The verdicts of methods by name, of which "gamma" is Γ, on M motions with N rows in all.
-
-    Attributes:
-        probability: Safety probability of every row by method, NaN for "don't know", (N,).
-        motion: Motion of each row, (N,).
-        is_unsafe: Whether each motion ends unsafely, (M,).
+    It is NaN for "don't know".
     """
-
-    def __init__(self, judges: Mapping[str, Judge], motions: Sequence[Episode]):
-        rows = [np.concatenate([getattr(one, name) for one in motions]) for name in SEEN]
-        rows.append(np.concatenate([is_outside(one.margins) for one in motions]))
-        self.probability = {name: judge(*rows) for name, judge in judges.items()}
-        self.motion = np.repeat(np.arange(len(motions)), [len(one.state) for one in motions])
-        self.is_unsafe = np.array([not one.is_safe for one in motions])
-
-    def is_wrong(self, name: str) -> np.ndarray:
-        """Whether a method is sure and wrong in each row, (N,)."""
-        return (self.probability[name] >= CONFIDENT) & self.is_unsafe[self.motion]
+    inputs = (getattr(episode, name)[rows] for name in SEEN)
+    probability = assessment_scorer("gamma", assessment).probability(*inputs)
+    is_unsafe = is_outside(episode.margins[rows]) & ~np.isnan(probability)
+    return np.where(is_unsafe, 0.0, probability)
 
 
-def shift_estimates(judged: JudgedShift) -> dict[str, Estimate]:
-    """Shares of rows sure and wrong and "don't know", and the AUC of all rows, of each method.
+def shift_estimates(
+    assessments: Mapping[str, SafetyAssessment], episodes: Episodes
+) -> dict[tuple[str, str], Estimate]:
+    """Shares of rows sure and wrong and "don't know", and the AUC of all rows, of each Γ.
 
-    "Don't know" counts as the lowest probability. Intervals are over motions.
+    Rows count from the first undisturbed one. "Don't know" counts as the lowest probability.
+    Intervals are over episodes.
+
+    Returns:
+        Estimates by name of Γ, "" for the episodes themselves, and metric.
     """
-    is_unsafe, motion = judged.is_unsafe, judged.motion
-    found = {"unsafe": proportion(int(is_unsafe.sum()), len(is_unsafe))}
-    for name, probability in judged.probability.items():
-        found[f"{name}.confident_error"] = mean(judged.is_wrong(name), motion, bootstrap=BOOTSTRAP)
-        found[f"{name}.unknown"] = mean(np.isnan(probability), motion, bootstrap=BOOTSTRAP)
+    kept = [one for one in episodes if one.cause != DIVERGED]
+    motion = np.repeat(np.arange(len(kept)), [len(one.state) - one.first_step for one in kept])
+    is_unsafe = np.array([not one.is_safe for one in kept])
+    estimates = {("", "unsafe"): proportion(int(is_unsafe.sum()), len(is_unsafe))}
+    for name, gamma in assessments.items():
+        rows = [safety_probability(gamma, one, slice(one.first_step, None)) for one in kept]
+        probability = np.concatenate(rows)
+        is_wrong = (probability >= CONFIDENT) & is_unsafe[motion]
+        estimates[name, "confident_error"] = mean(is_wrong, motion, bootstrap=BOOTSTRAP)
+        estimates[name, "unknown"] = mean(np.isnan(probability), motion, bootstrap=BOOTSTRAP)
         if 0 < is_unsafe.sum() < len(is_unsafe):
             score = 1.0 - np.nan_to_num(probability)
-            found[f"{name}.auc"] = auc(score, is_unsafe[motion], motion)
-    return found
+            estimates[name, "auc"] = auc(score, is_unsafe[motion], motion)
+    return estimates
 
 
-def evaluate_shifts(
-    sets: Mapping[str, MotionSet],
-    judges: Mapping[str, Judge],
-    progress: StageProgress,
-    more: Callable[[JudgedShift], Mapping[str, Estimate]] = lambda judged: {},
-) -> dict[str, Estimate]:
-    """Estimates of every shift by dotted key.
+def run_monitored(
+    scenario: Scenario,
+    variation: str,
+    num_motions: int,
+    seed: int,
+    detector: ChangeDetector,
+    *,
+    options: Mapping[str, Any],
+    num_workers: int | None = None,
+) -> list[Episode]:
+    """Simulates undisturbed motions of a plant; those without an alarm last a minute."""
+    make = worker_loop(scenario, variation, **options)
 
-    Judges are methods by name; "gamma" is Γ.
+    def simulated(indices: list[int], until_s: float) -> dict[int, Episode]:
+        run = partial(make.run, run_motion, seed=seed, until_s=until_s, with_features=True)
+        motions = map_items(run, indices, num_workers=num_workers, batch_size=1)
+        return {one.index: one for one in motions}
+
+    motions = simulated([*range(num_motions)], _FIRST_S)
+    quiet = [
+        i for i, one in motions.items() if one.is_safe and not detector.watch([rows_of(one)])[1]
+    ]
+    motions |= simulated(quiet, max(SPANS_S))
+    return [motions[i] for i in sorted(motions) if motions[i].cause != DIVERGED]
+
+
+class Minute(NamedTuple):
+    """A minute that begins with a motion and goes on with the next ones.
+
+    Attributes:
+        alarm_s: Time of the first alarm [s]; infinite without one, as is the next.
+        leave_s: Time of first leaving the safe set [s].
+        error_s: Durations of confident errors in the first 10 s and 60 s, outside alarms [s].
+        silent_error_s: The same without a monitor [s].
     """
-    found: dict[str, Estimate] = {}
-    for i, (name, (_, motions)) in enumerate(sets.items()):
-        progress("shifts", i, len(sets))
-        judged = JudgedShift(judges, motions)
-        of = {**shift_estimates(judged), **more(judged)}
-        found |= {f"shifts.{name}.{key}": estimate for key, estimate in of.items()}
-    progress("shifts", len(sets), len(sets))
-    return found
+
+    alarm_s: float
+    leave_s: float
+    error_s: list[float]
+    silent_error_s: list[float]
+
+
+def monitored(motions: Sequence[Episode], assessment: SafetyAssessment) -> list[Minute]:
+    """What the monitor and Γ say in the minute that begins with each of some motions."""
+    detector = assessment.detector_
+    rows = [rows_of(one) for one in motions]
+    every = max(1, round(assessment.info_.step_s / detector.step_s))
+    wrong_rows = [_sure_and_wrong(one, assessment, every) for one in motions]
+    most = round(max(SPANS_S) / detector.step_s)
+    minutes = []
+    for start in range(len(motions)):
+        order = np.roll(np.arange(len(motions)), -start).tolist()
+        begin = np.cumsum([0, *(len(rows[i]) for i in order)])
+        order = order[: np.searchsorted(begin[1:], most) + 1]
+        _, alarms = detector.watch([rows[i] for i in order])
+        is_alarm = np.zeros(begin[len(order)], dtype=bool)
+        for alarm in alarms:
+            is_alarm[alarm.begin : alarm.end] = True
+        wrong = np.concatenate([begin[k] + wrong_rows[i] for k, i in enumerate(order)])
+        leaves = [begin[k + 1] for k, i in enumerate(order) if not motions[i].is_safe]
+        firsts = (min(at, default=most) for at in ([one.begin for one in alarms], leaves))
+        alarm_s, leave_s = (row * detector.step_s if row < most else np.inf for row in firsts)
+        error_s, silent_error_s = (
+            [every * detector.step_s * (detector.step_s * one < span).sum() for span in SPANS_S]
+            for one in (wrong[~is_alarm[wrong]], wrong)
+        )
+        minutes.append(Minute(alarm_s, leave_s, error_s, silent_error_s))
+    return minutes
+
+
+def _sure_and_wrong(motion: Episode, assessment: SafetyAssessment, every: int) -> np.ndarray:
+    """Rows in which Γ is sure and wrong, of every n-th one."""
+    rows = last_rows(motion, assessment, every)
+    return rows[safety_probability(assessment, motion, rows) >= CONFIDENT]
+
+
+def last_rows(motion: Episode, assessment: SafetyAssessment, every: int) -> np.ndarray:
+    """Every n-th row within an episode's duration of leaving the safe set; none if it stays."""
+    rows = np.arange(0, len(motion.time_s), every)
+    info = assessment.info_
+    horizon = round(info.num_steps * info.step_s / assessment.detector_.step_s)
+    is_last = len(motion.time_s) - 1 - rows <= horizon
+    return rows[is_last & (not motion.is_safe)]
+
+
+def monitor_estimates(minutes: Sequence[Minute]) -> dict[str, Estimate]:
+    """Alarms, their delay, and Γ's confident errors outside alarms."""
+    delay_s = np.array([one.alarm_s for one in minutes])
+    return {
+        "alarmed": proportion(int(np.isfinite(delay_s).sum()), len(delay_s)),
+        "delay_s": quantile(delay_s, 0.5, bootstrap=BOOTSTRAP),
+        "delay_95_s": quantile(delay_s, 0.95, bootstrap=BOOTSTRAP),
+        **error_estimates([one.error_s for one in minutes]),
+    }
+
+
+def error_estimates(error_s: Sequence[Sequence[float]]) -> dict[str, Estimate]:
+    """Shares of confident errors since a change, from their durations in each minute [s]."""
+    return {
+        f"confident_error_{span_s:g}s": mean(
+            np.array(of_span) / span_s, np.arange(len(error_s)), bootstrap=BOOTSTRAP
+        )
+        for span_s, of_span in zip(SPANS_S, zip(*error_s, strict=True), strict=True)
+    }
+
+
+def false_alarms(motions: Episodes, detector: ChangeDetector) -> Estimate:
+    """False alarms per hour on motions of the nominal plant, each judged anew.
+
+    Rows shortly before leaving the safe set do not count.
+    """
+    rows = [one for one in usual_rows(motions) if len(one)]
+    count = sum(len(detector.watch([one])[1]) for one in rows)
+    return rate_per_hour(count, sum(map(len, rows)) * detector.step_s, len(rows))
 
 
 def shifts_tables(results: Results) -> list[Table]:
     """The table of all shifts, if there are any."""
-    sets = dict.fromkeys(row.set for row in results.values() if row.set.startswith("shifts."))
-    if not sets:
-        return []
-    false = results.get("shifts.nominal.monitor.false_alarms_per_hour")
+    sets = dict.fromkeys(set for set, _, metric in results if metric == "unsafe")
     meaning = _MEANING
-    if false is not None:
+    if false := results.get(("shifts.nominal", "monitor", "false_alarms_per_hour")):
         meaning += (
             f" On {false.n} undisturbed nominal motions the monitor gives {false.value:.2f} "
             f"({false.low:.2f}–{false.high:.2f}) false alarms an hour."
         )
-    labels = {name: spoken(name.removeprefix("shifts.")) for name in sets}
-    columns = [one for one in _COLUMNS if any(f"{name}.{one.key}" in results for name in sets)]
-    rows = rows_of(results, labels, columns)
-    title = "Γ under shifts"
-    return [Table(corner="shift", columns=columns, rows=rows, title=title, meaning=meaning)]
-
-
-def shifts_figure(estimates: Mapping[str, Estimate]) -> Figure:
-    """Plots shares of "don't know" and of rows sure and wrong, and the AUC, of all shifts."""
-    results = Results(estimates)
-    shown = [
-        replace(row, set=row.method, method=row.set.removeprefix("shifts."))
-        for metric in ("unknown", "confident_error", "auc", "confident_error_60s")
-        for row in results.select(metric=metric)
+    there = {(method, metric) for _, method, metric in results}
+    shown = [(method, one) for method, one in _COLUMNS if (method, one.key) in there]
+    rows = [
+        Row(
+            method="",
+            label=spoken(set.removeprefix("shifts.")),
+            estimates=[results.get((set, method, column.key)) for method, column in shown],
+        )
+        for set in sets
     ]
-    return interval_figure(shown)
+    columns = [column for _, column in shown]
+    table = Table(
+        corner="shift", columns=columns, rows=rows, title="Γ under shifts", meaning=meaning
+    )
+    return [table] if rows else []
+
+
+def shifts_figure(estimates: Mapping[Key, Estimate]) -> Figure:
+    """Plots shares of "don't know" and of rows sure and wrong, and the AUC, of all shifts."""
+    return interval_figure(
+        {
+            (method, set.removeprefix("shifts."), metric): estimates[set, method, metric]
+            for shown in ("unknown", "confident_error", "auc", "confident_error_60s")
+            for set, method, metric in estimates
+            if metric == shown
+        }
+    )

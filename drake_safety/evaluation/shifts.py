@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS
-from drake_safety.evaluation.results import key_part
 from drake_safety.robots.robot import ObservationNoise, Payload, PlantVariation
 from drake_safety.robots.robot_model import as_pattern
 from drake_safety.robots.robot_size import GRAVITY_M_S2
@@ -27,6 +26,7 @@ class PlantShift:
 
     Attributes:
         kind: "plant" or "sensor".
+        options: Of its diagram.
     """
 
     kind: str
@@ -35,12 +35,12 @@ class PlantShift:
 
 
 def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
-    """Shifts of plant and sensors from the nominal plant, and the scenario's variations.
+    """Shifts of plant and sensors from the nominal plant, and the scenario's variations, by name.
 
-    They are by name, as a part of a key. Robots with legs have more.
+    Robots with legs have more.
     """
     own = {
-        f"variation {key_part(name)}": PlantShift(
+        f"variation {name}": PlantShift(
             kind="plant", variation=variation, options=scenario.options_for("pairs", name)
         )
         for name, variation in scenario.variations.items()
@@ -49,35 +49,31 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     if not isinstance(loop, LeggedLoop):
         return own
     kinematics, nominal = loop.kinematics, scenario.variation("nominal")
-    robot, mass_kg = kinematics.robot, kinematics.total_mass
-    q = kinematics.standing_positions()
+    robot, mass_kg, plant = kinematics.robot, kinematics.total_mass, kinematics.plant
     is_stance = np.ones(kinematics.num_contacts, dtype=bool)
-    torques = np.abs(kinematics.gravity_torques(q, is_stance))
-    plant = kinematics.plant
+    torques = np.abs(kinematics.gravity_torques(kinematics.standing_positions(), is_stance))
     motors = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
     limits = {one.joint().name(): one.effort_limit() for one in motors if one.effort_limit() > 0.0}
     loads = dict(zip(kinematics.joint_names, torques.tolist(), strict=True))
     joint = max((name for name in loads if name in limits), key=loads.__getitem__)
     key = as_pattern(joint)
-    foot = kinematics.foot_names[0]
-    late_s = _whole(5 * scenario.control_period_s, scenario.time_step_s)
+    period_s = scenario.control_period_s
     lasting = {
         "slope": Shift(slope_rad=math.radians(10.0)),
         "side_force": Shift(base_force_n=[0.0, 0.1 * mass_kg * GRAVITY_M_S2, 0.0]),
         "locked_joint": Shift(joints={key: JointShift(is_locked=True)}),
-        "late_command": Shift(command_delay_s=late_s),
-        "hole": Shift(holes_m={foot: 0.07 * kinematics.standing_height}),
+        "late_command": Shift(command_delay_s=_whole(5 * period_s, scenario.time_step_s)),
+        "hole": Shift(holes_m={kinematics.foot_names[0]: 0.07 * kinematics.standing_height}),
     }
     if 0.0 < (weak_scale := 0.9 * loads[joint] / limits[joint]):  # Too weak to stand.
         lasting["weak_joint"] = Shift(joints={key: JointShift(effort_scale=weak_scale)})
     if robot.gains_of(joint) is not None:
         lasting["soft_joint"] = Shift(joints={key: JointShift(stiffness_scale=0.5)})
     names = [as_pattern(name) for name in plant.GetStateNames(add_model_instance_prefix=False)]
-    n_q, period_s = kinematics.num_positions, scenario.control_period_s
-    positions, velocities = names[NUM_BASE_POSITIONS:n_q], names[n_q:]
+    n_q = kinematics.num_positions
     faults = {
-        "joint_bias": Fault(kind="bias", entries=positions, value=0.05),
-        "dead_velocities": Fault(kind="zero", entries=velocities),
+        "joint_bias": Fault(kind="bias", entries=names[NUM_BASE_POSITIONS:n_q], value=0.05),
+        "dead_velocities": Fault(kind="zero", entries=names[n_q:]),
         "stale": Fault(kind="delay", value=_whole(0.2, period_s)),
         "frozen": Fault(kind="freeze"),
         "frozen_later": Fault(kind="freeze", start_s=0.4),
@@ -104,8 +100,8 @@ def _whole(time_s: float, period_s: float) -> float:
     return max(round(time_s / period_s), 1) * period_s
 
 
-def shifted_scenario(scenario: Scenario, name: str, shift: PlantShift) -> Scenario:
-    """The scenario with a shift as a further variation."""
+def shifted_scenario(scenario: Scenario, name: str, variation: PlantVariation) -> Scenario:
+    """The scenario with a further variation."""
     shifted = copy.copy(scenario)
-    shifted.variations = {**scenario.variations, name: shift.variation}
+    shifted.variations = {**scenario.variations, name: variation}
     return shifted

@@ -11,8 +11,7 @@ import rich.table
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
 
-OURS = "sharpened"
-"""The method that baselines are compared with."""
+_OURS = "sharpened"  # The method that baselines are compared with.
 _SCALES = {"%": 100.0, "points": 100.0, "=%": 100.0, "ms": 1000.0}
 
 
@@ -62,13 +61,9 @@ class Column:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a table.
+    """A row of a table: an estimate for each column, None if missing."""
 
-    Attributes:
-        estimates: One a column; None if missing.
-    """
-
-    key: str
+    method: str
     label: str
     estimates: Sequence[Estimate | None]
 
@@ -96,42 +91,44 @@ class Table:
         return {i for i, value in values.items() if value == max(values.values())}
 
     def better_baselines(self) -> list[str]:
-        """Describes each column in which another row is better than `OURS`."""
-        keys, found = [row.key for row in self.rows], []
-        for number, column in enumerate(self.columns if OURS in keys else ()):
-            ours, best = keys.index(OURS), self.best(number)
+        """Describes each column in which another row is better than "sharpened"."""
+        ours = next((i for i, row in enumerate(self.rows) if row.method == _OURS), None)
+        if ours is None:
+            return []
+        described = []
+        for k, column in enumerate(self.columns):
+            best = self.best(k)
             first = min(best, default=ours)
-            mine, other = (self.rows[i].estimates[number] for i in (ours, first))
+            mine, other = (self.rows[i].estimates[k] for i in (ours, first))
             if ours in best or mine is None or other is None or first == ours:
                 continue
             is_clear = other.low > mine.high if column.better > 0 else other.high < mine.low
             certainty = "beyond both intervals" if is_clear else "the intervals overlap"
-            found.append(
+            described.append(
                 f"{column.title}: {self.rows[first].label}, {column.value_text(other)} against "
                 f"{column.value_text(mine)} ({certainty})"
             )
-        return found
+        return described
 
     def to_rich(self) -> rich.table.Table:
         """The table for a terminal, with its explanation; cells fold if they do not fit."""
         ahead = self.better_baselines()
-        caption = (
-            f"{self.meaning}\nBetter than {OURS}: {'; '.join(ahead)}" if ahead else self.meaning
-        )
-        headings = (
-            rich.table.Column(title, overflow="fold")
-            for title in (self.corner, *(column.title for column in self.columns))
-        )
-        table = rich.table.Table(*headings, title=self.title or None, caption=caption or None)
+        better = f"\nBetter than {_OURS}: {'; '.join(ahead)}" if ahead else ""
+        caption = f"{self.meaning}{better}" or None
+        table = rich.table.Table(title=self.title or None, caption=caption)
+        for title in (self.corner, *(column.title for column in self.columns)):
+            table.add_column(title, overflow="fold")
         for row in self.rows:
             table.add_row(row.label, *map(Column.text, self.columns, row.estimates))
         return table
 
 
-def rows_of(results: Results, labels: Mapping[str, str], columns: Sequence[Column]) -> list[Row]:
-    """Rows of the results by beginning of their keys and label; empty rows are left out."""
+def rows_of(
+    results: Results, labels: Mapping[tuple[str, str], str], columns: Sequence[Column]
+) -> list[Row]:
+    """Rows of the results by set and method, and their labels; empty rows are left out."""
     rows = [
-        Row(prefix, label, [results.get(f"{prefix}.{column.key}") for column in columns])
-        for prefix, label in labels.items()
+        Row(method, label, [results.get((set, method, column.key)) for column in columns])
+        for (set, method), label in labels.items()
     ]
     return [row for row in rows if any(row.estimates)]
