@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import Context
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
@@ -116,10 +115,9 @@ def assess_goal(
     with_goals = require(loop, HasGoals)
     box, words = with_goals.target_box, goal_words(with_goals)
     if is_in_box(goal, box):
-        (verdict,) = assess_goals(
+        return assess_goals(
             loop, assessment, goal[None], threshold=threshold, unsafe_below=unsafe_below
-        )
-        return verdict
+        )[0]
     place = "is outside" if np.isfinite(goal).all() else "is not finite, so not in"
     entries = zip(words.axes, *box.tolist(), strict=True)
     region = ", ".join(f"{axis} {low:g}…{high:g}" for axis, low, high in entries)
@@ -145,7 +143,7 @@ def assess_goals(
     threshold: float,
     unsafe_below: float | None = None,
 ) -> list[GoalVerdict]:
-    """Assesses goals inside the region sampled in training.
+    """Assesses goals (N, 3) inside the region sampled in training, as `assess_goal` does.
 
     The verdict is "don't know" where the input is novel, or half of the belief or more comes from
     cells without training data.
@@ -154,38 +152,42 @@ def assess_goals(
         return []
     unsafe_below = threshold if unsafe_below is None else unsafe_below
     noun = goal_words(require(loop, HasGoals)).goal
-    seen = goal_inputs(loop, goals)
-    prediction = assessment.predict(*seen)
+    inputs = goal_inputs(loop, goals)
+    prediction = assessment.predict(*inputs)
     has_no_data = is_unknown(prediction.belief, assessment.parameters.initial_uncertainty)
-    verdicts = []
-    for i, goal in enumerate(goals):
-        probability, reason = float(prediction.probability[i]), ""
+
+    def reason(i: int) -> str:
+        """Why goal i is not known; "" if it is."""
+        probability = prediction.probability[i]
         if prediction.novelty[i] > 1.0:
-            name, deviation = assessment.strangest_input(*(part[i] for part in seen))
-            reason = (
+            name, deviation = assessment.strangest_input(*(part[i] for part in inputs))
+            return (
                 f"the input is unlike those of training: '{name}' differs by {abs(deviation):.0f} "
                 "standard deviations from what the other entries say"
             )
-        elif has_no_data[i]:
-            reason = f"too little training data near this {noun}'s embedding"
-        elif unsafe_below <= probability < threshold:
-            reason = (
+        if has_no_data[i]:
+            return f"too little training data near this {noun}'s embedding"
+        if unsafe_below <= probability < threshold:
+            return (
                 f"the probability {probability:.3f} lies between {unsafe_below:.3f} and "
                 f"{threshold:.3f}, where safe and unsafe {noun}s cannot be distinguished"
             )
-        one = GoalVerdict(
+        return ""
+
+    return [
+        GoalVerdict(
             goal=np.array(goal, dtype=float),
             belief=prediction.belief[i],
-            probability=probability,
+            probability=float(prediction.probability[i]),
             threshold=threshold,
             constraint_names=tuple(loop.constraint_names),
             cause_probability=prediction.cause_probability[i],
             predicted_margins=prediction.predicted_margins[i],
             margin_unit=assessment.parameters.margin_unit,
-            reason=reason,
+            reason=reason(i),
         )
-        verdicts.append(one)
-    return verdicts
+        for i, goal in enumerate(goals)
+    ]
 
 
 def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> list[np.ndarray]:
@@ -194,18 +196,11 @@ def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> list[np.ndarray]:
     Returns:
         State (N, n_s), desired preview (N, H n_z) and features (N, n_f).
     """
-    reset = require(loop, HasGoals).reset_standing
-    return inputs_of_each(loop, loop.CreateDefaultContext(), reset, goals)
-
-
-def inputs_of_each(
-    loop: ClosedLoop, context: Context, setting: Callable[..., object], values: Iterable[Any]
-) -> list[np.ndarray]:
-    """State, desired preview and features, (N, ...) each, after setting each of N values."""
+    with_goals, context = require(loop, HasGoals), loop.CreateDefaultContext()
     ports = [loop.GetOutputPort(name) for name in ("state", "desired_preview", "features")]
     rows = []
-    for value in values:
-        setting(context, value)
+    for goal in goals:
+        with_goals.reset_standing(context, goal)
         rows.append([port.Eval(context).copy() for port in ports])
     return [np.array(column) for column in zip(*rows, strict=True)]
 

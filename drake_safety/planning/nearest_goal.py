@@ -14,11 +14,10 @@ from drake_safety.planning.goal_verdict import GoalVerdict, assess_goals, checke
 from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
-_METHODS = ("both", "gradient", "search")
 _DIFFERENCE_M = 1e-3  # Step of the finite differences of the inputs by the goal.
 _MAX_STEPS = 12  # Along the gradient.
 _LONGEST_STEP_M = 0.15  # The logit is nearly linear over that distance.
-_MARGIN = 0.5  # By how much the target logit falls where Γ does not follow it.
+_MARGIN = 0.5  # By how much the aimed-at logit falls where Γ does not follow it.
 _LARGEST_LOGIT = 8.0
 _FIRST_RADIUS_M = 0.05
 _GROWTH = 1.6  # From one ball of candidates to the next.
@@ -38,7 +37,6 @@ def nearest_accepted_goal(
     reserve: float = 0.8,
     num_candidates: int = 64,
     resolution_m: float = 1e-3,
-    method: str = "both",
 ) -> GoalVerdict | None:
     """Finds an accepted goal near a given one, with a reserve.
 
@@ -59,18 +57,14 @@ def nearest_accepted_goal(
         reserve: Share of the interval from the threshold to the largest probability, in [0, 1].
         num_candidates: Candidates of the search per batch; half as many if the descent has found
             an accepted goal.
-        method: ``both``, or the ``gradient`` or the ``search`` alone.
 
     Returns:
         The verdict on the goal found, with the threshold itself; None if the given goal is not
         finite, or no goal was found that is accepted with the reserve.
 
     Raises:
-        ValueError: The loop's plans have no goal, the goal is not three numbers, an argument is out
-            of range, or the method is ``gradient`` and the maps have no safety head.
+        ValueError: The loop's plans have no goal, or an argument is out of range.
     """
-    if method not in _METHODS:
-        raise ValueError(f"nearest accepted goal: method must be one of {_METHODS}; got '{method}'")
     if not 0.0 <= reserve <= 1.0:
         raise ValueError(f"nearest accepted goal: reserve is {reserve}, expected a value in [0, 1]")
     # Without heads the probability is b_safe.
@@ -81,10 +75,8 @@ def nearest_accepted_goal(
         return None
     box = require(loop, HasGoals).target_box
     near = _Search(loop, assessment, goal, box, stricter, resolution_m)
-    descends = method == "gradient" or (method == "both" and assessment.embedding_.has_safety_head)
-    best = near.descend() if descends else None
-    if method != "gradient":
-        best = near.search(best, rng, num_candidates)
+    best = near.descend() if assessment.embedding_.has_safety_head else None
+    best = near.search(best, rng, num_candidates)
     return None if best is None else replace(best, threshold=threshold)
 
 
@@ -99,24 +91,27 @@ class _Search:
     threshold: float
     resolution_m: float
 
-    def nearest_of(self, candidates: np.ndarray) -> GoalVerdict | None:
-        """The nearest accepted one of candidates, (N, 3) [m]."""
+    def accepted(self, candidates: np.ndarray) -> GoalVerdict | None:
+        """The nearest candidate (N, 3) [m] that is accepted, if any."""
         points = np.unique(on_grid(candidates, self.resolution_m), axis=0)
         inside = points[np.all((points >= self.box[0]) & (points <= self.box[1]), axis=1)]
         verdicts = assess_goals(self.loop, self.assessment, inside, threshold=self.threshold)
         return self.nearest(verdict for verdict in verdicts if verdict.is_accepted)
 
     def nearest(self, verdicts: Iterable[GoalVerdict | None]) -> GoalVerdict | None:
-        """The nearest one of verdicts, if any."""
-        found = [verdict for verdict in verdicts if verdict is not None]
-        return min(found, key=lambda verdict: _distance(verdict.goal, self.goal), default=None)
+        """The nearest verdict, if any."""
+        return min(filter(None, verdicts), key=lambda one: self.distance(one.goal), default=None)
+
+    def distance(self, point: np.ndarray) -> float:
+        """Distance of a point to the goal [m]."""
+        return float(np.linalg.norm(point - self.goal))
 
     def descend(self) -> GoalVerdict | None:
         """Moves a refused goal along the gradient to an accepted one.
 
         Each step goes to the point nearest to the goal on the plane where the linearised logit has
-        the target value. The gradient of the network is exact; the derivative of its inputs by the
-        goal is a finite difference of four goals. The target value falls until Γ accepts the goal.
+        the value aimed at, which falls until Γ accepts the goal. The gradient of the network is
+        exact; the derivative of its inputs by the goal is a finite difference of four goals.
         """
         goal, box = self.goal, self.box
         best: GoalVerdict | None = None
@@ -130,10 +125,10 @@ class _Search:
             inputs = goal_inputs(self.loop, point + np.vstack([np.zeros(3), np.diag(inwards)]))
             x, logit, gradient = self.assessment.unsafe_logits(*inputs)
             slope = (x[1:] - x[0]) @ gradient[0] / inwards
-            found = self.nearest_of(point[None])
-            if found is None and logit[0] <= aim + 0.1:
+            here = self.accepted(point[None])
+            if here is None and logit[0] <= aim + 0.1:
                 aim = logit[0] - _MARGIN
-            best = self.nearest((best, found))
+            best = self.nearest((best, here))
             steepness = float(slope @ slope)
             if steepness < 1e-12:
                 break
@@ -156,44 +151,44 @@ class _Search:
         """
         goal, box = self.goal, self.box
         centre = np.clip(goal, *box)
-        best = self.nearest_of(centre[None])
+        best = self.accepted(centre[None])
         num_in_ball, num_rounds = num_candidates, _NUM_ROUNDS
-        radius, farthest = _FIRST_RADIUS_M, _distance(*box)
+        radius, farthest = _FIRST_RADIUS_M, float(np.linalg.norm(box[0] - box[1]))
         if known is not None:
             num_candidates, num_rounds = max(num_candidates // 2, 2), _ROUNDS_FROM_KNOWN
-            num_in_ball, farthest = num_candidates // 2, _distance(known.goal, goal)
+            num_in_ball, farthest = num_candidates // 2, self.distance(known.goal)
         while best is None and radius < farthest:
-            best = self.nearest_of(centre + radius * _in_unit_ball(rng, num_in_ball))
+            best = self.accepted(centre + radius * _in_unit_ball(rng, num_in_ball))
             radius *= _GROWTH
         best = self.nearest((best, known))
         if best is None:
-            best = self.nearest_of(rng.uniform(box[0], box[1], (_LAST_CHANCE * num_candidates, 3)))
+            best = self.accepted(rng.uniform(*box, (_LAST_CHANCE * num_candidates, 3)))
         if best is None:
             return None
         for _ in range(num_rounds):
             best = self.bisect(best)
-            distance = _distance(best.goal, goal)
+            distance = self.distance(best.goal)
             if distance < self.resolution_m:
                 break
             about = best.goal + _SPREAD * distance * _in_unit_ball(rng, num_candidates // 2)
             ball = goal + distance * _in_unit_ball(rng, num_candidates - num_candidates // 2)
             candidates = np.clip(np.concatenate([about, ball]), *box)
             is_nearer = np.linalg.norm(candidates - goal, axis=1) < distance
-            found = self.nearest_of(candidates[is_nearer])
-            if found is not None and _distance(found.goal, goal) < distance:
-                best = found
+            nearer = self.accepted(candidates[is_nearer])
+            if nearer is not None and self.distance(nearer.goal) < distance:
+                best = nearer
         return best
 
     def bisect(self, best: GoalVerdict) -> GoalVerdict:
         """Moves an accepted goal straight towards the given one while it stays accepted."""
         refused = centre = np.clip(self.goal, *self.box)
-        while _distance(best.goal, refused) > self.resolution_m:
+        while np.linalg.norm(best.goal - refused) > self.resolution_m:
             between = 0.5 * (best.goal + refused)
-            found = self.nearest_of(between[None])
-            if found is None:
+            nearer = self.accepted(between[None])
+            if nearer is None:
                 refused = between
-            elif _distance(found.goal, centre) < _distance(best.goal, centre):
-                best = found
+            elif np.linalg.norm(nearer.goal - centre) < np.linalg.norm(best.goal - centre):
+                best = nearer
             else:
                 break
         return best
@@ -210,7 +205,3 @@ def _in_unit_ball(rng: np.random.Generator, num_points: int) -> np.ndarray:
     directions = rng.normal(size=(num_points, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return directions * np.cbrt(rng.uniform(size=(num_points, 1)))
-
-
-def _distance(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.linalg.norm(one - other))
