@@ -31,10 +31,8 @@ class Bench:
         self.plant.set_gravity_enabled(self.robot, False)
         self.plant.Finalize()
         self.ball = Ball(self.plant, scene_graph, self.instance, robot.base)
-        self.diagram = builder.Build()
-        self.simulator = Simulator(self.diagram)
-        self.root = self.simulator.get_mutable_context()
-        self.context = self.plant.GetMyMutableContextFromRoot(self.root)
+        self.simulator = Simulator(builder.Build())
+        self.context = self.plant.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
         base = self.plant.GetBodyByName(robot.base)
         self.plant.SetFreeBodyPose(self.context, base, RigidTransform([0.3, -0.2, height]))
         port = self.plant.get_desired_state_input_port(self.robot)
@@ -54,68 +52,34 @@ class Bench:
         return momentum(self.context, [self.robot], np.zeros(3)).translational()
 
 
-DIRECTIONS = [0.0, math.pi / 2, math.pi, -math.pi / 3]
-
-
-@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize("direction", [math.pi / 2, -math.pi / 3])
 @pytest.mark.parametrize("name", ["laikago", "hexapod"])
-def test_the_ball_touches_at_the_promised_time_and_not_before(name, direction):
+def test_the_ball_touches_at_its_time_and_the_robot_gains_its_momentum(name, direction):
     bench = Bench(name)
-    throw = Throw(mass_kg=2.0, speed_m_s=6.0, direction_rad=direction)
+    throw = Throw(mass_kg=3.0, speed_m_s=5.0, direction_rad=direction)
     bench.ball.throw(bench.context, throw, 0.1)
+    assert bench.plant.CalcTotalMass(bench.context, [bench.instance]) == pytest.approx(3.0)
     bench.simulator.AdvanceTo(0.1 - 3 * TIME_STEP_S)
     assert np.linalg.norm(bench.robot_momentum()) < 1e-6
-    bench.simulator.AdvanceTo(0.1 + 6 * TIME_STEP_S)
-    along = bench.robot_momentum() @ [math.cos(direction), math.sin(direction), 0.0]
-    assert along > 0.1 * throw.mass_kg * throw.speed_m_s
-
-
-@pytest.mark.parametrize("direction", DIRECTIONS)
-def test_what_the_ball_loses_the_robot_gains(direction):
-    bench = Bench()
-    throw = Throw(mass_kg=3.0, speed_m_s=5.0, direction_rad=direction)
-    bench.ball.throw(bench.context, throw, 0.05)
-    bench.simulator.AdvanceTo(0.045)
-    before = throw.mass_kg * bench.velocity() + bench.robot_momentum()
-    bench.simulator.AdvanceTo(0.08)
-    after = throw.mass_kg * bench.velocity() + bench.robot_momentum()
+    # It arrives horizontally at its speed.
+    along = np.array([math.cos(direction), math.sin(direction), 0.0])
+    np.testing.assert_allclose(bench.velocity(), 5.0 * along, atol=0.03)
+    bench.simulator.AdvanceTo(0.13)
+    assert bench.robot_momentum() @ along > 0.3 * 15
     # Horizontally nothing else acts: the robot hangs in the air.
-    np.testing.assert_allclose(after[:2], before[:2], atol=0.02 * 15)
-    assert np.linalg.norm(bench.robot_momentum()[:2]) > 0.3 * 15
+    after = throw.mass_kg * bench.velocity() + bench.robot_momentum()
+    np.testing.assert_allclose(after[:2], 15.0 * along[:2], atol=0.02 * 15)
 
 
-def test_the_ball_arrives_horizontally_at_its_speed():
-    bench = Bench()
-    throw = Throw(speed_m_s=7.0, direction_rad=0.5)
-    bench.ball.throw(bench.context, throw, 0.15)
-    bench.simulator.AdvanceTo(0.15 - 2 * TIME_STEP_S)
-    expected = 7.0 * np.array([math.cos(0.5), math.sin(0.5), 0.0])
-    np.testing.assert_allclose(bench.velocity(), expected, atol=0.03)
-
-
-def test_a_ball_thrown_without_a_flight_touches_now():
-    bench = Bench()
-    bench.ball.throw(bench.context, Throw(speed_m_s=6.0), 0.0)
-    np.testing.assert_allclose(bench.velocity(), [0.0, 6.0, 0.0], atol=1e-12)
-    bench.simulator.AdvanceTo(5 * TIME_STEP_S)
-    assert bench.robot_momentum()[1] > 1.0
-
-
-def test_the_ball_has_the_mass_it_was_thrown_with():
-    bench = Bench()
-    for mass in (4.0, 2.5):
-        bench.ball.throw(bench.context, Throw(mass_kg=mass), 0.0)
-        found = bench.plant.CalcTotalMass(bench.context, [bench.instance])
-        assert found == pytest.approx(mass)
-
-
-def test_height_and_offset_move_the_line_of_flight():
+def test_height_and_offset_move_the_line_of_flight_and_without_a_flight_it_touches_now():
     bench = Bench()
     positions = []
     for shift in ({}, {"height_m": 0.02, "offset_m": 0.03}):
         bench.ball.throw(bench.context, Throw(direction_rad=0.0, **shift), 0.0)
         positions.append(bench.position())
     np.testing.assert_allclose((positions[1] - positions[0])[1:], [0.03, 0.02], atol=1e-12)
+    bench.simulator.AdvanceTo(5 * TIME_STEP_S)
+    assert bench.robot_momentum()[0] > 1.0
 
 
 def test_a_parked_ball_lies_still_on_the_ground_far_away():
@@ -125,23 +89,18 @@ def test_a_parked_ball_lies_still_on_the_ground_far_away():
     before = bench.position()
     assert np.linalg.norm(before[:2]) > 10
     assert before[2] == pytest.approx(bench.ball.radius_m)
-    bench.simulator.AdvanceTo(0.2)
+    bench.simulator.AdvanceTo(0.1)
     np.testing.assert_allclose(bench.position(), before, atol=1e-3)
-    assert np.linalg.norm(bench.robot_momentum()) < 1e-6
 
 
-def test_a_throw_into_the_past_is_refused_and_a_line_that_misses_and_the_ball_parked():
-    bench = Bench()
-    for lead_s in (-0.1, math.nan):
-        with pytest.raises(ValueError, match="lead_s must not be negative"):
-            bench.ball.throw(bench.context, Throw(), lead_s)
+def test_an_impossible_flight_is_refused_and_the_ball_parked():
+    bench = Bench(height=0.45)
+    with pytest.raises(ValueError, match="lead_s must not be negative"):
+        bench.ball.throw(bench.context, Throw(), math.nan)
     with pytest.raises(ValueError, match=r"line of flight of Throw\(.*height_m=3.0.* misses"):
         bench.ball.throw(bench.context, Throw(height_m=3.0), 0.1)
     assert np.linalg.norm(bench.position()[:2]) > 10
-
-
-def test_a_flight_that_would_begin_underground_is_refused_with_the_longest_possible():
-    bench = Bench(height=0.45)
+    # It would begin underground.
     message = r"can fly for at most 0\.\d+ s; got lead_s = 0.5"
     with pytest.raises(ValueError, match=message) as error:
         bench.ball.throw(bench.context, Throw(), 0.5)

@@ -16,8 +16,7 @@ from drake_safety.robots.model_files import package_parser
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 
 _GRAVITY_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
-_MAX_STEPS = 30_000  # Of sphere tracing.
-_TOUCH_M = 1e-4  # Contact distance and shortest step.
+_TOUCH_M = 1e-4  # Distance in contact.
 _BEFORE_M, _BEYOND_M = 2.0, 1.0  # Ends of the line of flight, relative to its aim.
 _PARKED = np.array([50.0, 50.0, 0.0])  # Far from the robot [m].
 
@@ -47,22 +46,20 @@ def add_ball(plant: MultibodyPlant) -> ModelInstanceIndex:
 
 
 class Ball:
-    """A ball in a finalised plant, thrown at a target: the name of a body."""
+    """A ball in a finalised plant, thrown at a body of the robot."""
 
     def __init__(
         self,
         plant: MultibodyPlant,
         scene_graph: SceneGraph,
         instance: ModelInstanceIndex,
-        target: str,
+        body: str,
     ):
-        self._plant = plant
+        self._plant, self._hit_body = plant, plant.GetBodyByName(body)
         self._body = plant.get_body(plant.GetBodyIndices(instance)[0])
-        self._target = plant.GetBodyByName(target)
-        inspector = scene_graph.model_inspector()
         (self._geometry,) = plant.GetCollisionGeometriesForBody(self._body)
-        self.radius_m = inspector.GetShape(self._geometry).radius()
-        self._robot_geometries = collision_geometries(plant, [self._target.model_instance()])
+        self.radius_m = scene_graph.model_inspector().GetShape(self._geometry).radius()
+        self._robot_geometries = collision_geometries(plant, [self._hit_body.model_instance()])
 
     def park(self, context: Context) -> None:
         """Puts the ball at rest on the ground, far away, in the plant's Context."""
@@ -87,23 +84,19 @@ class Ball:
         self._body.SetSpatialInertiaInBodyFrame(context, inertia)
         direction = np.array([math.cos(throw.direction_rad), math.sin(throw.direction_rad), 0.0])
         sideways = np.array([-direction[1], direction[0], 0.0])
-        aim = self._plant.EvalBodyPoseInWorld(context, self._target).translation()
+        aim = self._plant.EvalBodyPoseInWorld(context, self._hit_body).translation()
         aim = aim + throw.offset_m * sideways + [0.0, 0.0, throw.height_m]
         # Sphere tracing: the signed distance is a step that cannot overshoot.
-        p = aim - _BEFORE_M * direction
-        for _ in range(_MAX_STEPS):
+        p, distance = aim - _BEFORE_M * direction, math.inf
+        while not distance < _TOUCH_M and (p - aim) @ direction <= _BEYOND_M:
             self._plant.SetFreeBodyPose(context, self._body, RigidTransform(p))
             query = self._plant.get_geometry_query_input_port().Eval(context)
             distance = min(
                 query.ComputeSignedDistancePairClosestPoints(self._geometry, other).distance
                 for other in self._robot_geometries
             )
-            if distance < _TOUCH_M or (p - aim) @ direction > _BEYOND_M:
-                break
-            # The least step length limits the number of steps along a grazed leg.
-            p = p + max(distance, _TOUCH_M) * direction
-        else:
-            distance = math.inf
+            if not distance < _TOUCH_M:
+                p = p + distance * direction
         if not distance < _TOUCH_M:
             self.park(context)
             raise ValueError(f"throw: the line of flight of {throw} misses the robot")

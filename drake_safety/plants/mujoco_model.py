@@ -28,7 +28,6 @@ from drake_safety.robots.robot_model import RobotModel
 if TYPE_CHECKING:
     import mujoco
 
-_MECHANICS = {"link", "joint", "mujoco"}  # Elements of a URDF that are passed to MuJoCo.
 _SHAPES = {
     Sphere: ("mjGEOM_SPHERE", lambda shape: [shape.radius(), 0.0, 0.0]),
     Box: ("mjGEOM_BOX", lambda shape: 0.5 * shape.size()),
@@ -49,38 +48,73 @@ def import_mujoco() -> Any:
     return mujoco
 
 
-def mechanics_of_urdf(text: str) -> str:
-    """Reduces a URDF to links, inertias and joints, without visuals and collision shapes."""
-    root = ElementTree.fromstring(text)
-    for element in list(root):
-        if element.tag not in _MECHANICS:
-            root.remove(element)
-    for link in root.findall("link"):
-        for element in link.findall("visual") + link.findall("collision"):
-            link.remove(element)
-    return ElementTree.tostring(root, encoding="unicode")
+def build_model(
+    robot: RobotModel,
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    variation: PlantVariation,
+    *,
+    time_step_s: float,
+    servos: bool,
+) -> tuple[mujoco.MjModel, list[int]]:
+    """Compiles a robot and its scene.
 
+    MuJoCo reads masses, inertias, joint frames, axes and stops from the URDF. Actuators, effort
+    limits, collision shapes, friction coefficients and collision filters are those of the Drake
+    plant, so that both engines simulate the same scene. Other contact parameters are MuJoCo's
+    defaults, with an elliptic friction cone.
 
-def _read_robot(robot: RobotModel) -> mujoco.MjSpec:
-    """The robot's bodies and joints as read by MuJoCo, with a free base."""
+    Returns the model, and for each of its controls the index of its value in the command: joint
+    positions and velocities with servos, joint torques without, in the order of
+    :func:`~drake_safety.robots.robot.servo_joints`.
+    """
     mujoco = import_mujoco()
     path = model_file(robot.urdf, robot.source_dir, robot.requires)
     if path.suffix != ".urdf":
         raise ValueError(
             f"robot '{robot.name}': engine 'mujoco' reads models from URDF files; got '{path}'"
         )
-    spec = mujoco.MjSpec.from_string(mechanics_of_urdf(path.read_text(encoding="utf-8")))
+    spec = mujoco.MjSpec.from_string(_mechanics(path.read_text(encoding="utf-8")))
     # Keeps the names of welded links, among which feet and hands may be.
     spec.compiler.fusestatic = False
-    base = spec.body(robot.base)
+    spec.option.timestep = time_step_s
+    # Implicit damping, including that of servos, as in Drake.
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    # By default a failed simulation is reset without an error.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     roots = [body.name for body in spec.worldbody.bodies]
-    if base is None or base.name not in roots:
+    if robot.base not in roots:
         raise ValueError(
             f"robot '{robot.name}': engine 'mujoco' expects base '{robot.base}' to be the root of "
             f"the model; roots are {roots}"
         )
-    base.add_freejoint()
-    return spec
+    spec.body(robot.base).add_freejoint()
+    commands = _add_actuators(spec, plant, robot, variation, servos)
+    _add_geometries(spec, plant, scene_graph, robot)
+    if variation.payload is not None:
+        _add_payload(spec, robot, variation)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise ValueError(f"robot '{robot.name}': MuJoCo cannot compile it: {error}") from error
+    if variation.mass_scale != 1.0:
+        model.body_mass *= variation.mass_scale
+        model.body_inertia *= variation.mass_scale
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model, commands
+
+
+def _mechanics(urdf: str) -> str:
+    """Reduces a URDF to links, inertias and joints, without visuals and collision shapes."""
+    root = ElementTree.fromstring(urdf)
+    for element in list(root):
+        if element.tag not in ("link", "joint", "mujoco"):
+            root.remove(element)
+    for link in root.findall("link"):
+        for element in link.findall("visual") + link.findall("collision"):
+            link.remove(element)
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _add_actuators(
@@ -111,14 +145,9 @@ def _add_actuators(
         commands.append(command)
 
     for row, name in enumerate(names):
-        joint = spec.joint(name)
-        if joint is None:
-            raise ValueError(
-                f"robot '{robot.name}': MuJoCo has no joint '{name}'; it has "
-                f"{[joint.name for joint in spec.joints if joint.name]}"
-            )
         if name not in limits:
             continue
+        joint = spec.joint(name)
         joint.damping[0] += variation.joint_damping
         joint.frictionloss = variation.joint_friction_nm
         # The limit applies to the sum of a joint's actuators.
@@ -139,68 +168,63 @@ def _add_geometries(
 ) -> None:
     """Adds collision geometry of robot and scene, and collision filters."""
     mujoco = import_mujoco()
-    inspector = scene_graph.model_inspector()
-    context = plant.CreateDefaultContext()
+    inspector, context = scene_graph.model_inspector(), plant.CreateDefaultContext()
     instance = plant.GetModelInstanceByName(robot.name)
-    bodies = [plant.get_body(BodyIndex(index)) for index in range(plant.num_bodies())]
-    of_bodies = [(body, plant.GetCollisionGeometriesForBody(body)) for body in bodies]
-    touchable = [(body, geometries) for body, geometries in of_bodies if geometries]
-    names = {}
-    for body, geometries in touchable:
+    touchable = []
+    for body in (plant.get_body(BodyIndex(index)) for index in range(plant.num_bodies())):
+        geometries = plant.GetCollisionGeometriesForBody(body)
+        if not geometries:
+            continue
         if body.model_instance() == instance:
             mujoco_body = spec.body(body.name())
         else:
             name = f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}"
-            mujoco_body = spec.worldbody.add_body(name=name)
-            X_WB = plant.EvalBodyPoseInWorld(context, body)
-            mujoco_body.pos = X_WB.translation()
-            mujoco_body.quat = X_WB.rotation().ToQuaternion().wxyz()
             if not plant.IsAnchored(body):
                 raise ValueError(
                     f"engine 'mujoco' simulates no moving body but the robot; got '{name}'"
                 )
-        names[body.index()] = mujoco_body.name
+            X_WB = plant.EvalBodyPoseInWorld(context, body)
+            mujoco_body = spec.worldbody.add_body(
+                name=name, pos=X_WB.translation(), quat=X_WB.rotation().ToQuaternion().wxyz()
+            )
+        touchable.append((mujoco_body.name, geometries))
         for geometry in geometries:
             shape = inspector.GetShape(geometry)
             if type(shape) not in _SHAPES:
-                known = [kind.__name__ for kind in _SHAPES]
                 raise ValueError(
                     f"body '{mujoco_body.name}': engine 'mujoco' has no collision shape "
-                    f"{type(shape).__name__}; it has {known}"
+                    f"{type(shape).__name__}; it has {[kind.__name__ for kind in _SHAPES]}"
                 )
             kind, size = _SHAPES[type(shape)]
             X_BG = inspector.GetPoseInFrame(geometry)
-            properties = inspector.GetProximityProperties(geometry)
-            friction = properties.GetProperty("material", "coulomb_friction").dynamic_friction()
             geom = mujoco_body.add_geom(
                 type=getattr(mujoco.mjtGeom, kind),
                 size=size(shape),
                 pos=X_BG.translation(),
                 quat=X_BG.rotation().ToQuaternion().wxyz(),
             )
-            geom.friction[0] = friction
+            properties = inspector.GetProximityProperties(geometry)
+            friction = properties.GetProperty("material", "coulomb_friction")
+            geom.friction[0] = friction.dynamic_friction()
             if isinstance(shape, Convex):
                 hull = inspector.GetConvexHull(geometry)
                 corners = [hull.vertex(i) for i in range(hull.num_vertices())]
                 geom.meshname = f"hull {inspector.GetName(geometry)}"
                 spec.add_mesh(name=geom.meshname, uservert=np.concatenate(corners))
-    for (one, ours), (other, theirs) in itertools.combinations(touchable, 2):
+    for (name, ours), (other, theirs) in itertools.combinations(touchable, 2):
         filtered = [inspector.CollisionFiltered(a, b) for a in ours for b in theirs]
-        pair = names[one.index()], names[other.index()]
         if all(filtered):
-            spec.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
+            spec.add_exclude(bodyname1=name, bodyname2=other)
         elif any(filtered):
             raise ValueError(
-                f"engine 'mujoco' filters collisions by body; of '{pair[0]}' and '{pair[1]}' only "
-                "some geometries are filtered"
+                f"engine 'mujoco' filters collisions by body; of '{name}' and '{other}' only some "
+                "geometries are filtered"
             )
 
 
 def _add_payload(spec: mujoco.MjSpec, robot: RobotModel, variation: PlantVariation) -> None:
     """Welds the variation's payload to its body."""
-    payload = variation.payload
-    if payload is None:
-        return
+    payload: Any = variation.payload
     name = payload.body or robot.base
     carrier = spec.body(name)
     if carrier is None:
@@ -210,54 +234,11 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotModel, variation: PlantVariati
         )
     # All masses are scaled after compiling; this cancels the payload's scale.
     mass_kg = payload.mass_kg / variation.mass_scale
-    inertia = 0.4 * mass_kg * PAYLOAD_RADIUS_M**2
     carrier.add_body(
         name="payload",
         pos=payload.position_m,
         ipos=[0.0, 0.0, 0.0],
         mass=mass_kg,
-        inertia=[inertia] * 3,
+        inertia=[0.4 * mass_kg * PAYLOAD_RADIUS_M**2] * 3,
         explicitinertial=True,
     )
-
-
-def build_model(
-    robot: RobotModel,
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    variation: PlantVariation,
-    *,
-    time_step_s: float,
-    servos: bool,
-) -> tuple[mujoco.MjModel, list[int]]:
-    """Compiles a robot and its scene.
-
-    MuJoCo reads masses, inertias, joint frames, axes and stops from the URDF. Actuators, effort
-    limits, collision shapes, friction coefficients and collision filters are those of the Drake
-    plant, so that both engines simulate the same scene. Other contact parameters are MuJoCo's
-    defaults, with an elliptic friction cone.
-
-    Returns the model, and for each of its controls the index of its value in the command: joint
-    positions and velocities with servos, joint torques without, in the order of
-    :func:`~drake_safety.robots.robot.servo_joints`.
-    """
-    mujoco = import_mujoco()
-    spec = _read_robot(robot)
-    spec.option.timestep = time_step_s
-    # Implicit damping, including that of servos, as in Drake.
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    # By default a failed simulation is reset without an error.
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    commands = _add_actuators(spec, plant, robot, variation, servos)
-    _add_geometries(spec, plant, scene_graph, robot)
-    _add_payload(spec, robot, variation)
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise ValueError(f"robot '{robot.name}': MuJoCo cannot compile it: {error}") from error
-    if variation.mass_scale != 1.0:
-        model.body_mass *= variation.mass_scale
-        model.body_inertia *= variation.mass_scale
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-    return model, commands

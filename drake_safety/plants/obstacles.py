@@ -13,8 +13,9 @@ from pydrake.geometry import (
     SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
+from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context, DiagramBuilder
 
 from drake_safety.files.schema import Triple, schema
@@ -35,46 +36,37 @@ class Obstacle:
     yaw_rad: FiniteFloat = 0.0
 
 
-def add_obstacles(plant: MultibodyPlant, obstacles: list[Obstacle]) -> list[ModelInstanceIndex]:
+def add_obstacles(plant: MultibodyPlant, obstacles: Iterable[Obstacle]) -> list[ModelInstanceIndex]:
     """Welds obstacles to the world of a plant that is not finalised; returns their models."""
     parser = package_parser(plant)
-    instances = []
-    for obstacle in obstacles:
-        who = f"obstacle '{obstacle.model}'"
-        path = model_file(obstacle.model)
-        if not (path.is_absolute() and path.is_file()):
-            raise ValueError(
-                f"{who}: model must be a package:// URL or the absolute path of an existing file"
-            )
-        check_meshes(path)
-        try:
-            found = parser.AddModels(str(path))
-        except RuntimeError as error:
-            raise ValueError(f"{who}: {error}") from error
-        if len(found) != 1:
-            raise ValueError(f"{who}: expected one model; the file has {len(found)}")
-        root = _root_link(plant, found[0], who)
-        R_WO = RotationMatrix.MakeZRotation(obstacle.yaw_rad)
-        X_WO = RigidTransform(R_WO, obstacle.position)
-        plant.WeldFrames(plant.world_frame(), root.body_frame(), X_WO)
-        instances.append(found[0])
-    return instances
+    return [_add_obstacle(plant, parser, obstacle) for obstacle in obstacles]
 
 
-def _root_link(plant: MultibodyPlant, instance: ModelInstanceIndex, who: str) -> RigidBody:
-    """The only root link of a rigid model."""
-    joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
-    if moving := [joint.name() for joint in joints if joint.num_velocities() > 0]:
-        raise ValueError(f"{who}: obstacles do not move; the model has the joints {moving}")
-    held = {joint.child_body().index() for joint in joints}
-    links = [plant.get_body(i) for i in plant.GetBodyIndices(instance)]
-    roots = [link for link in links if link.index() not in held]
-    if len(roots) != 1:
+def _add_obstacle(plant: MultibodyPlant, parser: Parser, obstacle: Obstacle) -> ModelInstanceIndex:
+    who, path = f"obstacle '{obstacle.model}'", model_file(obstacle.model)
+    if not (path.is_absolute() and path.is_file()):
         raise ValueError(
-            f"{who}: expected one root link; of the links {[link.name() for link in links]} these "
-            f"are {[link.name() for link in roots]}"
+            f"{who}: model must be a package:// URL or the absolute path of an existing file"
         )
-    return roots[0]
+    check_meshes(path)
+    try:
+        instance, *others = parser.AddModels(str(path))
+    except RuntimeError as error:
+        raise ValueError(f"{who}: {error}") from error
+    joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
+    held = {joint.child_body().index() for joint in joints}
+    roots = [i for i in plant.GetBodyIndices(instance) if i not in held]
+    if others or len(roots) != 1 or any(joint.num_velocities() for joint in joints):
+        raise ValueError(
+            f"{who}: expected one model with one root link and without moving joints; it has "
+            f"{1 + len(others)} models, and of the first the root links are "
+            f"{[plant.get_body(i).name() for i in roots]}, the joints "
+            f"{[joint.name() for joint in joints]}"
+        )
+    R_WO = RotationMatrix.MakeZRotation(obstacle.yaw_rad)
+    X_WO = RigidTransform(R_WO, obstacle.position)
+    plant.WeldFrames(plant.world_frame(), plant.get_body(roots[0]).body_frame(), X_WO)
+    return instance
 
 
 def collision_geometries(
@@ -190,7 +182,7 @@ class Clearance:
         distances = np.full(len(p_WP), range_m)
         if self._obstacles:
             for i, p in enumerate(p_WP):
-                for found in query.ComputeSignedDistanceToPoint(p, range_m):
-                    if found.id_G in self._obstacles and found.distance < distances[i]:
-                        distances[i] = found.distance
+                for near in query.ComputeSignedDistanceToPoint(p, range_m):
+                    if near.id_G in self._obstacles:
+                        distances[i] = min(distances[i], near.distance)
         return distances - radius_m

@@ -26,7 +26,6 @@ from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_safety.plants.balls import Ball, add_ball
-from drake_safety.plants.mujoco_dynamics import MujocoDynamics
 from drake_safety.plants.mujoco_plant import MujocoPlant
 from drake_safety.plants.obstacles import (
     Obstacle,
@@ -70,32 +69,19 @@ class DrakePhysics:
 
     def __init__(
         self,
-        builder: DiagramBuilder,
+        plant: MultibodyPlant,
+        scene_graph: SceneGraph,
+        instance: ModelInstanceIndex,
         robot: RobotModel,
         variation: PlantVariation,
-        scene: Scene,
-        *,
-        time_step_s: float,
-        servos: bool,
+        ball: ModelInstanceIndex | None,
     ):
-        config = MultibodyPlantConfig(
-            time_step=time_step_s,
-            discrete_contact_approximation="lagged",
-            # Output ports are evaluated at the present state, not sampled at the last step.
-            use_sampled_output_ports=False,
-        )
-        plant, scene_graph = AddMultibodyPlant(config, builder)
-        instance, ball = _furnish(plant, scene_graph, robot, variation, scene, servos=servos)
+        self.plant, self.scene_graph, self.instance = plant, scene_graph, instance
         self._robot, self._variation = robot, variation
-        self.plant: MultibodyPlant = plant
-        self.scene_graph: SceneGraph = scene_graph
-        self.instance = instance
-        self.ball = None if ball is None else Ball(plant, scene_graph, ball, robot.base)
         self.state: OutputPort = plant.get_state_output_port(instance)
-        self.ball_state: OutputPort | None = (
-            None if ball is None else plant.get_state_output_port(ball)
-        )
         self.applied_spatial_force: InputPort = plant.get_applied_spatial_force_input_port()
+        self.ball = None if ball is None else Ball(plant, scene_graph, ball, robot.base)
+        self.ball_state = None if ball is None else plant.get_state_output_port(ball)
 
     def actuation_matrix(self, joint_names: list[str]) -> np.ndarray:
         """Returns the map from joint torques (n_j,) to the input of :meth:`connect_torques`."""
@@ -120,9 +106,8 @@ class DrakePhysics:
         D = np.kron(np.eye(2), self.actuation_matrix(joint_names))
         servos = builder.AddNamedSystem("servo_map", MatrixGain(D=D))
         builder.Connect(desired_joint_state, servos.get_input_port())
-        builder.Connect(
-            servos.get_output_port(), self.plant.get_desired_state_input_port(self.instance)
-        )
+        port = self.plant.get_desired_state_input_port(self.instance)
+        builder.Connect(servos.get_output_port(), port)
 
     @contextmanager
     def edited(self, context: Context) -> Iterator[Context]:
@@ -135,43 +120,24 @@ class DrakePhysics:
 class MujocoPhysics:
     """Physics by MuJoCo, with the interface of DrakePhysics; no balls and no shifts."""
 
+    ball: Ball | None = None
+    ball_state: OutputPort | None = None
+
     def __init__(
         self,
         builder: DiagramBuilder,
-        robot: RobotModel,
-        variation: PlantVariation,
-        scene: Scene,
-        *,
-        time_step_s: float,
-        servos: bool,
+        plant: MultibodyPlant,
+        scene_graph: SceneGraph,
+        instance: ModelInstanceIndex,
+        system: MujocoPlant,
     ):
-        if scene.has_ball:
-            raise ValueError(
-                "engine 'mujoco' has no ball to throw: pass ball=False, for both sides of a "
-                "comparison, or set the share of pushes to 0"
-            )
-        if variation.shift is not None:
-            raise ValueError("engine 'mujoco' has no shifts; simulate them by engine 'drake'")
-        scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-        plant = MultibodyPlant(time_step_s)
-        plant.RegisterAsSourceForSceneGraph(scene_graph)
-        instance, _ = _furnish(plant, scene_graph, robot, variation, scene, servos=servos)
-        dynamics = MujocoDynamics(
-            robot, plant, scene_graph, variation, time_step_s=time_step_s, servos=servos
-        )
-        system = builder.AddNamedSystem("plant", MujocoPlant(dynamics, plant))
+        self.plant, self.scene_graph, self.instance = plant, scene_graph, instance
+        self._system = builder.AddNamedSystem("plant", system)
         poses = builder.AddNamedSystem("geometry_pose", MultibodyPositionToGeometryPose(plant))
         builder.Connect(system.GetOutputPort("positions"), poses.get_input_port())
-        builder.Connect(
-            poses.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id())
-        )
-        self._system = system
-        self.plant: MultibodyPlant = plant
-        self.scene_graph: SceneGraph = scene_graph
-        self.instance = instance
-        self.ball: Ball | None = None
+        source = scene_graph.get_source_pose_port(plant.get_source_id())
+        builder.Connect(poses.get_output_port(), source)
         self.state: OutputPort = system.GetOutputPort("state")
-        self.ball_state: OutputPort | None = None
         self.applied_spatial_force: InputPort = system.GetInputPort("applied_spatial_force")
 
     def actuation_matrix(self, joint_names: list[str]) -> np.ndarray:
@@ -185,8 +151,7 @@ class MujocoPhysics:
     def connect_servos(
         self, builder: DiagramBuilder, joint_names: list[str], desired_joint_state: OutputPort
     ) -> None:
-        """Connects joint positions and velocities (2 n_j,) to a robot with servos."""
-        del joint_names  # The order of the velocities.
+        """Connects joint positions and velocities (2 n_j,), in the order of the velocities."""
         builder.Connect(desired_joint_state, self._system.GetInputPort("command"))
 
     @contextmanager
@@ -220,8 +185,31 @@ def add_physics(
     The joints have robot.yaml's position servos, or else torque inputs. The variation's masses are
     set in a Context by ``edited``.
     """
-    engine = MujocoPhysics if variation.engine == "mujoco" else DrakePhysics
-    return engine(builder, robot, variation, scene, time_step_s=time_step_s, servos=servos)
+    if variation.engine == "drake":
+        config = MultibodyPlantConfig(
+            time_step=time_step_s,
+            discrete_contact_approximation="lagged",
+            # Output ports are evaluated at the present state, not sampled at the last step.
+            use_sampled_output_ports=False,
+        )
+        plant, scene_graph = AddMultibodyPlant(config, builder)
+        instance, ball = _add_robot_and_scene(plant, scene_graph, robot, variation, scene, servos)
+        return DrakePhysics(plant, scene_graph, instance, robot, variation, ball)
+    if scene.has_ball:
+        raise ValueError(
+            "engine 'mujoco' has no ball to throw: pass ball=False, for both sides of a "
+            "comparison, or set the share of pushes to 0"
+        )
+    if variation.shift is not None:
+        raise ValueError("engine 'mujoco' has no shifts; simulate them by engine 'drake'")
+    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+    plant = MultibodyPlant(time_step_s)
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    instance, _ = _add_robot_and_scene(plant, scene_graph, robot, variation, scene, servos)
+    system = MujocoPlant(
+        robot, plant, scene_graph, variation, time_step_s=time_step_s, servos=servos
+    )
+    return MujocoPhysics(builder, plant, scene_graph, instance, system)
 
 
 def add_ground(plant: MultibodyPlant, friction: float) -> None:
@@ -237,7 +225,7 @@ def add_ground(plant: MultibodyPlant, friction: float) -> None:
     )
 
 
-def _dig_holes(
+def _add_holes(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
     robot: RobotModel,
@@ -246,38 +234,42 @@ def _dig_holes(
     friction: float,
 ) -> None:
     """Lowers the ground under some feet."""
-    material = CoulombFriction(friction, friction)
-    holes = {}
-    for name, depth_m in depths_m.items():
-        if name not in robot.feet:
-            raise ValueError(
-                f"robot '{robot.name}' has no foot '{name}' for a hole; it has {list(robot.feet)}"
-            )
-        X_WH = RigidTransform([0.0, 0.0, -depth_m])
-        holes[name] = plant.RegisterCollisionGeometry(
-            plant.world_body(), X_WH, HalfSpace(), f"hole_{name}", material
+    if unknown := [name for name in depths_m if name not in robot.feet]:
+        raise ValueError(
+            f"robot '{robot.name}' has no foot '{unknown[0]}' for a hole; it has "
+            f"{list(robot.feet)}"
         )
+    material = CoulombFriction(friction, friction)
+    holes = {
+        robot.feet[name].body: plant.RegisterCollisionGeometry(
+            plant.world_body(),
+            RigidTransform([0.0, 0.0, -depth_m]),
+            HalfSpace(),
+            f"hole_{name}",
+            material,
+        )
+        for name, depth_m in depths_m.items()
+    }
     # After the registrations, which invalidate earlier lists of identifiers.
     everything = plant.GetCollisionGeometriesForBody(plant.world_body())
-    ground = [one for one in everything if one not in holes.values()]
+    ground = [geometry for geometry in everything if geometry not in holes.values()]
     filters = scene_graph.collision_filter_manager()
     for index in plant.GetBodyIndices(instance):
         body = plant.get_body(index)
         shapes = plant.GetCollisionGeometriesForBody(body)
-        own = [hole for name, hole in holes.items() if robot.feet[name].body == body.name()]
-        others = [hole for hole in holes.values() if hole not in own] + (ground if own else [])
+        others = [hole for name, hole in holes.items() if name != body.name()]
+        others += ground if body.name() in holes else []
         if shapes and others:
             sides = GeometrySet(shapes), GeometrySet(others)
             filters.Apply(CollisionFilterDeclaration().ExcludeBetween(*sides))
 
 
-def _furnish(
+def _add_robot_and_scene(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
     robot: RobotModel,
     variation: PlantVariation,
     scene: Scene,
-    *,
     servos: bool,
 ) -> tuple[ModelInstanceIndex, ModelInstanceIndex | None]:
     """Fills and finalises a plant; returns the model instances of robot and ball."""
@@ -292,22 +284,25 @@ def _furnish(
     ball = add_ball(plant) if scene.has_ball else None
     shift = variation.shift or Shift()
     if shift.holes_m:
-        _dig_holes(plant, scene_graph, robot, instance, shift.holes_m, friction)
+        _add_holes(plant, scene_graph, robot, instance, shift.holes_m, friction)
     if slope := shift.slope_rad:  # Gravity inclines: the ground stays at z = 0.
         gravity, direction = plant.mutable_gravity_field(), shift.slope_direction_rad
         magnitude = np.linalg.norm(gravity.gravity_vector())
         downhill = math.sin(slope) * np.array([math.cos(direction), math.sin(direction)])
         gravity.set_gravity_vector(magnitude * np.append(downhill, -math.cos(slope)))
-    obstacles = add_obstacles(plant, list(scene.obstacles or ()))
-    decorations = add_obstacles(plant, list(scene.decorations))
+    obstacles = add_obstacles(plant, scene.obstacles or ())
+    decorations = add_obstacles(plant, scene.decorations)
     plant.Finalize()
     require_motors(plant, robot)
-    for decoration, model in zip(scene.decorations, decorations, strict=True):
-        if collision_geometries(plant, [model]):
-            raise ValueError(
-                f"decoration '{decoration.model}' has collision geometry, which no margin covers; "
-                "list it under 'obstacles'"
-            )
+    if touchable := [
+        decoration.model
+        for decoration, model in zip(scene.decorations, decorations, strict=True)
+        if collision_geometries(plant, [model])
+    ]:
+        raise ValueError(
+            f"decorations {touchable} have collision geometry, which no margin covers; list them "
+            "under 'obstacles'"
+        )
     if scene.obstacles is not None:
         filter_collisions(plant, scene_graph, robot, obstacles)
     return instance, ball
