@@ -82,7 +82,8 @@ def test_clearances_are_signed_distances_to_the_nearest_box(tmp_path):
     near = Clearance(robot_model("porter"), obstacles, range_m=0.1)
     distances = []
     for q in postures():
-        expected = np.min([box_distance(hands(q), one) for one in obstacles], axis=0) - HAND_RADIUS_M
+        of_boxes = [box_distance(hands(q), one) for one in obstacles]
+        expected = np.min(of_boxes, axis=0) - HAND_RADIUS_M
         # Points are asked for in between: no answer depends on the one before.
         points = clearance.of_points(hands(q), HAND_RADIUS_M)
         np.testing.assert_allclose(points, expected, atol=1e-12)

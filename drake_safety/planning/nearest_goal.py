@@ -162,7 +162,7 @@ class _Search:
             radius *= _GROWTH
         best = self.nearest((best, known))
         if best is None:
-            best = self.accepted(rng.uniform(*box, (_LAST_CHANCE * num_candidates, 3)))
+            best = self.accepted(rng.uniform(box[0], box[1], (_LAST_CHANCE * num_candidates, 3)))
         if best is None:
             return None
         for _ in range(num_rounds):
