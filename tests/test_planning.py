@@ -30,9 +30,7 @@ def step(signed_distance):
 
 def ask(gamma, goal=INSIDE, *, threshold=0.5, unsafe_below=None, **options):
     assessment = FieldAssessment(gamma, **options)
-    return assess_goal(
-        GoalTask(), assessment, goal, threshold=threshold, unsafe_below=unsafe_below
-    )
+    return assess_goal(GoalTask(), assessment, goal, threshold=threshold, unsafe_below=unsafe_below)
 
 
 def suggest(assessment, goal=GOAL, *, task=None, seed=0, **options):

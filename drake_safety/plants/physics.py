@@ -236,8 +236,7 @@ def _add_holes(
     """Lowers the ground under some feet."""
     if unknown := [name for name in depths_m if name not in robot.feet]:
         raise ValueError(
-            f"robot '{robot.name}' has no foot '{unknown[0]}' for a hole; it has "
-            f"{list(robot.feet)}"
+            f"robot '{robot.name}' has no foot '{unknown[0]}' for a hole; it has {list(robot.feet)}"
         )
     material = CoulombFriction(friction, friction)
     holes = {
