@@ -20,7 +20,7 @@ class StandIn:
     parameters = SimpleNamespace(initial_uncertainty=0.3)
 
     def __init__(self, uses_true_state):
-        self.settings = SimpleNamespace(uses_true_state=uses_true_state)
+        self.settings = SimpleNamespace(is_paper=uses_true_state)
 
     def predict(self, state, desired_preview, features):
         assert features is not None

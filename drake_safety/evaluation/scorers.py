@@ -47,6 +47,6 @@ def assessment_scorer(name: str, assessment: SafetyAssessment) -> Scorer:
     return Scorer(
         name=name,
         probability=probability,
-        uses_true_state=assessment.settings.uses_true_state,
+        uses_true_state=assessment.settings.is_paper,
         used=assessment.used_,
     )

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from drake_safety.learning import beliefs as belief_masses
 from drake_safety.learning.assessment_parameters import AdaptationParameters, AssessmentParameters
-from drake_safety.learning.discrepancy import DiscrepancyFunction, updated_uncertainty
 from drake_safety.learning.feedback import FeedbackSegments
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.training_scores import TrainingScores, prior_beliefs
+
+_MOST_FITTED = 250
+_CHUNK = 2048
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,27 +44,75 @@ def paper_beliefs(
     num_causes: int,
 ) -> np.ndarray:
     """Beliefs by the paper's adaptation, (K, R*R, 3 + n_c), of feedback at Psi(x) (K, M, 2)."""
-    settings = parameters.adaptation
+    settings, uncertainty = parameters.adaptation, []
     difference = np.abs(feedback.score - feedback.nominal_score)
-    uncertainty = [
-        updated_uncertainty(
-            *DiscrepancyFunction().fit(member_points, difference).predict(training_points),
-            gate=settings.gate,
-            least=settings.least_uncertainty,
-            initial=parameters.initial_uncertainty,
-        )
-        for member_points, training_points in zip(points, training.points, strict=True)
-    ]
+    for member_points, training_points in zip(points, training.points, strict=True):
+        mean, deviation = DiscrepancyFunction(member_points, difference).predict(training_points)
+        mu = settings.least_uncertainty + mean * (1.0 - settings.least_uncertainty)
+        uncertainty.append(np.where(deviation <= settings.gate, mu, parameters.initial_uncertainty))
     prior = prior_beliefs(training, grid, parameters, num_causes, np.stack(uncertainty))
     certain = belief_masses.from_scores(feedback.score, 0.0, feedback.cause, num_causes)
-    return np.stack(
-        [
-            combined(
-                member_prior, feedback_beliefs(certain, grid.locate(member_points), grid, settings)
+    beliefs = [
+        combined(member_prior, feedback_beliefs(certain, grid.locate(member_points), grid, settings))
+        for member_prior, member_points in zip(prior, points, strict=True)
+    ]
+    return np.stack(beliefs)
+
+
+class DiscrepancyFunction:
+    """D(y), a Gaussian process regression of |lambda actual - lambda nominal| on Psi(x).
+
+    The kernel's amplitude is fixed at one: a fitted amplitude shrinks with the differences, which
+    makes sigma small everywhere, even without data. Length scale and noise are fitted on at most
+    250 points; the posterior is exact with all points.
+
+    Args:
+        points: Psi(x) of the feedback, (N, 2).
+        difference: |lambda actual - lambda nominal| there, (N,).
+    """
+
+    def __init__(self, points: np.ndarray, difference: np.ndarray):
+        from sklearn.gaussian_process import GaussianProcessRegressor
+        from sklearn.gaussian_process.kernels import RBF
+
+        is_finite = np.isfinite(points).all(axis=1)
+        points, difference = points[is_finite].astype(float), difference[is_finite].astype(float)
+        if not len(points):
+            raise ValueError("DiscrepancyFunction: none of the feedback's points is finite")
+        kernel = _fitted_kernel(points, difference)
+        scale, noise = float(kernel.k1.k2.length_scale), float(kernel.k2.noise_level)
+        # As `alpha`, the noise of the observations is no part of sigma.
+        process = GaussianProcessRegressor(RBF(scale), alpha=noise, optimizer=None)
+        self._process: Any = process.fit(points, difference)
+
+    def predict(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Predicts the mean m, clipped to [0, 1], and sigma without noise at points (M, 2).
+
+        Where a point is not finite, they are the prior's 0 and 1.
+        """
+        mean, deviation = np.zeros(len(points)), np.ones(len(points))
+        rows = np.flatnonzero(np.isfinite(points).all(axis=1))
+        for start in range(0, len(rows), _CHUNK):
+            chunk = rows[start : start + _CHUNK]
+            mean[chunk], deviation[chunk] = self._process.predict(
+                points[chunk].astype(float), return_std=True
             )
-            for member_prior, member_points in zip(prior, points, strict=True)
-        ]
-    )
+        return np.clip(mean, 0.0, 1.0), deviation
+
+
+def _fitted_kernel(points: np.ndarray, difference: np.ndarray) -> Any:
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+    kernel = ConstantKernel(1.0, "fixed") * RBF(10.0, (3.0, 40.0)) + WhiteKernel(0.03, (1e-3, 0.08))
+    if len(points) > _MOST_FITTED:
+        rows = np.random.default_rng(0).choice(len(points), _MOST_FITTED, replace=False)
+        points, difference = points[rows], difference[rows]
+    with warnings.catch_warnings():
+        # Hyperparameters may end at their bounds.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return GaussianProcessRegressor(kernel=kernel).fit(points, difference).kernel_
 
 
 def feedback_beliefs(
@@ -68,16 +120,14 @@ def feedback_beliefs(
 ) -> np.ndarray:
     """Computes the feedback belief of every cell by G, (R*R, 3 + n_c); empty without feedback.
 
-    Departure: n_f is by default the number of segments in the cell. Read literally, as the number
-    of all feedback, 40 leave an uncertainty of 5e-8, and one segment replaces its cell's prior.
+    Departure: n_f is the number of segments in the cell. Read literally, as the number of all
+    feedback, 40 leave an uncertainty of 5e-8, and one segment replaces its cell's prior.
 
     Args:
         certain: Beliefs of the feedback segments, mu = 0, (M, 3 + n_c).
         cells: Cell of each, -1 for outside, (M,).
     """
     num_feedback = np.bincount(cells[cells >= 0], minlength=grid.num_cells)
-    if settings.count == "segments":
-        num_feedback = np.full(grid.num_cells, len(certain))
     # mu_v = beta exp(-alpha (n_f - 1))
     uncertainty = settings.first_uncertainty * np.exp(-settings.decay_rate * (num_feedback - 1.0))
     return belief_masses.average_cells(certain, cells, np.minimum(uncertainty, 1.0))

@@ -7,6 +7,7 @@ import logging
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ import numpy as np
 
 from drake_safety.extras import require_extra
 from drake_safety.files.progress import StageProgress, shown, stage_of
-from drake_safety.learning import adaptation, assessment_file, prediction
-from drake_safety.learning.adaptation import Adaptation
+from drake_safety.learning import assessment_file
+from drake_safety.learning.adaptation import Adaptation, paper_beliefs
 from drake_safety.learning.assessment_parameters import AdaptationParameters, AssessmentParameters
+from drake_safety.learning.beliefs import empty
 from drake_safety.learning.blas_threads import one_blas_thread
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector, usual_rows
@@ -33,8 +35,8 @@ from drake_safety.learning.maps import learned_maps
 from drake_safety.learning.mode_settings import ModeSettings, mode_settings
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.points import embedded_points
-from drake_safety.learning.prediction import BaseLogit, Correction, Prediction
-from drake_safety.learning.recalibration import recalibrated_beliefs
+from drake_safety.learning.prediction import BaseLogit, Correction, Model, Prediction
+from drake_safety.learning.recalibration import recalibrated
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
 from drake_safety.learning.segments import (
     DIVERGED,
@@ -57,6 +59,11 @@ __all__ = [
 ]
 
 _LOGGER = logging.getLogger("drake_safety")
+_OF_MODEL = (
+    *("embedding", "grid", "beliefs", "correction", "novelty"),
+    *("base_logit", "trees", "fall_logit"),
+)
+"""Attributes of `Model`, each of which is a learned attribute."""
 
 
 class SafetyAssessment:
@@ -116,8 +123,8 @@ class SafetyAssessment:
         if not hasattr(self, "beliefs_"):
             return f"SafetyAssessment({mode}, not fitted)"
         words = [f"'{self.info_.scenario}'", mode, f"{len(self.beliefs_)} maps"]
-        for one in self.used_:
-            words.append(f"{one.purpose} on {one.num_episodes} episodes of '{one.variation}'")
+        for used in self.used_:
+            words.append(f"{used.purpose} on {used.num_episodes} episodes of '{used.variation}'")
         return f"SafetyAssessment({', '.join(words)})"
 
     @property
@@ -128,12 +135,19 @@ class SafetyAssessment:
     @property
     def uses_features(self) -> bool:
         """Whether x contains the features, as in the sharpened mode."""
-        return self.settings.uses_features
+        return self.parameters.mode != "paper"
 
     @property
     def feature_names(self) -> list[str]:
         """Names of the features that the training episodes have, in their order, (n_f,)."""
         return self.info_.feature_names
+
+    @property
+    def model(self) -> Model:
+        """All that a prediction is made from, as one object of the present learned attributes."""
+        self._check_fitted()
+        learned = {name: getattr(self, f"{name}_") for name in _OF_MODEL}
+        return Model(**learned, initial_uncertainty=self.parameters.initial_uncertainty)
 
     def fit(
         self,
@@ -148,7 +162,7 @@ class SafetyAssessment:
         Args:
             progress: Called with a stage ("distances", "t-SNE", "training", "beliefs", "monitor"),
                 the percentage done and 100; True shows it.
-            detector: That of undisturbed motion.
+            detector: A detector that has learned undisturbed motion.
             motions: Long undisturbed motions of the same diagram, from which the detector is
                 learned in its place. By default it is learned from the episodes, whose motion
                 rarely suffices for its limits.
@@ -164,21 +178,16 @@ class SafetyAssessment:
             shown(progress, lambda stages: stages) as report,
         ):
             if detector is None:
-                together = (episodes, None) if motions is None else (motions, episodes)
+                sets = (episodes, None) if motions is None else (motions, episodes)
                 of_monitor = stage_of(report, "monitor")
-                detector = ChangeDetector.fit(together[0], of_monitor, episodes=together[1])
-            vars(self).update(self._learned(episodes, report, detector))
+                detector = ChangeDetector.fit(sets[0], of_monitor, episodes=sets[1])
+            vars(self).update(self._learned(episodes, report), detector_=detector)
         if math.isinf(detector.alarm_level):
             _LOGGER.warning("SafetyAssessment.fit: %s", detector.describe())
         return self
 
-    def _learned(
-        self,
-        episodes: Episodes,
-        progress: StageProgress | None,
-        detector: ChangeDetector,
-    ) -> dict[str, Any]:
-        """The learned attributes, stage by stage."""
+    def _learned(self, episodes: Episodes, progress: StageProgress | None) -> dict[str, Any]:
+        """The learned attributes but the detector, stage by stage."""
         parameters, info = self.parameters, episodes.info
         segments = training_segments(episodes, parameters)
         grid, columns = Grid.of(parameters), InputColumns(info, parameters)
@@ -186,12 +195,6 @@ class SafetyAssessment:
         embedding, base_logit, trees = learned_maps(
             segments, points, columns, parameters, stage_of(progress, "training")
         )
-        x = columns.of_rows(segments)
-        trees_logit = None if trees is None else trees.evaluate(x)
-        training = TrainingScores.of(segments, embedding.evaluate(x), base_logit, trees_logit)
-        training = training.thinned(grid, parameters.seed)
-        beliefs = prior_beliefs(training, grid, parameters, len(info.constraint_names))
-        stage_of(progress, "beliefs")(1.0)
         every = split(episodes, stride=1, discount=1.0, shortest=1)
         novelty = Novelty.fit(
             # With noise in either mode, as on a robot.
@@ -202,19 +205,26 @@ class SafetyAssessment:
             range_limit=parameters.novelty_range,
             plan=columns.plan,
         )
-        return {
+        num_causes = len(info.constraint_names)
+        model = Model(
+            embedding=embedding,
+            grid=grid,
+            beliefs=empty((embedding.num_members, grid.num_cells), num_causes),
+            correction=Correction.none(embedding, grid, trees),
+            novelty=novelty,
+            base_logit=base_logit,
+            trees=trees,
+            fall_logit=None,
+            initial_uncertainty=parameters.initial_uncertainty,
+        )
+        training = TrainingScores.of(segments, model.evaluate(columns.of_rows(segments)))
+        training = training.thinned(grid, parameters.seed)
+        model = replace(model, beliefs=prior_beliefs(training, grid, parameters, num_causes))
+        stage_of(progress, "beliefs")(1.0)
+        return {f"{name}_": getattr(model, name) for name in _OF_MODEL} | {
             "info_": info,
-            "grid_": grid,
             "columns_": columns,
-            "embedding_": embedding,
-            "base_logit_": base_logit,
-            "trees_": trees,
-            "fall_logit_": None,
             "training_": training,
-            "beliefs_": beliefs,
-            "novelty_": novelty,
-            "detector_": detector,
-            "correction_": Correction.none(embedding, grid, trees),
             "adaptation_": None,
             "calibrations_": {},
             "used_": [UsedEpisodes.of("training", info, len(episodes))],
@@ -229,27 +239,24 @@ class SafetyAssessment:
             features: Features that it reads beside predicted margins and base logit.
         """
         require_extra("train", "SafetyAssessment.fit_falls", "sklearn")
-        self._check_fitted()
-        if self.base_logit_ is None or not self.embedding_.num_margins:
+        model, names = self.model, self.columns_.names
+        if model.base_logit is None or not model.embedding.num_margins:
             raise ValueError(f"{self._who}: the probability of a fall needs maps with margin heads")
-        names = self.columns_.names
         if unknown := sorted(set(features) - set(names)):
             raise ValueError(f"{self._who}: there are no features {unknown} among {names}")
         self.check_unused(episodes.info.seed, purpose="falls")
         columns = [names.index(name) for name in features]
-        labelled = [one for one in episodes if one.cause != DIVERGED]
+        labelled = [episode for episode in episodes if episode.cause != DIVERGED]
         inputs = []
-        for one in labelled:
-            x = self.columns_.of_rows(one)[one.first_step : len(one.time_s) - (not one.is_safe)]
-            output = self.embedding_.evaluate(x)
-            margins = prediction.mean_of_maps(output.margins)
-            trees_logit = None if self.trees_ is None else self.trees_.evaluate(x)
-            heads = self.base_logit_.heads(output, trees_logit, margins)
-            unsafe_logit = self.base_logit_.of_heads(heads)
-            inputs.append(FallLogit.inputs(margins, unsafe_logit, x, columns))
-        self.fall_logit_ = FallLogit.fit(inputs, [not one.is_safe for one in labelled], columns)
-        kept = [one for one in self.used_ if one.purpose != "falls"]
-        self.used_ = [*kept, UsedEpisodes.of("falls", episodes.info, len(episodes))]
+        for episode in labelled:
+            end = len(episode.time_s) - (not episode.is_safe)
+            x = self.columns_.of_rows(episode)[episode.first_step : end]
+            evaluation = model.evaluate(x)
+            assert evaluation.logit is not None
+            inputs.append(FallLogit.inputs(evaluation.margins, evaluation.logit, x, columns))
+        has_fallen = [not episode.is_safe for episode in labelled]
+        self.fall_logit_ = FallLogit.fit(inputs, has_fallen, columns)
+        self._replace_used("falls", [UsedEpisodes.of("falls", episodes.info, len(episodes))])
         return self
 
     def adapt(
@@ -264,7 +271,7 @@ class SafetyAssessment:
         Every adaptation starts from the nominal episodes, as F is not associative: pass all
         feedback, not only the new pairs.
 
-        Departure ("recalibration"): see `recalibration.recalibrated_beliefs`.
+        Departure ("recalibration"): see `recalibration.recalibrated`.
 
         Args:
             method: "recalibration" corrects the base logit and with it the training scores;
@@ -275,10 +282,9 @@ class SafetyAssessment:
                 of motion with more rows those between are left out.
         """
         require_extra("train", "SafetyAssessment.adapt", "sklearn")
-        self._check_fitted()
-        parameters, columns = self.parameters, self.columns_
+        model, columns, parameters = self.model, self.columns_, self.parameters
         parameters.check()
-        methods = ("paper",) if self.base_logit_ is None else ("recalibration", "paper")
+        methods = ("paper",) if model.base_logit is None else ("recalibration", "paper")
         method = method or methods[0]
         if method not in methods:
             raise ValueError(
@@ -286,45 +292,29 @@ class SafetyAssessment:
                 "'recalibration' needs maps with heads"
             )
         check_feedback(feedback, self.info_)
-        drawn = used_episodes(feedback)
-        self.check_unused(*{one.seed for one in drawn}, purpose="adaptation")
+        used = used_episodes(feedback)
+        self.check_unused(*{one_set.seed for one_set in used}, purpose="adaptation")
         segments = feedback_segments(feedback, parameters)
         adapted = copy.copy(self)
         adapted.parameters = copy.deepcopy(parameters)
         rows = [pair.rows for pair in feedback]
-        seen = [columns.of(one.state, one.desired_preview, one.features) for one in rows]
-        adapted.novelty_ = self.novelty_.with_feedback(
-            np.concatenate(seen), parameters.novelty_rate
-        )
+        x = np.concatenate([columns.of(r.state, r.desired_preview, r.features) for r in rows])
+        adapted.novelty_ = self.novelty_.with_feedback(x, parameters.novelty_rate)
         if motions is not None:
             adapted.detector_ = self._detector_with(motions)
         # The thresholds' promises hold for the old beliefs only.
         adapted.calibrations_ = {}
-        adapted.used_ = [*(one for one in self.used_ if one.purpose != "adaptation"), *drawn]
-        num_causes = len(self.info_.constraint_names)
-        if method == "paper" or self.base_logit_ is None:
+        adapted._replace_used("adaptation", used)
+        if method == "paper":
             x = columns.of(segments.state, segments.desired_preview, segments.features)
-            adapted.correction_ = Correction.none(self.embedding_, self.grid_, self.trees_)
-            adapted.beliefs_ = adaptation.paper_beliefs(
-                self.training_,
-                segments,
-                self.embedding_.embed(x),
-                self.grid_,
-                parameters,
-                num_causes,
+            points = model.embedding.embed(x)
+            adapted.correction_ = Correction.none(model.embedding, model.grid, model.trees)
+            adapted.beliefs_ = paper_beliefs(
+                self.training_, segments, points, model.grid, parameters, model.num_causes
             )
         else:
-            adapted.correction_, adapted.beliefs_ = recalibrated_beliefs(
-                feedback,
-                segments,
-                columns=columns,
-                embedding=self.embedding_,
-                base_logit=self.base_logit_,
-                trees=self.trees_,
-                training=self.training_,
-                grid=self.grid_,
-                parameters=parameters,
-                num_causes=num_causes,
+            adapted.correction_, adapted.beliefs_ = recalibrated(
+                model, feedback, segments, self.training_, columns, parameters
             )
         adapted.adaptation_ = Adaptation(
             method=method,
@@ -337,14 +327,17 @@ class SafetyAssessment:
     def _detector_with(self, motions: Episodes | Sequence[np.ndarray]) -> ChangeDetector:
         if not isinstance(motions, Episodes):
             return self.detector_.with_motions(motions)
-        found, wanted = motions.info.step_s, self.detector_.step_s
-        every = round(wanted / found)
-        if not math.isclose(every * found, wanted):
+        step_s, trained_step_s = motions.info.step_s, self.detector_.step_s
+        stride = round(trained_step_s / step_s)
+        if not math.isclose(stride * step_s, trained_step_s):
             raise ValueError(
-                f"{self._who}: rows of the motions are {found} s apart, which does not divide the "
-                f"{wanted} s of the monitor's training"
+                f"{self._who}: rows of the motions are {step_s} s apart, which does not divide the "
+                f"{trained_step_s} s of the monitor's training"
             )
-        return self.detector_.with_motions([rows[::every] for rows in usual_rows(motions)])
+        return self.detector_.with_motions([rows[::stride] for rows in usual_rows(motions)])
+
+    def _replace_used(self, purpose: str, used: Sequence[UsedEpisodes]) -> None:
+        self.used_ = [*(kept for kept in self.used_ if kept.purpose != purpose), *used]
 
     def check_unused(self, *seeds: int, purpose: str = "") -> None:
         """Checks that seeds were not used for training, calibration or adaptation.
@@ -352,22 +345,21 @@ class SafetyAssessment:
         Earlier sets of the ``purpose``, such as "calibration", which these replace, are ignored.
         """
         self._check_fitted()
-        used = [one for one in self.used_ if one.purpose != purpose]
-        check_unused(used, seeds, self._who)
+        check_unused([used for used in self.used_ if used.purpose != purpose], seeds, self._who)
 
     def adopt_calibrations(
         self, calibrations: Sequence[Calibration], info: EpisodesInfo, num_episodes: int
     ) -> None:
         """Replaces the calibrations."""
         self.check_unused(info.seed, purpose="calibration")
-        kept = [one for one in self.used_ if one.purpose != "calibration"]
-        self.calibrations_ = {one.kind: one for one in calibrations}
-        self.used_ = [*kept, UsedEpisodes.of("calibration", info, num_episodes)]
+        self.calibrations_ = {calibration.kind: calibration for calibration in calibrations}
+        self._replace_used("calibration", [UsedEpisodes.of("calibration", info, num_episodes)])
 
     def inputs_of(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
         """Returns x, (..., n_x); the arguments are those of `predict`."""
+        self._check_fitted()
         return self.columns_.of(state, desired_preview, features)
 
     @property
@@ -402,14 +394,8 @@ class SafetyAssessment:
             The prediction. Novel inputs and those that are not finite get the empty belief, whose
             probability is 0. A row has the same bits whatever the others are.
         """
-        self._check_fitted()
-        x = self.inputs_of(state, desired_preview, features)
-        if x.ndim != 2:
-            raise ValueError(
-                f"{self._who}: state has the shape {np.shape(state)}, expected (N, n_s); "
-                "predict_one assesses a single input"
-            )
-        return self._predict(x, beliefs, correction, novelty)
+        x = self._checked_inputs(2, state, desired_preview, features)
+        return self._predict(x, beliefs=beliefs, correction=correction, novelty=novelty)
 
     def predict_rows(self, rows: Episode | Segments, variation: str = "nominal") -> Prediction:
         """Assesses recorded rows of a plant.
@@ -420,29 +406,16 @@ class SafetyAssessment:
         return self._predict(self.columns_.of_rows(rows, variation))
 
     @one_blas_thread
-    def _predict(
-        self,
-        x: np.ndarray,
-        beliefs: np.ndarray | None = None,
-        correction: Correction | None = None,
-        novelty: Novelty | None = None,
-    ) -> Prediction:
-        if beliefs is not None or correction is not None:
-            beliefs = self.beliefs_ if beliefs is None else beliefs
-            correction = self.correction_ if correction is None else correction
-            prediction.check_shapes((beliefs, correction), (self.beliefs_, self.correction_))
-        return prediction.predict(
-            x,
-            embedding=self.embedding_,
-            grid=self.grid_,
-            beliefs=self.beliefs_ if beliefs is None else beliefs,
-            correction=self.correction_ if correction is None else correction,
-            base_logit=self.base_logit_,
-            trees=self.trees_,
-            fall_logit=self.fall_logit_,
-            novelty=self.novelty_ if novelty is None else novelty,
-            initial_uncertainty=self.parameters.initial_uncertainty,
-        )
+    def _predict(self, x: np.ndarray, **others: Any) -> Prediction:
+        """Predicts with other beliefs, correction or novelty where they are not None."""
+        own = self.model
+        changed = {name: value for name, value in others.items() if value is not None}
+        model = replace(own, **changed) if changed else own
+        if (given := model.shapes) != (expected := own.shapes):
+            raise ValueError(
+                f"{self._who}: the shapes of beliefs and correction are {given}, expected {expected}"
+            )
+        return model.predict(x)
 
     def predict_one(
         self,
@@ -458,14 +431,17 @@ class SafetyAssessment:
 
         The result has the same bits as that of `predict` in a row.
         """
-        self._check_fitted()
-        x = self.inputs_of(state, desired_preview, features)
-        if x.ndim != 1:
+        x = self._checked_inputs(1, state, desired_preview, features)[None]
+        return self._predict(x, beliefs=beliefs, correction=correction, novelty=novelty).one(0)
+
+    def _checked_inputs(self, ndim: int, state: np.ndarray, *others: Any) -> np.ndarray:
+        x = self.inputs_of(state, *others)
+        if x.ndim != ndim:
             raise ValueError(
-                f"{self._who}: state has the shape {np.shape(state)}, expected (n_s,); "
-                "predict assesses many inputs"
+                f"{self._who}: state has the shape {np.shape(state)}, but predict takes (N, n_s) "
+                "and predict_one (n_s,)"
             )
-        return self._predict(x[None], beliefs, correction, novelty).one(0)
+        return x
 
     def strangest_input(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
@@ -475,10 +451,9 @@ class SafetyAssessment:
         It is one of `columns_.names`; the difference from what the others say is in standard
         deviations of training. The arguments are those of `predict_one`.
         """
-        self._check_fitted()
-        found = self.novelty_.contradictions(self.inputs_of(state, desired_preview, features))
-        column = int(np.argmax(np.abs(found)))
-        return self.columns_.names[column], float(found[column])
+        difference = self.novelty_.contradictions(self.inputs_of(state, desired_preview, features))
+        column = int(np.argmax(np.abs(difference)))
+        return self.columns_.names[column], float(difference[column])
 
     def unsafe_logits(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None

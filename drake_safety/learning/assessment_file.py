@@ -27,7 +27,7 @@ from drake_safety.learning.fall_logit import FallLogit
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.novelty import Moments, Novelty
-from drake_safety.learning.prediction import BaseLogit, Correction, predict
+from drake_safety.learning.prediction import BaseLogit, Correction, Model
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
@@ -36,8 +36,6 @@ from drake_safety.learning.trees import Trees
 
 SCHEMA = "drake_safety.assessment"
 SCHEMA_VERSION = 12
-_WITHOUT_TREES = 11
-"""The version before, whose files are read as well."""
 
 _TRAINING: dict[str, tuple[type, type]] = {
     "points": (np.float32, np.float32),
@@ -49,6 +47,13 @@ _TRAINING: dict[str, tuple[type, type]] = {
     "count": (np.int32, np.int64),
 }
 """Arrays of `TrainingScores`: the type on disk and in memory."""
+_MADE_OF_JSON: dict[str, type] = {
+    "base_logit": BaseLogit,
+    "fall_logit": FallLogit,
+    "adaptation": Adaptation,
+    "calibrations": Calibration,
+    "used": UsedEpisodes,
+}
 _T = TypeVar("_T")
 _ROUNDING = 1e-6  # Of a sum of masses.
 _SIZES = dict(
@@ -73,8 +78,8 @@ _INDICES |= {"detector.columns": "y", "detector.watched": "s"}
 """Arrays of indices, and the sizes below which they are."""
 _SHARES = ("beliefs", "training_score", "correction.guard")
 _POSITIVE = re.compile("limits|deviation|scale|unit|multiplicity")
-_FORGED = ArithmeticError, AttributeError, IndexError, RecursionError, TypeError, ValueError
 _MAYBE_INFINITE = ("trees.threshold", "detector.settings")
+_FORGED = ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError
 
 
 def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, Any]) -> None:
@@ -87,7 +92,6 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
 
     embedding, correction = learned["embedding_"], learned["correction_"]
     novelty, training = learned["novelty_"], learned["training_"]
-    moments = {"novelty.": novelty.training, "feedback_novelty.": novelty.feedback}
     groups = {
         "": {"beliefs": learned["beliefs_"]},
         "embedding.": embedding.weights,
@@ -98,32 +102,28 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
             for name, (stored, _) in _TRAINING.items()
             if (values := getattr(training, name)) is not None
         },
+        "trees.": learned["trees_"].arrays if learned["trees_"] else {},
     }
-    if learned["trees_"] is not None:
-        groups["trees."] = learned["trees_"].arrays
     if np.isfinite(embedding.input_range).all():
         groups[""]["input_range"] = embedding.input_range
-    for prefix, one in moments.items():
-        if one is not None:
-            arrays = {name: value for name, value in vars(one).items() if name != "count"}
-            groups[prefix] = {name: value for name, value in arrays.items() if value is not None}
-    adaptation, base_logit = learned["adaptation_"], learned["base_logit_"]
-    fall_logit = learned["fall_logit_"]
-    numbers = {
-        "num_margins": embedding.num_margins,
-        "novelty_limits": novelty.limits.tolist(),
-        "novelty_counts": [0 if one is None else one.count for one in moments.values()],
-        "base_logit": None if base_logit is None else asdict(base_logit),
-        "fall_logit": None if fall_logit is None else asdict(fall_logit),
-        "calibrations": [one.to_json() for one in learned["calibrations_"].values()],
-        "used": [asdict(one) for one in learned["used_"]],
-    }
+    counts = []
+    of_novelty = {"novelty.": novelty.training, "feedback_novelty.": novelty.feedback}
+    for prefix, moments in of_novelty.items():
+        known = {} if moments is None else vars(moments)
+        counts.append(known.get("count", 0))
+        groups[prefix] = {k: v for k, v in known.items() if k != "count" and v is not None}
+    json_values = {name: _to_json(learned[f"{name}_"]) for name in _MADE_OF_JSON}
     entries = {
         "schema_version": SCHEMA_VERSION,
         "parameters": asdict(parameters),
         "info": asdict(learned["info_"]),
-        "adaptation": None if adaptation is None else asdict(adaptation),
-        "numbers": numbers,
+        "adaptation": json_values.pop("adaptation"),
+        "numbers": {
+            "num_margins": embedding.num_margins,
+            "novelty_limits": novelty.limits.tolist(),
+            "novelty_counts": counts,
+            **json_values,
+        },
     }
     arrays = {
         f"{prefix}{name}": np.ascontiguousarray(value)
@@ -131,27 +131,40 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
         for name, value in group.items()
     }
     # safetensors stores several entries of metadata in any order.
-    text = _to_json(entries | {"sha256": _digest(entries, arrays)})
+    text = json.dumps(entries | {"sha256": digest(entries, arrays)}, sort_keys=True)
     write_file(path, save(arrays, {SCHEMA: text}))
+
+
+def _to_json(value: Any) -> Any:
+    if isinstance(value, list | dict):
+        return [asdict(item) for item in (value.values() if isinstance(value, dict) else value)]
+    return None if value is None else asdict(value)
 
 
 def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
     """Reads parameters and learned attributes; ValueError if the file is damaged or foreign."""
-    metadata, tensors = _open(path)
-    # Before version 9 schema and version were entries of their own.
-    version = metadata.get("schema_version", "none")
-    if SCHEMA not in metadata and metadata.get("schema") != SCHEMA:
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no safety assessment at '{path}'")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            opened: Any = file
+            metadata = dict(opened.metadata() or {})
+            tensors = {name: opened.get_tensor(name) for name in opened.keys()}
+    except SafetensorError as error:
+        raise ValueError(f"'{path}' is not a safety assessment or truncated: {error}") from error
+    if SCHEMA not in metadata:
         raise ValueError(
-            f"'{path}' is not a safety assessment: its metadata has the entries "
+            f"'{path}' is not a safety assessment of this version: its metadata has the entries "
             f"{sorted(metadata)}, expected '{SCHEMA}'"
         )
     try:
-        if SCHEMA in metadata:
-            entries = json.loads(metadata[SCHEMA])
-            version = str(entries["schema_version"])
-        if version in (str(SCHEMA_VERSION), str(_WITHOUT_TREES)):
+        entries = json.loads(metadata[SCHEMA])
+        version = entries["schema_version"]
+        if version == SCHEMA_VERSION:
             return _learned(entries, tensors)
-    except (KeyError, *_FORGED) as error:
+    except _FORGED as error:
         what = f"it has no {error}" if isinstance(error, KeyError) else error
         raise ValueError(f"'{path}' is a damaged safety assessment: {what}") from error
     raise ValueError(
@@ -160,18 +173,14 @@ def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
     )
 
 
-def _to_json(entries: Mapping[str, Any]) -> str:
-    return json.dumps(entries, sort_keys=True)
-
-
-def _digest(entries: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> str:
+def digest(entries: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> str:
     """SHA-256 of the entries and of the names, types, shapes and bytes of the tensors."""
-    digest = hashlib.sha256(_to_json(entries).encode())
+    sha256 = hashlib.sha256(json.dumps(entries, sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name]
-        digest.update(f"{name} {tensor.dtype.str} {tensor.shape}".encode())
-        digest.update(np.ascontiguousarray(tensor).tobytes())
-    return digest.hexdigest()
+        sha256.update(f"{name} {tensor.dtype.str} {tensor.shape}".encode())
+        sha256.update(np.ascontiguousarray(tensor).tobytes())
+    return sha256.hexdigest()
 
 
 def _made(made: type[_T], entries: Mapping[str, Any]) -> _T:
@@ -188,16 +197,13 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: dict[str, int]) -> No
     for name, values in sorted(arrays.items()):
         kind = name.replace(".nominal.", ".")  # Of an adapted detector.
         letters = _SIZES.get(kind, "*" * values.ndim)
-        if len(letters) != values.ndim or not all(
-            one == "*" or sizes.setdefault(one, size) == size
-            for one, size in zip(letters, values.shape, strict=True)
-        ):
-            expected = tuple(sizes.get(one, one) for one in letters)
-            raise ValueError(f"'{name}' has the shape {values.shape}, expected {expected}")
+        fits = len(letters) == values.ndim and all(
+            letter == "*" or sizes.setdefault(letter, size) == size
+            for letter, size in zip(letters, values.shape, strict=True)
+        )
         if name.endswith(".bias"):  # Else it may be broadcast.
             of_weight = arrays[f"{name.removesuffix('bias')}weight"].shape
-            if values.shape != of_weight[:-2] + of_weight[-1:]:
-                raise ValueError(f"'{name}' has the shape {values.shape}, its weight {of_weight}")
+            fits &= values.shape == of_weight[:-2] + of_weight[-1:]
         most = math.inf if kind in _MAYBE_INFINITE else float(np.finfo(float).max)
         least = float(np.finfo(float).tiny) if _POSITIVE.search(name) else -most
         if name in _SHARES:
@@ -205,8 +211,11 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: dict[str, int]) -> No
         elif name in _INDICES:
             least, most = -1.0 * (name == "training_cause"), sizes[_INDICES[name]] - 1.0
         numbers = values.astype(float)
-        if (wrong := numbers[~((numbers >= least) & (numbers <= most))]).size:
-            raise ValueError(f"'{name}' has {wrong[0]}, expected {least + 0.0:g} to {most:g}")
+        if not fits or not ((numbers >= least) & (numbers <= most)).all():
+            raise ValueError(
+                f"'{name}' has the shape {values.shape}, or values outside [{least:g}, {most:g}], "
+                "that do not fit the rest"
+            )
     masses, variances = arrays["beliefs"], np.diag(arrays["novelty.covariance"])
     sums = masses[..., :3].sum(axis=-1) - 1.0, masses[..., 3:].sum(axis=-1) - masses[..., 1]
     if np.abs(sums).max() > _ROUNDING or variances.min() < 0.0:
@@ -220,51 +229,47 @@ def _learned(
     entries: dict[str, Any], tensors: dict[str, np.ndarray]
 ) -> tuple[AssessmentParameters, dict[str, Any]]:
     stored = entries.pop("sha256")
-    if stored != _digest(entries, tensors):
+    if stored != digest(entries, tensors):
         raise ValueError("its contents do not have the SHA-256 that it was written with")
-    # Files from before these parameters are of exact neighbours, and without trees.
-    own: dict[str, Any] = {"candidates_per_neighbour": 0, "trees": False} | entries["parameters"]
+    own = dict(entries["parameters"])
     own["paper"] = _known(PaperReading, own["paper"])
     own["adaptation"] = _known(AdaptationParameters, own["adaptation"])
     parameters, info = _made(AssessmentParameters, own), _made(EpisodesInfo, entries["info"])
+    numbers, columns = entries["numbers"], InputColumns(info, parameters)
 
     def group(prefix: str) -> dict[str, Any]:
         return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
-    numbers, columns = entries["numbers"], InputColumns(info, parameters)
-    base_logit, adaptation = numbers["base_logit"], entries["adaptation"]
-    trees, widths, causes = group("trees."), info.widths, len(info.constraint_names)
-    known = parameters.resolution**2, 3 + causes, causes, widths["state"], len(columns.names)
-    sizes = {"1": 1, "2": 2, "6": 6} | dict(zip("rbcsx", known, strict=True))
-    sizes |= {"g": 4 if trees else 3, "h": 3 if trees else 2, "m": 2 + numbers["num_margins"]}
-    sizes |= {"l": 1 + len(trees.get("left", ())), "v": 2 * len(tensors["detector.columns"])}
-    sizes["y"] = sum(widths[name] for name in ("state", "desired_preview", "features"))
+    trees, widths, num_causes = group("trees."), info.widths, len(info.constraint_names)
+    sizes = {
+        **{"1": 1, "2": 2, "6": 6, "r": parameters.resolution**2, "b": 3 + num_causes},
+        **{"c": num_causes, "s": widths["state"], "x": len(columns.names)},
+        **{"g": 4 if trees else 3, "h": 3 if trees else 2, "m": 2 + numbers["num_margins"]},
+        **{"l": 1 + len(trees.get("left", ())), "v": 2 * len(tensors["detector.columns"])},
+        "y": sum(widths[name] for name in ("state", "desired_preview", "features")),
+    }
     _check_arrays(tensors, sizes)
     correction = Correction(**group("correction."))
     correction.guard = correction.guard.astype(float)
-    # Files from before have none.
-    fall_logit = numbers.get("fall_logit")
-    training, counts = group("training_"), numbers["novelty_counts"]
-    limits = np.array(numbers["novelty_limits"], dtype=float)
+    counts, limits = numbers["novelty_counts"], np.array(numbers["novelty_limits"], dtype=float)
     if not (min(counts) >= 0 < counts[0] and (limits > 0.0).all() and len(limits) in (3, 4)):
         raise ValueError(f"its novelty has the counts {counts} and limits {limits.tolist()}")
     feedback = Moments(count=counts[1], **group("feedback_novelty.")) if counts[1] else None
+    training = {k: v.astype(_TRAINING[k][1]) for k, v in group("training_").items()}
     learned: dict[str, Any] = {
         "info_": info,
         "grid_": Grid.of(parameters),
         "columns_": columns,
-        # Maps of the paper's mode, and of files from before the range was stored, extrapolate.
+        # Maps of the paper's mode extrapolate: they have no range.
         "embedding_": Embedding(
             group("embedding."),
             num_margins=numbers["num_margins"],
             input_range=tensors.get("input_range"),
         ),
-        "base_logit_": None if base_logit is None else _made(BaseLogit, base_logit),
         "trees_": Trees(**trees) if trees else None,
-        "fall_logit_": None if fall_logit is None else _made(FallLogit, fall_logit),
         "beliefs_": tensors["beliefs"],
         "correction_": correction,
-        "training_": TrainingScores(**{k: v.astype(_TRAINING[k][1]) for k, v in training.items()}),
+        "training_": TrainingScores(**training),
         "novelty_": Novelty(
             training=Moments(count=counts[0], **group("novelty.")),
             feedback=feedback,
@@ -272,17 +277,24 @@ def _learned(
             plan=columns.plan,
         ),
         "detector_": ChangeDetector.from_arrays(group("detector.")),
-        "calibrations_": {one["kind"]: _made(Calibration, one) for one in numbers["calibrations"]},
-        "used_": [_made(UsedEpisodes, one) for one in numbers["used"]],
-        "adaptation_": None if adaptation is None else _made(Adaptation, adaptation),
     }
+    for name, made in _MADE_OF_JSON.items():
+        # Files from before the probability of a fall have none.
+        value = entries["adaptation"] if name == "adaptation" else numbers.get(name)
+        if isinstance(value, list):
+            learned[f"{name}_"] = [_made(made, item) for item in value]
+        else:
+            learned[f"{name}_"] = None if value is None else _made(made, value)
+    learned["calibrations_"] = {one.kind: one for one in learned["calibrations_"]}
     # Layers that do not fit together raise an error.
     names = "embedding grid beliefs correction base_logit novelty trees fall_logit"
-    parts = {name: learned[f"{name}_"] for name in names.split()}
+    model = Model(
+        **{name: learned[f"{name}_"] for name in names.split()},
+        initial_uncertainty=parameters.initial_uncertainty,
+    )
     with np.errstate(all="ignore"):
-        x = learned["novelty_"].training.mean[None]
-        predict(x, **parts, initial_uncertainty=parameters.initial_uncertainty)
-        learned["detector_"].predictor.errors(*(np.zeros((3, sizes[one])) for one in "uw"))
+        model.predict(model.novelty.training.mean[None])
+        learned["detector_"].predictor.errors(*(np.zeros((3, sizes[size])) for size in "uw"))
     return parameters, learned
 
 
@@ -290,17 +302,3 @@ def file_hash(path: Path) -> str:
     """Returns the SHA-256 of a file in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _open(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
-    from safetensors import SafetensorError, safe_open
-
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no safety assessment at '{path}'")
-    try:
-        with safe_open(path, framework="numpy") as file:
-            opened: Any = file
-            metadata = dict(opened.metadata() or {})
-            return metadata, {name: opened.get_tensor(name) for name in opened.keys()}
-    except SafetensorError as error:
-        raise ValueError(f"'{path}' is not a safety assessment or truncated: {error}") from error

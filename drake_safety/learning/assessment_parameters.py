@@ -15,7 +15,7 @@ from drake_safety.files.schema import (
     load_typed,
     schema,
 )
-from drake_safety.learning.distance import Backend, WarpingCost
+from drake_safety.learning.distance import Backend
 
 Widths = Annotated[list[Annotated[int, Field(ge=1, le=10_000)]], Field(min_length=1)]
 MOST_SAMPLES = 10_000
@@ -35,8 +35,6 @@ class AdaptationParameters:
         first_uncertainty: beta, uncertainty of a feedback belief from one sample (paper).
         update_interval: k_u, pairs of episodes between two updates: "The online adaptation process
             is performed once every 40 feedback data".
-        count: n_f in a feedback belief's uncertainty (paper): segments in its "cell", or all
-            "segments" of the feedback ("a collection of feedback data with n_f sets").
         offset_std: Prior standard deviation of the change of the base logit's offset (sharpened).
         slope_std: The same for each of its slopes (sharpened).
         hidden_std: The same for the contribution of the maps' last hidden layer at the feedback's
@@ -48,7 +46,6 @@ class AdaptationParameters:
     decay_rate: NotNegative = 0.4
     first_uncertainty: Share = 0.3
     update_interval: Count = 40
-    count: Literal["cell", "segments"] = "cell"
     offset_std: Positive = 2.0
     slope_std: Positive = 0.5
     hidden_std: Positive = 1.0
@@ -58,38 +55,27 @@ class AdaptationParameters:
 class PaperReading:
     """What the paper leaves open about its segments, its input x and its map Psi.
 
-    The defaults are the readings with the highest held-out accuracy on the robots; the table of
-    all of them is in docs/paper.md. Those about t-SNE and the grid are attributes of
-    `AssessmentParameters`, as both modes use them.
+    The defaults are the readings with the highest held-out accuracy on the robots, see
+    docs/paper.md.
 
     Attributes:
         stride: Samples between the starts of segments; 0 means H, segments that do not overlap: "We
             split the simulated trajectories into segments spanning a duration of H". Gamma is asked
             at every k, for which overlapping segments are the training data.
-        velocities: Whether x has the velocities in the state. "The robot's state s_k consists of
-            its floating base and joints configurations"; a pushed robot and one at rest then differ
-            in nothing.
         standardized: Whether every column of x is scaled to mean 0 and standard deviation 1. The
             paper does not say; raw columns weigh as their spread in SI units.
-        loss: "squared", the mean of ||y - Psi(x)||^2, or "norm", literally "the cost function
-            ||y - Psi(x)||_2".
         hidden_sizes: Widths of the layers of Psi, "a deep neural network".
         dropout: Dropout rate.
         weight_decay: Weight decay of AdamW.
         epochs: Passes over the segments.
-        held_out: Share of episodes held out of the training of Psi. The weights of the epoch with
-            the lowest loss on them are kept; 0 keeps the last.
     """
 
     stride: Annotated[int, Field(ge=0)] = 1
-    velocities: bool = True
     standardized: bool = False
-    loss: Literal["squared", "norm"] = "squared"
     hidden_sizes: Widths = field(default_factory=lambda: [128, 128])
     dropout: ShareBelowOne = 0.3
     weight_decay: NotNegative = 0.01
     epochs: Count = 60
-    held_out: ShareBelowOne = 0.0
 
 
 @schema(kw_only=True)
@@ -110,10 +96,6 @@ class AssessmentParameters:
             "are identical [...] except for the prediction horizon", so both have about the same
             step.
         score_weight: delta, the weight of score differences in Omega.
-        warping_cost: Cost of a path of dynamic time warping, one of `WARPING_COSTS`. The paper
-            names "the dynamic time warping operator"; with the sum of squares its delta = 0.01
-            gives its "two clusters separated in a low-dimensional space", with the root it does
-            not.
         initial_uncertainty: mu_ini of nominal beliefs.
         min_count: k_min, beliefs below which a cell stays empty.
         resolution: Number of cells per side of the grid.
@@ -122,12 +104,9 @@ class AssessmentParameters:
             which takes about twenty times as long and gives the same values.
         perplexity: Effective number of neighbours in t-SNE.
         candidates_per_neighbour: Segments among which each of t-SNE's neighbours is sought, those
-            with the smallest bounds of Omega; 0 for all segments, with which the neighbours are
-            exact and the cost grows as the square of the number of segments.
+            with the smallest bounds of Omega; 0 for all segments, at a cost of their number squared.
         exaggeration: Factor of t-SNE's attraction after its early phase; 1 is plain t-SNE. A larger
             one contracts the clusters, whose inner order Psi cannot reproduce for new inputs.
-        initialization: Initial points of t-SNE: "spectral", which keeps the global order, or
-            "random".
         novelty_rate: Share of safe episodes, and of first inputs of all, in which an input may
             exceed a limit of novelty, see `novelty.Novelty`.
         novelty_range: Largest distance of a known input's column from the centre of its range in
@@ -170,12 +149,10 @@ class AssessmentParameters:
     min_count: Count = 5
     resolution: Annotated[int, Field(ge=1, le=1000)] = 14
     cell_length: Positive = 10.0
-    warping_cost: WarpingCost = "squared"
     distance_backend: Backend = "dtaidistance"
     perplexity: Annotated[float, Field(ge=1)] = 30.0
     candidates_per_neighbour: Annotated[int, Field(ge=0)] = 2
     exaggeration: Annotated[float, Field(ge=1)] = 4.0
-    initialization: Literal["spectral", "random"] = "spectral"
     novelty_rate: Annotated[float, Field(gt=0, lt=1)] = 0.01
     novelty_range: Annotated[float, Field(ge=1)] = 1.25
     seed: int = 0

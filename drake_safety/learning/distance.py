@@ -1,8 +1,7 @@
 """The safety distance Omega between segments, as a graph of nearest neighbours.
 
-The paper names "the dynamic time warping operator" without a definition. `WARPING_COSTS` are the
-definitions in use: the sum of squared distances along the warping path, its root (tslearn,
-dtaidistance), and the sum of distances (fastdtw).
+The paper names "the dynamic time warping operator" without a definition. Here it is the sum of
+squared distances along the warping path.
 
 The Euclidean distance of two error sequences, the shorter one held at its last value, is the cost
 of one admissible warping path and so bounds DTW from above. A tree finds the candidates with the
@@ -25,9 +24,6 @@ from drake_safety.files.progress import ignore
 
 Backend = Literal["dtaidistance", "tslearn"]
 BACKENDS = get_args(Backend)
-WarpingCost = Literal["squared", "rooted", "absolute"]
-WARPING_COSTS = get_args(WarpingCost)
-"""Cost of a warping path: sum ||.||^2, its square root, or sum ||.||."""
 
 _ROWS = 32  # Segments that share their candidates.
 _BLOCK = 512
@@ -43,8 +39,7 @@ class NeighbourGraph:
     Attributes:
         indices: Neighbours, (N, k).
         distances: Omega to each neighbour, (N, k), dimensionless.
-        max_dtw: w_max, the largest DTW distance over all pairs [unit of the errors; its square for
-            the cost "squared"].
+        max_dtw: w_max, the largest DTW distance over all pairs [squared unit of the errors].
     """
 
     indices: np.ndarray
@@ -60,7 +55,6 @@ def neighbour_graph(
     score_weight: float,
     num_neighbours: int,
     num_candidates: int | None = None,
-    cost: WarpingCost = "squared",
     backend: Backend = "dtaidistance",
     progress: Callable[[float], object] = ignore,
 ) -> NeighbourGraph:
@@ -76,39 +70,31 @@ def neighbour_graph(
         num_candidates: Segments with the smallest bounds of Omega among which the neighbours of a
             segment are sought, at least k; None for all others, with which they are exact and the
             cost grows as N^2.
-        cost: Cost of a warping path.
-        backend: "dtaidistance", or "tslearn", which ignores the bounds and has no "absolute" cost.
+        backend: "dtaidistance", or "tslearn", which ignores the bounds.
     """
-    if backend == "tslearn" and cost == "absolute":
-        raise ValueError("distance: the backend 'tslearn' has no cost 'absolute'")
-    error = np.asarray(error, dtype=float)
-    score = np.asarray(score, dtype=float)
+    from scipy.spatial import cKDTree
+
     num_segments = len(error)
     if not np.all(np.isfinite(error)):
         raise ValueError("neighbour_graph: the errors contain values that are not finite")
-    from scipy.spatial import cKDTree
-
-    series = [np.ascontiguousarray(one[:n]) for one, n in zip(error, length, strict=True)]
+    series = [np.ascontiguousarray(e[:n]) for e, n in zip(error, length, strict=True)]
     # Each with its last counted sample repeated, flattened, (N, H*n_z).
     steps = np.minimum(np.arange(error.shape[1]), np.asarray(length)[:, None] - 1)
     held = np.take_along_axis(error, steps[:, :, None], axis=1).reshape(num_segments, -1)
-    # Omega is 1 / w_max * DTW ** power; bounds and DTW itself are those without the power.
-    power = 2.0 if cost == "squared" else 1.0
-    # sum ||.|| over H pairs is at most sqrt(H) times the root of sum ||.||^2.
-    looseness = np.sqrt(error.shape[1]) if cost == "absolute" else 1.0
-    dtw = partial(_dtw, series, backend=backend, is_absolute=cost == "absolute")
-    largest = _max_dtw(held, dtw, looseness)
-    scale = largest**-power if largest > 0.0 else 0.0
+    # `_dtw` and bounds are roots of the sums of squares.
+    dtw = partial(_dtw, series, backend=backend)
+    largest = _max_dtw(held, dtw)
+    scale = largest**-2.0 if largest > 0.0 else 0.0
 
     def omega(rows: np.ndarray, columns: np.ndarray, warping: np.ndarray) -> np.ndarray:
         # Omega^ij = w^ij / w_max + delta |lambda^i - lambda^j|
-        warping **= power
+        warping **= 2.0
         warping *= scale
         warping += score_weight * np.abs(score[rows, None] - score[columns])
         warping[rows[:, None] == columns] = np.inf
         return warping
 
-    places = _places(held * (looseness * scale ** (1.0 / power)), score * score_weight, power)
+    places = _places(held * scale**0.5, score * score_weight)
     tree = cKDTree(places, leafsize=_ROWS)
     columns = np.arange(num_segments)
     distances = np.empty((num_segments, num_neighbours))
@@ -118,31 +104,28 @@ def neighbour_graph(
         rows = tree.indices[start : start + _ROWS]
         if num_candidates is not None and num_candidates < num_segments - 1:
             columns = np.unique(tree.query(places[rows], num_candidates + 1)[1])
-        bound = omega(rows, columns, looseness * _euclidean(held[rows], held[columns]))
+        bound = omega(rows, columns, _euclidean(held[rows], held[columns]))
         radius = np.partition(bound, num_neighbours - 1, axis=1)[:, num_neighbours - 1].max()
-        limit = (radius * (1.0 + _SLACK)) ** (1.0 / power) * largest * (1.0 + _SLACK)
-        found = omega(rows, columns, dtw(rows, columns, limit=limit))
-        nearest = np.argpartition(found, num_neighbours - 1, axis=1)[:, :num_neighbours]
-        found = np.take_along_axis(found, nearest, axis=1)
-        order = np.lexsort((columns[nearest], found), axis=1)
-        distances[rows] = np.take_along_axis(found, order, axis=1)
+        limit = (radius * (1.0 + _SLACK)) ** 0.5 * largest * (1.0 + _SLACK)
+        omegas = omega(rows, columns, dtw(rows, columns, limit=limit))
+        nearest = np.argpartition(omegas, num_neighbours - 1, axis=1)[:, :num_neighbours]
+        omegas = np.take_along_axis(omegas, nearest, axis=1)
+        order = np.lexsort((columns[nearest], omegas), axis=1)
+        distances[rows] = np.take_along_axis(omegas, order, axis=1)
         indices[rows] = np.take_along_axis(columns[nearest], order, axis=1)
         progress(min(start + _ROWS, num_segments) / num_segments)
-    return NeighbourGraph(indices=indices, distances=distances, max_dtw=largest**power)
+    return NeighbourGraph(indices=indices, distances=distances, max_dtw=largest**2.0)
 
 
-def _places(held: np.ndarray, score: np.ndarray, power: float) -> np.ndarray:
-    """Points whose Euclidean distances order pairs as the bounds of Omega do, nearly, (N, m).
+def _places(held: np.ndarray, score: np.ndarray) -> np.ndarray:
+    """Points whose squared distances are the bounds of Omega, nearly, (N, m).
 
-    For the cost "squared" the squared distance of two points is the bound itself, but for the
-    rounding of scores and the components with the least variance.
+    Scores are rounded, and the components with the least variance are left out.
     """
-    part = score[:, None]
-    if power == 2.0:
-        # Points on a staircase of steps of equal size: ||p_i - p_j||^2 = |lambda_i - lambda_j|.
-        step = max(float(score.max()), np.finfo(float).tiny) / _SCORE_STEPS
-        part = np.sqrt(step) * (part > step * (np.arange(_SCORE_STEPS) + 0.5))
-    points = np.hstack([held, part])
+    # Points on a staircase of steps of equal size: ||p_i - p_j||^2 = |lambda_i - lambda_j|.
+    step = max(float(score.max()), np.finfo(float).tiny) / _SCORE_STEPS
+    stairs = np.sqrt(step) * (score[:, None] > step * (np.arange(_SCORE_STEPS) + 0.5))
+    points = np.hstack([held, stairs])
     points -= points.mean(axis=0)
     variance, axes = np.linalg.eigh(points.T @ points)
     share = np.cumsum(variance[::-1]) / max(variance.sum(), np.finfo(float).tiny)
@@ -157,10 +140,9 @@ def _dtw(
     columns: Iterable[int],
     *,
     backend: str = BACKENDS[0],
-    is_absolute: bool = False,
     limit: float = np.inf,
 ) -> np.ndarray:
-    """DTW, sqrt(sum ||.||^2) or, if absolute, sum ||.||; above `limit` it may be infinite."""
+    """DTW, sqrt(sum ||.||^2), of rows and columns; above `limit` it may be infinite."""
     sides = [series[i] for i in rows], [series[i] for i in columns]
     if backend == "tslearn":
         from tslearn.metrics import cdist_dtw
@@ -177,7 +159,6 @@ def _dtw(
         max_dist=max(limit, np.finfo(float).tiny) if np.isfinite(limit) else None,
         compact=True,
         parallel=False,
-        inner_dist="euclidean" if is_absolute else "squared euclidean",
     )
     return np.frombuffer(distances, dtype=float).reshape(num_rows, num_columns).copy()
 
@@ -192,7 +173,7 @@ def _euclidean(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return np.sqrt(block, out=block)
 
 
-def _max_dtw(held: np.ndarray, dtw: Callable[..., np.ndarray], looseness: float) -> float:
+def _max_dtw(held: np.ndarray, dtw: Callable[..., np.ndarray]) -> float:
     """Largest DTW over all pairs, with DTW only where its bound exceeds the largest yet."""
     held = held - held.mean(axis=0)
     size = np.linalg.norm(held, axis=1)
@@ -201,15 +182,14 @@ def _max_dtw(held: np.ndarray, dtw: Callable[..., np.ndarray], looseness: float)
     largest = float(dtw(by_size[:64], by_size[:64]).max())
     for start in range(0, len(held), _BLOCK):
         # Two segments are no further apart than their distances from the mean together.
-        reach = largest / looseness * (1.0 - _SLACK) - size[start]
+        reach = largest * (1.0 - _SLACK) - size[start]
         end = int(np.searchsorted(-size, -reach, side="right"))
         if end <= start:
             break
-        bound = _euclidean(held[start : start + _BLOCK], held[start:end])
-        is_open = looseness * bound > largest
+        is_open = _euclidean(held[start : start + _BLOCK], held[start:end]) > largest
         rows = by_size[start + np.flatnonzero(is_open.any(axis=1))]
         columns = by_size[start + np.flatnonzero(is_open.any(axis=0))]
         for first in range(0, len(columns), 8 * _BLOCK):
-            found = dtw(rows, columns[first : first + 8 * _BLOCK])
-            largest = max(largest, float(found.max()))
+            distances = dtw(rows, columns[first : first + 8 * _BLOCK])
+            largest = max(largest, float(distances.max()))
     return largest

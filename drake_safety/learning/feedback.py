@@ -19,6 +19,7 @@ from drake_safety.learning.segments import (
     Episodes,
     EpisodesInfo,
     Segments,
+    joined,
     split,
     unsafety_score,
 )
@@ -29,7 +30,7 @@ _SAME_TASK = (
     *("scenario", "step_s", "horizon", "preview_stride"),
     *("state_names", "output_names", "feature_names"),
 )
-_logger = logging.getLogger("drake_safety")
+_LOGGER = logging.getLogger("drake_safety")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,7 +38,7 @@ class EpisodePair:
     """An actual episode and its nominal twin, from the same state along the same plan.
 
     Attributes:
-        info: That of the actual episode.
+        info: Metadata of the actual episode.
         nominal_hash: Scenario hash of the nominal plant.
         twin_seed: Seed of the twin's set.
     """
@@ -70,12 +71,7 @@ def pair_episodes(
             of the pairs; the twins' hash by default.
     """
     who = f"feedback of '{actual.info.scenario}'"
-    for name in _SAME_TASK:
-        here, there = getattr(actual.info, name), getattr(nominal.info, name)
-        if here != there:
-            raise ValueError(
-                f"feedback: actual and nominal episodes differ in {name}: {here} and {there}"
-            )
+    _check_same(who, actual.info, nominal.info, _SAME_TASK)
     twins = {episode.index: episode for episode in nominal}
     pairs = []
     for episode in actual:
@@ -91,18 +87,25 @@ def pair_episodes(
                 f"states differ by {apart:.3g}"
             )
         if DIVERGED in (episode.cause, twin.cause):
-            _logger.info("pair %d of '%s' diverged", episode.index, actual.info.scenario)
-        elif all(one.num_steps > one.first_step for one in (episode, twin)):
-            pairs.append(
-                EpisodePair(
-                    info=actual.info,
-                    actual=episode,
-                    twin=twin,
-                    nominal_hash=nominal_hash or nominal.info.scenario_hash,
-                    twin_seed=nominal.info.seed,
-                )
+            _LOGGER.info("pair %d of '%s' diverged", episode.index, actual.info.scenario)
+        elif episode.num_steps > episode.first_step and twin.num_steps > twin.first_step:
+            pair = EpisodePair(
+                info=actual.info,
+                actual=episode,
+                twin=twin,
+                nominal_hash=nominal_hash or nominal.info.scenario_hash,
+                twin_seed=nominal.info.seed,
             )
+            pairs.append(pair)
     return pairs
+
+
+def _check_same(
+    who: str, feedback: EpisodesInfo, other: EpisodesInfo, names: Sequence[str]
+) -> None:
+    for name in names:
+        if (own := getattr(feedback, name)) != (expected := getattr(other, name)):
+            raise ValueError(f"{who}: {name} differs: it is {own}, expected {expected}")
 
 
 def check_feedback(feedback: Sequence[EpisodePair], learned: EpisodesInfo) -> None:
@@ -110,23 +113,17 @@ def check_feedback(feedback: Sequence[EpisodePair], learned: EpisodesInfo) -> No
     if not feedback:
         raise ValueError(f"feedback of '{learned.scenario}': got none, expected at least one pair")
     for pair in feedback:
-        sides = {
-            name: (getattr(pair.info, name), getattr(learned, name))
-            for name in (*_SAME_TASK, "constraint_names")
-        }
-        sides["the nominal twin's scenario hash"] = (pair.nominal_hash, learned.scenario_hash)
-        for what, (got, expected) in sides.items():
-            if got != expected:
-                raise ValueError(
-                    f"pair {pair.actual.index} and the assessment differ in {what}: the feedback "
-                    f"has {got}, the assessment was trained with {expected}"
-                )
+        who = f"pair {pair.actual.index} of the feedback for '{learned.scenario}'"
+        _check_same(who, pair.info, learned, (*_SAME_TASK, "constraint_names"))
+        # A pair's own hash is that of the actual plant.
+        nominal = replace(pair.info, scenario_hash=pair.nominal_hash)
+        _check_same(f"{who}, nominal twin", nominal, learned, ["scenario_hash"])
 
 
 def used_episodes(feedback: Sequence[EpisodePair]) -> list[UsedEpisodes]:
     """Returns the sets of actual and twin episodes in feedback."""
-    sides = [(one.info.variation, one.info.scenario_hash, one.info.seed) for one in feedback]
-    sides += [("nominal", one.nominal_hash, one.twin_seed) for one in feedback]
+    sets = [(pair.info.variation, pair.info.scenario_hash, pair.info.seed) for pair in feedback]
+    sets += [("nominal", pair.nominal_hash, pair.twin_seed) for pair in feedback]
     return [
         UsedEpisodes(
             purpose="adaptation",
@@ -135,7 +132,7 @@ def used_episodes(feedback: Sequence[EpisodePair]) -> list[UsedEpisodes]:
             seed=seed,
             num_episodes=count,
         )
-        for (variation, scenario_hash, seed), count in Counter(sides).items()
+        for (variation, scenario_hash, seed), count in Counter(sets).items()
     ]
 
 
@@ -145,11 +142,9 @@ class FeedbackSegments(Segments):
 
     Attributes:
         nominal_score: lambda of the twin, (N,).
-        nominal_is_unsafe: Whether the twin ended unsafely, (N,).
     """
 
     nominal_score: np.ndarray
-    nominal_is_unsafe: np.ndarray
 
 
 def feedback_segments(
@@ -168,30 +163,23 @@ def feedback_segments(
         left = rows.remaining_steps
         if not pair.actual.is_safe:
             left = np.maximum(left, pair.info.num_steps - since_start)
-        is_taken = (since_start % settings.stride == 0) & (left >= settings.shortest * sample)
-        taken = rows.take(is_taken)
-        is_unsafe = np.full(len(taken), not pair.twin.is_safe)
-        remaining = np.maximum(pair.twin.num_steps - taken.start_row, 0)
-        taken = replace(
-            taken,
-            episode=np.full(len(taken), position),
-            score=unsafety_score(taken.remaining_steps / sample, taken.is_unsafe, discount),
+        segments = rows.take(
+            (since_start % settings.stride == 0) & (left >= settings.shortest * sample)
         )
-        if settings.uses_true_state and pair.info.variation == "nominal":
-            taken = replace(taken, state=taken.true_state)
-        parts.append(
-            FeedbackSegments(
-                **vars(taken),
-                nominal_score=unsafety_score(remaining / sample, is_unsafe, discount),
-                nominal_is_unsafe=is_unsafe,
-            )
+        segments.episode = np.full(len(segments), position)
+        segments.score = unsafety_score(
+            segments.remaining_steps / sample, segments.is_unsafe, discount
         )
-    segments = FeedbackSegments(
-        **{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
-    )
-    if not len(segments):
+        if settings.is_paper and pair.info.variation == "nominal":
+            segments.state = segments.true_state
+        remaining = np.maximum(pair.twin.num_steps - segments.start_row, 0)
+        twin_is_unsafe = np.full(len(segments), not pair.twin.is_safe)
+        twin_score = unsafety_score(remaining / sample, twin_is_unsafe, discount)
+        parts.append(FeedbackSegments(**vars(segments), nominal_score=twin_score))
+    every = joined(parts)
+    if not len(every):
         raise ValueError(
             f"feedback of '{feedback[0].info.scenario}': none of {len(feedback)} pairs has a "
             f"segment of {settings.shortest} samples"
         )
-    return segments
+    return every

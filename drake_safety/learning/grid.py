@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 
 from drake_safety.learning.assessment_parameters import AssessmentParameters
-from drake_safety.learning.mode_settings import mode_settings
 
 OUTSIDE = -1
 """Cell of a point outside the grid, and of NaN."""
@@ -42,7 +41,7 @@ class Grid:
         return cls(
             resolution=parameters.resolution,
             cell_length=parameters.cell_length,
-            interpolates=mode_settings(parameters).interpolates,
+            interpolates=parameters.mode != "paper",
         )
 
     @property

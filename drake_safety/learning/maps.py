@@ -14,7 +14,7 @@ from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.mode_settings import ModeSettings, mode_settings
 from drake_safety.learning.points import Points
-from drake_safety.learning.prediction import LOGIT_LIMIT, BaseLogit
+from drake_safety.learning.prediction import LOGIT_LIMIT, BaseLogit, mean_of_maps
 from drake_safety.learning.segments import Segments
 from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 from drake_safety.learning.trees import Trees
@@ -83,12 +83,11 @@ def learned_maps(
         sample_weight=_sample_weight(segments, settings),
         input_scale=np.where(is_raw, settings.raw_input_scale, 1.0),
     )
+    if settings.is_paper:
+        return _train(data, parameters, progress), None, None
     is_held_out = held_out_segments(segments, parameters)
-    if settings.is_regression:
-        held_out = data.take(is_held_out) if is_held_out.any() else None
-        return _train(data.take(~is_held_out), parameters, progress, held_out), None, None
-    trees = trees_logit = None
     label = segments.is_unsafe[is_held_out]
+    tried_trees = trees = base_logit = None
     if not 0 < label.sum() < len(label):
         # No held-out episodes of both labels.
         tried = embedding = _train(data, parameters, progress)
@@ -98,42 +97,41 @@ def learned_maps(
         # on the held-out episodes, and the final one is trained on all episodes.
         tried = _train(data.take(~is_held_out), parameters, lambda done: progress(0.5 * done))
         embedding = _train(data, parameters, lambda done: progress(0.5 * (1 + done)))
-        of = data, segments.episode, is_held_out, parameters.seed
-        if settings.trees and embedding.has_heads and (found := learned_trees(*of)):
-            tried_trees, trees = found
-            trees_logit = tried_trees.evaluate(x[is_held_out])
-    base_logit = None
+        if settings.trees and embedding.has_heads:
+            tried_trees, trees = learned_trees(data, segments.episode, is_held_out, parameters.seed)
     if embedding.has_heads:
-        judged = segments.take(is_held_out)
-        output = tried.evaluate(x[is_held_out])
-        base_logit = fitted_base_logit(output, judged, parameters, trees_logit)
+        judged = x[is_held_out]
+        trees_logit = None if tried_trees is None else tried_trees.evaluate(judged)
+        base_logit = fitted_base_logit(
+            tried.evaluate(judged), segments.take(is_held_out), parameters, trees_logit
+        )
     known = np.quantile(x, [_CLIPPED_SHARE, 1.0 - _CLIPPED_SHARE], axis=0)
     return embedding.clipping(known), base_logit, trees
 
 
 def learned_trees(
     data: MapData, episode: np.ndarray, is_held_out: np.ndarray, seed: int
-) -> tuple[Trees, Trees] | None:
+) -> tuple[Trees, Trees] | tuple[None, None]:
     """Trees without the held-out inputs, and as many of all; None if the others have one label."""
     # A tenth of the other episodes, on which their number is chosen.
     is_stopping = np.isin(episode, np.unique(episode[~is_held_out])[::10])
     label = data.is_unsafe[~is_held_out & ~is_stopping]
     if label.all() or not label.any():
-        return None
-
-    def fit(rows: np.ndarray, **options: Any) -> Trees:
-        of = data.x[rows], data.is_unsafe[rows], data.sample_weight[rows]
-        return Trees.fit(*of, seed=seed, **options)
-
-    tried = fit(~is_held_out, is_held_out=is_stopping[~is_held_out])
-    return tried, fit(np.ones(len(episode), dtype=bool), num_trees=len(tried))
+        return None, None
+    others = data.take(~is_held_out)
+    tried = Trees.fit(
+        *(others.x, others.is_unsafe, others.sample_weight),
+        seed=seed,
+        is_held_out=is_stopping[~is_held_out],
+    )
+    every = data.x, data.is_unsafe, data.sample_weight
+    return tried, Trees.fit(*every, seed=seed, num_trees=len(tried))
 
 
 def held_out_segments(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
-    """Returns which segments are held out, (N,), by whole episodes.
+    """Returns which segments are held out for the base logit, (N,), by whole episodes.
 
-    They are held out for the base logit, a function of the ensemble's mean, so all maps hold out
-    the same episodes; in the paper's mode for early stopping.
+    It is a function of the ensemble's mean, so all maps hold out the same episodes.
     """
     settings, episodes = mode_settings(parameters), np.unique(segments.episode)
     seed = np.random.SeedSequence(parameters.seed, spawn_key=(settings.num_maps,))
@@ -146,12 +144,7 @@ def _sample_weight(segments: Segments, settings: ModeSettings) -> np.ndarray:
     return weight / weight.mean()
 
 
-def _train(
-    data: MapData,
-    parameters: AssessmentParameters,
-    progress: _Report,
-    held_out: MapData | None = None,
-) -> Embedding:
+def _train(data: MapData, parameters: AssessmentParameters, progress: _Report) -> Embedding:
     settings, members = mode_settings(parameters), []
     num_maps = settings.num_maps
     for k in range(num_maps):
@@ -160,10 +153,10 @@ def _train(
             progress((k + fraction) / num_maps)
 
         seed = int(np.random.SeedSequence(parameters.seed, spawn_key=(k,)).generate_state(1)[0])
-        members.append(train_map(data, parameters, seed=seed, held_out=held_out, progress=report))
+        members.append(train_map(data, parameters, seed=seed, progress=report))
     num_margins = data.margins.shape[1] if settings.margin_weight > 0.0 else 0
     embedding = stack_members(members, num_margins=num_margins)
-    if settings.is_regression:
+    if settings.is_paper:
         return embedding
     # Departure: a small weight of the distance to t-SNE's points leaves the maps' scale open;
     # outputs would fall outside the grid, or into few of its cells. They become as wide as the
@@ -201,7 +194,6 @@ def train_map(
     parameters: AssessmentParameters,
     *,
     seed: int,
-    held_out: MapData | None = None,
     progress: _Report = ignore,
 ) -> dict[str, np.ndarray]:
     """Trains one map Psi, the same for a seed and a machine; names its arrays as in `Embedding`.
@@ -209,20 +201,16 @@ def train_map(
     Departure: the paper trains Psi on ||y - Psi(x)|| alone. With a safety head on y and a margin
     head on the trunk, the map separates neighbours in t-SNE that end differently; held-out accuracy
     on the robots rises to that of a direct classifier.
-
-    Args:
-        data: Inputs and targets; x is standardised here, with a lower bound on the spread so that
-            nearly constant columns are not amplified.
-        held_out: If given, the weights of the epoch with the smallest distance to t-SNE's points of
-            these inputs are kept instead of the last epoch's.
     """
     import torch
+    from torch.nn import functional
 
     settings = mode_settings(parameters)
     has_safety, has_margins = settings.safety_weight > 0.0, settings.margin_weight > 0.0
     mean = data.x.mean(axis=0)
     spread = np.ones(len(mean))
     if settings.standardized:
+        # With a lower bound, so that nearly constant columns are not amplified.
         spread = np.maximum(data.x.std(axis=0), _SMALLEST_SPREAD) / data.input_scale
     target_scale = float(data.target.std())
     num_margins = data.margins.shape[1] if has_margins else 0
@@ -253,27 +241,15 @@ def train_map(
             max_lr=parameters.learning_rate,
             total_steps=settings.epochs * -(-len(x) // parameters.batch_size) + 1,
         )
-        functional = torch.nn.functional
         # The share of targets varies between batches, so the mean over the whole set normalises.
         mean_target_weight = float(target_weight.mean())
-        best: dict[str, Any] = {}
-        least = np.inf
-        if held_out is not None:
-            unseen = single((held_out.x[held_out.has_target] - mean) / spread)
-            wanted = single(held_out.target / target_scale)
         for epoch in range(settings.epochs):
             for batch in torch.randperm(len(x)).split(parameters.batch_size):
                 output = net["output"](net["trunk"](x[batch]))
                 y, w = output[:, :2], weight[batch]
                 distance = ((y - target[batch]) ** 2).sum(dim=1)
-                if settings.loss == "norm":
-                    # The offset keeps the gradient finite at distance zero.
-                    distance = torch.sqrt(distance + _SMALLEST_SPREAD**2)
-                loss = (
-                    settings.target_weight
-                    * (target_weight[batch] * distance).mean()
-                    / mean_target_weight
-                )
+                distance = (target_weight[batch] * distance).mean()
+                loss = settings.target_weight * distance / mean_target_weight
                 if has_safety:
                     logit = net["safety"](y)[:, 0]
                     entropy = functional.binary_cross_entropy_with_logits(
@@ -287,18 +263,7 @@ def train_map(
                 loss.backward()
                 optimiser.step()
                 schedule.step()
-            if held_out is not None:
-                net.eval()
-                with torch.no_grad():
-                    y = net["output"](net["trunk"](unseen))[:, :2]
-                    error = float((y - wanted).norm(dim=1).mean())
-                net.train()
-                if error < least:
-                    least = error
-                    best = {name: value.clone() for name, value in net.state_dict().items()}
             progress((epoch + 1) / settings.epochs)
-        if best:
-            net.load_state_dict(best)
     return _folded_weights(net, mean, spread, target_scale, parameters.margin_unit)
 
 
@@ -364,7 +329,7 @@ def fitted_base_logit(
     logit = BaseLogit(margin_unit=parameters.margin_unit, margin_range=(low, high))
     weight = _sample_weight(segments, mode_settings(parameters))
     offset, safety_slope, margin_slope, *of_trees = _logistic(
-        logit.heads(output, trees_logit), segments.is_unsafe, weight
+        logit.heads(output, mean_of_maps(output.margins), trees_logit), segments.is_unsafe, weight
     )
     trees_slope = sum(of_trees)
     total = max(1.0, safety_slope + trees_slope) if of_trees else 1.0

@@ -35,16 +35,9 @@ def embedded_points(
     parameters: AssessmentParameters,
     progress: StageProgress | None = None,
 ) -> Points:
-    """Embeds segments by t-SNE.
+    """Embeds segments by t-SNE, scaled to the grid; when sharpened, a segment every H/2 samples.
 
-    When sharpened, it embeds a segment every H/2 samples.
-
-    Args:
-        grid: The grid that the points are scaled to.
-        progress: Called with "distances" or "t-SNE", the percentage done and 100.
-
-    Raises:
-        ValueError: There are too few segments for the perplexity.
+    `progress` is called with "distances" or "t-SNE", the percentage done and 100.
     """
     _, first, episode = np.unique(segments.episode, return_index=True, return_inverse=True)
     since_start = segments.start_row - segments.start_row[first][episode]
@@ -62,7 +55,6 @@ def embedded_points(
         targeted.length,
         targeted.score,
         score_weight=parameters.score_weight,
-        cost=parameters.warping_cost,
         num_neighbours=num_neighbours,
         num_candidates=parameters.candidates_per_neighbour * num_neighbours or None,
         backend=parameters.distance_backend,
@@ -72,7 +64,6 @@ def embedded_points(
         graph,
         perplexity=parameters.perplexity,
         exaggeration=parameters.exaggeration,
-        initialization=parameters.initialization,
         seed=parameters.seed,
         progress=stage_of(progress, "t-SNE"),
     )
@@ -84,7 +75,6 @@ def tsne(
     *,
     perplexity: float,
     exaggeration: float,
-    initialization: str,
     seed: int,
     progress: Callable[[float], object] = ignore,
 ) -> np.ndarray:
@@ -118,9 +108,8 @@ def tsne(
             random_state=seed,
             n_jobs=1,
         )
-        is_random = initialization == "random"
         embedding = openTSNE.TSNE(
-            initialization="random" if is_random else spectral(affinities.P, random_state=seed),
+            initialization=spectral(affinities.P, random_state=seed),
             exaggeration=exaggeration,
             random_state=seed,
             n_jobs=1,

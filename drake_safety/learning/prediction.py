@@ -1,10 +1,10 @@
-"""Evaluation of an assessment: beliefs read from the grid at the maps' outputs."""
+"""Prediction: beliefs read from the grid at the maps' outputs, and the probability beside them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import FiniteFloat
@@ -108,27 +108,22 @@ class BaseLogit:
         return self.safety_slope, self.margin_slope, self.trees_slope
 
     def heads(
-        self,
-        output: EmbeddingOutput,
-        trees_logit: np.ndarray | None = None,
-        margins: np.ndarray | None = None,
+        self, maps: EmbeddingOutput, margins: np.ndarray, trees_logit: np.ndarray | None = None
     ) -> np.ndarray:
-        """Returns z, -m / margin_unit and, if given, t of all inputs, (N, 2) or (N, 3).
+        """Returns z, -m / margin_unit and, with trees, t of all inputs, (N, 2) or (N, 3).
 
-        It is zero for a missing head of the maps. The mean of their margins, (N, n_c), is computed
-        if it is not given.
+        A missing head of the maps gives zero. `margins` is the mean of the maps', (N, n_c).
         """
-        found = np.zeros((output.embedding.shape[1], 2 if trees_logit is None else 3))
-        logit = mean_of_maps(_clip(output.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT))
+        heads = np.zeros((len(margins), 2 if trees_logit is None else 3))
+        logit = mean_of_maps(_clip(maps.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT))
         if np.count_nonzero(np.isnan(logit)) < logit.size:
-            found[:, 0] = logit
-        if output.margins.shape[2]:
-            margins = mean_of_maps(output.margins) if margins is None else margins
+            heads[:, 0] = logit
+        if maps.margins.shape[2]:
             smallest = np.minimum.reduce(margins, axis=1)
-            found[:, 1] = _clip(smallest, *self.margin_range) / -self.margin_unit
+            heads[:, 1] = _clip(smallest, *self.margin_range) / -self.margin_unit
         if trees_logit is not None:
-            found[:, 2] = _clip(trees_logit, -LOGIT_LIMIT, LOGIT_LIMIT)
-        return found
+            heads[:, 2] = _clip(trees_logit, -LOGIT_LIMIT, LOGIT_LIMIT)
+        return heads
 
     def of_heads(self, heads: np.ndarray) -> np.ndarray:
         """Returns the base logit (N,) from the values of `heads`, (N, 2) or (N, 3)."""
@@ -156,7 +151,7 @@ class Correction:
     guard: np.ndarray
 
     @classmethod
-    def none(cls, embedding: Embedding, grid: Grid, trees: Trees | None = None) -> Correction:
+    def none(cls, embedding: Embedding, grid: Grid, trees: Trees | None) -> Correction:
         """Returns the zero correction."""
         return cls(
             change=np.zeros(3 if trees is None else 4),
@@ -171,10 +166,9 @@ class Correction:
         # Without weights the hidden layer has the range zero.
         return any(self.change.tolist()) or any(self.hidden_range.tolist())
 
-    def residual(self, embedding: Embedding, x: np.ndarray) -> np.ndarray:
-        """Returns the hidden layer's contribution at finite inputs (N, n_x), (N,)."""
-        added = hidden_sum(embedding.activations(x), self.hidden)
-        return _clip(added, *self.hidden_range)
+    def residual(self, activations: np.ndarray) -> np.ndarray:
+        """Returns the hidden layer's contribution by its activations (K, N, n), (N,)."""
+        return _clip(hidden_sum(activations, self.hidden), *self.hidden_range)
 
     def shift(self, heads: np.ndarray, residual: np.ndarray, guard: np.ndarray) -> np.ndarray:
         """The shift of the base logit, (N,), from heads, hidden layer and interpolated guard."""
@@ -184,24 +178,118 @@ class Correction:
         return np.where(shift < 0.0, (1.0 - guard) * shift, shift)
 
 
+class Evaluation(NamedTuple):
+    """What maps and trees say of N inputs.
+
+    Attributes:
+        maps: Outputs of the K maps.
+        margins: Mean of the maps' predicted margins, (N, n_c); NaN without a margin head.
+        heads: Inputs of the base logit, see `BaseLogit.heads`; None without a base logit.
+        logit: The base logit before its correction, (N,); None without one.
+    """
+
+    maps: EmbeddingOutput
+    margins: np.ndarray
+    heads: np.ndarray | None
+    logit: np.ndarray | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """All that a prediction is made from; the attributes are those of `SafetyAssessment`.
+
+    Attributes:
+        beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
+        initial_uncertainty: mu_ini, the uncertainty of a filled cell.
+    """
+
+    embedding: Embedding
+    grid: Grid
+    beliefs: np.ndarray
+    correction: Correction
+    novelty: Novelty
+    base_logit: BaseLogit | None
+    trees: Trees | None
+    fall_logit: FallLogit | None
+    initial_uncertainty: float
+
+    @property
+    def num_causes(self) -> int:
+        """n_c, the number of constraints."""
+        return self.beliefs.shape[2] - 3
+
+    @property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Shapes of the beliefs and of the correction's arrays."""
+        of = self.correction
+        arrays = (self.beliefs, of.change, of.hidden, of.hidden_range, of.guard)
+        return tuple(array.shape for array in arrays)
+
+    def evaluate(self, x: np.ndarray) -> Evaluation:
+        """Evaluates maps, trees and base logit at inputs (N, n_x)."""
+        maps = self.embedding.evaluate(x)
+        if maps.margins.shape[2]:
+            margins = mean_of_maps(maps.margins)
+        else:
+            margins = np.full((len(x), self.num_causes), np.nan)
+        if self.base_logit is None:
+            return Evaluation(maps, margins, None, None)
+        trees_logit = None if self.trees is None else self.trees.evaluate(x)
+        heads = self.base_logit.heads(maps, margins, trees_logit)
+        return Evaluation(maps, margins, heads, self.base_logit.of_heads(heads))
+
+    def predict(self, x: np.ndarray) -> Prediction:
+        """Assesses inputs; novel ones and those that are not finite get the empty belief."""
+        maps, margins, heads, logit = self.evaluate(x)
+        num_members, _, num_columns = self.beliefs.shape
+        has_correction = logit is not None and self.correction.is_any
+        table = self.beliefs
+        if has_correction:
+            table = np.concatenate([table, self.correction.guard[..., None]], axis=2)
+        values, is_inside = self.grid.read(maps.embedding, table)
+        summed = np.add.reduce(values, axis=0)
+        masses = summed[:, :num_columns] / num_members
+        if np.count_nonzero(is_inside) < is_inside.size:
+            # A map whose output lies outside its grid contributes the empty belief.
+            share_inside = np.add.reduce(is_inside, axis=0) / num_members
+            masses[:, belief_masses.UNCERTAINTY] += 1.0 - share_inside
+        # Departure: beyond the training inputs the maps place x in cells of others.
+        distance = self.novelty.of(x)
+        # Nothing is known either where a cell's belief is not finite.
+        is_empty = ~((distance <= 1.0) & np.isfinite(np.add.reduce(masses, axis=1)))
+        if np.count_nonzero(is_empty):
+            masses[is_empty] = belief_masses.empty((), num_columns - 3)
+        fall_probability = np.full(len(x), np.nan)
+        if heads is None or logit is None:
+            # The paper's Γ(x) = b_safe of the cell of Psi(x).
+            probability = masses[:, belief_masses.SAFE].copy()
+        else:
+            if has_correction:
+                is_usable = np.isfinite(logit)
+                guard = summed[:, num_columns] / np.maximum(np.add.reduce(is_inside, axis=0), 1)
+                residual = np.zeros(len(x))
+                activations = self.embedding.activations(x[is_usable])
+                residual[is_usable] = self.correction.residual(activations)
+                logit += self.correction.shift(heads, residual, guard)
+            probability = 1.0 / (1.0 + np.exp(logit))
+            if self.fall_logit is not None and maps.margins.shape[2]:
+                fall_probability = sigmoid(self.fall_logit.of(margins, logit, x))
+                fall_probability[np.isnan(maps.embedding[0, :, 0])] = 1.0
+        probability[is_unknown(masses, self.initial_uncertainty)] = 0.0
+        return Prediction(
+            belief=masses[:, :3],
+            probability=probability,
+            embedding=maps.embedding[0],
+            cause_probability=masses[:, 3:],
+            predicted_margins=margins,
+            novelty=distance,
+            fall_probability=fall_probability,
+        )
+
+
 def _weighted(heads: np.ndarray, slopes: Sequence[float], offset: float = 0.0) -> np.ndarray:
     """The weighted sum of heads, (N,); a product of matrices would round by the number of rows."""
     return np.add.reduce(heads * slopes, axis=1) + offset
-
-
-_CORRECTION = tuple(field.name for field in fields(Correction))
-
-
-def check_shapes(given: tuple[np.ndarray, Correction], own: tuple[np.ndarray, Correction]) -> None:
-    """Checks that beliefs and a correction are shaped as those of an assessment."""
-    pairs = [("beliefs", given[0], own[0])]
-    pairs += [(name, getattr(given[1], name), getattr(own[1], name)) for name in _CORRECTION]
-    for name, one, expected in pairs:
-        if one.shape != expected.shape:
-            what = name if name == "beliefs" else f"the correction's {name}"
-            raise ValueError(
-                f"SafetyAssessment: the shape of {what} is {one.shape}, expected {expected.shape}"
-            )
 
 
 def hidden_sum(activations: np.ndarray, hidden: np.ndarray) -> np.ndarray:
@@ -233,74 +321,3 @@ def _clip(values: np.ndarray, least: float, largest: float) -> np.ndarray:
 def sigmoid(z: np.ndarray) -> np.ndarray:
     """Returns 1 / (1 + exp(-z)) for logits of moderate magnitude."""
     return 1.0 / (1.0 + np.exp(-z))
-
-
-def predict(
-    x: np.ndarray,
-    *,
-    embedding: Embedding,
-    grid: Grid,
-    beliefs: np.ndarray,
-    correction: Correction,
-    base_logit: BaseLogit | None,
-    novelty: Novelty,
-    initial_uncertainty: float,
-    trees: Trees | None = None,
-    fall_logit: FallLogit | None = None,
-) -> Prediction:
-    """Assesses inputs; novel ones and those that are not finite get the empty belief.
-
-    Args:
-        beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
-        initial_uncertainty: mu_ini, the uncertainty of a filled cell.
-    """
-    output = embedding.evaluate(x)
-    num_members, _, num_columns = beliefs.shape
-    has_correction = base_logit is not None and correction.is_any
-    table = beliefs
-    if has_correction:
-        table = np.concatenate([beliefs, correction.guard[..., None]], axis=2)
-    found, is_inside = grid.read(output.embedding, table)
-    summed = np.add.reduce(found, axis=0)
-    masses = summed[:, :num_columns] / num_members
-    if np.count_nonzero(is_inside) < is_inside.size:
-        # A map whose output lies outside its grid contributes the empty belief.
-        share_inside = np.add.reduce(is_inside, axis=0) / num_members
-        masses[:, belief_masses.UNCERTAINTY] += 1.0 - share_inside
-    # Departure: beyond the training inputs the maps place x in cells of others.
-    distance = novelty.of(x)
-    # Nothing is known either where a cell's belief is not finite.
-    is_empty = ~((distance <= 1.0) & np.isfinite(np.add.reduce(masses, axis=1)))
-    if np.count_nonzero(is_empty):
-        masses[is_empty] = belief_masses.empty((), num_columns - 3)
-    margins = np.full((len(x), num_columns - 3), np.nan)
-    if output.margins.shape[2]:
-        margins = mean_of_maps(output.margins)
-    fall_probability = np.full(len(x), np.nan)
-    if base_logit is None:
-        # The paper's Γ(x) = b_safe of the cell of Psi(x).
-        probability = masses[:, belief_masses.SAFE].copy()
-    else:
-        trees_logit = None if trees is None else trees.evaluate(x)
-        heads = base_logit.heads(output, trees_logit, margins)
-        logit = base_logit.of_heads(heads)
-        if has_correction:
-            is_usable = np.isfinite(logit)
-            guard = summed[:, num_columns] / np.maximum(np.add.reduce(is_inside, axis=0), 1)
-            residual = np.zeros(len(x))
-            residual[is_usable] = correction.residual(embedding, x[is_usable])
-            logit += correction.shift(heads, residual, guard)
-        probability = 1.0 / (1.0 + np.exp(logit))
-        if fall_logit is not None and output.margins.shape[2]:
-            fall_probability = sigmoid(fall_logit.of(margins, logit, x))
-            fall_probability[np.isnan(output.embedding[0, :, 0])] = 1.0
-    probability[is_unknown(masses, initial_uncertainty)] = 0.0
-    return Prediction(
-        belief=masses[:, :3],
-        probability=probability,
-        embedding=output.embedding[0],
-        cause_probability=masses[:, 3:],
-        predicted_margins=margins,
-        novelty=distance,
-        fall_probability=fall_probability,
-    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,15 +13,13 @@ from drake_safety.learning.assessment_parameters import AdaptationParameters, As
 from drake_safety.learning.feedback import EpisodePair, FeedbackSegments
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import InputColumns
-from drake_safety.learning.prediction import BaseLogit, Correction, hidden_sum, sigmoid
-from drake_safety.learning.trained_maps import Embedding
+from drake_safety.learning.prediction import BaseLogit, Correction, Model, hidden_sum, sigmoid
 from drake_safety.learning.training_scores import TrainingScores
-from drake_safety.learning.trees import Trees
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Outcomes:
-    """Outputs of the maps for rows of episodes, with the episodes' labels.
+class LabelledHeads:
+    """Heads and activations for rows of episodes, with the episodes' labels.
 
     Attributes:
         heads: Inputs of the base logit, see `BaseLogit.heads`, (M, 2) or (M, 3).
@@ -48,33 +45,36 @@ def row_weights(num_rows: np.ndarray) -> np.ndarray:
     return weight
 
 
-def outcomes(
-    feedback: Sequence[EpisodePair],
-    columns: InputColumns,
-    embedding: Embedding,
-    base_logit: BaseLogit,
-    trees: Trees | None,
-) -> tuple[Outcomes, Outcomes]:
-    """Outcomes of all rows of the actual episodes, and of the twins' first rows."""
+def _labelled(
+    feedback: Sequence[EpisodePair], columns: InputColumns, model: Model
+) -> tuple[LabelledHeads, LabelledHeads]:
+    """All rows of the actual episodes, and the twins' first rows."""
     num_rows = np.array([len(pair.rows) for pair in feedback])
-    actual = [(one.rows.state, one.rows.desired_preview, one.rows.features) for one in feedback]
-    first = [(one.twin, slice(one.twin.first_step, one.twin.first_step + 1)) for one in feedback]
-    twins = [(one.state[k], one.desired_preview[k], one.features[k]) for one, k in first]
-    fell = np.repeat([not one.actual.is_safe for one in feedback], num_rows)
-    twin_fell = np.array([not one.twin.is_safe for one in feedback])
+    actual = [(pair.rows.state, pair.rows.desired_preview, pair.rows.features) for pair in feedback]
+    twins = [pair.twin.first_inputs for pair in feedback]
 
-    def of(rows: list[Any], is_unsafe: np.ndarray, weight: np.ndarray) -> Outcomes:
-        x = columns.of(*map(np.concatenate, zip(*rows, strict=True)))
-        trees_logit = None if trees is None else trees.evaluate(x)
-        heads = base_logit.heads(embedding.evaluate(x), trees_logit)
-        known = embedding.activations(x)
-        return Outcomes(heads=heads, activations=known, is_unsafe=is_unsafe, weight=weight)
+    def labelled(x: np.ndarray, is_unsafe: np.ndarray, weight: np.ndarray) -> LabelledHeads:
+        heads, activations = model.evaluate(x).heads, model.embedding.activations(x)
+        assert heads is not None
+        return LabelledHeads(
+            heads=heads, activations=activations, is_unsafe=is_unsafe, weight=weight
+        )
 
-    return of(actual, fell, row_weights(num_rows)), of(twins, twin_fell, np.ones(len(feedback)))
+    x = columns.of(*map(np.concatenate, zip(*actual, strict=True)))
+    is_unsafe = np.repeat([not pair.actual.is_safe for pair in feedback], num_rows)
+    x_twins = columns.of(*map(np.stack, zip(*twins, strict=True)))
+    twin_is_unsafe = np.array([not pair.twin.is_safe for pair in feedback])
+    return (
+        labelled(x, is_unsafe, row_weights(num_rows)),
+        labelled(x_twins, twin_is_unsafe, np.ones(len(feedback))),
+    )
 
 
 def fitted_change(
-    actual: Outcomes, twins: Outcomes, base_logit: BaseLogit, settings: AdaptationParameters
+    actual: LabelledHeads,
+    twins: LabelledHeads,
+    base_logit: BaseLogit,
+    settings: AdaptationParameters,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fits `change` (3,) or (4,), `hidden` (K, n + 1) and `hidden_range` (2,) of a `Correction`.
 
@@ -93,9 +93,9 @@ def fitted_change(
     unit = np.sqrt(np.mean(np.sum((actual.activations - mean) ** 2, axis=(0, 2))))
     unit = max(float(unit), 1e-12)  # Zero for a single row.
 
-    def columns(outcomes: Outcomes) -> np.ndarray:
-        hidden = (outcomes.activations - mean).transpose(1, 0, 2).reshape(len(outcomes.heads), -1)
-        return np.column_stack([np.ones(len(hidden)), outcomes.heads, hidden / unit])
+    def columns(rows: LabelledHeads) -> np.ndarray:
+        hidden = (rows.activations - mean).transpose(1, 0, 2).reshape(len(rows.heads), -1)
+        return np.column_stack([np.ones(len(hidden)), rows.heads, hidden / unit])
 
     phi, logit = columns(actual), base_logit.of_heads(actual.heads)
     label = actual.is_unsafe.astype(float)
@@ -116,17 +116,17 @@ def fitted_change(
 
     bounds: list[tuple[float | None, None]] = [(None, None)] * phi.shape[1]
     bounds[1 : 1 + num_heads] = [(-slope, None) for slope in base_logit.slopes[:num_heads]]
-    options = {"ftol": 1e-13, "gtol": 1e-7, "maxiter": 2000, "maxfun": 4000, "maxcor": 30}
+    options: dict[str, Any] = {"ftol": 1e-13, "gtol": 1e-7, "maxiter": 2000, "maxcor": 30}
+    options["maxfun"] = 4000
     start = np.zeros(phi.shape[1])
-    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
-    weights = found[1 + num_heads :].reshape(num_members, num_activations) / unit
-    constant = -np.sum(weights * mean[:, 0], axis=1)
-    hidden = np.column_stack([weights, constant])
+    w = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+    weights = w[1 + num_heads :].reshape(num_members, num_activations) / unit
+    hidden = np.column_stack([weights, -np.sum(weights * mean[:, 0], axis=1)])
     added = hidden_sum(actual.activations, hidden)
-    return found[: 1 + num_heads], hidden, np.array([added.min(), added.max()])
+    return w[: 1 + num_heads], hidden, np.array([added.min(), added.max()])
 
 
-def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
+def _cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
     """Averages values (M,) at points (K, M, 2) in each map's cells, (K, R*R); 0 in empty ones."""
     means = []
     for member_points in points:
@@ -138,20 +138,15 @@ def cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray
     return np.array(means)
 
 
-def recalibrated_beliefs(
+def recalibrated(
+    model: Model,
     feedback: Sequence[EpisodePair],
     segments: FeedbackSegments,
-    *,
-    columns: InputColumns,
-    embedding: Embedding,
-    base_logit: BaseLogit,
-    trees: Trees | None,
     training: TrainingScores,
-    grid: Grid,
+    columns: InputColumns,
     parameters: AssessmentParameters,
-    num_causes: int,
 ) -> tuple[Correction, np.ndarray]:
-    """Corrects base logit and beliefs, (K, R*R, 3 + n_c), by feedback and its segments.
+    """Returns the correction and the beliefs, (K, R*R, 3 + n_c), by feedback and its segments.
 
     Only pairs with different outcomes are evidence of a reality gap; without any, the correction is
     zero. Training scores are shifted as the base logit is; cells that training leaves empty are
@@ -163,47 +158,43 @@ def recalibrated_beliefs(
     unsafe. The hidden layer's contribution is known at the feedback only; its mean in a cell is
     used for all training segments of the cell.
     """
-    if training.heads is None or training.nearest is None:
-        raise ValueError("recalibrated_beliefs: the maps have no heads")
+    assert model.base_logit is not None
+    assert training.heads is not None and training.nearest is not None
+    grid, mu, num_causes = model.grid, parameters.initial_uncertainty, model.num_causes
     x = columns.of(segments.state, segments.desired_preview, segments.features)
-    points = embedding.embed(x)
-    correction = Correction.none(embedding, grid, trees)
+    points = model.embedding.embed(x)
+    correction = Correction.none(model.embedding, grid, model.trees)
     if any(pair.differs for pair in feedback):
-        both = outcomes(feedback, columns, embedding, base_logit, trees)
-        fitted = fitted_change(*both, base_logit, parameters.adaptation)
+        actual, twins = _labelled(feedback, columns, model)
+        change = fitted_change(actual, twins, model.base_logit, parameters.adaptation)
         # Where most feedback was unsafe, the base logit must not fall.
         vote = np.where(segments.is_unsafe, 1.0, -1.0)
-        guard = (cell_means(vote, points, grid) > 0.0).astype(float)
-        correction = Correction(*fitted, guard)
-    all_logit = base_logit.of_heads(training.heads)
-    actual = belief_masses.from_scores(
-        segments.score, parameters.initial_uncertainty, segments.cause, num_causes
-    )
-    fuse = partial(
-        belief_masses.fuse_cells, num_cells=grid.num_cells, min_count=parameters.min_count
-    )
-    fused = []
-    means = cell_means(correction.residual(embedding, x), points, grid)
+        guard = (_cell_means(vote, points, grid) > 0.0).astype(float)
+        correction = Correction(*change, guard)
+    means = _cell_means(correction.residual(model.embedding.activations(x)), points, grid)
+    of_feedback = belief_masses.from_scores(segments.score, mu, segments.cause, num_causes)
+    options = {"num_cells": grid.num_cells, "min_count": parameters.min_count}
+    beliefs = []
     members = zip(training.points, points, means, correction.guard, strict=True)
-    for training_points, actual_points, added, guard in members:
+    for training_points, feedback_points, added, guard in members:
         cells = grid.locate(training_points)
         inside = cells >= 0
-        logit, score = all_logit[inside], training.score[inside]
-        here = cells[inside]
-        shift = correction.shift(training.heads[inside], added[here], guard[here])
+        heads, score, cells = training.heads[inside], training.score[inside], cells[inside]
+        logit = model.base_logit.of_heads(heads)
+        shift = correction.shift(heads, added[cells], guard[cells])
         # Without a shift the difference is exactly zero, and the scores stay the same.
         score = np.clip(score + (sigmoid(logit + shift) - sigmoid(logit)), 0.0, 1.0)
-        cause = training.cause[inside]
         # Newly unsafe segments get the constraint with the smallest margin.
-        cause = np.where(cause >= 0, cause, training.nearest[inside])
-        masses = belief_masses.from_scores(score, parameters.initial_uncertainty, cause, num_causes)
+        cause = np.where(training.cause >= 0, training.cause, training.nearest)[inside]
+        masses = belief_masses.from_scores(score, mu, cause, num_causes)
         times = training.times[inside]
-        learned = fuse(masses, here, multiplicity=times)
-        filled = fuse(
-            np.concatenate([masses, actual]),
-            np.concatenate([here, grid.locate(actual_points)]),
-            multiplicity=np.concatenate([times, np.ones(len(actual))]),
+        learned = belief_masses.fuse_cells(masses, cells, multiplicity=times, **options)
+        filled = belief_masses.fuse_cells(
+            np.concatenate([masses, of_feedback]),
+            np.concatenate([cells, grid.locate(feedback_points)]),
+            multiplicity=np.concatenate([times, np.ones(len(of_feedback))]),
+            **options,
         )
         is_empty = learned[:, belief_masses.UNCERTAINTY] == 1.0
-        fused.append(np.where(is_empty[:, None], filled, learned))
-    return correction, np.stack(fused)
+        beliefs.append(np.where(is_empty[:, None], filled, learned))
+    return correction, np.stack(beliefs)

@@ -7,7 +7,7 @@ import importlib.metadata
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
 
@@ -357,6 +357,17 @@ class Segments:
     def take(self, rows: np.ndarray) -> Segments:
         """Selects segments by a mask or by indices, (M,)."""
         return replace(self, **{name: values[rows] for name, values in vars(self).items()})
+
+
+_Segments = TypeVar("_Segments", bound=Segments)
+
+
+def joined(parts: Sequence[_Segments]) -> _Segments:
+    """Joins segments of one class into one object."""
+    names = vars(parts[0])
+    return replace(
+        parts[0], **{name: np.concatenate([vars(part)[name] for part in parts]) for name in names}
+    )
 
 
 def split(

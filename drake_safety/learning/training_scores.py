@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drake_safety.learning import beliefs as belief_masses
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.grid import Grid
-from drake_safety.learning.prediction import BaseLogit
+from drake_safety.learning.prediction import Evaluation
 from drake_safety.learning.segments import Segments
-from drake_safety.learning.trained_maps import EmbeddingOutput
 
 _KEPT_IN_CELL = 500
 
@@ -41,25 +40,16 @@ class TrainingScores:
     count: np.ndarray | None = None
 
     @classmethod
-    def of(
-        cls,
-        segments: Segments,
-        output: EmbeddingOutput,
-        base_logit: BaseLogit | None,
-        trees_logit: np.ndarray | None = None,
-    ) -> TrainingScores:
-        """Those of training segments, in the precision in which files store them."""
+    def of(cls, segments: Segments, evaluation: Evaluation) -> TrainingScores:
+        """Returns the scores of training segments, rounded as files store them."""
         heads = nearest = None
-        if base_logit is not None:
-            margins = output.margins.mean(axis=0)
-            heads = _single(base_logit.heads(output, trees_logit))
-            nearest = (
-                margins.argmin(axis=1)
-                if margins.shape[1]
-                else np.zeros(len(segments), dtype=np.int64)
-            )
+        if evaluation.heads is not None:
+            heads = _single(evaluation.heads)
+            nearest = np.zeros(len(segments), dtype=np.int64)
+            if evaluation.maps.margins.shape[2]:
+                nearest = evaluation.margins.argmin(axis=1)
         return cls(
-            points=output.embedding.astype(np.float32),
+            points=evaluation.maps.embedding.astype(np.float32),
             score=_single(segments.score),
             cause=segments.cause,
             heads=heads,
@@ -94,16 +84,13 @@ class TrainingScores:
             own = np.where(cells >= 0, _KEPT_IN_CELL / np.maximum(member_count[cells], 1), 0.0)
             probability = np.maximum(probability, np.minimum(own, 1.0))
         kept = np.random.default_rng(seed).random(len(self.score)) < probability
-
-        def rows(values: np.ndarray | None) -> np.ndarray | None:
-            return None if values is None else values[kept]
-
-        return TrainingScores(
+        return replace(
+            self,
             points=self.points[:, kept],
             score=self.score[kept],
             cause=self.cause[kept],
-            heads=rows(self.heads),
-            nearest=rows(self.nearest),
+            heads=None if self.heads is None else self.heads[kept],
+            nearest=None if self.nearest is None else self.nearest[kept],
             multiplicity=_single(1.0 / probability[kept]),
             count=count,
         )
@@ -124,16 +111,17 @@ def prior_beliefs(
     """Beliefs of every map's cells, (K, R*R, 3 + n_c); `uncertainty` is mu, (K, N)."""
     if uncertainty is None:
         uncertainty = np.full(training.points.shape[:2], parameters.initial_uncertainty)
-    return np.stack(
-        [
+    beliefs = []
+    for points, mu in zip(training.points, uncertainty, strict=True):
+        masses = belief_masses.from_scores(training.score, mu, training.cause, num_causes)
+        beliefs.append(
             belief_masses.fuse_cells(
-                belief_masses.from_scores(training.score, mu, training.cause, num_causes),
+                masses,
                 # L(x) is the cell of Psi(x), not of the segment's point in t-SNE.
                 grid.locate(points),
                 num_cells=grid.num_cells,
                 min_count=parameters.min_count,
                 multiplicity=training.times,
             )
-            for points, mu in zip(training.points, uncertainty, strict=True)
-        ]
-    )
+        )
+    return np.stack(beliefs)
