@@ -108,7 +108,6 @@ def our_cost(folder: Path, num_episodes: int, num_segments: int) -> dict[str, fl
             graph,
             perplexity=perplexity,
             exaggeration=parameters.exaggeration,
-            initialization=parameters.initialization,
             seed=parameters.seed,
         )
 

@@ -1,11 +1,13 @@
-"""What is learned of the stand-in data quickly, and feedback that contradicts it as one likes."""
+"""Assessments that learn the stand-in data quickly, and feedback that contradicts them."""
 
+import copy
 import dataclasses
 import functools
 
 import numpy as np
 
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
+from drake_safety.learning.assessment_parameters import PaperReading
 from drake_safety.learning.calibration import PLAN, Calibration
 from drake_safety.learning.feedback import pair_episodes
 from drake_safety.learning.maps import MapData
@@ -14,18 +16,19 @@ from lip_episodes import make_episodes
 
 QUICK = {
     "perplexity": 15.0,
-    "epochs": 20,
-    "hidden_sizes": [48, 48],
+    "epochs": 12,
+    "hidden_sizes": [32, 32],
     "ensemble_size": 2,
-    "batch_size": 128,
+    "batch_size": 256,
     "score_weight": 0.1,
+    "paper": PaperReading(epochs=12, hidden_sizes=[48, 48], dropout=0.1),
 }
 NUM_PAIRS = 40
 
 
 @functools.cache
 def quick_episodes():
-    return make_episodes(260, noise=0.002)
+    return make_episodes(200, noise=0.002)
 
 
 @functools.cache
@@ -34,8 +37,14 @@ def held_out_segments():
     return split(make_episodes(150, seed=1, noise=0.002), stride=2, discount=0.99)
 
 
-def quick_assessment(mode):
+@functools.cache
+def _learned(mode):
     return SafetyAssessment(AssessmentParameters(mode=mode, **QUICK)).fit(quick_episodes())
+
+
+def quick_assessment(mode):
+    """A copy of one that is learned once for all tests, so that attributes can be replaced."""
+    return copy.copy(_learned(mode))
 
 
 def map_data(x, target, **changes):

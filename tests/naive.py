@@ -18,18 +18,16 @@ def fusion(beliefs):
     return np.append(masses, (len(mu) - mu.sum()) * mu.prod() / divisor)
 
 
-def dtw(error, length, cost="rooted"):
+def dtw(error, length):
     """Dynamic time warping of all pairs of sequences, cell by cell, (n, n)."""
     n, m = error.shape[:2]
     total, beyond = {(0, 0): np.zeros((n, n))}, np.full((n, n), np.inf)
     for i, j in itertools.product(range(m), repeat=2):
-        apart = np.linalg.norm(error[:, None, i] - error[:, j], axis=-1)
+        squared = np.sum((error[:, None, i] - error[:, j]) ** 2, axis=-1)
         before = [total.get(cell, beyond) for cell in ((i, j), (i, j + 1), (i + 1, j))]
-        step = apart if cost == "absolute" else apart**2
-        total[i + 1, j + 1] = step + np.minimum.reduce(before)
+        total[i + 1, j + 1] = squared + np.minimum.reduce(before)
     rows = range(n)
-    found = np.array([[total[length[a], length[b]][a, b] for b in rows] for a in rows])
-    return np.sqrt(found) if cost == "rooted" else found
+    return np.array([[total[length[a], length[b]][a, b] for b in rows] for a in rows])
 
 
 def charts(detector, motions):
@@ -68,6 +66,85 @@ def whitened_distances(known, x, plan):
         squares = (along**2 / np.maximum(variance, least))[:, variance < most]
         found.append(np.sqrt(squares.sum(axis=1)))
     return np.stack(found, axis=1)
+
+
+def prediction(assessment, x):
+    """Belief with causes, probability, margins, novelty and fall probability of one finite input.
+
+    One map, layer, cell, tree and head after another, in double precision.
+    """
+    maps, grid, logit = assessment.embedding_, assessment.grid_, assessment.base_logit_
+    correction, novelty = assessment.correction_, assessment.novelty_
+    empty = np.eye(assessment.beliefs_.shape[2])[2]
+    belief, clipped, guards = np.zeros(len(empty)), np.clip(x, *maps.input_range.astype(float)), []
+    said, margins, hidden = [], [], 0.0
+    for k in range(maps.num_members):
+        w = {name: array[k].astype(float) for name, array in maps.weights.items()}
+        z = clipped
+        for i in range(maps.num_layers):
+            z = np.maximum(z @ w[f"trunk.{i}.weight"] + w[f"trunk.{i}.bias"], 0.0)
+        hidden += z @ correction.hidden[k, :-1] + correction.hidden[k, -1]
+        output = z @ w["output.weight"] + w["output.bias"]
+        margins.append(output[2:])
+        if maps.has_safety_head:
+            h = np.maximum(output[:2] @ w["safety.0.weight"] + w["safety.0.bias"], 0.0)
+            said.append(np.clip(h @ w["safety.1.weight"] + w["safety.1.bias"], -8, 8).item())
+        weights = cell_weights(grid, output[:2])
+        belief += empty * (1.0 - weights.sum()) + weights @ assessment.beliefs_[k]
+        guards += [weights @ correction.guard[k]] * bool(weights.any())
+    margins = np.mean(margins, axis=0)
+    distances = whitened_distances(novelty._known, x[None], novelty.plan)[0]
+    distance = max(distances / novelty.limits[:3])
+    if len(novelty.limits) > 3:
+        low, high = novelty._known.least, novelty._known.largest
+        offset = np.abs(x - (low + high) / 2) / np.maximum((high - low) / 2, 0.05)
+        distance = max(distance, offset.max() / novelty.limits[3])
+    belief = belief / maps.num_members if distance <= 1.0 else empty
+    probability, fall = belief[0], np.nan
+    if logit is not None:
+        smallest = np.clip(margins.min(), *logit.margin_range) if len(margins) else 0.0
+        heads = [np.mean(said) if said else 0.0, -smallest / logit.margin_unit]
+        if assessment.trees_ is not None:
+            heads.append(np.clip(tree_sum(assessment.trees_.arrays, x), -8, 8))
+        unsafe = np.clip(logit.offset + np.dot(heads, logit.slopes[: len(heads)]), -8, 8)
+        shift = correction.change[0] + np.dot(heads, correction.change[1:])
+        shift = np.clip(shift + np.clip(hidden, *correction.hidden_range), -100, 100)
+        unsafe += shift * (1.0 - np.mean(guards or [0.0]) if shift < 0.0 else 1.0)
+        probability = 1.0 / (1.0 + np.exp(unsafe))
+        if assessment.fall_logit_ is not None and len(margins):
+            of = assessment.fall_logit_
+            terms = np.dot(of.weights, [*margins, unsafe, *x[list(of.columns)]]) + of.offset
+            fall = 1.0 / (1.0 + np.exp(-terms))
+    if belief[2] > 0.5 * (1.0 + assessment.parameters.initial_uncertainty) - 1e-9:
+        probability = 0.0
+    return belief, probability, margins, distance, fall
+
+
+def cell_weights(grid, y):
+    """The weight of every cell at a point, (R*R,): bilinear, or one for the cell around it."""
+    weights, place = np.zeros((grid.resolution,) * 2), (y + grid.half_width) / grid.cell_length
+    if np.all((place >= 0.0) & (place < grid.resolution)):
+        for i, j in itertools.product(range(grid.resolution), repeat=2):
+            if grid.interpolates:
+                u = np.clip(place - 0.5, 0.0, grid.resolution - 1.0)
+                weights[i, j] = max(0.0, 1.0 - abs(u[0] - i)) * max(0.0, 1.0 - abs(u[1] - j))
+            else:
+                weights[i, j] = (i, j) == tuple(place.astype(int))
+    return weights.ravel()
+
+
+def tree_sum(arrays, x):
+    """The sum of the leaves that one input reaches, tree by tree and node by node."""
+    total, single = 0.0, x.astype(np.float32)
+    for tree, leaves in enumerate(arrays["value"].astype(float)):
+        excluded = 0
+        for feature, threshold, left in zip(
+            *(arrays[name][:, tree] for name in ("feature", "threshold", "left")), strict=True
+        ):
+            if single[feature] > threshold:
+                excluded |= int(left)
+        total += next(leaf for i, leaf in enumerate(leaves) if not excluded >> i & 1)
+    return total
 
 
 def capital(outcomes, mean, shares, weights, is_above):

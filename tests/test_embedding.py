@@ -27,7 +27,7 @@ SETTINGS = AssessmentParameters(
     margin_range=[-0.03, 0.10],
 )
 
-PLAIN = {"exaggeration": 1.0, "initialization": "random"}
+PLAIN = {"exaggeration": 1.0}
 
 
 @pytest.fixture(scope="module")

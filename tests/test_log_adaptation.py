@@ -26,7 +26,6 @@ def folder(tmp_path_factory):
     scenario = load_scenario(folder / "short.yaml")
     # Plain t-SNE spreads these few segments over more cells.
     assessment = scenario.assessment
-    assessment.warping_cost, assessment.initialization = "rooted", "random"
     assessment.exaggeration = 1.0
     assessment.paper = PaperReading(stride=0, standardized=True, dropout=0.0, epochs=40)
     episodes = run_episodes(scenario, 64, seed=11, num_workers=1)

@@ -3,14 +3,14 @@ import pytest
 
 from drake_safety.learning.assessment import AdaptationParameters
 from drake_safety.learning.prediction import BaseLogit, sigmoid
-from drake_safety.learning.recalibration import Outcomes, fitted_change, row_weights
+from drake_safety.learning.recalibration import LabelledHeads, fitted_change, row_weights
 
 LOGIT = BaseLogit(margin_unit=0.02, margin_range=(-0.03, 0.1), margin_slope=0.5, trees_slope=0.4)
 SETTINGS = AdaptationParameters()
 
 
-def outcomes(heads, is_unsafe, activations=None):
-    return Outcomes(
+def labelled(heads, is_unsafe, activations=None):
+    return LabelledHeads(
         heads=heads,
         activations=np.zeros((1, len(heads), 0)) if activations is None else activations,
         is_unsafe=is_unsafe,
@@ -25,7 +25,7 @@ def drawn(rng, num, change=(0.0, 0.0, 0.0), hidden=None):
     shifted = LOGIT.of_heads(heads) + change[0] + heads @ change[1:]
     if hidden is not None:
         shifted += np.einsum("kni,ki->n", activations, hidden)
-    return outcomes(heads, rng.random(num) < sigmoid(shifted), activations)
+    return labelled(heads, rng.random(num) < sigmoid(shifted), activations)
 
 
 @pytest.mark.parametrize("made", [(0.8, 0.2, 0.1), (1.2, 0.2, 0.1, 0.2)])
@@ -65,8 +65,8 @@ def test_what_is_wrong_of_the_twins_too_is_not_adapted_to():
 def test_more_danger_never_counts_as_less():
     rng = np.random.default_rng(3)
     heads = rng.normal(scale=2.0, size=(5000, 3))
-    upside_down = outcomes(heads, rng.random(5000) < sigmoid(-3.0 * heads.sum(axis=1)))
-    right = outcomes(heads, rng.random(5000) < sigmoid(LOGIT.of_heads(heads)))
+    upside_down = labelled(heads, rng.random(5000) < sigmoid(-3.0 * heads.sum(axis=1)))
+    right = labelled(heads, rng.random(5000) < sigmoid(LOGIT.of_heads(heads)))
     change, *_ = fitted_change(upside_down, right, LOGIT, SETTINGS)
     np.testing.assert_allclose(change[1:], -np.array(LOGIT.slopes))
 
@@ -74,7 +74,7 @@ def test_more_danger_never_counts_as_less():
 def test_the_change_stays_finite_however_large_the_gap():
     heads = np.full((4000, 2), -4.0)
     every, none = np.ones(4000, dtype=bool), np.zeros(4000, dtype=bool)
-    change, *_ = fitted_change(outcomes(heads, every), outcomes(heads, none), LOGIT, SETTINGS)
+    change, *_ = fitted_change(labelled(heads, every), labelled(heads, none), LOGIT, SETTINGS)
     assert np.isfinite(change).all()
     assert change[0] + heads[0] @ change[1:] > 8.0
 

@@ -77,7 +77,7 @@ def test_where_the_rest_to_learn_from_has_one_label_there_are_no_trees(num_rare,
     label = np.isin(episode, [10, 20, 30][:num_rare]) | (is_held_out & (episode % 2 == 0))
     x = drawn(len(episode))[0]
     data = map_data(x, x[:, :2], is_unsafe=label == is_rare)
-    assert learned_trees(data, episode, is_held_out, 0) is None
+    assert learned_trees(data, episode, is_held_out, 0) == (None, None)
     data.is_unsafe[episode == 33] = is_rare
     tried, trees = learned_trees(data, episode, is_held_out, 0)
     assert 0 < len(tried) == len(trees)

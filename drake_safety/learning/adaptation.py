@@ -52,10 +52,10 @@ def paper_beliefs(
         uncertainty.append(np.where(deviation <= settings.gate, mu, parameters.initial_uncertainty))
     prior = prior_beliefs(training, grid, parameters, num_causes, np.stack(uncertainty))
     certain = belief_masses.from_scores(feedback.score, 0.0, feedback.cause, num_causes)
-    beliefs = [
-        combined(member_prior, feedback_beliefs(certain, grid.locate(member_points), grid, settings))
-        for member_prior, member_points in zip(prior, points, strict=True)
-    ]
+    beliefs = []
+    for member_prior, member_points in zip(prior, points, strict=True):
+        actual = feedback_beliefs(certain, grid.locate(member_points), grid, settings)
+        beliefs.append(combined(member_prior, actual))
     return np.stack(beliefs)
 
 

@@ -413,7 +413,7 @@ class SafetyAssessment:
         model = replace(own, **changed) if changed else own
         if (given := model.shapes) != (expected := own.shapes):
             raise ValueError(
-                f"{self._who}: the shapes of beliefs and correction are {given}, expected {expected}"
+                f"{self._who}: beliefs and correction have the shapes {given}, expected {expected}"
             )
         return model.predict(x)
 

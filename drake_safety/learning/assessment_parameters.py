@@ -104,7 +104,7 @@ class AssessmentParameters:
             which takes about twenty times as long and gives the same values.
         perplexity: Effective number of neighbours in t-SNE.
         candidates_per_neighbour: Segments among which each of t-SNE's neighbours is sought, those
-            with the smallest bounds of Omega; 0 for all segments, at a cost of their number squared.
+            with the smallest bounds of Omega; 0 for all segments, with the cost N².
         exaggeration: Factor of t-SNE's attraction after its early phase; 1 is plain t-SNE. A larger
             one contracts the clusters, whose inner order Psi cannot reproduce for new inputs.
         novelty_rate: Share of safe episodes, and of first inputs of all, in which an input may

@@ -50,6 +50,10 @@ _DESCRIPTIONS = {
     "not learned.",
     "embedding": "Place of the input in the first map.",
 }
+_OUTPUTS = (
+    *("belief", "safety_probability", "cause_probability", "predicted_margins"),
+    *("novelty", "embedding", "fall_probability"),
+)
 _UNITS = (
     "those of the recorded ports: SI and radians (m, m/s, rad, rad/s, N, N·m) in the tasks of "
     "drake_safety"
@@ -103,6 +107,9 @@ class _Value:
     def __sub__(self, other: Any) -> _Value:
         return self.Sub(other)
 
+    def __rsub__(self, other: float) -> _Value:
+        return self.graph.node("Sub", other, self)
+
     def __mul__(self, other: Any) -> _Value:
         return self.Mul(other)
 
@@ -117,11 +124,9 @@ class _Value:
         return self.Slice([start], [stop], [axis], output=output)
 
     def double(self) -> _Value:
-        """Converts to double precision."""
         return self.Cast(to=11)  # onnx.TensorProto.DOUBLE
 
     def single(self) -> _Value:
-        """Converts to single precision."""
         return self.Cast(to=1)  # onnx.TensorProto.FLOAT
 
 
@@ -133,30 +138,28 @@ def write(path: Path, assessment: Any) -> None:
     require_extra("onnx", f"export to '{path}'")
     import onnx
 
-    info, num_causes = assessment.info_, len(assessment.info_.constraint_names)
+    info, parameters = assessment.info_, assessment.parameters
     ports = ["state", "desired_preview", *["features"] * assessment.columns_.has_features]
-    inputs = {name: info.widths[name] for name in ports}
-    graph = _Graph()
-    _add_prediction(
-        graph, assessment.model, inputs, assessment.parameters.feature_unit, num_causes
-    )
-    outputs = {
-        "belief": 3,
-        "safety_probability": None,
-        "cause_probability": num_causes,
-        "predicted_margins": num_causes,
-        "novelty": None,
-        "embedding": 2,
-        "fall_probability": None,
-    }
-    contract = _contract(assessment, inputs)
+    contract, graph = _contract(assessment, ports), _Graph()
+    _add_prediction(graph, assessment.model, ports, parameters.feature_unit)
+    widths = info.widths | dict.fromkeys(("safety_probability", "novelty", "fall_probability"))
+    widths |= dict.fromkeys(("cause_probability", "predicted_margins"), info.widths["margins"])
+    widths |= {"belief": 3, "embedding": 2}
+
+    def described(names: Iterable[str]) -> list[onnx.ValueInfoProto]:
+        """Ports of double precision, (N, width) or (N,)."""
+        return [
+            onnx.helper.make_tensor_value_info(
+                *(name, onnx.TensorProto.DOUBLE),
+                ["N"] if widths[name] is None else ["N", widths[name]],
+                _DESCRIPTIONS[name],
+            )
+            for name in names
+        ]
+
     model = onnx.helper.make_model(
         onnx.helper.make_graph(
-            graph.nodes,
-            "gamma",
-            [_port(name, width) for name, width in inputs.items()],
-            [_port(name, width) for name, width in outputs.items()],
-            graph.constants,
+            graph.nodes, "gamma", described(ports), described(_OUTPUTS), graph.constants
         ),
         opset_imports=[onnx.helper.make_opsetid("", OPSET)],
         ir_version=_IR_VERSION,
@@ -168,24 +171,12 @@ def write(path: Path, assessment: Any) -> None:
     write_file(path, model.SerializeToString(deterministic=True))
 
 
-def _port(name: str, width: int | None) -> onnx.ValueInfoProto:
-    """A port of double precision, (N, width) or (N,)."""
-    from onnx import TensorProto, helper
-
-    shape: list[str | int | None] = ["N"] if width is None else ["N", width]
-    return helper.make_tensor_value_info(name, TensorProto.DOUBLE, shape, _DESCRIPTIONS[name])
-
-
 def _contract(assessment: Any, ports: Iterable[str]) -> dict[str, Any]:
     """What the file is, by the name of the entry of its metadata."""
     info, parameters = assessment.info_, assessment.parameters
     adaptation, calibrations = assessment.adaptation_, assessment.calibrations_.values()
     preview = [f"{name} [{k}]" for k in range(info.horizon) for name in info.output_names]
-    columns = {
-        "state": info.state_names,
-        "desired_preview": preview,
-        "features": info.feature_names,
-    }
+    columns = info.columns | {"desired_preview": preview}
     return {
         "schema_version": SCHEMA_VERSION,
         "drake_safety": installed_versions()["drake_safety"],
@@ -201,15 +192,14 @@ def _contract(assessment: Any, ports: Iterable[str]) -> dict[str, Any]:
         "step_s": info.step_s,
         "preview_step_s": info.preview_step_s,
         "unknown_above": unknown_above(parameters.initial_uncertainty),
-        "calibrations": [asdict(found) | {"promise": found.promise} for found in calibrations],
+        "calibrations": [asdict(each) | {"promise": each.promise} for each in calibrations],
     }
 
 
-def _add_prediction(
-    graph: _Graph, model: Model, ports: Iterable[str], feature_unit: float, num_causes: int
-) -> None:
+def _add_prediction(graph: _Graph, model: Model, ports: Iterable[str], feature_unit: float) -> None:
     """Adds `Model.predict`; the outputs have the names of the ports."""
     base_logit, correction, embedding = model.base_logit, model.correction, model.embedding
+    num_causes = model.num_causes
     x = _inputs(graph, ports, feature_unit)
     # False for NaN.
     is_small = x.Abs().Less(INPUT_LIMIT).double()
@@ -234,14 +224,14 @@ def _add_prediction(
     if base_logit is not None:
         heads = _heads(logit, margins, base_logit)
         if model.trees is not None:
-            heads = heads.Concat(_trees(graph, usable, model.trees), axis=1)
+            heads = heads.Concat(_trees(usable, model.trees), axis=1)
         slopes = np.array(base_logit.slopes[: 2 if model.trees is None else 3], dtype=float)
         unsafe_logit = heads @ slopes[:, None] + base_logit.offset
         unsafe_logit = unsafe_logit.Clip(-LOGIT_LIMIT, LOGIT_LIMIT)
         if correction.is_any:
             guard = _read_grid(weights, correction.guard[..., None])
             guard = guard / inside.ReduceSum([0], keepdims=0).Max(1.0)
-            unsafe_logit = unsafe_logit + _shift(graph, heads, activations, guard, correction)
+            unsafe_logit = unsafe_logit + _shift(heads, activations, guard, correction)
         probability = unsafe_logit.Neg().Sigmoid()
         if model.fall_logit is not None and margins is not None:
             columns = usable.Gather(np.array(model.fall_logit.columns, dtype=np.int64), axis=1)
@@ -322,8 +312,7 @@ def _cell_weights(y: _Value, grid: Grid) -> tuple[_Value, _Value]:
     cells = np.arange(resolution)
     if grid.interpolates:
         position = (position - 0.5).Clip(0.0, resolution - 1.0)
-        distance = (position.Unsqueeze([3]) - cells).Abs()
-        weights = y.graph.node("Sub", 1.0, distance).Max(0.0)
+        weights = (1.0 - (position.Unsqueeze([3]) - cells).Abs()).Max(0.0)
     else:
         weights = position.Floor().Unsqueeze([3]).Equal(cells).double()
     return weights * inside.Unsqueeze([3]), inside
@@ -353,7 +342,7 @@ def _heads(logit: _Value | None, margins: _Value | None, base_logit: BaseLogit) 
     return columns[0].Concat(columns[1], axis=1)
 
 
-def _trees(graph: _Graph, x: _Value, trees: Trees) -> _Value:
+def _trees(x: _Value, trees: Trees) -> _Value:
     """The clipped logit of the trees, (N, 1).
 
     As `Trees.evaluate`, with counts of the nodes that exclude a leaf: the first leaf without any is
@@ -366,16 +355,14 @@ def _trees(graph: _Graph, x: _Value, trees: Trees) -> _Value:
     bits = arrays["left"].T[..., None] >> np.arange(num_leaves, dtype=np.uint32) & 1
     is_right = x.single().Gather(feature, axis=1).Greater(threshold)
     is_right = is_right.single().Unsqueeze([2])
-    excludes = graph.node("Cast", bits.astype(np.uint8), to=1)
+    excludes = x.graph.node("Cast", bits.astype(np.uint8), to=1)
     leaf = (is_right @ excludes).ArgMin(axis=3, keepdims=0)
     leaf = leaf.Squeeze([2]) + num_leaves * np.arange(num_trees)
-    logits = graph.node("Gather", arrays["value"].ravel(), leaf).double()
+    logits = x.graph.node("Gather", arrays["value"].ravel(), leaf).double()
     return logits.ReduceSum([1], keepdims=1).Clip(-LOGIT_LIMIT, LOGIT_LIMIT)
 
 
-def _shift(
-    graph: _Graph, heads: _Value, activations: _Value, guard: _Value, correction: Correction
-) -> _Value:
+def _shift(heads: _Value, activations: _Value, guard: _Value, correction: Correction) -> _Value:
     """The shift of the base logit by feedback, (N, 1), see `Correction.shift`."""
     hidden = correction.hidden
     shift = heads @ correction.change[1:, None] + correction.change[0]
@@ -384,5 +371,5 @@ def _shift(
         added = (added + hidden[:, -1].sum()).Clip(*correction.hidden_range)
         shift = shift + added
     shift = shift.Clip(-SHIFT_LIMIT, SHIFT_LIMIT)
-    lessened = graph.node("Sub", 1.0, guard) * shift
+    lessened = (1.0 - guard) * shift
     return shift.Less(0.0).Where(lessened, shift)
