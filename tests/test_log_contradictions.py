@@ -96,87 +96,41 @@ WORLD, BODY = "velocity_z], frame: body", "velocity_z]"
 UNMAPPED = [(line, "") for line in TABLE_MAP.splitlines() if "velocit" in line]
 HALF = about("x", 180)
 CONTRADICTIONS = {
-    # What the velocity of the base is.
     "in the world": (in_world(LINEAR), [], r"linear_velocity', columns .* by 0\.48 m/s.*, but by "
                      r"0\.00 m/s if 'base_linear_velocity.frame' is world"),
-    "in the base": (lambda f: f, [(WORLD, BODY)], "if 'base_linear_velocity.frame' is body"),
     "millimetres": (times(LINEAR, 1e3), [], "if 'base_linear_velocity.unit' is mm"),
-    "backwards": (times(LINEAR, -1), [], "if its sign is reversed"),
     "x forwards, z down": (times(LINEAR, 1, -1, -1), [], r"by 180° about \[-?1.0, 0.0, 0.0\] in"
                            " the body"),
-    "sensor turned": (exchanged("velocity_x", "velocity_y"), [], "or the base's, are turned by"),
     "noise alone": (lambda f: f.assign(**{n: np.resize([0.7, -0.6, 0.5, -0.8], len(f)) for n in
                                           LINEAR}), [],
                     r"columns \['velocity_x', .* unit agrees: leave 'base_linear_velocity' out"),
-    "a command": (lambda f: f.assign(velocity_x=-2.0), [], "no other frame, sign or unit agrees"),
-    # What the gyroscope measures.
-    "gyro in degrees": (lambda f: f, [("unit: deg, frame", "unit: rad, frame")],
-                        "if 'base_angular_velocity.unit' is deg"),
     "gyro in radians": (times(GYRO, np.pi / 180), [], "if 'base_angular_velocity.unit' is rad"),
-    "gyro in the world": (in_world(GYRO), [], "if 'base_angular_velocity.frame' is world"),
-    "gyro reversed": (times(GYRO, -1), [], "if its sign is reversed"),
-    "gyro upside down": (times(GYRO, 1, -1, -1), [], r"turned by 180° about \[-?1.0, 0.0, 0.0\]"),
     "gyro turned": (lambda f: f.assign(gyro_x=f.gyro_y, gyro_y=-f.gyro_x), [],
                     r"turned by 90° about \[-?0.0, -?0.0, 1.0\] .* in the body"),
-    # What the joints' velocities are.
-    "joints in degrees": (times(RATES, 180 / np.pi), [], "if 'joint_velocities.unit' is deg"),
     "motors": (times(RATES, 6.33), [], "is multiplied by 0.158: a gear ratio"),
-    "one reversed": (times(RATES, *[1] * 4, -1, *[1] * 7), [],
-                     rf"columns \['{RATES[4]}'\].*if its sign is reversed"),
     "two exchanged": (exchanged(RATES[1], RATES[4]), [], f"it is of joint '{JOINTS[4]}'"),
-    "encoders that stop": (
-        lambda f: f.assign(**{n: f[n].where(f.index < 150, f[n][150]) for n in ANGLES}), [],
-        r"columns \['\w+_vel'\].*no other .* agrees: 'joint_positions' stands still"),
-    "one is zero": (times(RATES, *[1] * 4, 0, *[1] * 7), [], rf"'{RATES[4]}'.*no other frame"),
-    # Another clock.
     "half as fast": (lambda f: f.assign(stamp=2 * f.stamp), [], "by 0.5: .*the rate of time"),
     "stamps that jitter": (
         lambda f: f.assign(stamp=f.stamp + np.random.default_rng(0).integers(0, 4_900_000, len(f))),
         UNMAPPED, r"line 2, column 'stamp': .* jitter: .* of 'base_position' varies by \d+\.\d "),
-    # What the orientation is, by feet that slide.
-    "inverse": (oriented(lambda R: R.inv()), [], "slide .*_orientation' is the inverse"),
-    "sensor turned by 90°": (oriented(lambda R: R * about("z", 90)),
-                             [], r"slide by .* turned on the base by 90° about \[0.0, 0.0, 1.0\]"),
-    "sensor backwards": (oriented(lambda R: R * about("z", 180)), [],
-                         r"slide by .* turned on the base by 180° about \[0.0, 0.0, 1.0\]"),
     "another north": (oriented(lambda R: about("z", 57) * R), [],
                       "slide by .*_orientation' is turned by 60° about the vertical"),
     "order": (lambda f: f, [("order: xyzw", "order: wxyz")],
               r"line 2 and .* slide by .* 'base_orientation.order' is xyzw"),
     "upside down": (oriented(lambda R: R * about("x", 180)), [],
                     r"does not stand .* turned on the base by 180° about \[1.0, 0.0, 0.0\]"),
-    "z down": (
-        lambda f: times([BASE[1], BASE[2]], -1)(oriented(lambda R: HALF * R * HALF)(f)), [],
-        "below the ground; it would stand if world and base have z downwards$"),
-    "on its side": (oriented(lambda R: R * about("y", -90)), [],
-                    r"does not stand .* turned on the base by 90° about \[0.0, -1.0, 0.0\]"),
     "world with y up": (turned(about("x", -90), with_base=False), [],
                         "it would stand if the world has y upwards"),
-    "world and base with y up": (turned(about("x", -90), with_base=True), [],
-                                 "it would stand if world and base have y upwards"),
-    # What joints are of, by feet that stand still and lie on the ground.
     "left is right": (with_legs({"FR": "FL", "FL": "FR", "RR": "RL", "RL": "RR"}), [],
                       r"of left and right legs are exchanged: {'FR_hip_joint': 'FL_hip_joint_pos'"),
-    "front is rear": (with_legs({"FR": "RR", "FL": "RL", "RR": "FR", "RL": "FL"}), [],
-                      "of front and rear legs are exchanged"),
-    "diagonal": (with_legs({"FR": "RL", "FL": "RR", "RR": "FL", "RL": "FR"}), [],
-                 "of diagonal legs are exchanged"),
     "motors mounted mirrored": (with_signs("R_hip"), [], r"slide by .* if 'joint_positions.sign' "
                                 r"is {'FR_hip_joint_pos': -1, 'RR_hip_joint_pos': -1}$"),
-    "one motor": (with_signs("RL_hip"), [], "sign' is {'RL_hip_joint_pos': -1}$"),
-    "knees": (with_signs("calf"), [], r"far beyond its stops .*if 'joint_positions.sign' is "
-              r"{'FR_calf_joint_pos': -1, 'FL_calf_joint_pos': -1, 'RR_calf_joint_pos': -1, "),
     "height from the start": (lambda f: f.assign(base_z=f.base_z - f.base_z[0]), [],
                               r"below the .* m higher: 'base_position.offset' of .base_z: 4"),
-    # What no robot does.
     "two frames in turn": (lambda f: f.assign(base_y=f.base_y + 250.0 * (f.index % 2)), [],
                            "line 3, column 'base_y': .* m/s since the row before"),
-    "an orientation that jumps": (oriented(lambda R: R * Rotation.from_rotvec(np.outer(
-        np.arange(len(R)) > 200, [0, 0, 1.0]))), [], "line 203, column 'quat_x': .* rad/s since"),
     "a gyroscope's spike": (lambda f: f.assign(gyro_x=f.gyro_x + 9e3 * (f.index == 30)), [],
                             "line 32, column 'gyro_x': the value is 8947.84, .*rad/s; robots stay"),
-    "a joint's spike": (lambda f: f.assign(**{ANGLES[0]: f[ANGLES[0]] + 30 * (f.index == 99)}), [],
-                        f"line 101, column '{ANGLES[0]}': .* rad/s since the row before"),
 }  # fmt: skip
 
 
@@ -210,14 +164,13 @@ def noisy(frame, rng):
 
 
 @pytest.mark.parametrize("every", [1, 4, 20], ids=["200 Hz", "50 Hz", "10 Hz"])
-@pytest.mark.parametrize("seed", range(3))
-def test_a_noisy_log_is_read(every, seed, tmp_path):
-    frame = noisy(frame_of(walked()), np.random.default_rng(seed))[::every]
+def test_a_noisy_log_is_read(every, tmp_path):
+    frame = noisy(frame_of(walked()), np.random.default_rng(0))[::every]
     log = read(save(frame, tmp_path), ("ns}", "ns}\nmax_gap_s: 0.11"), reader=read_log)
     assert len(log.time_s) == len(frame)
 
 
-@pytest.mark.parametrize("index", [SAFE, UNSAFE, *range(1, 5)])
+@pytest.mark.parametrize("index", [SAFE, UNSAFE])
 def test_a_noisy_log_of_a_robot_that_stands_or_falls_is_read(index, tmp_path):
     rng = np.random.default_rng(index)
     read(save(noisy(frame_of(recorded(index)), rng), tmp_path), reader=read_log)
@@ -234,8 +187,7 @@ def test_velocities_that_were_never_filled_in_or_are_not_mapped_are_derivatives(
 HELD = {"all": [*BASE, *QUATERNION, *GYRO, *LINEAR, *ANGLES, *RATES], "base": BASE}
 
 
-@pytest.mark.parametrize("held", HELD)
-@pytest.mark.parametrize("number", [2, 5, 2.5])
+@pytest.mark.parametrize(("held", "number"), [("all", 2.5), ("base", 5)])
 def test_rows_that_repeat_a_measurement_are_left_out(held, number, tmp_path):
     frame, columns = frame_of(walked()), HELD[held]
     rows = (np.floor(np.arange(len(frame)) / number) * number).astype(int)
@@ -272,14 +224,7 @@ def test_signs_and_offsets_of_the_map_are_applied_and_a_height_is_noted(tmp_path
         read(tmp_path / "run.csv", ("base_z], ", "base_z], offset: {z: -20}, "))
 
 
-@pytest.mark.parametrize("digits", [0, 1, 2])
-def test_stamps_with_too_few_digits_are_refused(digits, tmp_path):
-    frame = frame_of(walked()).assign(stamp=lambda f: (1e-9 * f.stamp).round(digits).map(str))
+def test_stamps_with_too_few_digits_are_refused(tmp_path):
+    frame = frame_of(walked()).assign(stamp=lambda f: (1e-9 * f.stamp).round(1).map(str))
     with pytest.raises(ValueError, match=r"line \d+, column 'stamp': .*too few digits"):
-        read(save(frame, tmp_path), ("unit: ns", "unit: s"))
-
-
-def test_a_unit_of_time_is_suggested_if_its_motion_is_one_of_robots(tmp_path):
-    frame = frame_of(walked(rate_hz=20)).assign(stamp=np.arange(40))
-    with pytest.raises(ValueError, match=r"rows are 1 apart, which as s is implausible$"):
         read(save(frame, tmp_path), ("unit: ns", "unit: s"))

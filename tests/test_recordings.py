@@ -13,9 +13,6 @@ from log_files import (
     ANGLES,
     BASE,
     GOAL,
-    GYRO,
-    LINEAR,
-    MESSAGE_MAP,
     QUATERNION,
     RATES,
     frame_of,
@@ -57,32 +54,19 @@ def after_line(number, *lines):
 WIDTH = frame_of(PLAIN).shape[1]
 TABLES = {
     "spaces after commas": lambda text: text.replace(",", ", "),
-    "spaces before commas": lambda text: text.replace(",", " ,"),
-    "semicolons": lambda text: text.replace(",", ";"),
     "semicolons and decimal commas": lambda text: text.replace(",", ";").replace(".", ","),
-    "tabs": lambda text: text.replace(",", "\t"),
-    "bars": lambda text: text.replace(",", "|"),
     "columns of spaces": lambda text: text.replace(",", "   "),
-    "quotes": lambda text: '"' + text.replace(",", '","').replace("\n", '"\n"')[:-1],
-    "a byte-order mark": lambda text: "\ufeff" + text,
     "UTF-16": lambda text: ("\ufeff" + text).encode("utf-16-le"),
-    "Windows": lambda text: text.replace("\n", "\r\n"),
     "a comment sign before the header": lambda text: "# " + text,
-    "a per cent sign before the header": lambda text: "%" + text,
-    "comments before the header": lambda text: "# robot 7, run 3\n# firmware, 1.2\n\n" + text,
     "a preamble": lambda text: "Recorder;1.2\nDate;14.11.2023\n" + text,
-    "comments between rows": after_line(20, "# push", "# marker, 5"),
     "units in the header": with_units,
     "a row of units": after_line(1, ",".join(["ns"] + ["mm"] * (WIDTH - 1))),
-    "the header again": lambda text: after_line(30, text.splitlines()[0])(text),
-    "empty lines": lambda text: text + "\n\n",
     "an empty row": after_line(20, "," * (WIDTH - 1)),
-    "separators at the end of rows": lambda text: text.replace("\n", ",\n"),
 }
 
 
 @pytest.mark.parametrize("kind", TABLES)
-def test_a_table_is_read_however_it_is_written(kind, tmp_path):
+def test_dialects_of_csv_are_read(kind, tmp_path):
     changed = TABLES[kind](frame_of(PLAIN).to_csv(index=False))
     data = changed if isinstance(changed, bytes) else changed.encode()
     (tmp_path / "run.csv").write_bytes(data)
@@ -100,33 +84,24 @@ def dated(shown):
 
 DATES = {
     "ISO": dated(lambda t: t.isoformat()),
-    "a space and no zone": dated(lambda t: t.strftime("%Y-%m-%d %H:%M:%S.%f")),
-    "Z": dated(lambda t: t.strftime("%Y-%m-%dT%H:%M:%S.%fZ")),
     "a zone": dated(lambda t: t.strftime("%Y-%m-%dT%H:%M:%S.%f+05:30")),
-    "a decimal comma": dated(lambda t: t.strftime('"%Y-%m-%d %H:%M:%S,%f"')),
-    "whole seconds among them": dated(lambda t: t.isoformat().removesuffix(".000000")),
-    "the month first": dated(lambda t: t.strftime("%m/%d/%Y %H:%M:%S.%f")),
     "the time of day": dated(lambda t: t.strftime("%H:%M:%S.%f")),
-    "nanoseconds": lambda stamps: stamps,
     "microseconds": lambda stamps: stamps / 1e3,
-    "seconds": lambda stamps: stamps / 1e9,
 }
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
 @pytest.mark.parametrize("kind", DATES)
-def test_dates_need_no_unit(kind, suffix, tmp_path):
+def test_dates_need_no_unit(kind, tmp_path):
     frame = frame_of(PLAIN)
     stamps = [str(one).strip('"') for one in DATES[kind](frame.stamp.to_numpy())]
-    path = save(frame.assign(stamp=stamps), tmp_path, suffix)
-    unit = {"seconds": "s", "microseconds": "us"}.get(kind, "ns")
+    path = save(frame.assign(stamp=stamps), tmp_path)
+    unit = "us" if kind == "microseconds" else "ns"
     assert_reads(read(path, ("unit: ns", f"unit: {unit}")), atol=1e-4)
 
 
-@pytest.mark.parametrize("zone", [None, "Asia/Tokyo"])
-def test_a_date_as_the_index_of_a_parquet_file_is_a_column(zone, tmp_path):
+def test_a_date_as_the_index_of_a_parquet_file_is_a_column(tmp_path):
     frame = frame_of(PLAIN)
-    dates = pd.to_datetime(frame.stamp).dt.tz_localize(zone)
+    dates = pd.to_datetime(frame.stamp).dt.tz_localize("Asia/Tokyo")
     frame = frame.assign(stamp=dates).set_index("stamp")
     assert_reads(read(save(frame, tmp_path, "parquet"), ("unit: ns", "unit: s")))
 
@@ -152,11 +127,10 @@ def sparse(frame, row_of):
     return pd.concat(parts).sort_values("stamp")
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
 @pytest.mark.parametrize("row_of", [by_topic, by_joint])
-def test_a_sparse_table_has_every_quantity_at_its_own_rows(row_of, suffix, tmp_path):
+def test_a_sparse_table_has_every_quantity_at_its_own_rows(row_of, tmp_path):
     frame = frame_of(PLAIN)
-    path = save(sparse(frame, row_of), tmp_path, suffix)
+    path = save(sparse(frame, row_of), tmp_path)
     found = read(path)
     (one,) = found.pieces
     assert len(one.time_s) >= len(frame) - 3
@@ -168,7 +142,7 @@ def test_a_sparse_table_has_every_quantity_at_its_own_rows(row_of, suffix, tmp_p
     assert read(path, reader=read_log).piece == 0
 
 
-@pytest.mark.parametrize("every", [2, 4, 10])
+@pytest.mark.parametrize("every", [2, 10])
 def test_a_slow_source_has_fewer_rows_than_the_others(every, tmp_path):
     frame = frame_of(PLAIN)
     frame.loc[frame.index % every > 0, BASE] = np.nan
@@ -188,8 +162,8 @@ def test_a_goal_that_is_logged_when_it_changes_holds_until_the_next(tmp_path):
     assert_reads(read(save(frame, tmp_path)), log)
 
 
-@pytest.mark.parametrize("size", [2, 5], ids=["some", "all"])
-def test_what_is_logged_before_the_estimator_starts_is_cut(size, tmp_path):
+def test_rows_before_the_estimator_starts_are_cut(tmp_path):
+    size = 5
     quaternions = [(QUATERNION, value) for value in (0.0, np.nan, [0.0, 0.0, 0.0, 1.0])]
     for names, value in [*quaternions, (BASE, 0.0), (ANGLES, 0.0)]:
         frame = frame_of(PLAIN)
@@ -253,14 +227,6 @@ def test_an_entry_is_selected_by_its_frame_or_the_message_says_how():
         field_of("ranges[base]")(message)
 
 
-def test_three_holds_tell_the_rate_of_updates(tmp_path):
-    frame = frame_of(PLAIN)
-    names = [*ANGLES, *RATES, *BASE, *QUATERNION, *GYRO, *LINEAR]
-    frame[names] = frame[names].to_numpy()[10 * (frame.index // 10)]
-    found = read(save(frame[:40], tmp_path))
-    assert "changes only at every 10th row" in found.cuts[0]
-
-
 def split_joints(number, *, shift_ns=0):
     """Joint messages that name some of the joints each, in an order of their own."""
 
@@ -291,16 +257,15 @@ JOINT_MESSAGES = {
 }
 
 
-@pytest.mark.parametrize("format", ["ros2", "ros1", "mcap"])
 @pytest.mark.parametrize("kind", JOINT_MESSAGES)
-def test_joints_are_gathered_from_messages_that_name_some_of_them(kind, format, tmp_path):
+def test_joints_are_gathered_from_messages_that_name_some_of_them(kind, tmp_path):
     change, atol = JOINT_MESSAGES[kind]
-    found = read(write(PLAIN, tmp_path, format, change=change))
+    found = read(write(PLAIN, tmp_path, "mcap", change=change))
     assert_reads(found, part(PLAIN, 1, 59) if atol > 1e-3 else PLAIN, atol)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "ros2", "a file of it", "csv", "zeros at end"])
-def test_of_a_recording_that_was_cut_off_what_is_whole_is_read(kind, tmp_path):
+def test_the_whole_part_of_a_recording_that_was_cut_off_is_read(kind, tmp_path):
     format = {"a file of it": "mcap", "zeros at end": "csv"}.get(kind, kind)
     log = recorded(0)
     path = write(log, tmp_path, format, chunk_size=40_000)
@@ -327,7 +292,7 @@ def test_of_a_recording_that_was_cut_off_what_is_whole_is_read(kind, tmp_path):
         read(path, reader=read_log)
 
 
-def test_a_bag_of_which_the_next_file_was_just_begun_is_read(tmp_path):
+def test_a_bag_with_an_incomplete_last_file_is_read(tmp_path):
     bag, whole = tmp_path / "bag", write(PLAIN, tmp_path, "mcap").read_bytes()
     bag.mkdir()
     (bag / "bag_0.mcap").write_bytes(whole)
@@ -337,29 +302,17 @@ def test_a_bag_of_which_the_next_file_was_just_begun_is_read(tmp_path):
     assert "is cut off" in found.cuts[0]
 
 
-@pytest.mark.parametrize("value", [0.0, np.nan])
-def test_velocities_of_a_topic_that_was_never_filled_are_derivatives(value, tmp_path):
-    log = dataclasses.replace(PLAIN, foot_positions=np.full_like(PLAIN.foot_positions, value))
-    feet = MESSAGE_MAP[MESSAGE_MAP.index("foot_positions") :]
-    velocity = "/odom, columns: [twist.twist.linear.x, twist.twist.linear.y, twist.twist.linear.z]"
-    empty = '/feet, columns: ["position[0]", "position[1]", "position[2]"]'
-    found = read(write(log, tmp_path, "mcap"), (feet, ""), (velocity, empty))
-    assert_reads(found, atol=0.02)
-    assert "'base_linear_velocity'" in found.notes[0] and "derivative" in found.notes[0]
-
-
-@pytest.mark.parametrize("format", ["ros2", "ros1", "mcap"])
-def test_velocities_that_messages_leave_empty_are_derivatives(format, tmp_path):
+def test_velocities_that_messages_leave_empty_are_derivatives(tmp_path):
     def without(message, i):
         yield named(message, message.name, message.position, np.zeros(0)), 0
 
-    found = read(write(PLAIN, tmp_path, format, change=without))
+    found = read(write(PLAIN, tmp_path, "ros2", change=without))
     assert_reads(found, atol=0.02)
     (note,) = found.notes
     assert "'joint_velocities'" in note and "derivative" in note
 
 
-def test_topics_that_are_no_ros_messages_do_not_matter_unless_they_are_mapped(tmp_path):
+def test_topics_of_other_encodings_are_refused_only_if_mapped(tmp_path):
     import mcap.reader
     import mcap.writer
 
@@ -392,14 +345,14 @@ def test_topics_that_are_no_ros_messages_do_not_matter_unless_they_are_mapped(tm
         ("parquet", -500, "damaged, cut off, or not a Parquet file"),
     ],
 )
-def test_a_recording_of_which_nothing_can_be_read_says_what_may_help(kind, end, message, tmp_path):
+def test_an_unreadable_recording_is_refused_with_a_remedy(kind, end, message, tmp_path):
     path = write(PLAIN, tmp_path, kind)
     path.write_bytes(path.read_bytes()[:end])
     with pytest.raises(ValueError, match=message):
         read(path)
 
 
-def test_topics_of_other_clocks_are_told(tmp_path):
+def test_topics_of_different_clocks_are_refused(tmp_path):
     path = write(PLAIN, tmp_path, "mcap", change=lambda message, i: [(message, 10**12)])
     with pytest.raises(ValueError, match="its topics do not overlap"):
         read(path)
