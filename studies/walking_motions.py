@@ -11,7 +11,7 @@ import numpy as np
 
 from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.simulation.motion import Motion, simulate
+from drake_safety.simulation.motion import End, Motion, simulate
 from drake_safety.simulation.rollouts import episode_rng, run_to_goal
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import MadeOnce, Progress
@@ -35,7 +35,7 @@ def run_tour(loop: Any, index: int, *, seed: int, duration_s: float) -> Motion:
         loop,
         lambda context: loop.reset_undisturbed(context, episode_rng(seed, index), duration_s),
         (*SEEN, "margins", "output", *filter(loop.HasOutputPort, ["guard_active"])),
-        duration_s=duration_s,
+        End(duration_s=duration_s),
         index=index,
     )
 

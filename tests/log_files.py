@@ -12,7 +12,7 @@ from drake_safety import load_scenario
 from drake_safety.logs.conversion import angular_velocities, rates
 from drake_safety.logs.robot_log import RobotLog, read_pieces
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.simulation.motion import simulate
+from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.rollouts import episode_rng
 
 ORIGIN_NS = 1_700_000_000_123_000_000
@@ -55,9 +55,8 @@ def record(loop, index=0, **goal):
         loop,
         start,
         ["plant_state", "desired_output"],
-        duration_s=scenario.episode_duration_s,
+        End(duration_s=scenario.episode_duration_s, after_fall_s=math.inf),
         step_s=scenario.time_step_s,
-        after_fall_s=math.inf,
     )
     q, v = np.split(motion["plant_state"].copy(), [loop.kinematics.num_positions], axis=1)
     times, feet = motion.time_s, starts[0].foot_positions

@@ -7,7 +7,6 @@ import sys
 import time
 from pathlib import Path
 
-import joblib
 import pytest
 
 from cart_episodes import assert_identical
@@ -71,13 +70,6 @@ def two_workers(tmp_path):
                 worker.wait(PATIENCE_S)
 
 
-@pytest.mark.parametrize("backend", ["threading", "multiprocessing"])
-def test_a_backend_that_is_no_cluster_is_not_called_one(backend):
-    name = rf"joblib's {backend.capitalize()}Backend has its own number of workers; got 2"
-    with joblib.parallel_config(backend), pytest.raises(ValueError, match=name):
-        next(map_items(abs, [1, 2], num_workers=2, batch_size=1))
-
-
 @pytest.mark.train
 def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed(two_workers):
     address, workers = two_workers
@@ -93,7 +85,9 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed(two_workers):
     with connected(address):
         glided = run_episodes(own_task, 8)
         found = run_episodes(pendulum, NUM_EPISODES, progress=kill_one)
-        with pytest.raises(ValueError, match="a cluster has its own number of workers; got 2"):
+        with pytest.raises(
+            ValueError, match="DaskDistributedBackend has its own number"
+        ):
             run_episodes(pendulum, 8, num_workers=2)
     assert workers[0].poll() == -signal.SIGKILL
     assert seen == sorted(seen)
@@ -104,22 +98,17 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed(two_workers):
 
 @pytest.mark.train
 def test_a_scheduler_that_does_not_answer_or_has_no_workers_is_an_error(tmp_path):
-    with (
-        pytest.raises(ValueError, match=r"no dask scheduler answers at 'tcp://127.0.0.1:9'"),
-        connected("tcp://127.0.0.1:9", timeout_s=1.0),
-    ):
-        pass
-    with (
-        running_scheduler(tmp_path) as address,
-        pytest.raises(ValueError, match=r"has no workers: start some, `dask worker"),
-        connected(address, timeout_s=1.0),
-    ):
-        pass
+    with running_scheduler(tmp_path) as address:
+        for where in ("tcp://127.0.0.1:9", address):
+            told = f"no dask scheduler with workers answers at '{where}'.* start workers by"
+            with pytest.raises(ValueError, match=told), connected(where, timeout_s=1.0):
+                pass
 
 
-def test_a_worker_with_other_versions_is_refused_by_name():
-    with pytest.raises(ValueError, match=r"has drake 1\S+, expected 0.1, as here"):
-        worker_processes._called({"drake": "0.1"}, print, [])
+def test_a_worker_with_other_versions_is_refused_by_name(monkeypatch):
+    monkeypatch.setattr(worker_processes, "_versions", iter([{"drake": "0.1"}, {}]).__next__)
+    with pytest.raises(ValueError, match=r"has {}, expected {'drake': '0.1'}, as here"):
+        next(map_items(abs, [1], num_workers=1))
 
 
 @pytest.mark.train

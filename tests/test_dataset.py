@@ -21,24 +21,16 @@ pq = pytest.importorskip("pyarrow.parquet")
 
 
 def write(path, episodes, info=None, shard=64):
-    """Episodes, or indices of made-up ones, so many a shard."""
+    """Writes episodes, or those of indices; `shard` of them to a file."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dataset, "FLUSH_EPISODES", shard)
         with EpisodeWriter(path, info or make_info()) as writer:
-            for one in episodes:
-                writer.append(make_episode(one) if isinstance(one, int) else one)
+            for episode in episodes:
+                writer.append(make_episode(episode) if isinstance(episode, int) else episode)
 
 
 def names_in(path):
     return sorted(file.name for file in path.iterdir() if file.name != ".lock")
-
-
-def test_episodes_come_back_bit_for_bit_and_sorted_by_index(tmp_path):
-    write(tmp_path, [3, 0, 2, 1], shard=3)
-    episodes = load_episodes(tmp_path)
-    assert [episode.index for episode in episodes] == [0, 1, 2, 3]
-    assert_identical(episodes, map(make_episode, range(4)))
-    assert episodes.info == make_info()
 
 
 STATE = np.array([[np.nan, np.inf, -np.inf], [-0.0, 5e-324, 1 / 3]])
@@ -49,21 +41,17 @@ BARE = make_info(feature_names=[])
     ("info", "written"),
     [
         (make_info(), [make_episode(1, num_rows=2, state=STATE, cause="diverged")]),
-        (make_info(), [make_episode(index, num_rows=1 + index) for index in range(4)]),
+        (make_info(), [make_episode(index, num_rows=1 + index) for index in (3, 0, 2, 1)]),
         (BARE, [make_episode(0, BARE)]),  # Without features.
     ],
 )
-def test_episodes_of_any_numbers_and_lengths_share_a_shard(tmp_path, info, written):
-    write(tmp_path, written, info)
-    assert names_in(tmp_path) == ["episodes-00000.parquet", "info.json"]
-    assert_identical(load_episodes(tmp_path), written)
-
-
-def test_loaded_arrays_can_be_written_to(tmp_path):
-    write(tmp_path, [0, 1])
-    first, second = load_episodes(tmp_path)
-    first.state[:] = 0.0
-    assert_identical([second], [make_episode(1)])
+def test_episodes_come_back_bit_for_bit_sorted_and_writable(tmp_path, info, written):
+    write(tmp_path, written, info, shard=3)
+    episodes = load_episodes(tmp_path)
+    assert episodes.info == info
+    assert_identical(episodes, sorted(written, key=lambda episode: episode.index))
+    episodes[0].state[:] = 0.0
+    assert_identical(episodes[1:2], [make_episode(1, num_rows=2)][: len(episodes) - 1])
 
 
 def test_pandas_reads_one_row_per_episode_and_step(tmp_path):
@@ -89,33 +77,23 @@ def test_info_and_extra_are_plain_json_and_tell_the_command_that_a_set_goes_on_w
         assert read_info(tmp_path) == (info, {"command": expected, "gain": 0.1})
     content = json.loads((tmp_path / "info.json").read_text())
     assert content["info"]["scenario"] == "cart"
-
-
-def test_extra_that_json_cannot_hold_is_refused_and_leaves_nothing(tmp_path):
     with pytest.raises(ValueError, match="JSON types"):
-        EpisodeWriter(tmp_path, make_info(), {"when": object()})
-    assert names_in(tmp_path) == []
+        EpisodeWriter(tmp_path / "other", make_info(), {"when": object()})
+    assert names_in(tmp_path / "other") == []
 
 
-def test_a_shard_is_written_after_a_number_of_episodes(tmp_path, monkeypatch):
+def test_a_shard_is_written_after_some_episodes_or_when_the_last_one_is_old(tmp_path, monkeypatch):
     monkeypatch.setattr(dataset, "FLUSH_EPISODES", 2)
-    writer = EpisodeWriter(tmp_path, make_info())
-    for index, shards in enumerate([0, 1, 1, 2]):
-        writer.append(make_episode(index))
-        assert len(names_in(tmp_path)) == 1 + shards
-    writer.close()
-    assert completed(tmp_path) == {0, 1, 2, 3}
-
-
-def test_an_episode_is_written_at_once_if_the_last_shard_is_old(tmp_path, monkeypatch):
-    monkeypatch.setattr(dataset, "FLUSH_S", 0.2)
     with EpisodeWriter(tmp_path, make_info()) as writer:
-        writer.append(make_episode(0))
-        assert completed(tmp_path) == set()
-        time.sleep(0.2)
-        writer.append(make_episode(1))
-        assert completed(tmp_path) == {0, 1}
-        assert names_in(tmp_path) == ["episodes-00000.parquet", "info.json"]
+        for index, shards in enumerate([0, 1, 1, 2]):
+            writer.append(make_episode(index))
+            assert len(names_in(tmp_path)) == 1 + shards
+        monkeypatch.setattr(dataset, "FLUSH_S", 0.1)
+        time.sleep(0.1)
+        writer.append(make_episode(4))
+        assert completed(tmp_path) == {0, 1, 2, 3, 4}
+    with pytest.raises(ValueError, match="is closed"):
+        writer.append(make_episode(5))
 
 
 @pytest.mark.parametrize("interruption", [RuntimeError, KeyboardInterrupt])
@@ -132,45 +110,48 @@ def test_a_failed_write_leaves_no_file_and_the_episodes_pending(tmp_path, monkey
         where.write_bytes(b"PAR1")
         raise OSError("no space left")
 
-    writer = EpisodeWriter(tmp_path, make_info())
+    writer = EpisodeWriter(tmp_path / "here", make_info())
     writer.append(make_episode(0))
     with monkeypatch.context() as patch:
         patch.setattr(pq, "write_table", fill_the_disk)
         with pytest.raises(OSError, match=r"00000.parquet cannot be written: no space left; what"):
             writer.flush()
-    assert names_in(tmp_path) == ["info.json"]
+    assert names_in(tmp_path / "here") == ["info.json"]
+    shutil.move(tmp_path / "here", tmp_path / "there")
+    with pytest.raises(OSError, match=r"here/episodes-00000.parquet cannot be written: No su"):
+        writer.flush()
+    shutil.move(tmp_path / "there", tmp_path / "here")
     writer.close()
-    assert completed(tmp_path) == {0}
+    assert completed(tmp_path / "here") == {0}
 
 
-def test_a_removed_shard_is_not_overwritten_but_followed(tmp_path):
+def test_a_set_goes_on_after_its_last_shard_and_takes_an_index_once(tmp_path):
+    assert completed(tmp_path / "nowhere") == set()
+    write(tmp_path, [], make_info())
+    assert completed(tmp_path) == set() and len(load_episodes(tmp_path)) == 0
     write(tmp_path, range(3), shard=1)
     (tmp_path / "episodes-00001.parquet").unlink()
-    write(tmp_path, [1])
+    (tmp_path / ".episodes-00001.parquet.123.tmp").write_bytes(b"PAR1 half")
+    assert completed(tmp_path) == {0, 2}
+    # Names given as a tuple are the same set.
+    write(tmp_path, [1], make_info(state_names=("x", "v", "a")))
     assert names_in(tmp_path)[-2:] == ["episodes-00003.parquet", "info.json"]
-    assert completed(tmp_path) == {0, 1, 2}
+    assert not list(tmp_path.glob(".*.tmp"))
+    with pytest.raises(ValueError, match="episode 1 is already in"):
+        write(tmp_path, [3, 1])
+    assert completed(tmp_path) == {0, 1, 2, 3}
 
 
-def test_nothing_is_completed_where_nothing_was_written(tmp_path):
-    assert completed(tmp_path / "nowhere") == set()
-    with EpisodeWriter(tmp_path, make_info()):
-        assert completed(tmp_path) == set()
-    assert len(load_episodes(tmp_path)) == 0
-
-
-def test_another_set_is_refused_with_both_sides_named(tmp_path):
+@pytest.mark.parametrize(
+    "changes",
+    [{"scenario_hash": "cd" * 32}, {"seed": 8}, {"horizon": 3}, {"state_names": ["x", "v", "j"]}],
+)
+def test_another_set_is_refused_with_both_sides_named(tmp_path, changes):
     write(tmp_path, [0])
-    for name, here in [
-        ("scenario_hash", "cd" * 32),
-        ("seed", 8),
-        ("variation", "actual"),
-        ("horizon", 3),
-        ("state_names", ["x", "v", "j"]),
-    ]:
-        there = getattr(make_info(), name)
-        with pytest.raises(ValueError) as caught:
-            EpisodeWriter(tmp_path, make_info(**{name: here}))
-        assert f"{name}: there {there!r}, here {here!r}" in str(caught.value)
+    ((name, here),) = changes.items()
+    with pytest.raises(ValueError) as caught:
+        EpisodeWriter(tmp_path, make_info(**changes))
+    assert f"{name}: there {getattr(make_info(), name)!r}, here {here!r}" in str(caught.value)
 
 
 def test_other_package_versions_are_a_warning_and_the_first_ones_are_kept(tmp_path, caplog):
@@ -181,36 +162,17 @@ def test_other_package_versions_are_a_warning_and_the_first_ones_are_kept(tmp_pa
     assert read_info(tmp_path)[0].versions == {"numpy": "2.4.6"}
 
 
-def test_fields_that_an_earlier_version_knew_are_passed_over(tmp_path):
-    write(tmp_path, [0])
-    file = tmp_path / "info.json"
+def test_folders_of_earlier_versions_are_read(tmp_path):
+    write(tmp_path, [0, 1])
+    file, shard = tmp_path / "info.json", tmp_path / "episodes-00000.parquet"
     content = json.loads(file.read_text())
-    content["info"]["code"] = "ab" * 32
+    content["info"]["code"] = "ab" * 32  # A field that is not known any more.
     file.write_text(json.dumps(content))
-    write(tmp_path, [1])
+    # Failures were not counted yet.
+    pq.write_table(pq.read_table(shard).drop_columns(["num_controller_failures"]), shard)
+    write(tmp_path, [2])
     assert load_episodes(tmp_path).info == make_info()
-
-
-def test_names_given_as_a_tuple_are_the_same_set(tmp_path):
-    write(tmp_path, [0])
-    write(tmp_path, [1], make_info(state_names=("x", "v", "a")))
-    assert completed(tmp_path) == {0, 1}
-
-
-def test_an_index_is_accepted_once(tmp_path):
-    write(tmp_path, [0])
-    with EpisodeWriter(tmp_path, make_info()) as writer:
-        writer.append(make_episode(1))
-        for index in [0, 1]:
-            with pytest.raises(ValueError, match=f"episode {index} is already in"):
-                writer.append(make_episode(index))
-
-
-def test_equal_episodes_in_two_shards_are_taken_once(tmp_path):
-    write(tmp_path, [0, 1], shard=1)
-    shard = tmp_path / "episodes-00000.parquet"
-    (tmp_path / "episodes-00002.parquet").write_bytes(shard.read_bytes())
-    assert [episode.index for episode in load_episodes(tmp_path)] == [0, 1]
+    assert [episode.num_controller_failures for episode in load_episodes(tmp_path)] == [0, 0, 2]
 
 
 def flip_a_bit(content):
@@ -221,10 +183,10 @@ def flip_a_bit(content):
 @pytest.mark.parametrize(
     ("damage", "readers"),
     [
-        (lambda c, k=kept: c[: int(k * len(c))], (completed, load_episodes))
-        for kept in (0, 0.5, 0.99)
-    ]
-    + [(lambda c: c[:10], (completed, load_episodes)), (flip_a_bit, [load_episodes])],
+        (lambda c: b"", (completed, load_episodes)),
+        (lambda c: c[: len(c) // 2], (completed, load_episodes)),
+        (flip_a_bit, [load_episodes]),
+    ],
 )
 def test_a_damaged_shard_is_named(tmp_path, damage, readers):
     write(tmp_path, range(4))
@@ -235,59 +197,27 @@ def test_a_damaged_shard_is_named(tmp_path, damage, readers):
             read(tmp_path)
 
 
-def test_leftover_temporary_files_are_ignored_and_removed_by_the_next_writer(tmp_path):
-    write(tmp_path, [0])
-    (tmp_path / ".episodes-00001.parquet.123.tmp").write_bytes(b"PAR1 half")
-    assert completed(tmp_path) == {0}
-    write(tmp_path, [1])
-    assert completed(tmp_path) == {0, 1}
-    assert not list(tmp_path.glob(".*.tmp"))
-
-
-def test_a_folder_that_is_gone_is_named(tmp_path):
-    with EpisodeWriter(tmp_path / "gone", make_info()) as writer:
-        writer.append(make_episode(0))
-        shutil.rmtree(tmp_path / "gone")
-        with pytest.raises(OSError, match=r"gone/episodes-00000.parquet cannot be written: No su"):
-            writer.flush()
-        (tmp_path / "gone").mkdir()
-
-
-def test_a_folder_has_one_writer_at_a_time(tmp_path):
-    with EpisodeWriter(tmp_path, make_info()) as writer:
-        writer.append(make_episode(0))
-        with pytest.raises(ValueError, match=f"{tmp_path} is being written by another process"):
-            EpisodeWriter(tmp_path, make_info())
-    write(tmp_path, [1])
-    assert [episode.index for episode in load_episodes(tmp_path)] == [0, 1]
-
-
-def test_the_lock_of_a_killed_writer_is_gone(tmp_path):
+def test_a_folder_has_one_writer_at_a_time_and_the_lock_of_a_killed_one_is_gone(tmp_path):
     lock = f"FileLock({str(tmp_path / '.lock')!r})"
     code = f"from filelock import FileLock; lock = {lock}; lock.acquire(); "
     code += "import time; print('locked', flush=True); time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
         assert process.stdout.readline() == b"locked\n"
-        with pytest.raises(ValueError, match="another process"):
+        with pytest.raises(ValueError, match=f"{tmp_path} is being written by another process"):
             EpisodeWriter(tmp_path, make_info())
         process.kill()
     write(tmp_path, [0])
 
 
-@pytest.mark.parametrize(
-    ("info", "index", "message"),
-    [
-        (make_info(), 0, r"episodes-00000\.parquet differs from that of episodes-00001\.parquet"),
-        (make_info(state_names=["x", "v"]), 1, r"state is .* expected lists of length 3"),
-    ],
-)
-def test_a_shard_that_contradicts_the_set_is_refused(tmp_path, info, index, message):
-    write(tmp_path / "a", [0])
-    write(tmp_path / "b", [make_episode(index, info, num_rows=4)], info)
-    other = (tmp_path / "b" / "episodes-00000.parquet").read_bytes()
-    (tmp_path / "a" / "episodes-00001.parquet").write_bytes(other)
-    with pytest.raises(ValueError, match=message):
-        load_episodes(tmp_path / "a")
+def test_an_episode_in_two_shards_is_taken_once_if_both_are_equal(tmp_path):
+    write(tmp_path, [0, 1], shard=1)
+    first = tmp_path / "episodes-00000.parquet"
+    (tmp_path / "episodes-00002.parquet").write_bytes(first.read_bytes())
+    assert [episode.index for episode in load_episodes(tmp_path)] == [0, 1]
+    write(tmp_path / "b", [make_episode(0, num_rows=4)])
+    first.write_bytes((tmp_path / "b" / first.name).read_bytes())
+    with pytest.raises(ValueError, match=r"00000\.parquet differs from that of episodes-00002"):
+        load_episodes(tmp_path)
 
 
 def test_shards_without_an_info_are_refused(tmp_path):
@@ -303,8 +233,8 @@ def test_shards_without_an_info_are_refused(tmp_path):
     ("content", "message"),
     [
         ("{", "is not JSON"),
-        ("[]", "schema version None; expected 1"),
-        ('{"schema_version": 99}', "schema version 99; expected 1"),
+        ("[]", "expected schema version 1"),
+        ('{"schema_version": 99}', "its version is 99"),
         ('{"schema_version": 1, "info": {"scenario": "cart"}, "extra": {}}', "does not describe"),
     ],
 )
@@ -314,49 +244,31 @@ def test_a_foreign_info_is_refused(tmp_path, content, message):
         read_info(tmp_path)
 
 
-def test_a_foreign_parquet_file_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "value"), [("horizon", 10**12), ("step_s", float("nan")), ("state_names", 3)]
+)
+def test_an_info_with_forged_values_is_refused(tmp_path, name, value):
     write(tmp_path, [0])
-    pd.DataFrame({"a": [1]}).to_parquet(tmp_path / "episodes-00001.parquet")
-    with pytest.raises(ValueError, match="expected columns"):
-        completed(tmp_path)
-    with pytest.raises(ValueError, match=r"columns \['a'\]; expected \['episode', 'step'"):
+    info = json.loads((tmp_path / "info.json").read_text())
+    info["info"][name] = value
+    (tmp_path / "info.json").write_text(json.dumps(info))
+    with pytest.raises(ValueError, match=rf"info\.json does not describe episodes: .*{name}"):
         load_episodes(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"state": np.zeros((5, 2))}, r"state has shape \(5, 2\), expected \(5, 3\)"),
-        ({"margins": np.zeros((4, 2))}, r"margins has shape \(4, 2\), expected \(5, 2\)"),
-        ({"desired_preview": np.zeros((5, 1))}, r"desired_preview has shape \(5, 1\)"),
-        ({"cause": "moon"}, r"unknown cause 'moon'; the constraints are \['wall', 'speed'\]"),
-        ({"is_safe": True}, "is_safe is True but the cause is 'wall'"),
-    ],
+    "changes",
+    [{"state": np.zeros((5, 2))}, {"margins": np.zeros((4, 2))}, {"cause": "moon"}],
 )
-def test_an_episode_that_does_not_fit_the_info_is_refused(tmp_path, changes, message):
+def test_an_episode_that_does_not_fit_the_info_is_refused(tmp_path, changes):
     with EpisodeWriter(tmp_path, make_info()) as writer:
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match=next(iter(changes))):
             writer.append(make_episode(1, **changes))
     assert completed(tmp_path) == set()
 
 
-def test_a_closed_writer_takes_no_more(tmp_path):
-    writer = EpisodeWriter(tmp_path, make_info())
-    writer.close()
-    with pytest.raises(ValueError, match="is closed"):
-        writer.append(make_episode(0))
-
-
-def test_a_shard_from_before_failures_were_counted_has_none(tmp_path):
-    write(tmp_path, [0, 1])
-    shard = tmp_path / "episodes-00000.parquet"
-    table = pq.read_table(shard)
-    pq.write_table(table.drop_columns(["num_controller_failures"]), shard)
-    assert [episode.num_controller_failures for episode in load_episodes(tmp_path)] == [0, 0]
-
-
-def forged(path, name, row, value, type_=None):
-    """A folder with a shard of a safe and an unsafe episode, with another value or type."""
+def forge(path, name, row, value, type_=None):
+    """Writes a shard of a safe and an unsafe episode, with another value or type."""
     write(path, [0, 1])
     shard = path / "episodes-00000.parquet"
     table = pq.read_table(shard)
@@ -372,45 +284,37 @@ def forged(path, name, row, value, type_=None):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("margins", 2, [0.1, -0.1]), "episode 0: it is safe, and a margin is negative"),
-        (("is_safe", 3, False), r"episode 0: its rows differ in \['is_safe', 'cause', 'first_s"),
-        (("cause", 7, ""), "episode 1: its rows differ"),
-        (("state", 1, [0.0, np.nan, 0.0]), r"episode 0: \['state'\] hold values that are not fin"),
-        (("features", 1, [1e13]), r"episode 0: \['features'\] hold values that are not finite"),
-        (("step", 4, 0), "episode 0: its steps are not 0, 1, 2"),
-        (("time_s", 4, 0.0), "episode 0: its time does not increase"),
-        (("is_safe", 0, 0, pa.string()), "is_safe is string; expected another type"),
-        (("first_step", 0, 0, pa.float64()), "first_step is double; expected another type"),
+        (("margins", 2, [0.1, -0.1]), ": episode 0: it is safe, and a margin is negative"),
+        (("is_safe", 3, False), r": episode 0: its rows differ in \['is_safe', 'cause', 'first_s"),
+        (("cause", 7, ""), ": episode 1: its rows differ"),
+        (("state", 1, [0.0, np.nan, 0.0]), r": episode 0: \['state'\] hold values that are not"),
+        (("features", 1, [1e13]), r": episode 0: \['features'\] hold values that are not finite"),
+        (("step", 4, 0), ": episode 0: its steps are not 0, 1, 2"),
+        (("time_s", 4, 0.0), ": episode 0: its time does not increase"),
+        (("is_safe", 0, 0, pa.string()), " holds no episodes of this set"),
+        (("time_s", 0, None), " holds no episodes of this set"),
     ],
 )
 def test_a_shard_with_forged_content_is_refused_where_it_is_read(tmp_path, change, message):
-    forged(tmp_path, *change)
-    with pytest.raises(ValueError, match=rf"episodes-00000\.parquet: {message}"):
+    forge(tmp_path, *change)
+    with pytest.raises(ValueError, match=rf"episodes-00000\.parquet{message}"):
         load_episodes(tmp_path)
 
 
-def test_a_shard_with_more_steps_than_its_set_is_refused(tmp_path):
+def test_a_shard_of_other_columns_or_too_many_steps_is_refused(tmp_path):
     write(tmp_path, [0], make_info(num_steps=3))
     with pytest.raises(ValueError, match="episode 0: it has more than 3 steps"):
         load_episodes(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("horizon", 10**12, r"horizon is 1000000000000, expected 1\.\.10000"),
-        ("step_s", float("nan"), "step_s is nan, expected > 0"),
-        ("seed", "seven", "'seed' must be a valid integer; got 'seven'"),
-        ("state_names", 3, "'state_names' must be a valid array; got 3"),
-    ],
-)
-def test_an_info_with_forged_values_is_refused(tmp_path, name, value, message):
-    write(tmp_path, [0])
-    info = json.loads((tmp_path / "info.json").read_text())
-    info["info"][name] = value
-    (tmp_path / "info.json").write_text(json.dumps(info))
-    with pytest.raises(ValueError, match=rf"info\.json does not describe episodes: .*{message}"):
-        load_episodes(tmp_path)
+    shard = tmp_path / "episodes-00000.parquet"
+    pd.DataFrame({"a": [1]}).to_parquet(shard)
+    with pytest.raises(ValueError, match="expected columns"):
+        completed(tmp_path)
+    info = make_info(state_names=["x", "v"])
+    write(tmp_path / "b", [make_episode(1, info)], info)
+    for other in (shard, tmp_path / "b" / shard.name):
+        shard.write_bytes(other.read_bytes())
+        with pytest.raises(ValueError, match="no episodes of this set: expected full columns"):
+            load_episodes(tmp_path)
 
 
 def test_a_shard_that_takes_too_much_memory_is_refused_by_its_header(tmp_path, monkeypatch):

@@ -18,7 +18,7 @@ from drake_safety.cli.training_folder import assessment_file
 from drake_safety.live.session import BREAK_S, FORCE, PUSH, START, STOP, TICK_S, LiveSession
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
-from drake_safety.simulation.motion import simulate
+from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import Gliding, gliding
 from live_scenarios import learned, quick
@@ -215,7 +215,7 @@ def test_ports_that_are_not_exported_are_named(meshcat):
     with pytest.raises(ValueError, match=message):
         LiveSession(loop, meshcat, threshold=0.5)
     with pytest.raises(ValueError, match=message):
-        simulate(loop, lambda context: None, ["cause_probability"], duration_s=0.4)
+        simulate(loop, lambda context: None, ["cause_probability"], End(duration_s=0.4))
 
 
 def trained(folder, task):

@@ -26,7 +26,7 @@ from drake_safety.evaluation.results import Results
 from drake_safety.learning.segments import DIVERGED, RECORDED
 from drake_safety.policies.policy import network_file, read_policy_file
 from drake_safety.simulation.dataset import load_episodes
-from drake_safety.simulation.motion import simulate
+from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.rollouts import episode_rng
 from studies import gate as study
 
@@ -204,11 +204,10 @@ def test_a_violation_between_two_rows_is_a_failure_at_its_instant(dips, metric, 
         loop,
         lambda context: 0,
         (*RECORDED,),
-        duration_s=0.2,
+        End(duration_s=0.2, **outcomes.simulated),
         step_s=0.04,
         watch_period_s=0.01,
         constraint_names=words.constraint_names,
-        **outcomes.simulated,
     )
     found = outcomes.of(motion.episode())
     assert (found.value, pytest.approx(found.time_s), found.cause) == expected

@@ -84,7 +84,7 @@ def test_visual_shapes_are_simulated_only_where_somebody_watches(loop, is_watche
     if is_watched:
         loop = load_scenario(SCENARIO).make_loop(meshcat=Meshcat())
     context = loop.CreateDefaultContext()
-    loop.remove_visuals(context)
+    loop.prepare(context)
     scene_graph = loop.scene_graph
     query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
     model, simulated = scene_graph.model_inspector(), query.inspector()

@@ -2,16 +2,17 @@ import numpy as np
 import pytest
 
 from drake_safety.learning.segments import EpisodeError
-from drake_safety.simulation.motion import simulate
+from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.rollouts import episode_rng
 from gliding_task import gliding
 
 
-def glide(loop, index, **options):
+def glide(loop, index, after_leaving_s=np.inf, **options):
     def start(context):
         return loop.reset(context, episode_rng(0, index))
 
-    return simulate(loop, start, ["margins", "state"], duration_s=0.8, index=index, **options)
+    end = End(duration_s=0.8, after_leaving_s=after_leaving_s)
+    return simulate(loop, start, ["margins", "state"], end, index=index, **options)
 
 
 def test_a_motion_goes_on_for_a_while_after_it_left_the_safe_set():
@@ -62,9 +63,9 @@ def test_events_happen_at_their_times_and_a_row_shows_the_state_before_later_upd
         loop,
         3,
         events=[(0.33, stop), (0.105, stop)],
-        each_row=lambda context, time_s: rows.append(time_s),
+        each_row=lambda context: rows.append(context.get_time()),
     )
     assert done == pytest.approx([0.105, 0.33])
-    assert rows == motion.time_s.tolist()
+    assert rows == pytest.approx(motion.time_s)
     is_after = motion.time_s > 0.105
     assert motion["state"][~is_after, 1].all() and not motion["state"][is_after].any()

@@ -22,7 +22,7 @@ from drake_safety.plants.balls import Throw
 from drake_safety.simulation.capabilities import HasBall, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.legged_loop import LeggedLoop
-from drake_safety.simulation.motion import Motion, simulate
+from drake_safety.simulation.motion import End, Motion, simulate
 from drake_safety.simulation.rollouts import episode_rng, worker_loop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import Progress, map_items
@@ -96,6 +96,7 @@ def run_throw(
     trigger_time_s: float = math.nan,
     throws: list[Throw] | None = None,
     duration_s: float | None = None,
+    after_fall_s: float = 0.0,
     ports: Iterable[str] = (),
     **options: Any,
 ) -> Motion:
@@ -148,9 +149,9 @@ def run_throw(
         loop,
         start,
         (*_PORTS, *ports, *filter(loop.HasOutputPort, ["recovery_active"])),
-        duration_s=duration_s,
+        End(duration_s=duration_s, after_fall_s=after_fall_s),
         events=events,
-        each_row=lambda context, time_s: rows.append(violations(context)),
+        each_row=lambda context: rows.append(violations(context)),
         index=index,
         who=f"throw {index} of '{loop.scenario.name}' (seed {seed})",
         **options,

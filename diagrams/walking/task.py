@@ -345,7 +345,7 @@ class Walking(LeggedLoop):
             )
         simulator = Simulator(other)
         context = simulator.get_mutable_context()
-        other.remove_visuals(context)
+        other.prepare(context)
         plan = PiecewisePolynomial(command[:, None])
         other.reset_to(context, None, replace(other.standing_start(), plan=plan))
         simulator.Initialize()

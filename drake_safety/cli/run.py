@@ -37,7 +37,7 @@ from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import CanBePushed, HasBall, HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.legged_loop import LeggedLoop
-from drake_safety.simulation.motion import Motion, simulate
+from drake_safety.simulation.motion import End, Motion, simulate
 from drake_safety.simulation.rollouts import episode_rng, run_to_goal
 from drake_safety.simulation.scenario import Scenario
 
@@ -223,13 +223,15 @@ def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
     return _Shown(motion, events, threshold, told, timeline, instants, marked=marked)
 
 
-def _move(loop: ClosedLoop, rule: folders.GoalThreshold, *, seed: int, **options: Any) -> _Shown:
+def _move(
+    loop: ClosedLoop, rule: folders.GoalThreshold, *, seed: int, duration_s: float, **options: Any
+) -> _Shown:
     """Simulates an episode from a random start, and a little beyond the safe set."""
     motion = simulate(
         loop,
         lambda context: loop.reset(context, episode_rng(seed, 0)),
         ("margins", *_logged_ports(loop)),
-        after_leaving_s=_AFTER_LEAVING_S,
+        End(duration_s=duration_s, after_leaving_s=_AFTER_LEAVING_S),
         may_fail=True,
         who=f"run of '{loop.scenario.name}' (seed {seed})",
         **options,

@@ -137,8 +137,9 @@ def compare_loops(
         missing = ((index, [index not in found for found in runs]) for index in range(max_pairs))
         items = [item for item in missing if any(item[1])]
         results = map_items(
-            partial(make.run, _run_pair, **simulated),
+            partial(_run_pair, **simulated),
             items,
+            make=make,
             num_workers=num_workers,
             batch_size=_BATCH,
             progress=progress,

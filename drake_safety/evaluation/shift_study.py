@@ -125,8 +125,8 @@ def run_monitored(
     make = worker_loop(scenario, variation, **options)
 
     def simulated(indices: list[int], until_s: float) -> dict[int, Episode]:
-        run = partial(make.run, run_motion, seed=seed, until_s=until_s, with_features=True)
-        motions = map_items(run, indices, num_workers=num_workers, batch_size=1)
+        run = partial(run_motion, seed=seed, until_s=until_s, with_features=True)
+        motions = map_items(run, indices, make=make, num_workers=num_workers, batch_size=1)
         return {one.index: one for one in motions}
 
     motions = simulated([*range(num_motions)], _FIRST_S)

@@ -67,6 +67,9 @@ class ClosedLoop(Diagram):
     angular_constraints: tuple[str, ...] = ()
     """Constraints whose margins are angles [rad]; the others are lengths [m]."""
 
+    fall_name: str = ""
+    """The constraint whose violation is a fall, which ends a motion; "" if nothing can fall."""
+
     monitored: Mapping[str, list[str]] = {}
     """What the change monitor reads: ``states`` that it predicts, such as those that a real robot
     measures, and ``features`` by which it predicts them beside the desired preview, such as what
@@ -116,6 +119,9 @@ class ClosedLoop(Diagram):
 
     def _is_outermost(self) -> bool:
         return str(self.GetSystemPathname()).count("::") == 1
+
+    def prepare(self, context: Context) -> None:
+        """Removes from the root Context what only pictures need, before a simulation."""
 
     def reset(self, context: Context, rng: np.random.Generator) -> int:
         """Samples an initial state and a plan into the root Context.
@@ -185,13 +191,14 @@ class ClosedLoop(Diagram):
         }
         for what, (learned, here) in sides.items():
             if learned != here:
+                texts = _describe_difference(learned, here), _describe_difference(here, learned)
                 raise ValueError(
                     f"assessment and diagram differ in {what}: the assessment was learned with "
-                    f"{_told_from(learned, here)}, the diagram has {_told_from(here, learned)}"
+                    f"{texts[0]}, the diagram has {texts[1]}"
                 )
 
 
-def _told_from(value: Any, other: Any) -> str:
+def _describe_difference(value: Any, other: Any) -> str:
     """A value; of a long list of names what the other one does not have."""
     if not isinstance(value, list) or len(value) <= _MOST_NAMES:
         return f"{value}"

@@ -10,28 +10,20 @@ from drake_safety.extras import require_extra
 
 @contextlib.contextmanager
 def connected(address: str, *, timeout_s: float = 20.0) -> Iterator[None]:
-    """Simulates on a dask cluster, in place of processes of this machine, while the block runs.
-
-    Raises:
-        MissingExtraError: dask is not installed.
-        ValueError: No scheduler answers, or it has no workers.
-    """
+    """Simulates on a dask cluster, in place of processes of this machine, while the block runs."""
     require_extra("cluster", f"cluster '{address}'")
     import joblib
     from distributed import Client
 
-    try:
-        client = Client(address, timeout=timeout_s)
-    # Another server's answer may be taken for the size of a huge message.
-    except (MemoryError, OSError, TimeoutError, ValueError) as error:
-        raise ValueError(f"no dask scheduler answers at '{address}': {error}") from error
-    with client:
+    with contextlib.ExitStack() as stack:
         try:
+            client = stack.enter_context(Client(address, timeout=timeout_s))
             client.wait_for_workers(1, timeout=timeout_s)
-        except TimeoutError:
+        # Another server's answer may be taken for the size of a huge message.
+        except (MemoryError, OSError, TimeoutError, ValueError) as error:
             raise ValueError(
-                f"the dask scheduler at '{address}' has no workers: start some, "
-                f"`dask worker {address} --nthreads 1`"
-            ) from None
-        with joblib.parallel_config("dask", client=client, n_jobs=-1):
-            yield
+                f"no dask scheduler with workers answers at '{address}': {error}; start workers "
+                f"by `dask worker {address} --nthreads 1`"
+            ) from error
+        stack.enter_context(joblib.parallel_config("dask", client=client, n_jobs=-1))
+        yield

@@ -10,28 +10,26 @@ rows by ``pandas.read_parquet(sorted(folder.glob("episodes-*.parquet")))``.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import logging
 import os
+import re
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from drake_safety.extras import require_extra
 from drake_safety.files.atomic import lock_folder, replacing, write_file
-from drake_safety.files.reading import reading
+from drake_safety.files.reading import check_memory, reading
 from drake_safety.files.schema import load_typed
-from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
-from drake_safety.simulation.episode_shards import (
-    from_table,
-    read_shard,
-    shard_number,
-    shards_in,
-    to_table,
-)
+from drake_safety.learning.segments import DIVERGED, LARGEST, Episode, Episodes, EpisodesInfo
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 FLUSH_EPISODES = 64
 """Number of pending episodes that are written as a shard."""
@@ -39,6 +37,9 @@ FLUSH_S = 10.0
 """Age of the last shard at which the next episode is written at once, with those pending [s]."""
 _SCHEMA_VERSION = 1
 _INFO_NAME = "info.json"
+_SHARD_NAME = re.compile(r"episodes-\d{5,}\.parquet")
+_FAILURES = "num_controller_failures"
+_LABELS = {"is_safe": bool, "cause": str, "first_step": int, _FAILURES: int}
 _LOGGER = logging.getLogger("drake_safety")
 
 
@@ -74,7 +75,7 @@ class EpisodeWriter:
         except BaseException:
             self._lock.release()
             raise
-        self._next_shard = 1 + max(map(shard_number, shards_in(self.path)), default=-1)
+        self._next_shard = 1 + max(map(_number, _shards_in(self.path)), default=-1)
         self._flushed_s = time.monotonic()
 
     def append(self, episode: Episode) -> None:
@@ -96,14 +97,12 @@ class EpisodeWriter:
             return
         import pyarrow.parquet as pq
 
-        table = to_table(self._pending, self.info)
         columns = [f"{name}.list.element" for name, width in self.info.widths.items() if width]
-        final = self.path / f"episodes-{self._next_shard:05d}.parquet"
-        with replacing(final) as temporary:
+        with replacing(self.path / f"episodes-{self._next_shard:05d}.parquet") as temporary:
             # float64 compresses better with its bytes split by significance; checksums detect
             # damaged pages.
             pq.write_table(
-                table,
+                _table_of(self._pending, self.info),
                 temporary,
                 compression="zstd",
                 use_dictionary=["cause"],
@@ -136,23 +135,22 @@ def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any
         raise ValueError(f"{path} holds no episodes: it has no {_INFO_NAME}") from None
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{file} is not JSON: {error}") from error
-    schema_version = content.get("schema_version") if isinstance(content, dict) else None
-    if schema_version != _SCHEMA_VERSION:
+    who = f"{file} does not describe episodes"
+    content = content if isinstance(content, dict) else {}
+    version, fields, extra = (content.get(name) for name in ("schema_version", "info", "extra"))
+    if version != _SCHEMA_VERSION or not isinstance(fields, dict) or not isinstance(extra, dict):
         raise ValueError(
-            f"{file} has schema version {schema_version!r}; expected {_SCHEMA_VERSION}"
+            f"{who}: expected schema version {_SCHEMA_VERSION}, info and extra; its version is "
+            f"{version!r}"
         )
-    fields, extra = content.get("info"), content.get("extra")
-    if not (isinstance(fields, dict) and isinstance(extra, dict)):
-        raise ValueError(f"{file} does not describe episodes: it has no info, or no extra")
     # Fields that older folders lack have defaults that mean "unknown"; others mean nothing now.
     known = {field.name for field in dataclasses.fields(EpisodesInfo)} & fields.keys()
-    who = f"{file} does not describe episodes"
     return load_typed(EpisodesInfo, {name: fields[name] for name in known}, who), extra
 
 
 def completed(path: str | os.PathLike[str]) -> set[int]:
     """Indices of the episodes on disk; empty if nothing was written yet."""
-    shards = shards_in(Path(path))
+    shards = _shards_in(Path(path))
     if shards and not (Path(path) / _INFO_NAME).exists():
         raise ValueError(
             f"{path} holds {len(shards)} shards but no {_INFO_NAME}, so the set that they belong "
@@ -160,7 +158,7 @@ def completed(path: str | os.PathLike[str]) -> set[int]:
         )
     indices: set[int] = set()
     for shard in shards:
-        indices.update(read_shard(shard, ["episode"]).column("episode").unique().to_pylist())
+        indices.update(_read_shard(shard, ["episode"]).column("episode").unique().to_pylist())
     return indices
 
 
@@ -171,11 +169,11 @@ def load_episodes(path: str | os.PathLike[str]) -> Episodes:
     """
     info, _ = read_info(path)
     episodes: dict[int, tuple[Episode, Path]] = {}
-    for shard in shards_in(Path(path)):
+    for shard in _shards_in(Path(path)):
         with reading(shard):
-            found = from_table(read_shard(shard), info, shard)
-            Episodes(info, found)  # Checks them.
-        for episode in found:
+            read = _episodes_of(_read_shard(shard), info, shard)
+            Episodes(info, read)  # Checks them.
+        for episode in read:
             known, where = episodes.setdefault(episode.index, (episode, shard))
             if known is not episode and not is_same(known, episode):
                 raise ValueError(
@@ -190,7 +188,22 @@ def _open_folder(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> No
     known = None
     if (path / _INFO_NAME).exists():
         stored, known = read_info(path)
-        _check_same_set(path, stored, info)
+        there = dataclasses.asdict(stored)
+        # Through JSON, like the stored info, so that tuples of names equal lists.
+        here = json.loads(json.dumps(dataclasses.asdict(info)))
+        differences = {
+            name: f"{name}: there {there[name]!r}, here {here[name]!r}"
+            for name in there
+            if there[name] != here[name] and (name != "robot" or there[name])
+        }
+        versions = differences.pop("versions", None)
+        if differences:
+            raise ValueError(
+                f"{path} holds episodes of another set and cannot be continued "
+                f"({'; '.join(differences.values())})"
+            )
+        if versions:
+            _LOGGER.warning("%s was begun with other package versions (%s)", path, versions)
         info, extra = stored, {**known, **extra}
     if extra == known:
         return
@@ -202,26 +215,6 @@ def _open_folder(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> No
     write_file(path / _INFO_NAME, text + "\n")
 
 
-def _check_same_set(path: Path, stored: EpisodesInfo, given: EpisodesInfo) -> None:
-    """Raises if the sets differ, and warns if only the package versions do."""
-    there = dataclasses.asdict(stored)
-    # Through JSON, like the stored info, so that tuples of names equal lists.
-    here = json.loads(json.dumps(dataclasses.asdict(given)))
-    differences = {
-        name: f"{name}: there {there[name]!r}, here {here[name]!r}"
-        for name in there
-        if there[name] != here[name] and (name != "robot" or there[name])
-    }
-    versions = differences.pop("versions", None)
-    if differences:
-        raise ValueError(
-            f"{path} holds episodes of another set and cannot be continued "
-            f"({'; '.join(differences.values())})"
-        )
-    if versions:
-        _LOGGER.warning("%s was begun with other package versions (%s)", path, versions)
-
-
 def is_same(a: Episode, b: Episode) -> bool:
     """Whether two episodes are the same to the last bit."""
     for field in dataclasses.fields(Episode):
@@ -230,3 +223,108 @@ def is_same(a: Episode, b: Episode) -> bool:
         if left.shape != right.shape or left.tobytes() != right.tobytes():
             return False
     return True
+
+
+def _schema_of(info: EpisodesInfo) -> pa.Schema:
+    """The columns of a set's shards. Parquet has no lists of length 0."""
+    import pyarrow as pa
+
+    arrays = {name: pa.list_(pa.float64(), n) for name, n in info.widths.items() if n}
+    columns = {"episode": pa.int64(), "step": pa.int32(), "time_s": pa.float64(), **arrays}
+    labels = {"is_safe": pa.bool_(), "cause": pa.string()}
+    counts = {"first_step": pa.int32(), _FAILURES: pa.int32()}
+    return pa.schema(list((columns | labels | counts).items()))
+
+
+def _table_of(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:
+    """The rows of episodes, one after another."""
+    import pyarrow as pa
+
+    counts = [len(episode.time_s) for episode in episodes]
+    columns: dict[str, Any] = {"step": np.concatenate([np.arange(count) for count in counts])}
+    for name, attribute in {"episode": "index", **{label: label for label in _LABELS}}.items():
+        columns[name] = np.repeat([getattr(episode, attribute) for episode in episodes], counts)
+    for name, width in {"time_s": 0, **info.widths}.items():
+        rows = [np.asarray(getattr(e, name), dtype=np.float64).reshape(-1) for e in episodes]
+        flat = pa.array(np.concatenate(rows))
+        columns[name] = pa.FixedSizeListArray.from_arrays(flat, width) if width else flat
+    schema = _schema_of(info)
+    return pa.table({name: columns[name] for name in schema.names}, schema=schema)
+
+
+def _episodes_of(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode]:
+    """The episodes of a shard's rows; ValueError if they are damaged or of another set."""
+    schema, widths, num_rows = _schema_of(info), info.widths, table.num_rows
+    # Older shards have no count of failures; nothing is learned from it.
+    older = schema.remove(schema.get_field_index(_FAILURES))
+    is_full = num_rows and not any(column.null_count for column in table.columns)
+    if not is_full or not (table.schema.equals(schema) or table.schema.equals(older)):
+        raise ValueError(
+            f"{shard} holds no episodes of this set: expected full columns\n{schema}\nbut it has "
+            f"{num_rows} rows of\n{table.schema}"
+        )
+    arrays = {name: np.empty((num_rows, 0)) for name in widths} | {_FAILURES: np.zeros(num_rows)}
+    for name in table.column_names:
+        column, width = table.column(name), widths.get(name)
+        if width:
+            column = column.combine_chunks().flatten()
+        arrays[name] = column.to_numpy().reshape((num_rows, width) if width else num_rows)
+    watched = slice(None) if not info.until else [info.constraint_names.index(info.until)]
+    bounds = [0, *(np.flatnonzero(np.diff(arrays["episode"])) + 1), num_rows]
+    episodes = []
+    for first, last in itertools.pairwise(bounds):
+        part = {name: array[first:last] for name, array in arrays.items()}
+        labels: dict[str, Any] = {name: kind(part[name][0]) for name, kind in _LABELS.items()}
+        longest = info.num_steps or num_rows
+        large = [n for n in ("time_s", *widths) if not (np.abs(part[n]) < LARGEST).all()]
+        faults = {
+            "its steps are not 0, 1, 2, ...": (part["step"] != np.arange(last - first)).any(),
+            "its time does not increase": not (np.diff(part["time_s"]) > 0.0).all(),
+            f"it has more than {longest} steps": last - first > longest + 1,
+            f"its rows differ in {[*_LABELS]}": any((part[n] != part[n][0]).any() for n in _LABELS),
+            "it is safe, and a margin is negative": (
+                labels["is_safe"] and (part["margins"][:, watched] < 0.0).any()
+            ),
+            f"{large} hold values that are not finite numbers below {LARGEST:g}": (
+                large and labels["cause"] != DIVERGED
+            ),
+        }
+        index = int(part["episode"][0])
+        for what, is_wrong in faults.items():
+            if is_wrong:
+                raise ValueError(f"{shard}: episode {index}: {what}")
+        copies: dict[str, Any] = {name: part[name].copy() for name in ("time_s", *widths)}
+        episodes.append(Episode(index=index, **copies, **labels))
+    return episodes
+
+
+def _shards_in(path: Path) -> list[Path]:
+    """The shards of a folder, in the order of their numbers; none if it does not exist."""
+    files = path.glob("episodes-*.parquet")
+    return sorted((file for file in files if _SHARD_NAME.fullmatch(file.name)), key=_number)
+
+
+def _number(shard: Path) -> int:
+    return int(shard.stem.removeprefix("episodes-"))
+
+
+def _read_shard(shard: Path, columns: list[str] | None = None) -> pa.Table:
+    """The rows of a shard, of all columns by default; ValueError if it is damaged."""
+    require_extra("train", f"episodes in {shard.parent}", "pyarrow")
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        # ParquetFile and not read_table, which adds columns for folders named like `seed=1`.
+        with pq.ParquetFile(shard, page_checksum_verification=True) as file:
+            sizes = (getattr(column.type, "list_size", 1) for column in file.schema_arrow)
+            check_memory(8 * file.metadata.num_rows * sum(sizes), f"{shard}")
+            table = file.read(columns=columns)
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(
+            f"shard {shard} is truncated or damaged ({error}); remove it and resume: its episodes "
+            "will be run again"
+        ) from error
+    if columns is not None and table.column_names != columns:
+        raise ValueError(f"{shard} holds no episodes: expected columns {columns}")
+    return table

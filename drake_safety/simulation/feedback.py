@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import numpy as np
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.files.progress import shown
 from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
 from drake_safety.learning.feedback import EpisodePair, pair_episodes
 from drake_safety.learning.seeds import ADAPTATION, NOT_DRAWN
@@ -48,11 +46,9 @@ def run_pairs(
     *,
     variation: str = "actual",
     seed: int = ADAPTATION.first,
-    num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
     progress: Progress | bool | None = None,
-    extra: dict[str, Any] | None = None,
-    **loop_options: Any,
+    **options: Any,
 ) -> EpisodePairs:
     """Simulates actual episodes and their nominal twins, in worker processes.
 
@@ -61,44 +57,36 @@ def run_pairs(
     Args:
         path: Folder for the episodes, with a folder for either plant; episodes that it already
             holds are not simulated again.
-        **loop_options: Options of the task; they replace those for pairs.
+        progress: Called with the number done and in all; True shows it.
+        **options: As for `run_episodes`; options of the task replace those for pairs.
 
     Raises:
         ValueError: No such variation, or the folder holds other sets.
     """
-    loop_options = scenario.options_for("pairs", variation) | loop_options
+    options = scenario.options_for("pairs", variation) | options
     sets = {}
-    with shown(progress, lambda stages: partial(stages, "episodes and their twins")) as report:
+    for i, name in enumerate((variation, _TWINS)):
 
-        def report_of(offset: int) -> Progress | None:
-            if report is None:
-                return None
-            return lambda done, total: report(offset + done, 2 * num_pairs)
+        def report(done: int, wanted: int, first: int = i * num_pairs) -> None:
+            if callable(progress):
+                progress(first + done, 2 * num_pairs)
 
-        for i, name in enumerate((variation, _TWINS)):
-            sets[name] = run_episodes(
-                scenario,
-                num_pairs,
-                variation=name,
-                seed=seed,
-                num_workers=num_workers,
-                path=None if path is None else Path(path) / name,
-                progress=report_of(i * num_pairs),
-                extra=extra,
-                **loop_options,
-            )
+        sets[name] = run_episodes(
+            scenario,
+            num_pairs,
+            variation=name,
+            seed=seed,
+            path=None if path is None else Path(path) / name,
+            progress=report if callable(progress) else progress,
+            **options,
+        )
     return EpisodePairs(
         actual=sets[variation], nominal=sets[_TWINS], nominal_hash=scenario.simulation_hash()
     )
 
 
 def AddFeedbackRecorder(builder: DiagramBuilder, loop: ClosedLoop) -> FeedbackRecorder:
-    """Adds a recorder named ``feedback_recorder`` to a diagram, and connects it to a loop.
-
-    Raises:
-        ValueError: The twins of its windows cannot begin as the windows do.
-    """
-    size = _memory_size(loop)
+    """Adds a recorder named ``feedback_recorder`` to a diagram, and connects it to a loop."""
     recorder = builder.AddNamedSystem(
         "feedback_recorder",
         FeedbackRecorder(
@@ -106,18 +94,17 @@ def AddFeedbackRecorder(builder: DiagramBuilder, loop: ClosedLoop) -> FeedbackRe
             num_steps=loop.scenario.num_steps,
             plant_state_size=loop.GetOutputPort("plant_state").size(),
             watch_period_s=loop.scenario.watch_period_s,
-            controller_memory_size=size,
+            controller_memory_size=_memory_size(loop),
         ),
     )
-    for i in range(recorder.num_input_ports()):
-        port = recorder.get_input_port(i)
+    for port in map(recorder.get_input_port, range(recorder.num_input_ports())):
         if loop.HasOutputPort(port.get_name()):
             builder.Connect(loop.GetOutputPort(port.get_name()), port)
     return recorder
 
 
 def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
-    """Initial state and plan of the nominal twin of a recorded window.
+    """Returns initial state and plan of the nominal twin of a recorded window.
 
     The plan interpolates the desired outputs of the window and of its last preview, and is constant
     after that.
@@ -139,7 +126,10 @@ def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
 
 
 def _memory_size(loop: ClosedLoop) -> int:
-    """Size of the memory with which a loop's controller begins a twin; 0 without one."""
+    """Size of the memory with which a loop's controller begins a twin; 0 without one.
+
+    A window begins at a row, so a row must be a time at which the controller updates.
+    """
     size = port_sizes(loop).get("controller_memory", 0)
     period_s, step_s = getattr(loop, "memory_period_s", loop.scenario.step_s), loop.scenario.step_s
     if abs(step_s / period_s - round(step_s / period_s)) > 1e-6:
@@ -175,19 +165,14 @@ def pair_starts(
 def pair_windows(
     scenario: Scenario, recorder: FeedbackRecorder, windows: Sequence[RecordedWindow]
 ) -> list[EpisodePair]:
-    """Pairs of recorded windows and their nominal twins, which are simulated in this process.
-
-    Raises:
-        ValueError: The task cannot begin with a given start, or windows lack its controller's
-            memory.
-    """
+    """Pairs of recorded windows and their nominal twins, which are simulated in this process."""
     loop = worker_loop(scenario, _TWINS)()
     size = _memory_size(loop)
-    for one in windows:
-        found = 0 if one.controller_memory is None else len(one.controller_memory)
-        if found != size:
+    for window in windows:
+        memory = window.controller_memory
+        if (got := 0 if memory is None else len(memory)) != size:
             raise ValueError(
-                f"feedback of '{scenario.name}': a window has {found} entries of the controller's "
+                f"feedback of '{scenario.name}': a window has {got} entries of the controller's "
                 f"memory, expected {size}: without it its twin begins in mid-stride as if at rest. "
                 "Connect the recorder's 'controller_memory', as AddFeedbackRecorder does"
             )

@@ -245,7 +245,7 @@ class LeggedLoop(PlannedLoop):
             own_context = self._change_monitor.GetMyMutableContextFromRoot(context)
             self._change_monitor.expect_disturbance(own_context, begin_s, end_s)
 
-    def remove_visuals(self, context: Context) -> None:
+    def prepare(self, context: Context) -> None:
         """Removes the visual shapes, unless the diagram has a visualiser."""
         if not self._is_shown:
             remove_visuals(self.plant, self.scene_graph, context)

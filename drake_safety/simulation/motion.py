@@ -21,14 +21,31 @@ from drake_safety.learning.segments import (
     Episode,
     EpisodeError,
 )
-from drake_safety.simulation.capabilities import CanFall
 from drake_safety.simulation.closed_loop import ClosedLoop, require_ports
-from drake_safety.simulation.legged_loop import LeggedLoop
 
 _SAME_TIME = 1e-3  # Largest difference between the times reached and asked for, in steps.
 _ENDED = SimulatorStatus.ReturnReason.kReachedTerminationCondition
 _FAILED = EventStatus.Failed
 _LOGGER = logging.getLogger("drake_safety")
+
+
+@dataclass(frozen=True, kw_only=True)
+class End:
+    """When a simulated motion ends, whatever comes first.
+
+    Attributes:
+        duration_s: Time since the start [s].
+        after_leaving_s: Time outside the safe set [s]; by default it does not end a motion.
+        after_fall_s: Time after a fall, a violation of the diagram's ``fall_name`` [s].
+        until: Constraint whose violation ends the motion.
+        until_first_row: Whether it ends at the first row whose future is undisturbed.
+    """
+
+    duration_s: float
+    after_leaving_s: float = math.inf
+    after_fall_s: float = 0.0
+    until: str = ""
+    until_first_row: bool = False
 
 
 @dataclass(kw_only=True, eq=False)
@@ -78,9 +95,8 @@ class Motion:
     def intervals_s(self, port: str) -> list[tuple[float, float]]:
         """First and last times at which a port was 1 [s]; what lasts to the end ends there."""
         active = self.ports.get(port, np.zeros((len(self.time_s), 1)))[:, 0]
-        is_first, is_last = np.diff(active, prepend=0.0) > 0, np.diff(active, append=0.0) < 0
-        pairs = zip(self.time_s[is_first].tolist(), self.time_s[is_last].tolist(), strict=True)
-        return list(pairs)
+        begins, ends = np.diff(active, prepend=0.0) > 0, np.diff(active, append=0.0) < 0
+        return [*zip(self.time_s[begins].tolist(), self.time_s[ends].tolist(), strict=True)]
 
     def episode(self, num_features: int = 0) -> Episode:
         """The motion as an episode: ``diverged`` if the simulation failed.
@@ -126,10 +142,9 @@ class Recorder:
     def record(
         self, context: Context, time_s: float | None = None, *, is_checked: bool = False
     ) -> None:
-        """Appends a row, unless a port raises; a given time is without rounding errors [s].
+        """Appends a row, unless a port raises or, if that is checked, is not finite.
 
-        Raises:
-            DivergenceError: A port of ``RECORDED`` is not finite, if that is checked.
+        A given time is without rounding errors [s].
         """
         row = {name: np.array(port.Eval(context)) for name, port in self._ports.items()}
         time_s = context.get_time() if time_s is None else time_s
@@ -154,18 +169,14 @@ def simulate(
     diagram: Diagram,
     start: Callable[[Context], int | None],
     ports: Iterable[str] | Mapping[str, str],
+    end: End,
     *,
-    duration_s: float,
     step_s: float = 0.02,
     watch_period_s: float = math.inf,
-    after_leaving_s: float = math.inf,
-    after_fall_s: float = 0.0,
-    until: str = "",
-    until_first_row: bool = False,
     events: Iterable[tuple[float, Callable[[Context], object]]] = (),
-    each_row: Callable[[Context, float], None] = lambda context, time_s: None,
+    each_row: Callable[[Context], object] = lambda context: None,
     monitor: Callable[[Context], object] | None = None,
-    constraint_names: Sequence[str] | None = None,
+    constraint_names: Sequence[str] = (),
     may_fail: bool = False,
     realtime_rate: float = 0.0,
     index: int = 0,
@@ -183,16 +194,11 @@ def simulate(
         ports: Ports to log; a mapping from logged names to those of ports renames them, also
             ``margins`` and ``safe``, which is below 1 outside the safe set; without a port
             ``safe`` that is where a margin is negative.
-        duration_s: End time [s].
         step_s: Time between two rows [s].
         watch_period_s: Sampling period of the safe set, counted from each row [s]; by default it
             is sampled at rows.
-        after_leaving_s: Time for which a motion goes on outside the safe set [s].
-        after_fall_s: Time for which it goes on after a fall [s]; only a :class:`CanFall` falls.
-        until: Constraint whose violation ends the motion.
-        until_first_row: Whether it ends at the first row whose future is undisturbed.
         events: Times [s] and what is done then with the Context.
-        each_row: Called with Context and time [s] after each row.
+        each_row: Called with the Context after each row.
         monitor: Called with the Context after each step of the simulator; it may end it.
         constraint_names: Names of the margins; by default the diagram's.
         may_fail: Whether a failure of the simulation is a result, ``Motion.failure``. The motion
@@ -201,54 +207,51 @@ def simulate(
         who: What is simulated, for messages.
 
     Raises:
-        ValueError: The diagram has no such port, or a time is out of range.
         EpisodeError: A system raised an error, which is its cause, or the simulation failed, before
             the first row or where it may not.
     """
-    check_times(who, step_s=step_s, watch_period_s=min(watch_period_s, step_s))
-    ends = {"after_leaving_s": after_leaving_s, "after_fall_s": after_fall_s}
-    finite = {name: min(value, duration_s) for name, value in ends.items()}
-    check_times(who, or_zero=["duration_s", *ends], duration_s=duration_s, **finite)
-    if isinstance(diagram, ClosedLoop):
-        constraint_names = constraint_names or diagram.constraint_names
-    names = list(constraint_names or ())
+    times = {"step_s": step_s, "watch_period_s": min(watch_period_s, step_s)}
+    check_times(who, or_zero=["duration_s"], duration_s=end.duration_s, **times)
     recorder = Recorder(diagram, ports)
     margins_port = diagram.GetOutputPort(recorder.names.get("margins", "margins"))
     safe = recorder.names.get("safe", "safe")
     safe_port = diagram.GetOutputPort(safe) if diagram.HasOutputPort(safe) else None
-    fall = names.index(diagram.fall_name) if isinstance(diagram, CanFall) else None
     simulator = Simulator(diagram)
     simulator.set_target_realtime_rate(realtime_rate)
     if monitor is not None:
         simulator.set_monitor(monitor)
     context = simulator.get_mutable_context()
-    if isinstance(diagram, LeggedLoop):
-        diagram.remove_visuals(context)
+    names, fall = list(constraint_names), None
+    if isinstance(diagram, ClosedLoop):
+        names = names or diagram.constraint_names
+        fall = names.index(diagram.fall_name) if diagram.fall_name else None
+        diagram.prepare(context)
     first_row = start(context)
     begin_s = context.get_time()
     is_finite_at_start = np.abs(_state(context)) < LARGEST
     waiting = sorted(events, key=lambda event: event[0])
-    is_last = False
     leave_s = fall_s = math.inf
-    now_s, is_ended = 0.0, False
+    now_s, is_ended, is_last = 0.0, False, False
     cause = failure = ""
 
     def is_over(time_s: float) -> bool:
         nonlocal leave_s, fall_s, cause
-        now = margins_port.Eval(context)
-        if len(wrong := np.flatnonzero(~(np.abs(now) < LARGEST))):
-            k = max(wrong, key=lambda i: not now[i] > 0.0)  # One that shows a divergence, if any.
-            text = f"constraint '{names[k]}' has a margin of {now[k]} at {time_s:g} s"
-            if now[k] > 0:
+        margins = margins_port.Eval(context)
+        if len(wrong := np.flatnonzero(~(np.abs(margins) < LARGEST))):
+            # The margin that shows a divergence, if there is one.
+            k = max(wrong, key=lambda i: not margins[i] > 0.0)
+            text = f"constraint '{names[k]}' has a margin of {margins[k]} at {time_s:g} s"
+            if margins[k] > 0:
                 raise ValueError(f"{text}; cap it at a finite distance, such as a query's range")
             raise DivergenceError(text)
-        is_safe = now.min() >= 0 if safe_port is None else safe_port.Eval(context)[0] >= 1
+        is_safe = margins.min() >= 0 if safe_port is None else safe_port.Eval(context)[0] >= 1
         if not is_safe and not cause:
-            leave_s, cause = time_s, names[int(np.argmin(now))]
-        if fall is not None and now[fall] < 0:
+            leave_s, cause = time_s, names[int(np.argmin(margins))]
+        if fall is not None and margins[fall] < 0:
             fall_s = min(fall_s, time_s)
-        is_until = bool(until) and (cause == until or now[names.index(until)] < 0)
-        return is_until or time_s >= min(leave_s + after_leaving_s, fall_s + after_fall_s)
+        if end.until and (cause == end.until or margins[names.index(end.until)] < 0):
+            return True
+        return time_s >= min(leave_s + end.after_leaving_s, fall_s + end.after_fall_s)
 
     def advance(to_s: float) -> None:
         nonlocal now_s, is_ended
@@ -263,9 +266,12 @@ def simulate(
         if not 0.0 <= begin_s < math.inf:
             raise ValueError(f"it starts at {begin_s} s; Drake's periodic events begin at 0 s")
         is_ended = simulator.Initialize().reason() == _ENDED
-        num_steps = first_row or 0 if until_first_row else round(duration_s / step_s)
+        num_steps = first_row or 0 if end.until_first_row else round(end.duration_s / step_s)
         for row in range(num_steps + 1):
-            for time_s in _watch_times(row, step_s, watch_period_s):
+            # The safe set is sampled since the row before, and at the row.
+            count = math.ceil(step_s / watch_period_s - 1e-6) if row else 1
+            between_s = [(row - 1) * step_s + i * watch_period_s for i in range(1, count)]
+            for time_s in (*between_s, row * step_s):
                 while waiting and waiting[0][0] <= time_s:
                     event_s, act = waiting.pop(0)
                     advance(event_s)
@@ -277,7 +283,7 @@ def simulate(
             if is_ended and row:  # Perhaps at the instant of the row before.
                 now_s = max(now_s, math.nextafter((row - 1) * step_s, math.inf))
             recorder.record(context, now_s, is_checked=True)
-            each_row(context, now_s)
+            each_row(context)
             if is_last:
                 break
     except (Exception, SystemExit) as error:
@@ -303,7 +309,7 @@ def simulate(
 
 
 def _failed(system: System | None, message: str) -> None:
-    """Raises what a system says of its failure: pydrake's message of one in Python would crash."""
+    """Raises a system's failure as an error: pydrake crashes on that of a system in Python."""
     raise RuntimeError(f"system '{system and system.get_name()}' failed: {message}")
 
 
@@ -320,21 +326,12 @@ def advance_to(simulator: Simulator, time_s: float) -> bool:
     return is_later and simulator.AdvanceTo(before_s).reason() == _ENDED
 
 
-def _watch_times(row: int, step_s: float, period_s: float) -> list[float]:
-    """Times at which the safe set is sampled after the row before, its own time included."""
-    count = max(math.ceil(step_s / period_s - 1e-6), 1) if row else 1
-    begin_s = (row - 1) * step_s
-    return [*(begin_s + i * period_s for i in range(1, count)), row * step_s]
-
-
+# Drake's contact solver, SceneGraph and integrators raise RuntimeError, as any other error; failed
+# assertions, such as TAMSI's on a huge force, are SystemExit.
 _NUMERICAL_FAILURE = re.compile(
     r"solver failed to converge|Detected NaN|is NaN\b|non-finite value|step smaller than minimum"
     r"|Failure at .*(solver|multibody|integrator)"
 )
-"""Messages of numerical failures of Drake's contact solver, SceneGraph and integrators.
-
-Drake raises them as RuntimeError, like any other error, and failed assertions, such as TAMSI's on a
-huge force, as SystemExit."""
 
 
 def _is_divergence(error: BaseException, context: Context, is_finite_at_start: np.ndarray) -> bool:

@@ -22,9 +22,14 @@ from drake_safety.learning.segments import (
     installed_versions,
 )
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, port_sizes
-from drake_safety.simulation.motion import simulate
-from drake_safety.simulation.rollouts import collect_episodes, episode_rng, seed_random_sources
-from drake_safety.simulation.worker_processes import MadeOnce, Progress, Sent
+from drake_safety.simulation.motion import End, simulate
+from drake_safety.simulation.rollouts import (
+    Execution,
+    collect_episodes,
+    episode_rng,
+    seed_random_sources,
+)
+from drake_safety.simulation.worker_processes import CloudPickled, MadeOnce, Progress
 from drake_safety.systems.monitored_assessor import warn_of_sampled_ports
 
 _LOGGER = logging.getLogger("drake_safety")
@@ -78,33 +83,30 @@ def record_episodes(
         state_names: Names of the n_s entries of ``state``; numbered by default.
         name: Name of the set; that of ``make_diagram`` by default.
         monitor_period_s: Sampling period of ``safe`` [s]; a tenth of ``step_s`` by default.
-        num_workers: Number of processes; that of cores by default. 1 runs in this process.
-        path: Folder for the episodes; those of the same set that it already holds are kept. A set
-            is identified by name, parameters, ports, times and seed, and by one of its episodes,
-            which is simulated again and must be the same to the last bit.
+        num_workers, path, progress: See `Execution`. A set is identified by name, parameters,
+            ports, times and seed, and by one of its episodes, which is simulated again.
 
     Returns:
         The episodes, for ``SafetyAssessment.fit``. Those whose simulation failed have the cause
         ``diverged`` and are counted in a warning.
 
     Raises:
-        ValueError: A port is missing or its size fits no other, the number of names is not that
-            of the entries, a time is out of range, the folder holds another set or one of another
-            diagram, or the diagram keeps state outside its Context.
+        ValueError: A port, its size, a name or a time does not fit, the folder holds another set or
+            one of another diagram, or the diagram keeps state outside its Context.
         EpisodeError: A system of the diagram or ``reset`` raised an error, which is its cause.
     """
     name = str(name or getattr(make_diagram, "__name__", type(make_diagram).__name__))
     period_s = step_s / 10 if monitor_period_s is None else monitor_period_s
     check_times("record_episodes", duration_s=duration_s, step_s=step_s, monitor_period_s=period_s)
-    if round(duration_s / step_s) < 1:
+    num_steps = round(duration_s / step_s)
+    if num_steps < 1:
         raise ValueError(
             f"record_episodes: an episode has at least one step; got duration_s {duration_s} and "
             f"step_s {step_s}"
         )
-    num_steps = round(duration_s / step_s)
     # The diagram is built anew for each call: a function does not tell whether its result changed.
     key = uuid.uuid4().hex
-    make = MadeOnce(key, Sent(partial(make_diagram, **dict(parameters or {}))))
+    make = MadeOnce(key, CloudPickled(partial(make_diagram, **dict(parameters or {}))))
     warn_of_sampled_ports("record_episodes", [make()])
     used, sizes = _used_ports(make(), dict(ports or {}))
     # As the hash has always been made of it, so that kept sets stay valid.
@@ -131,58 +133,43 @@ def record_episodes(
         versions=installed_versions("drake", "numpy"),
         num_steps=num_steps,
     )
-    episodes = collect_episodes(
-        info,
-        range(num_episodes),
-        make,
-        partial(_record, reset=Sent(reset), ports=used, watch_period_s=period_s, info=info),
-        num_workers=num_workers,
-        path=path,
-        progress=progress,
-        is_repeated=True,
-    )
+    start = CloudPickled(reset)
+
+    def run(
+        diagram: Diagram, index: int, monitor: Callable[[Context], object] | None = None
+    ) -> Episode:
+        who = f"episode {index} of '{name}' (seed {seed})"
+
+        def begin(context: Context) -> int | None:
+            seed_random_sources(diagram, context, seed, index)
+            try:
+                return start(diagram, context, episode_rng(seed, index))
+            except Exception as error:
+                raise EpisodeError(f"{who}, reset: {type(error).__name__}: {error}") from error
+
+        return simulate(
+            diagram,
+            begin,
+            used,
+            End(duration_s=num_steps * step_s, after_leaving_s=0.0),
+            step_s=step_s,
+            watch_period_s=period_s,
+            monitor=monitor,
+            constraint_names=info.constraint_names,
+            may_fail=True,
+            index=index,
+            who=who,
+        ).episode()
+
+    execution = Execution(num_workers=num_workers, path=path, progress=progress)
+    episodes = collect_episodes(info, range(num_episodes), make, run, execution, is_repeated=True)
     episodes.warn()
-    if ended := [one.index for one in episodes if one.is_safe and one.num_steps < num_steps]:
+    if ended := [e.index for e in episodes if e.is_safe and e.num_steps < num_steps]:
         _LOGGER.warning(
             "a system of '%s' ended %d of %d episodes early, as episode %d, and they count as safe",
             *(name, len(ended), len(episodes), ended[0]),
         )
     return episodes
-
-
-def _record(
-    diagram: Diagram,
-    index: int,
-    *,
-    reset: Reset,
-    ports: dict[str, str],
-    watch_period_s: float,
-    info: EpisodesInfo,
-    monitor: Callable[[Context], None] | None = None,
-) -> Episode:
-    who = f"episode {index} of '{info.scenario}' (seed {info.seed})"
-
-    def start(context: Context) -> int | None:
-        seed_random_sources(diagram, context, info.seed, index)
-        try:
-            return reset(diagram, context, episode_rng(info.seed, index))
-        except Exception as error:
-            raise EpisodeError(f"{who}, reset: {type(error).__name__}: {error}") from error
-
-    return simulate(
-        diagram,
-        start,
-        ports,
-        duration_s=info.num_steps * info.step_s,
-        step_s=info.step_s,
-        watch_period_s=watch_period_s,
-        after_leaving_s=0.0,
-        monitor=monitor,
-        constraint_names=info.constraint_names,
-        may_fail=True,
-        index=index,
-        who=who,
-    ).episode()
 
 
 def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str], dict[str, int]]:
@@ -192,41 +179,37 @@ def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str]
             f"record_episodes: ports has {sorted(unknown)}; expected some of {REQUIRED_PORTS}"
         )
     there = port_sizes(diagram)
-    used = {name: given.get(name, name) for name in REQUIRED_PORTS}
-    missing = {
-        name: port
-        for name, port in used.items()
-        if port not in there and (name in given or name not in _OPTIONAL_PORTS)
+    used = {
+        name: given.get(name, name)
+        for name in REQUIRED_PORTS
+        if name in given or name in there or name not in _OPTIONAL_PORTS
     }
-    if missing:
+    if missing := {name: port for name, port in used.items() if port not in there}:
         raise ValueError(
             f"record_episodes: the diagram exports no port {sorted(missing.values())} for "
             f"{sorted(missing)}; it exports {sorted(there)}. Call builder.ExportOutput(port, NAME) "
             "for each, or give its name by 'ports'"
         )
-    used = {name: port for name, port in used.items() if port in there}
     sizes = {name: there[port] for name, port in used.items()}
-    n_z = sizes["output"]
-    expected = {"true_state": sizes["state"], "desired_output": n_z, "safe": 1}
-    for name, size in expected.items():
+    n_z, n_preview = sizes["output"], sizes["desired_preview"]
+    if n_z < 1 or n_preview < 1 or n_preview % n_z:
+        raise ValueError(
+            f"record_episodes: port '{used['desired_preview']}' has size {n_preview}; expected H "
+            f"times the size {n_z} of the output"
+        )
+    for name, size in {"true_state": sizes["state"], "desired_output": n_z, "safe": 1}.items():
         if sizes.get(name, size) != size:
             raise ValueError(
                 f"record_episodes: port '{used[name]}' for {name} has size {sizes[name]}; "
                 f"expected {size}"
             )
-    if n_z < 1 or sizes["desired_preview"] < 1 or sizes["desired_preview"] % n_z:
-        raise ValueError(
-            f"record_episodes: port '{used['desired_preview']}' has size "
-            f"{sizes['desired_preview']}; expected H times the size {n_z} of the output"
-        )
     return used, sizes
 
 
 def _names(what: str, given: Sequence[str] | None, size: int) -> list[str]:
-    if given is None:
-        return [f"{what}_{i}" for i in range(size)]
-    if len(given) != size:
+    names = [f"{what}_{i}" for i in range(size)] if given is None else list(given)
+    if len(names) != size:
         raise ValueError(
-            f"record_episodes: {what}_names has {len(given)} names, the port has {size} entries"
+            f"record_episodes: {what}_names has {len(names)} names, the port has {size} entries"
         )
-    return list(given)
+    return names

@@ -39,7 +39,7 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed
 from drake_safety.simulation.hidden_state import difference
 from drake_safety.simulation.legged_loop import LeggedLoop
-from drake_safety.simulation.motion import simulate
+from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
 
@@ -460,7 +460,7 @@ def _walks(loop: Any) -> Generator[Finding, None, str]:
         loop.reset_to(context, None, replace(loop.standing_start(), plan=plan))
 
     ports = ("output", "margins", "controller_status")
-    motion = simulate(loop, begin, ports, duration_s=_WALKED_S, may_fail=True)
+    motion = simulate(loop, begin, ports, End(duration_s=_WALKED_S), may_fail=True)
     mean = motion["output"][len(motion.time_s) // 2 :].mean(axis=0)
     message = f"asked for {command[0]:.2f} m/s, it moves at {mean[0]:.2f} m/s"
     if motion.failure:

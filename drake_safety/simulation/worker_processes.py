@@ -11,7 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Generator, Hashable, Iterable
-from contextlib import closing, nullcontext
+from contextlib import nullcontext
 from functools import cache, partial
 from operator import attrgetter
 from typing import Any, ClassVar, Generic, TypeVar
@@ -25,28 +25,50 @@ from drake_safety.learning.segments import installed_versions
 BATCH_SIZE = 4
 """Number of items that are sent to a worker at a time."""
 _WATCH_PERIOD_S = 1.0
-_LOCAL_BACKENDS = ("LokyBackend", "SequentialBackend")
-_DASKS = "KilledWorker"
-_TURN = threading.RLock()
+_DASK_WORKER_KILLED = "KilledWorker"
+_lock = threading.RLock()
 
-_Item = TypeVar("_Item")
 _Made = TypeVar("_Made")
 _Result = TypeVar("_Result")
 Progress = Callable[[int, int], None]
 """Called with the number done and in all."""
 
 
+class MadeOnce(Generic[_Made]):
+    """A diagram that each process makes once, when it is first called.
+
+    It is sent to workers with all that ``make`` uses. pydrake never frees a system in Python: a
+    loop made for every call would cost 2.4 MB each. Only the last one is kept.
+
+    Args:
+        key: Tells diagrams apart.
+    """
+
+    _made: ClassVar[dict[Hashable, Any]] = {}
+
+    def __init__(self, key: Hashable, make: Callable[[], _Made]) -> None:
+        self._key, self.make = key, make
+
+    def __call__(self) -> _Made:
+        """Returns the diagram."""
+        if self._key not in self._made:
+            self._made.clear()
+            self._made[self._key] = self.make()
+        return self._made[self._key]
+
+
 def map_items(
-    function: Callable[[_Item], _Result],
-    items: Iterable[_Item],
+    function: Callable[..., _Result],
+    items: Iterable[Any],
     *,
+    make: MadeOnce[Any] | None = None,
     num_workers: int | None = None,
     batch_size: int = BATCH_SIZE,
     progress: Progress | bool | None = None,
     num_done: int = 0,
     stage: str = "simulations",
 ) -> Generator[_Result, None, None]:
-    """Calls ``function(item)`` in worker processes; yields results as batches finish.
+    """Calls a function of each item in worker processes; yields results as batches finish.
 
     Within ``joblib.parallel_config`` of another backend than loky, or :func:`cluster.connected`,
     that backend's workers are used.
@@ -56,8 +78,8 @@ def map_items(
     two.
 
     Args:
+        make: If given, the function is called with the worker's diagram and an item.
         num_workers: Number of processes; that of cores by default. 1 runs in this process.
-        batch_size: Number of items that are sent to a worker at a time.
         progress: Called with the number done and in all, at the start and after each batch; True
             shows it.
         num_done: Number that had been done before.
@@ -67,56 +89,49 @@ def map_items(
         ValueError: A number of processes is given, but the backend has its own, or a worker has
             other versions of Python, Drake, NumPy or this package.
     """
-    pending = list(items)
-    batches = [pending[i : i + batch_size] for i in range(0, len(pending), batch_size)]
-    results = _map_batches(partial(_called, _versions(), function), batches, num_workers)
-    with shown(progress, lambda stages: partial(stages, stage)) as report, closing(results):
-        report = report or (lambda done, wanted: None)
-        num_wanted = num_done + len(pending)
-        report(num_done, num_wanted)
-        for batch in results:
-            yield from batch
-            num_done += len(batch)
-            report(num_done, num_wanted)
-
-
-def _map_batches(
-    call: Callable[[list[_Item]], list[_Result]],
-    batches: list[list[_Item]],
-    num_workers: int | None,
-) -> Generator[list[_Result], None, None]:
     import joblib
     from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import BrokenProcessPool
     from joblib.parallel import get_active_backend
 
     backend = type(get_active_backend()[0]).__name__
-    is_local = backend in _LOCAL_BACKENDS
+    is_local = backend in ("LokyBackend", "SequentialBackend")
     if not is_local and num_workers is not None:
-        who = "a cluster" if backend.startswith("Dask") else f"joblib's {backend}"
         raise ValueError(
-            f"{who} has its own number of workers; got {num_workers}: leave out num_workers, on "
-            "the command line --workers"
+            f"joblib's {backend} has its own number of workers; got {num_workers}: leave out "
+            "num_workers, on the command line --workers"
         )
     num_workers = num_workers or joblib.cpu_count()
-    if is_local and (num_workers == 1 or len(batches) <= 1):
-        yield from map(call, batches)
-        return
-    local = {"initializer": end_with_parent, "initargs": (os.getpid(),)}
+    pending = list(items)
+    batches = [pending[i : i + batch_size] for i in range(0, len(pending), batch_size)]
+    call = partial(_call_batch, function, make, _versions())
+    is_alone = is_local and (num_workers == 1 or len(batches) <= 1)
+    local: dict[str, Any] = {"initializer": end_with_parent, "initargs": (os.getpid(),)}
     with (
+        shown(progress, lambda stages: partial(stages, stage)) as report,
         joblib.parallel_config("loky", n_jobs=num_workers, inner_max_num_threads=1, **local)
-        if is_local
-        else nullcontext()
+        if is_local and not is_alone
+        else nullcontext(),
     ):
-        results = joblib.Parallel(return_as="generator_unordered", batch_size=1)(
-            joblib.delayed(call)(batch) for batch in batches
-        )
+        report = report or (lambda done, wanted: None)
+        num_wanted = num_done + len(pending)
+        report(num_done, num_wanted)
+        results: Generator[list[_Result], None, None]
+        if is_alone:
+            results = (call(batch) for batch in batches)
+        else:
+            results = joblib.Parallel(return_as="generator_unordered", batch_size=1)(
+                joblib.delayed(call)(batch) for batch in batches
+            )
         try:
-            for result in results:  # noqa: UP028 (`yield from` would hand Ctrl-C to joblib)
-                yield result
+            for batch in results:
+                yield from batch
+                num_done += len(batch)
+                report(num_done, num_wanted)
         except BaseException as error:
-            is_killed = isinstance(error, BrokenProcessPool) or type(error).__name__ == _DASKS
-            if is_local and not is_killed:
+            is_killed = isinstance(error, BrokenProcessPool)
+            is_killed |= type(error).__name__ == _DASK_WORKER_KILLED
+            if is_local and not is_alone and not is_killed:
                 # With other arguments than joblib's it would replace the executor, and wait for a
                 # thread that waits for its lock.
                 get_reusable_executor(reuse=True).shutdown(wait=False, kill_workers=True)
@@ -133,21 +148,24 @@ def _map_batches(
             raise
 
 
-def _called(
-    versions: dict[str, str], function: Callable[[_Item], _Result], batch: list[_Item]
+def _call_batch(
+    function: Callable[..., _Result],
+    make: MadeOnce[Any] | None,
+    versions: dict[str, str],
+    batch: list[Any],
 ) -> list[_Result]:
+    """Calls the function of a batch's items, in a worker."""
     from threadpoolctl import threadpool_limits
 
-    here = _versions()
-    for name, expected in versions.items():
-        if here.get(name) != expected:
-            raise ValueError(
-                f"the worker at {socket.gethostname()} has {name} {here.get(name)}, expected "
-                f"{expected}, as here: install the same there"
-            )
-    # Threads of one worker would share its loops.
-    with _TURN, threadpool_limits(1):
-        return [function(item) for item in batch]
+    if (own := _versions()) != versions:
+        raise ValueError(
+            f"the worker at {socket.gethostname()} has {own}, expected {versions}, as here: "
+            "install the same there"
+        )
+    # Threads of one worker would share its diagram.
+    with _lock, threadpool_limits(1):
+        diagram = [] if make is None else [make()]
+        return [function(*diagram, item) for item in batch]
 
 
 @cache
@@ -173,38 +191,11 @@ def end_with_parent(parent: int) -> None:
     threading.Thread(target=watch, name="end_with_parent", daemon=True).start()
 
 
-class MadeOnce(Generic[_Made]):
-    """A diagram that each process makes once, when it is first called.
-
-    It is sent to workers with all that ``make`` uses. pydrake never frees a system in Python: a
-    loop made for every call would cost 2.4 MB each. Only the last one is kept.
-
-    Args:
-        key: Tells diagrams apart.
-    """
-
-    _made: ClassVar[dict[Hashable, Any]] = {}
-
-    def __init__(self, key: Hashable, make: Callable[[], _Made]) -> None:
-        self._key, self.make = key, make
-
-    def __call__(self) -> _Made:
-        """The diagram."""
-        if self._key not in self._made:
-            self._made.clear()
-            self._made[self._key] = self.make()
-        return self._made[self._key]
-
-    def run(self, function: Callable[..., _Result], *arguments: Any, **options: Any) -> _Result:
-        """Calls a function of the diagram and of more arguments."""
-        return function(self(), *arguments, **options)
-
-
-class Sent:
+class CloudPickled:
     """A user's function, which reaches workers from a notebook or a script too.
 
-    It is sent with all that it uses, as joblib sends such functions, for whose pickling Drake lacks
-    two things: a module of its bound functions, such as StabilizingLQRController, and one of the
+    It is pickled with all that it uses, as joblib pickles such functions. For that Drake lacks two
+    things: a module of its bound functions, such as StabilizingLQRController, and one of the
     metaclass of its systems.
     """
 
