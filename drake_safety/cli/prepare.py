@@ -15,6 +15,7 @@ from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.robot_figure import robot_figure
 from drake_safety.extras import MissingExtraError
 from drake_safety.importing.policy_template import survey_policy
+from drake_safety.importing.robot_check import check_urdf
 from drake_safety.importing.robot_template import write_robot
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -152,7 +153,12 @@ def check(
     num_episodes = 0 if quick else episodes
     with console.open_stages() as stages:
         for finding in check_scenario(
-            scenario, num_episodes=num_episodes, seed=seed, is_imported=import_, progress=stages
+            scenario,
+            num_episodes=num_episodes,
+            seed=seed,
+            is_imported=import_,
+            check_robot=check_urdf,
+            progress=stages,
         ):
             num_problems += not finding.is_ok
             word = ("problem", "red")

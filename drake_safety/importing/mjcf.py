@@ -17,7 +17,8 @@ from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.extras import require_extra
-from drake_safety.importing.urdf_copy import DRAKE, as_number, as_text
+from drake_safety.importing.urdf_copy import as_text
+from drake_safety.robots.urdf import DRAKE, as_number
 
 _SIZES = ("count", "nrow", "ncol", "width", "height")
 _MOST_CELLS, _MOST_COPIES = 1e8, 1e4  # Of a height field or a picture, and of all replicates.

@@ -19,24 +19,27 @@ from drake_safety.importing.mjcf import ModelFacts, is_mjcf, mjcf_to_urdf
 from drake_safety.importing.scenario_template import TASKS, Sizes, scenario_yaml
 from drake_safety.importing.simulatable_urdf import simulatable_copy
 from drake_safety.importing.standing_posture import standing_posture
-from drake_safety.importing.urdf_copy import UrdfCopy, joint_elements
+from drake_safety.importing.urdf_copy import UrdfCopy
 from drake_safety.importing.urdf_survey import (
     WITHOUT_STOPS_RAD,
     Limb,
     Survey,
-    effort_unit,
-    extent,
-    listed,
     mirrored,
-    odd_inertias,
-    odd_limits,
     require_masses,
     require_motors,
     require_shapes,
     upright_base,
 )
 from drake_safety.robots.meshes import above
+from drake_safety.robots.plausibility import (
+    effort_unit,
+    extent,
+    listed,
+    odd_inertias,
+    odd_limits,
+)
 from drake_safety.robots.robot_model import as_pattern, load_robot_file
+from drake_safety.robots.urdf import joint_elements
 
 # Servo gains in proportion to mass times height, from `BALANCING_REFERENCE`.
 _STIFFNESS = 28.0  # [1/s² · N·m/(rad kg m)]

@@ -19,16 +19,7 @@ import numpy as np
 
 from drake_safety.extras import MissingExtraError
 from drake_safety.files.reading import is_number
-from drake_safety.importing.urdf_copy import (
-    FIXED_MIMIC,
-    UrdfCopy,
-    as_number,
-    joint_elements,
-    number,
-    pose_of,
-    read_urdf,
-    remove,
-)
+from drake_safety.importing.urdf_copy import UrdfCopy, pose_of
 from drake_safety.robots.meshes import (
     SHOWN_FORMATS,
     check_meshes,
@@ -37,12 +28,22 @@ from drake_safety.robots.meshes import (
     shown_mesh,
 )
 from drake_safety.robots.model_files import model_file
+from drake_safety.robots.urdf import (
+    as_number,
+    empty_shapes,
+    joint_elements,
+    number,
+    read_urdf,
+    remove,
+    remove_fixed_mimics,
+    replace_visual_meshes,
+    shape_meshes,
+)
 
 if TYPE_CHECKING:
     import trimesh
 
-_IGNORED = (  # By Drake, with a warning, or rejected: places and tags.
-    FIXED_MIMIC,
+_IGNORED = (  # By Drake, with a warning: places and tags.
     (".", "gazebo"),
     ("joint", "calibration"),
     ("joint", "safety_controller"),
@@ -64,11 +65,13 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     Of meshes that Drake does not read, visual ones are converted to glTF and collision ones become
     convex hulls, see :mod:`~drake_safety.robots.meshes`; what cannot be read is left out.
     """
-    copy = read_urdf(path)
+    copy = UrdfCopy(source=path, root=read_urdf(path))
+    remove_fixed_mimics(copy.root)
     for place, tag in _IGNORED:
-        copy.remove(place, tag)
+        for element in copy.root.findall(place):
+            remove(element, tag)
     copy.drop_world()
-    for link, shape, words in copy.empty_shapes():
+    for link, shape, words in empty_shapes(copy.root):
         link.remove(shape)
         copy.warn(f"{words}: it is left out")
     turned = [
@@ -230,8 +233,10 @@ def _gather_meshes(copy: UrdfCopy) -> None:
         done.setdefault(what, []).append(file.name)
         return "hull"
 
-    copy.replace_visual_meshes(lambda url, rgba: converted("visual", url, partial(shown, rgba)))
-    for link, shape, mesh in copy.shape_meshes("collision"):
+    replace_visual_meshes(
+        copy.root, lambda url, rgba: converted("visual", url, partial(shown, rgba))
+    )
+    for link, shape, mesh in shape_meshes(copy.root, "collision"):
         name, url = link.get("name", ""), mesh.get("filename", "")
         copy.mesh_urls.setdefault(name, []).append(url)
         found = converted("collision", url, partial(touched, name, shape, mesh))

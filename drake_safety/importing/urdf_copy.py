@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import glob
-import math
 import re
 import shutil
 import xml.etree.ElementTree as ET
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,22 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from drake_safety.files.reading import is_number
-from drake_safety.robots.meshes import is_shown, shown_mesh
-from drake_safety.robots.model_files import model_file
+from drake_safety.robots.urdf import DRAKE, as_number, joint_elements, number, remove
 
 if TYPE_CHECKING:
     import trimesh
 
-DRAKE = "http://drake.mit.edu"
-"""Namespace of Drake's elements."""
-FIXED_MIMIC = "joint[@type='fixed']", "mimic"
-"""Place and tag of what Drake rejects."""
 _MOVABLE = ("revolute", "continuous", "prismatic", "screw")
-_PREFIX = re.compile(rb"""(xmlns:drake\s*=\s*)["'][^"']*["']""")
-ET.register_namespace("drake", DRAKE)
-_VECTORS = {"xyz", "rpy", "size", "scale", "radius", "length"}
-_SIZES = ("size", "radius", "length", "scale")  # Attributes of shapes.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +85,7 @@ class UrdfCopy:
 
     source: Path
     root: ET.Element
-    drives: JointDrives
+    drives: JointDrives = field(init=False)
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
@@ -107,21 +96,12 @@ class UrdfCopy:
     hulls: dict[str, list[trimesh.Trimesh]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._as_read = self.text()
-
-    def text(self) -> str:
-        """Returns the edited URDF."""
-        return ET.tostring(self.root, encoding="unicode")
+        self.drives = read_drives(self.root)
 
     def warn(self, note: str) -> None:
         """Adds a note that the user should see at once."""
         self.notes.append(note)
         self.warnings.append(note)
-
-    @property
-    def is_changed(self) -> bool:
-        """Whether it differs from the file."""
-        return self.text() != self._as_read
 
     def link(self, name: str) -> ET.Element:
         """Returns a link's element."""
@@ -132,22 +112,6 @@ class UrdfCopy:
         """Links whose collision meshes were removed and that have no other shape."""
         links = (link for link in self.root.findall("link") if link.find("collision") is None)
         return [name for link in links if (name := link.get("name", "")) in self.lost_links]
-
-    def empty_shapes(self) -> list[tuple[ET.Element, ET.Element, str]]:
-        """Returns shapes without extent: link, shape, and both in words."""
-        found = []
-        for link in self.root.findall("link"):
-            for shape in (*link.findall("visual"), *link.findall("collision")):
-                for part in shape.findall("geometry/*"):
-                    stated = {key: part.get(key, "") for key in _SIZES if key in part.attrib}
-                    sizes = [*map(as_number, " ".join(stated.values()).split())]
-                    # Meshes may be mirrored by a negative scale.
-                    if 0.0 in sizes or ("scale" not in stated and any(x < 0 for x in sizes)):
-                        words = f"the {shape.tag} of link '{link.get('name')}' is a "
-                        words += f"{part.tag.rpartition('}')[2]} of "
-                        words += ", ".join(f"{key} {text}" for key, text in stated.items())
-                        found.append((link, shape, words))
-        return found
 
     def drop_world(self) -> None:
         """Removes a root link 'world', and root links under which the robot floats."""
@@ -174,51 +138,6 @@ class UrdfCopy:
         ET.SubElement(joint, "child", link=below)
         _set_pose(joint, pose.inverse())
         return name
-
-    def remove(self, place: str, tag: str) -> None:
-        """Removes the children with a tag of all elements at a path from the root."""
-        for element in self.root.findall(place):
-            remove(element, tag)
-
-    def shape_meshes(self, kind: str) -> list[tuple[ET.Element, ET.Element, ET.Element]]:
-        """Returns the meshes of ``visual`` or ``collision`` shapes: link, shape, mesh."""
-        return [
-            (link, shape, mesh)
-            for link in self.root.findall("link")
-            for shape in link.findall(kind)
-            for mesh in shape.findall("geometry/mesh")
-        ]
-
-    def replace_visual_meshes(self, shown: Callable[[str, str], str]) -> None:
-        """Replaces visual meshes by ``shown(url, rgba)``, or removes them where that is "".
-
-        The material of a converted mesh is removed: the mesh has its own, and Drake warns of two.
-        """
-        shared = {one.get("name"): _colour(one) for one in self.root.findall("material")}
-        for link, visual, mesh in self.shape_meshes("visual"):
-            material, url = visual.find("material"), mesh.get("filename", "")
-            name = None if material is None else material.get("name")
-            mesh.set("filename", shown(url, _colour(material) or shared.get(name, "")))
-            if not mesh.get("filename"):
-                link.remove(visual)
-            elif Path(mesh.get("filename", "")).suffix != Path(url).suffix:
-                remove(visual, "material")
-
-    def convert_visual_meshes(self) -> None:
-        """Replaces visual meshes that Drake does not render by glTF files in the user's cache."""
-
-        def shown(url: str, rgba: str) -> str:
-            path = model_file(url, str(self.source.parent))
-            return url if is_shown(path) else shown_mesh(path, rgba).resolve().as_uri()
-
-        self.replace_visual_meshes(shown)
-
-    def anchor_meshes(self) -> None:
-        """Makes relative mesh paths absolute, as URDF text has no folder."""
-        for mesh in self.root.iter("mesh"):
-            url = mesh.get("filename", "")
-            if "://" not in url:
-                mesh.set("filename", (self.source.parent / url).resolve().as_uri())
 
     def fix_joints(self, poses: Mapping[str, RigidTransform | None]) -> None:
         """Fixes joints at zero, or at the pose of the child in the parent."""
@@ -300,65 +219,6 @@ class UrdfCopy:
                     shutil.copyfile(file, (path.parent / name).with_suffix(file.suffix))
 
 
-def read_urdf(path: Path) -> UrdfCopy:
-    """Reads a URDF as an editable copy."""
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"URDF '{path}' does not exist")
-    content = path.read_bytes()
-    try:
-        # Drake knows its elements by their prefix, whatever address the file gives.
-        root = ET.fromstring(_PREFIX.sub(rf'\1"{DRAKE}"'.encode(), content))
-    except ET.ParseError as error:
-        raise ValueError(f"'{path}' is not XML: {error}") from error
-    if root.tag != "robot":
-        raise ValueError(
-            f"'{path}' is not a URDF: its root element is <{root.tag}>, expected <robot>. Convert "
-            "it first, or write robot.yaml by hand: Drake also reads SDFormat and MJCF"
-        )
-    # It may be in a comment, too.
-    if b"<xacro:" in content and any("xacro" in element.tag for element in root.iter()):
-        raise ValueError(f"'{path}' is not expanded yet: run `xacro {path.name} > robot.urdf`")
-    if not root.findall("link"):
-        raise ValueError(f"'{path}' has no links")
-    for fault in _faults(root):
-        raise ValueError(f"'{path}': {fault}")
-    return UrdfCopy(source=path, root=root, drives=read_drives(root))
-
-
-def _faults(root: ET.Element) -> Iterator[str]:
-    """What Drake reads as something else, or refuses without the name of its link or joint."""
-    links, joints = root.findall("link"), joint_elements(root)
-    for link in links:
-        mass = number(element := link.find("inertial/mass"), "value")
-        if element is not None and not 0.0 <= mass < math.inf:
-            what = f"link '{link.get('name')}' has a mass of {mass:g} kg"
-            yield f"{what}, expected a finite number that is not negative"
-    parents: dict[str | None, list[str | None]] = {}
-    for joint in joints:
-        for child in joint.findall("child"):
-            parents.setdefault(child.get("link"), []).append(joint.get("name"))
-    for name, several in parents.items():
-        if len(several) > 1:
-            what = f"link '{name}' is the child of joints {several}"
-            yield f"{what}; expected one, as a URDF is a tree: remove the others"
-    for owner in (*links, *joints):
-        for part in owner.iter():
-            for key, text in part.attrib.items():
-                if key in _VECTORS and not all(map(is_number, text.split())):
-                    what = f"{owner.tag} '{owner.get('name')}' has {key}=\"{text}\""
-                    yield f"{what} in <{part.tag}>; expected numbers"
-    for joint in joints:
-        kind, limit = joint.get("type"), joint.find("limit")
-        wrong = [key for key in ("effort", "velocity") if number(limit, key) < 0]
-        if number(limit, "lower") > number(limit, "upper") and kind in ("revolute", "prismatic"):
-            wrong = ["lower", "upper"]
-        if limit is not None and wrong and kind != "fixed":
-            stated = " ".join(f'{key}="{limit.get(key)}"' for key in wrong)
-            what = f"joint '{joint.get('name')}' has {stated}"
-            yield f"{what}; expected lower below upper, and positive limits of effort and velocity"
-
-
 def pose_of(element: ET.Element) -> RigidTransform:
     """Returns the pose of an element's <origin>."""
     origin = element.find("origin")
@@ -385,22 +245,6 @@ def _hull_file(link: str, index: int) -> str:
     plain = re.sub(r"[^\w.-]", "_", link)
     mark = "" if plain == link else f"_{zlib.crc32(link.encode()):08x}"
     return f"meshes/{plain}{mark}_hull_{index}.obj"
-
-
-def remove(element: ET.Element, tag: str) -> None:
-    """Removes all children of an element with a tag."""
-    for part in element.findall(tag):
-        element.remove(part)
-
-
-def _colour(material: ET.Element | None) -> str:
-    colour = None if material is None else material.find("color")
-    return "" if colour is None else colour.get("rgba", "")
-
-
-def joint_elements(root: ET.Element) -> list[ET.Element]:
-    """Returns the joints of a URDF, with those that only Drake knows."""
-    return [one for one in root if one.tag in ("joint", f"{{{DRAKE}}}joint")]
 
 
 def read_drives(root: ET.Element) -> JointDrives:
@@ -444,16 +288,3 @@ def _stiffness(element: ET.Element) -> float:
     parts = ({**part.attrib, part.tag: part.text} for part in element.iter())
     stated = (text for one in parts for key, text in one.items() if "stiffness" in key.lower())
     return max((as_number(text, 0.0) for text in stated), default=0.0)
-
-
-def number(element: ET.Element | None, key: str) -> float:
-    """Returns an attribute as a number; NaN if it is missing or not a number."""
-    return as_number(None if element is None else element.get(key))
-
-
-def as_number(text: str | None, default: float = math.nan) -> float:
-    """Returns a text as a number; the default if it is missing or not a number."""
-    try:
-        return float(text or default)
-    except ValueError:
-        return default

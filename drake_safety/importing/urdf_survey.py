@@ -14,16 +14,14 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import (
     Joint,
-    ModelInstanceIndex,
-    PrismaticJoint,
     RevoluteJoint,
     ScrewJoint,
 )
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety.importing.urdf_copy import JointDrives, UrdfCopy
 from drake_safety.robots.model_files import package_parser
-from drake_safety.robots.robot_size import GRAVITY_M_S2
+from drake_safety.robots.plausibility import extent, listed
 
 WITHOUT_STOPS_RAD = 4 * math.pi
 """Range of a joint from which it may turn a wheel."""
@@ -31,11 +29,6 @@ _CORNER_RADIUS_M = 0.005  # Radius of spheres at the corners of a flat foot.
 _GUESSED_RADIUS_M = 0.02
 _STOP_RAD = 0.05  # Distance from a stop of a joint that cannot be at zero.
 _ROUND = 0.15  # Of a wheel's radius, by which it may be out of round.
-_MATTERS = 1e-4  # Moment of inertia that matters, by the robot's mass times extent squared.
-_POINT = 0.005  # Least radius of gyration, by the robot's extent.
-_MOST_TORQUE, _MOST_FORCE = 1.5, 8.0  # Of motors, by weight times extent (known: 0.4); by weight.
-_MOST_SPEED = 25.0  # Of joints, by √(g / extent); known robots have 5 to 20.
-_AIR_KG_M3, _LEAD_KG_M3 = 1.2, 11_300.0  # Density of the cube that is as large as the robot.
 _FLAT_M = 1e-3  # Height over a sole's lowest part within which other parts touch as well.
 _LEVEL_M = 0.005  # Height over the lowest sphere within which others count as contacts.
 _LEAST_INERTIA = 1e-10  # Of what a joint moves [kg·m², kg].
@@ -380,85 +373,6 @@ class Survey:
         return found
 
 
-def extent(plant: MultibodyPlant, context: Context, instance: ModelInstanceIndex) -> float:
-    """Returns the diagonal of the box around the origins of a model's bodies [m]."""
-    bodies = map(plant.get_body, plant.GetBodyIndices(instance))
-    origins = [body.EvalPoseInWorld(context).translation() for body in bodies]
-    return float(np.linalg.norm(np.ptp(origins, axis=0)))
-
-
-def odd_inertias(plant: MultibodyPlant, context: Context, instance: ModelInstanceIndex) -> str:
-    """Names links with masses that no body of a robot of this size has; "" if there is none.
-
-    The radius of gyration √(I/m) or the distance of the centre of mass is beyond the robot's
-    extent, a heavy link's radius is below 1/200 of it, or the robot is lighter than air or heavier
-    than lead.
-    """
-    size, total = extent(plant, context, instance), plant.CalcTotalMass(context, [instance])
-    found, told = [], []
-    for body in map(plant.get_body, plant.GetBodyIndices(instance)):
-        M_BBo = body.default_spatial_inertia()
-        mass, away = M_BBo.get_mass(), float(np.linalg.norm(M_BBo.get_com()))
-        if not mass > 0:
-            continue
-        G_BBcm = M_BBo.get_unit_inertia().ShiftToCenterOfMass(M_BBo.get_com())
-        radius = math.sqrt(max(*G_BBcm.CalcPrincipalMomentsOfInertia(), 0.0))
-        is_large = radius > size and mass * radius**2 > _MATTERS * total * size**2
-        if is_large or (radius < _POINT * size and mass > 0.01 * total):
-            found.append(
-                f"'{body.name()}' {mass * radius**2:.3g} kg·m² at {mass:.3g} kg, a radius of "
-                f"gyration of {radius:.2g} m"
-            )
-        if away > 2 * size:
-            told.append(f"the centre of mass of link '{body.name()}' is {away:.3g} m from it")
-    if found:
-        told.insert(
-            0,
-            f"{len(found)} links have inertias that no body of a robot of {size:.2g} m has (kg·mm² "
-            f"or g·mm² instead of kg·m²?): {'; '.join(found[:4])}{' ...' * (len(found) > 4)}",
-        )
-    if not _AIR_KG_M3 < total / size**3 < _LEAD_KG_M3:
-        told.append(f"no robot of {size:.2g} m has {total:.3g} kg (grams or tonnes?)")
-    return "; ".join(told)
-
-
-def effort_unit(joint: Joint) -> str:
-    """Returns the unit of a joint's effort."""
-    return "N" if isinstance(joint, PrismaticJoint) else "N·m"
-
-
-def odd_limits(
-    plant: MultibodyPlant,
-    context: Context,
-    instance: ModelInstanceIndex,
-    efforts: Mapping[str, float],
-) -> tuple[set[str], str]:
-    """Returns joints with efforts that no motor of a robot of this size has, and words; "" if none.
-
-    A torque is beyond 1.5 times weight times extent, a force beyond 8 times the weight. Words also
-    name speeds beyond 25 √(g / extent) of hinges and 25 √(g · extent) of sliders.
-    """
-    size, mass = extent(plant, context, instance), plant.CalcTotalMass(context, [instance])
-    found, told = set[str](), dict[str, str]()
-    for joint in map(plant.get_joint, plant.GetJointIndices(instance)):
-        if joint.num_velocities() != 1:
-            continue
-        name, unit = joint.name(), effort_unit(joint)
-        most, fastest = _MOST_TORQUE * size, _MOST_SPEED * math.sqrt(GRAVITY_M_S2 / size)
-        if unit == "N":
-            most, fastest = _MOST_FORCE, fastest * size
-        for value, limit, of in (
-            (efforts.get(name, math.inf), most * GRAVITY_M_S2 * mass, unit),
-            (joint.velocity_upper_limits()[0], fastest, "m/s" if unit == "N" else "rad/s"),
-        ):
-            if limit < value < math.inf:
-                told.setdefault(name, f"{value:g} {of}, at most {limit:.3g} expected")
-                found |= {name} if of == unit else set()
-    few = listed(dict([*told.items()][:4])) + " ..." * (len(told) > 4)
-    what = f"limits that no motor of a robot of {mass:.3g} kg and {size:.2g} m has (placeholders?)"
-    return found, f"{len(told)} joints have {what}: {few}" if told else ""
-
-
 def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]:
     """Spheres that replace a box: at its lower corners, or one below a small box."""
     down = X_WG.rotation().matrix().T @ [0.0, 0.0, -1.0]
@@ -532,11 +446,6 @@ def require_motors(survey: Survey, legs: list[Limb], moved: Collection[str]) -> 
                 f"new: '{survey.source}': a robot that stands by servos needs a motor on every "
                 f"joint of its legs, but some {what}: {listed(found)}. Remedy: {remedy}"
             )
-
-
-def listed(reasons: Mapping[str, str]) -> str:
-    """Returns names with their reasons in a sentence."""
-    return ", ".join(f"'{name}' ({why})" for name, why in reasons.items())
 
 
 def require_masses(survey: Survey) -> None:

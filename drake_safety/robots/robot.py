@@ -34,11 +34,11 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import Context
 
 from drake_safety.files.schema import NotNegative, Positive, Triple, schema
-from drake_safety.importing.urdf_copy import FIXED_MIMIC, read_urdf
 from drake_safety.robots.meshes import check_meshes
 from drake_safety.robots.model_files import model_file, package_parser
 from drake_safety.robots.robot_model import CollisionShape, RobotModel, by_pattern
 from drake_safety.robots.shift import JointShift, Shift
+from drake_safety.robots.urdf import drake_urdf, empty_shapes, read_urdf
 
 _T = TypeVar("_T")
 
@@ -144,29 +144,28 @@ def _add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceI
     """Adds a robot's bodies, joints and shapes; without a scene graph, geometry is left out."""
     parser = package_parser(plant, robot.urdf)
     path = model_file(robot.urdf, robot.source_dir, robot.requires)
-    urdf = None
+    text = None
     if path.is_file():
         check_meshes(path)
     if path.suffix == ".urdf":
-        urdf = read_urdf(path)
-        urdf.remove(*FIXED_MIMIC)
-        if robot.collision == "stated":
-            urdf.remove("link", "collision")
-        if plant.geometry_source_is_registered():
-            urdf.convert_visual_meshes()
+        text = drake_urdf(
+            path,
+            with_collisions=robot.collision != "stated",
+            with_visuals=plant.geometry_source_is_registered(),
+        )
     try:
         with _quiet_about(robot):
-            if urdf is not None and urdf.is_changed:
-                urdf.anchor_meshes()
-                (instance,) = parser.AddModelsFromString(urdf.text(), "urdf")
+            if text is not None:
+                (instance,) = parser.AddModelsFromString(text, "urdf")
             elif robot.urdf.startswith("package://"):
                 (instance,) = parser.AddModels(url=robot.urdf)
             else:
                 (instance,) = parser.AddModels(str(path))
     except SystemExit as error:  # pydrake raises it where a condition of Drake's C++ fails.
-        shapes = [] if urdf is None else [words for _, _, words in urdf.empty_shapes()]
-        what = [f"Drake cannot build '{path}'", *shapes, str(error)]
-        raise ValueError("; ".join(what)) from error
+        is_urdf = path.suffix == ".urdf"
+        shapes = [words for _, _, words in empty_shapes(read_urdf(path))] if is_urdf else []
+        what = "; ".join([f"Drake cannot build '{path}'", *shapes, str(error)])
+        raise ValueError(what) from error
     plant.RenameModelInstance(instance, robot.name)
     return instance
 

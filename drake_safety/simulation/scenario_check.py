@@ -19,21 +19,12 @@ from pydrake.systems.framework import Context
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
 from drake_safety.files.progress import StageProgress, ignore
-from drake_safety.importing.urdf_copy import read_urdf
-from drake_safety.importing.urdf_survey import (
-    WITHOUT_STOPS_RAD,
-    Limb,
-    Survey,
-    effort_unit,
-    odd_inertias,
-    odd_limits,
-)
 from drake_safety.learning.causes import describe_margin, is_outside
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.models import load_robot, robot_files
 from drake_safety.policies.policy_network import network_kinds
-from drake_safety.robots.model_files import model_file
-from drake_safety.robots.robot_model import RobotModel, by_pattern
+from drake_safety.robots.plausibility import effort_unit, odd_inertias, odd_limits
+from drake_safety.robots.robot_model import RobotModel
 from drake_safety.simulation.capabilities import FollowsCommands, HasBall
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed
@@ -75,6 +66,7 @@ def check_scenario(
     num_episodes: int = 16,
     seed: int = 0,
     is_imported: bool = True,
+    check_robot: Callable[[RobotKinematics], Iterator[Finding]] | None = None,
     progress: StageProgress = ignore,
 ) -> Iterator[Finding]:
     """Checks a scenario item by item, the cheap ones first.
@@ -86,6 +78,7 @@ def check_scenario(
         num_episodes: Number of episodes simulated to estimate the share of unsafe ones.
         is_imported: Whether the scenario's task is imported, which runs its code. If not, only the
             files are checked.
+        check_robot: Further checks of the robot.
     """
     scenario = yield from _guarded("scenario", _scenario, name, is_imported)
     if scenario is None:
@@ -99,8 +92,9 @@ def check_scenario(
             return
         yield from _guarded("standing posture", _posture, kinematics)
         yield from _guarded("motors", _motors, kinematics)
-        yield from _guarded("model file", _model_file, kinematics)
-        yield from _guarded("collision shapes", _collisions, robot)
+        yield from _guarded("inertias", _inertias, kinematics)
+        if check_robot is not None:
+            yield from _guarded("model file", check_robot, kinematics)
     if not is_imported:
         return
     with suppress(ValueError):  # Which building the diagram finds, too.
@@ -296,56 +290,14 @@ def _motors(kinematics: RobotKinematics) -> _Check:
     )
 
 
-def _model_file(kinematics: RobotKinematics) -> _Check:
-    """Checks couplings, wheels and inertias; nothing is said of what is in order."""
-    robot, plant = kinematics.robot, kinematics.plant
-    path = model_file(robot.urdf, robot.source_dir, robot.requires)
-    mimics = read_urdf(path).drives.mimics if path.suffix == ".urdf" else {}
-    if coupled := [one for foot in robot.feet.values() for one in foot.joints if one in mimics]:
-        yield failed(
-            "joints of legs",
-            f"{coupled} follow others by <mimic>, but servos move every joint by itself",
-            f"remove <mimic> from {path.name} if each has a motor of its own",
-        )
-    free = np.ptp(kinematics.position_limits, axis=1) > WITHOUT_STOPS_RAD
-    endless = {name for name, is_free in zip(kinematics.joint_names, free, strict=True) if is_free}
-    legs = [Limb(body=foot.body, joints=foot.joints) for foot in robot.feet.values()]
-    legs = [limb for limb in legs if limb.joints and limb.joints[-1] in endless]
-    with suppress(ValueError):  # Meshes that Drake does not read, which `add_robot` replaces.
-        if wheels := Survey(path).wheels(legs) if legs else []:
-            yield passed(
-                "wheels",
-                f"joints {wheels} turn wheels, and position servos hold them",
-                "judge by this scenario only a robot whose wheels are braked",
-            )
+def _inertias(kinematics: RobotKinematics) -> _Check:
+    """Checks masses and inertias; nothing is said of what is in order."""
+    plant, name = kinematics.plant, Path(kinematics.robot.urdf).name
     kinematics.set_positions(kinematics.standing_positions())
-    instance = plant.GetModelInstanceByName(robot.name)
+    instance = plant.GetModelInstanceByName(kinematics.robot.name)
     if odd := odd_inertias(plant, kinematics.context, instance):
         remedy = "correct <inertia>, <mass> and <origin> of these links [kg·m², kg, m] in"
-        yield passed("inertias", odd, f"{remedy} {path.name}")
-
-
-def _collisions(robot: RobotModel) -> _Check:
-    """Checks whether links that lost their collision meshes have got a shape since."""
-    if not robot.without_collision:
-        return
-    root = read_urdf(Path(robot.source_dir) / robot.urdf).root
-    shaped = {link.get("name") for link in root.iter("link") if link.find("collision") is not None}
-    bare = [
-        name
-        for name in robot.without_collision
-        if name not in shaped and by_pattern(robot.shapes, name, "shapes", robot.name) is None
-    ]
-    if not bare:
-        yield passed("collision shapes", "every link that lost its meshes has a shape")
-        return
-    yield passed(
-        "collision shapes",
-        f"{len(bare)} links have none, as their meshes were left out; everything passes through "
-        f"{', '.join(bare)}",
-        f"add a <collision> with a box, sphere or capsule [m] to those that touch something, in "
-        f"{Path(robot.urdf).name}, or delete them from 'without_collision' in robot.yaml",
-    )
+        yield passed("inertias", odd, f"{remedy} {name}")
 
 
 def _target(loop: LeggedLoop) -> _Check:
