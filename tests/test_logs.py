@@ -90,7 +90,7 @@ SPOILT = {
     "metres as millimetres": (lambda f: f.assign(base_z=f.base_z / 1e3), [],
                               "below the ground.*'base_position.unit' is m$"),
     "milliseconds": (lambda f: f.assign(stamp=f.stamp / 1e6), [("unit: ns", "unit: s")],
-                     r"2.5 apart, .* one of \['ms'\]"),
+                     r"2.5 apart, which as s is implausible: check 'time.unit'"),
     "goal in millimetres": (lambda f: f.assign(goal_z=1e3 * f.goal_z), [],
                             "desired output is .* m from the base"),
     "a joint beyond its stop": (

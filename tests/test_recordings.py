@@ -36,13 +36,6 @@ def assert_reads(found, log=PLAIN, atol=1e-8):
         np.testing.assert_allclose(one_s, log_s, atol=atol, err_msg=name)
 
 
-def with_units(text):
-    units = dict.fromkeys(BASE, "[mm]") | {"gyro_x": "(deg/s)"}
-    for name, unit in units.items():
-        text = text.replace(f"{name},", f"{name} {unit},", 1)
-    return text
-
-
 def after_line(number, *lines):
     def change(text):
         whole = text.splitlines()
@@ -59,8 +52,6 @@ TABLES = {
     "UTF-16": lambda text: ("\ufeff" + text).encode("utf-16-le"),
     "a comment sign before the header": lambda text: "# " + text,
     "a preamble": lambda text: "Recorder;1.2\nDate;14.11.2023\n" + text,
-    "units in the header": with_units,
-    "a row of units": after_line(1, ",".join(["ns"] + ["mm"] * (WIDTH - 1))),
     "an empty row": after_line(20, "," * (WIDTH - 1)),
 }
 
@@ -85,7 +76,6 @@ def dated(shown):
 DATES = {
     "ISO": dated(lambda t: t.isoformat()),
     "a zone": dated(lambda t: t.strftime("%Y-%m-%dT%H:%M:%S.%f+05:30")),
-    "the time of day": dated(lambda t: t.strftime("%H:%M:%S.%f")),
     "microseconds": lambda stamps: stamps / 1e3,
 }
 
@@ -264,22 +254,19 @@ def test_joints_are_gathered_from_messages_that_name_some_of_them(kind, tmp_path
     assert_reads(found, part(PLAIN, 1, 59) if atol > 1e-3 else PLAIN, atol)
 
 
-@pytest.mark.parametrize("kind", ["mcap", "ros2", "a file of it", "csv", "zeros at end"])
+@pytest.mark.parametrize("kind", ["mcap", "a file of it", "csv", "zeros at end"])
 def test_the_whole_part_of_a_recording_that_was_cut_off_is_read(kind, tmp_path):
     format = {"a file of it": "mcap", "zeros at end": "csv"}.get(kind, kind)
     log = recorded(0)
     path = write(log, tmp_path, format, chunk_size=40_000)
-    inner = path if path.is_file() else next(path.glob("*.db3"))
+    inner = path
     if kind == "a file of it":
         path = tmp_path / "bag"
         path.mkdir()
         inner = inner.rename(path / "bag_0.mcap")
-    elif path.is_dir():
-        (path / "metadata.yaml").unlink()
     found = read(path)
     assert_reads(found, log)
-    # Without its metadata, a whole SQLite file is not told from one that ends between two rows.
-    assert found.cuts == [] or (kind == "ros2" and "100% of its bytes" in found.cuts[0])
+    assert found.cuts == []
     whole = inner.read_bytes()
     end = len(whole) * 2 // 3 if format != "csv" else len(whole.rsplit(b",", 30)[0])
     inner.write_bytes(whole[:end] + (b"\0" * 5000 if kind == "zeros at end" else b""))
@@ -340,8 +327,8 @@ def test_topics_of_other_encodings_are_refused_only_if_mapped(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "end", "message"),
     [
-        ("mcap", 500, "'mcap recover' may mend it"),
-        ("ros1", -500, "'rosbag reindex' mends it"),
+        ("mcap", 500, "'mcap recover' may repair it"),
+        ("ros1", -500, "'rosbag reindex' repairs it"),
         ("parquet", -500, "damaged, cut off, or not a Parquet file"),
     ],
 )

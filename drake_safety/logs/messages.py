@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-import sqlite3
 from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,8 +19,8 @@ from drake_safety.logs.log_map import LogTime
 
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]|\.")
 _REMEDIES = {
-    ".mcap": " ('mcap recover' may mend it)",
-    ".bag": ", cut off ('rosbag reindex' mends it)",
+    ".mcap": " ('mcap recover' may repair it)",
+    ".bag": ", cut off ('rosbag reindex' repairs it)",
 }
 
 
@@ -30,8 +29,7 @@ def read_messages(
 ) -> tuple[dict[str, Channel], list[str]]:
     """Reads the wanted fields, by topic, of an MCAP file, a ROS 1 bag or the folder of a ROS 2 bag.
 
-    Of a file that was cut off, other than a ROS 1 bag, what is whole is read; the text says how
-    much that is.
+    Of an MCAP file that was cut off the whole chunks are read; the text says how much that is.
     """
     require_extra("logs", f"log '{path}'", "mcap", "rosbags")
     files, has_index = [path], (path / "metadata.yaml").is_file()
@@ -47,14 +45,14 @@ def read_messages(
         except Exception as error:
             if str(error).startswith(f"log '{path}'"):  # Of what the map says, not of damage.
                 raise
-            copies = {one: Path(folder) / one.name for one in files if one.suffix != ".bag"}
+            copies = {one: Path(folder) / one.name for one in files if one.suffix == ".mcap"}
             shares = [_recover(one, copy, wanted) for one, copy in copies.items()]
             if not any(shares):
                 raise
         channels = _channels(path, [*copies.values()], wanted, time)
         share = np.average(shares, weights=[one.stat().st_size for one in copies])
         cut = f"log '{path}' is cut off: what is whole is read, {share:.0%} of its bytes"
-        return channels, [cut] if share < 1 or files[0].suffix == ".db3" else []
+        return channels, [cut] if share < 1 else []
 
 
 def _recover(source: Path, target: Path, wanted: Wanted) -> float:
@@ -62,8 +60,6 @@ def _recover(source: Path, target: Path, wanted: Wanted) -> float:
 
     Topics that are not ROS messages are left out: one of them makes rosbags refuse the file.
     """
-    if source.suffix == ".db3":
-        return _recover_sqlite(source, target)
     from mcap.reader import NonSeekingReader
     from mcap.writer import Writer
 
@@ -91,22 +87,6 @@ def _recover(source: Path, target: Path, wanted: Wanted) -> float:
             "expected ROS's 'cdr'"
         )
     return end / max(source.stat().st_size, 1)
-
-
-def _recover_sqlite(source: Path, target: Path) -> float:
-    """Copies an SQLite file up to the first row that is lost; returns the share of its bytes."""
-    data, uri = source.read_bytes(), f"{source.resolve().as_uri()}?mode=ro"
-    size = int.from_bytes(data[16:18], "big") * int.from_bytes(data[28:32], "big")
-    with closing(sqlite3.connect(uri, uri=True)) as old, closing(sqlite3.connect(target)) as new:
-        old.execute("PRAGMA writable_schema=ON")  # Else a file that lacks pages is not opened.
-        tables = "SELECT name, sql FROM sqlite_master WHERE type = 'table'"
-        for name, statement in old.execute(tables).fetchall():
-            with suppress(sqlite3.DatabaseError):
-                new.execute(statement)
-                for row in old.execute(f'SELECT * FROM "{name}"'):
-                    new.execute(f'INSERT INTO "{name}" VALUES ({",".join("?" * len(row))})', row)
-        new.commit()
-    return min(len(data) / max(size, 1), 1.0)
 
 
 def _channels(

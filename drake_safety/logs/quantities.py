@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -199,14 +198,12 @@ def _held(command: Channel, base: Channel, max_gap_s: float) -> Channel:
 
 
 def cut(
-    channels: Mapping[str, Channel],
-    max_gap_s: float,
-    is_plausible: Callable[[str, Channel], bool],
+    channels: Mapping[str, Channel], max_gap_s: float
 ) -> tuple[list[dict[str, Channel]], list[str]]:
     """Cuts quantities where a value is missing or a gap in time is longer than ``max_gap_s``.
 
     Returns the channels of each piece in order of time, whose common time is covered by all without
-    a cut, and the reasons of the cuts. A unit of time is suggested if its motion is plausible.
+    a cut, and the reasons of the cuts.
 
     Raises:
         ValueError: A quantity has less than three rows, or rows that are implausibly far apart.
@@ -214,7 +211,7 @@ def cut(
     pieces: list[tuple[float, float, dict[str, Channel]]] = [(-math.inf, math.inf, {})]
     reasons: dict[str, None] = {}
     for name, channel in channels.items():
-        stretches, found = _unbroken(channel, max_gap_s, partial(is_plausible, name))
+        stretches, found = _unbroken(channel, max_gap_s)
         reasons |= dict.fromkeys(found)
         joined, i, k = [], 0, 0
         while i < len(pieces) and k < len(stretches):
@@ -227,9 +224,7 @@ def cut(
     return [piece for _, _, piece in pieces], list(reasons)
 
 
-def _unbroken(
-    channel: Channel, max_gap_s: float, is_plausible: Callable[[Channel], bool]
-) -> tuple[list[Channel], list[str]]:
+def _unbroken(channel: Channel, max_gap_s: float) -> tuple[list[Channel], list[str]]:
     """Stretches of rows without a missing value and without a gap, and what lies between them."""
     steps_s, clock = np.diff(channel.time_s), channel.time_name
     if len(channel.time) < MIN_ROWS:
@@ -241,12 +236,9 @@ def _unbroken(
     low, high = _INTERVALS_S
     if not low <= (usual_s := float(np.median(steps_s))) <= high:
         usual = usual_s * TIME_UNITS[channel.time_unit]
-        likely = [unit for unit, n in TIME_UNITS.items() if low <= usual / n <= high]
-        likely = [one for one in likely if is_plausible(replace(channel, time_unit=one))]
         raise ValueError(
             f"{channel.where(0, clock)}: rows are {usual:g} apart, which as "
-            f"{channel.time_unit} is implausible"
-            + (f"; 'time.unit' may rather be one of {likely}" if likely else "")
+            f"{channel.time_unit} is implausible: check 'time.unit' of the map"
         )
     # A value that is missing, not finite or absurdly large is bad.
     bad = ~(channel.frame.abs() < LARGEST).to_numpy()

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.extras import require_extra
 from drake_safety.files.schema import check_times, load_typed
-from drake_safety.logs.channel import Channel, Wanted
-from drake_safety.logs.checks import check, too_fast
+from drake_safety.logs.channel import Wanted
+from drake_safety.logs.checks import check
 from drake_safety.logs.conversion import Source, common_span, rotations_at, values_at
 from drake_safety.logs.log_map import COMMANDS, QUANTITIES, TIME_UNITS, Joints, LogMap, load_log_map
 from drake_safety.logs.messages import read_messages
@@ -154,11 +154,7 @@ def read_pieces(
     topics = {topic: replace(channel, origin=origin) for topic, channel in topics.items()}
     channels, log_map, notes = quantities(topics, log_map, joints)
     read = partial(Source, log_map=log_map, joints=joints)
-
-    def is_plausible(name: str, channel: Channel) -> bool:
-        return not too_fast(read(channels={name: channel}), name, kinematics)
-
-    found, reasons = cut(channels, log_map.max_gap_s, is_plausible)
+    found, reasons = cut(channels, log_map.max_gap_s)
     lost += [f"{where}: time begins anew, with another log" for where in restarts]
     lost += [one for one in reasons if not one.startswith(tuple(restarts))]
     sources = [read(channels=part, step_s=step_s) for part in found]

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import re
-import warnings
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +21,6 @@ _SEPARATORS = (",", ";", "\t", "|", " ")
 _NUM_HEAD_LINES = 60  # Among which the header is sought.
 _COMMENT = "#%"
 _MISSING = ["", "na", "n/a", "nan", "null", "none", "-"]
-_UNIT = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]$")  # In brackets at the end of a name.
 
 
 def read_csv(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Channel], list[str]]:
@@ -43,9 +39,7 @@ def read_csv(path: Path, wanted: Wanted, time: LogTime) -> tuple[dict[str, Chann
         lines = text[: 1 << 20].splitlines()[:_NUM_HEAD_LINES] or [""]
         keys = {_key(name) for name in (time.column, *wanted.get("", ()))}
         headers = [(i, by, _cells(line, by)) for i, line in enumerate(lines) for by in _SEPARATORS]
-        line, separator, names = max(
-            headers, key=lambda one: sum(bool({_key(n), _bare(n)} & keys) for n in one[2])
-        )
+        line, separator, names = max(headers, key=lambda one: len(keys & set(map(_key, one[2]))))
         places = _places(path, wanted, time, names)
         frame = pd.read_csv(
             io.StringIO(text),
@@ -107,12 +101,8 @@ def _key(name: str) -> str:
     return name.strip().lstrip(_COMMENT).strip()
 
 
-def _bare(name: str) -> str:
-    return _UNIT.sub("", _key(name))
-
-
 def _places(path: Path, wanted: Wanted, time: LogTime, existing: list[str]) -> dict[str, int]:
-    """Places of the columns, by their name or by that without a unit."""
+    """Places of the columns by name."""
     if topics := [topic for topic in wanted if topic]:
         raise ValueError(f"log '{path}' is a table and has no topics; the map names {topics}")
     if not time.column:
@@ -120,27 +110,21 @@ def _places(path: Path, wanted: Wanted, time: LogTime, existing: list[str]) -> d
             f"log '{path}' is a table: 'time.column' of the map must name its time; it has "
             f"{existing}"
         )
-    keys, bare = list(map(_key, existing)), list(map(_bare, existing))
-    columns = {name: keys if _key(name) in keys else bare for name in (time.column, *wanted[""])}
-    counts = {name: among.count(_key(name)) for name, among in columns.items()}
+    keys = list(map(_key, existing))
+    counts = {name: keys.count(_key(name)) for name in (time.column, *wanted[""])}
     if missing := [name for name, count in counts.items() if not count]:
         raise ValueError(
             f"log '{path}' has no columns {listed(missing, 5)}; it has {listed(existing)}"
         )
     if twice := [name for name, count in counts.items() if count > 1]:
         raise ValueError(f"log '{path}' has columns of the same name: {twice}")
-    return {name: among.index(_key(name)) for name, among in columns.items()}
+    return {name: keys.index(_key(name)) for name in counts}
 
 
 def _without_remarks(frame: pd.DataFrame, clock: str) -> pd.DataFrame:
-    """Leaves out rows that are comments, units, empty, or the header once more."""
-    import pandas as pd
-
-    stamps = frame[clock].fillna("").str.strip()
-    is_comment = stamps.str.startswith(tuple(_COMMENT))
-    doubtful = frame[~is_comment & (~stamps.str.contains(r"\d") | (stamps == clock))]
-    has_number = doubtful.apply(pd.to_numeric, errors="coerce").notna().any(axis=1)
-    return frame[~is_comment].drop(doubtful.index[~has_number])
+    """Leaves out rows that are comments or empty."""
+    is_comment = frame[clock].fillna("").str.strip().str.startswith(tuple(_COMMENT))
+    return frame[~is_comment & frame.notna().any(axis=1)]
 
 
 def _channel(path: Path, frame: pd.DataFrame, time: LogTime, row_name: str) -> Channel:
@@ -176,7 +160,7 @@ def _channel(path: Path, frame: pd.DataFrame, time: LogTime, row_name: str) -> C
 
 
 def _dates(stamps: pd.Series) -> pd.Series | None:
-    """Dates, or times of day, if the cells of a column are all of that kind."""
+    """Dates, if all cells of a column are dates."""
     import pandas as pd
 
     if stamps.dtype.kind in "Mm":
@@ -184,11 +168,5 @@ def _dates(stamps: pd.Series) -> pd.Series | None:
     if stamps.dtype.kind in "iuf" or is_number(next(iter(stamps), 0)):
         return None
     text = stamps.astype(str).str.strip().str.replace(",", ".")
-    date = partial(pd.to_datetime, utc=True)
-    for parse in (partial(date, format="ISO8601"), pd.to_timedelta, date):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # That the format had to be guessed.
-            dates = parse(text, errors="coerce")
-        if not dates.isna().any():
-            return dates
-    return None
+    dates = pd.to_datetime(text, utc=True, format="ISO8601", errors="coerce")
+    return None if dates.isna().any() else dates
