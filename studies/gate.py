@@ -18,7 +18,7 @@ from scipy.stats import norm
 
 from drake_safety.assessments import assessed_scenarios, load_assessment
 from drake_safety.cli.console import ScenarioArgument, WorkersOption
-from drake_safety.cli.gate import changed_loop
+from drake_safety.cli.gate import changed_plant
 from drake_safety.evaluation.failure_rate import in_turns, strata_of, stratified_rate
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.paired_test import betting_log_e
@@ -57,7 +57,7 @@ def gate(
     """
     with open_study("gate", scenario, out, seed=GATE.first, workers=workers, out=out) as study:
         shipped = study.scenario.name
-        study.scenario, variation = changed_loop(scenario, baseline)
+        study.scenario, variation = changed_plant(scenario, baseline)
         real = simulated(study, variation, 1.0, episodes)
         for effort in map(float, filter(None, efforts.split(","))):
             candidate = failures(simulated(study, variation, effort, episodes))

@@ -56,7 +56,9 @@ class SceneCamera(StillCamera):
             properties = PerceptionProperties()
             properties.AddProperty("phong", "diffuse", colour)
             shown.set_perception_properties(properties)
-            self._scene_graph.RegisterGeometry(context, source, self._world, shown)
+            self._scene_graph.RegisterGeometry(
+                context, source, self._scene_graph.world_frame_id(), shown
+            )
 
         # Below that of the plant, which is smaller.
         draw([100.0, 100.0, 0.01], [0.0, 0.0, -0.01], _GROUND, "ground")

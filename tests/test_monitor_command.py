@@ -9,7 +9,6 @@ import pytest
 
 from command_line import call
 from drake_safety import load_assessment, load_scenario
-from drake_safety.cli import repeat_log
 from drake_safety.learning.change_detector import rows_of
 from drake_safety.logs.episodes import cut_log, motions_from_log
 from drake_safety.logs.robot_log import read_pieces
@@ -198,7 +197,10 @@ def test_what_is_too_short_or_missing_is_not_judged(folder, kept, monkeypatch, c
     log, out = write(folder / "bad.npz", rows), folder / "new" / "out"
     options = ("--map", folder / "map.yaml", "--assessment", folder, "--out", out)
     good = folder / "runs" / "b.npz"
-    assert call(monkeypatch, "monitor", "--log", log, good, "laikago_balancing", *options) == 2
+    assert (
+        call(monkeypatch, "monitor", "--log", log, "--log", good, "laikago_balancing", *options)
+        == 2
+    )
     printed = " ".join(capsys.readouterr().out.split())
     assert printed.count("no alarm") == 1
     assert "not judged: 0." in printed
@@ -206,13 +208,3 @@ def test_what_is_too_short_or_missing_is_not_judged(folder, kept, monkeypatch, c
     logs = json.loads((out / "monitor.json").read_text())["entries"]["logs"]
     assert logs[0]["judged_s"] < 1.0 < logs[1]["judged_s"]
     assert logs[1]["judged_s"] == pytest.approx(logs[1]["duration_s"])
-
-
-def test_what_follows_logs_may_be_the_scenario(tmp_path):
-    for name in ("a.csv", "bag"):
-        (tmp_path / name).mkdir()
-    a, bag = str(tmp_path / "a.csv"), str(tmp_path / "bag")
-    for scenario in ("laikago_balancing", "robot/scenario.yaml"):
-        given = ["--log", a, bag, scenario, "--map", "m"]
-        assert repeat_log(given) == ["--log", a, "--log", bag, scenario, "--map", "m"]
-    assert repeat_log([scenario, "--log", a, "x.csv"]) == [scenario, "--log", a, "--log", "x.csv"]

@@ -11,7 +11,7 @@ from drake_safety.evaluation.paired_test import (
     _SHARES,
     _WEIGHTS,
     betting_log_e,
-    look,
+    interim_estimate,
 )
 
 ALPHA = 0.05
@@ -73,7 +73,7 @@ def test_a_confidence_sequence_ends_where_the_capital_is_one_over_alpha():
     outcomes = np.random.default_rng(2).choice([-0.5, 0.0, 1.0, 2.0], 300)
     looks = []
     for n in (1, 60, 300):
-        looks.append(look(outcomes[:n], looks, ALPHA, 2.0))
+        looks.append(interim_estimate(outcomes[:n], looks, ALPHA, 2.0))
     assert [one.n for one in looks] == [1, 60, 300]
     first, *_, last = looks
     assert last.value == pytest.approx(outcomes.mean())
@@ -85,12 +85,12 @@ def test_a_confidence_sequence_ends_where_the_capital_is_one_over_alpha():
         assert log_e == pytest.approx(-math.log(ALPHA))
     for wrong in (2.5, np.nan):
         with pytest.raises(ValueError, match=rf"outcomes must be in ±2; got ±{wrong}"):
-            look([0.0, wrong], [], ALPHA, 2.0)
+            interim_estimate([0.0, wrong], [], ALPHA, 2.0)
 
 
 def test_what_a_look_has_excluded_stays_so():
-    first = look(np.ones(50), [], ALPHA)
-    assert look(np.zeros(1000), [first], ALPHA).low == first.low > 0.8
+    first = interim_estimate(np.ones(50), [], ALPHA)
+    assert interim_estimate(np.zeros(1000), [first], ALPHA).low == first.low > 0.8
 
 
 REFERENCE_BETS = ((1, 0.0), (-1, 0.0), (-1, 0.05))
@@ -118,14 +118,14 @@ def test_capital_and_ends_are_those_of_confseq(num_pairs, capitals, low, high, t
     values, counts = np.unique(outcomes, return_counts=True)
     log_e = [betting_log_e(sign * values, counts, sign * m) for sign, m in REFERENCE_BETS]
     assert np.exp(log_e) == pytest.approx(capitals)
-    found = look(outcomes, [], ALPHA)
+    found = interim_estimate(outcomes, [], ALPHA)
     assert (found.low, found.high) == pytest.approx((low, high), abs=1e-7)
     assert found.high - found.low < theirs
 
 
 @pytest.mark.parametrize("value", [-1.0, 0.0, 1.0])
 def test_equal_outcomes_have_an_interval_too(value):
-    found = look(np.full(200, value), [], ALPHA)
+    found = interim_estimate(np.full(200, value), [], ALPHA)
     assert found.low <= value <= found.high
     assert found.high - found.low < 0.06
 
@@ -188,4 +188,4 @@ def test_evidence_is_that_of_a_mixture_of_all_shares_but_for_a_factor():
 
 def test_it_is_soon_known_that_a_loop_which_never_fails_more_is_not_worse():
     for difference, most in ((0.01, 500), (0.02, 240), (0.1, 48)):
-        assert look(np.zeros(most), [], ALPHA).high < difference
+        assert interim_estimate(np.zeros(most), [], ALPHA).high < difference

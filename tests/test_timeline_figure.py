@@ -118,16 +118,3 @@ def test_the_timeline_marks_alarms_of_the_monitor_for_as_long_as_they_last(run):
     ends = [(one.get_x(), one.get_x() + one.get_width()) for one in spans]
     assert ends == [pytest.approx((0.5, 0.9)), pytest.approx((1.7, 1.98))]
     assert [text.get_text() for text in axes.texts].count("monitor's alarm") == 2
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"belief": np.zeros((3, 3))}, "belief has 3 rows, expected 100"),
-        ({"constraint_names": ["height"]}, r"margins have 2 columns, .*\['height'\]"),
-        ({"stills": [(9.0, np.zeros((2, 2, 3)))]}, "a still at 9.0 s is outside"),
-    ],
-)
-def test_the_timeline_refuses_what_does_not_fit(run, change, message):
-    with pytest.raises(ValueError, match=message):
-        timeline_figure(**{**run, **change})

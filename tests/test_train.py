@@ -66,8 +66,6 @@ def test_the_monitor_is_learned_from_undisturbed_motion_that_is_kept(monkeypatch
     ("given", "wanted_s"),
     [
         (("--episodes", 4), 24.0),
-        (("--episodes", 64), 384.0),
-        (("--episodes", 128), 768.0),
         (("--episodes", 2048), 2880.0),
         (("--episodes", 64, "--motion", 5), 300.0),
     ],

@@ -8,16 +8,13 @@ imported.
 from __future__ import annotations
 
 import errno
-import itertools
 import logging
 import os
-import re
 import signal
 import sys
 import traceback
 from collections.abc import Callable, Container, Sequence
 from importlib import import_module
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -31,23 +28,31 @@ from drake_safety.files.reading import is_number
 from drake_safety.learning.segments import EpisodeError, installed_versions
 
 COMMANDS = {
-    "scenarios": ("prepare", ""),
-    "new": ("prepare", ""),
-    "check": ("prepare", ""),
-    "train": ("train", "train"),
-    "calibrate": ("calibrate", "train"),
-    "ask": ("ask", ""),
-    "run": ("run", ""),
-    "play": ("play", "live"),
-    "evaluate": ("evaluate", "train"),
-    "gate": ("gate", ""),
-    "rate": ("gate", ""),
-    "adapt": ("adapt", "train"),
-    "monitor": ("monitor", ""),
-    "export": ("export", ""),
-    "report": ("report", "report"),
+    "scenarios": ("prepare", "", "List the scenarios that come with the package."),
+    "new": (
+        "prepare",
+        "",
+        "Write the folder of a robot and a first scenario from a URDF or an MJCF, for review.",
+    ),
+    "check": ("prepare", "", "Check a scenario and its robot, and print problems with remedies."),
+    "train": ("train", "train", "Simulate the nominal closed loop and train Γ."),
+    "calibrate": (
+        "calibrate",
+        "train",
+        "Choose thresholds with a promised miss rate on fresh episodes.",
+    ),
+    "ask": ("ask", "", "Print the verdict on a target, or on a command of a walking robot."),
+    "run": ("run", "", "Simulate once with Γ in the loop; write a recording and a timeline."),
+    "play": ("play", "live", "Simulate a task on a page in the browser, in real time."),
+    "evaluate": ("evaluate", "train", "Evaluate Γ on fresh episodes, throws and other plants."),
+    "gate": ("gate", "", "Decide whether a candidate fails more often than the baseline."),
+    "rate": ("gate", "", "Estimate a failure rate from few episodes, chosen by Γ."),
+    "adapt": ("adapt", "train", "Adapt Γ to an actual robot, and say whether it is better."),
+    "monitor": ("monitor", "", "Run the change monitor over logs of a robot."),
+    "export": ("export", "", "Write Γ as one ONNX file."),
+    "report": ("report", "report", "Write RUN/report.html, a self-contained page of a run."),
 }
-"""In the order of the help: module, and the extra that it needs, said before it does anything."""
+"""In the order of the help: module, the extra that it needs, and a line of help."""
 _KEEPING = ("calibrate", "evaluate", "gate", "rate", "adapt")
 _RESUMED = {"train": "--resume"} | dict.fromkeys(_KEEPING, "")
 """Commands that the same line continues after Ctrl-C, and the option that does so."""
@@ -60,8 +65,8 @@ class _Command(TyperCommand):
     """A command whose extra is installed, and whose ``--cluster`` is connected while it runs."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parses the arguments with the numbers of a target joined, and ``--log`` before each."""
-        return super().parse_args(ctx, repeat_log(join_targets(args)))
+        """Parses the arguments, of which the three numbers of a target are one value."""
+        return super().parse_args(ctx, join_targets(args))
 
     def invoke(self, ctx: Any) -> Any:
         """Runs the command."""
@@ -78,34 +83,13 @@ class _Command(TyperCommand):
 
 
 def join_targets(args: Sequence[str]) -> list[str]:
-    """Joins the numbers of a target or command: an option has a fixed number of words."""
+    """Joins the three numbers of a target or command, which may as well be a name."""
     words = list(args)
     for i, word in enumerate(words):  # Which become fewer.
-        if word in ("--target", "--command") and words[i + 1 :]:
-            numbers = list(itertools.takewhile(is_number, words[i + 1 : i + 4]))
-            end = i + 1 + max(len(numbers), 1)
-            words[i:end] = [f"{word}={' '.join(words[i + 1 : end])}"]
+        numbers = words[i + 1 : i + 4]
+        if word in ("--target", "--command") and len(numbers) == 3 and all(map(is_number, numbers)):
+            words[i + 1 : i + 4] = [" ".join(numbers)]
     return words
-
-
-_YAML = (".yaml", ".yml")
-
-
-def repeat_log(args: Sequence[str]) -> list[str]:
-    """Puts ``--log`` before every file that follows it, as where a shell expands ``log_*.csv``.
-
-    A YAML file, or a name of nothing that exists, is a scenario.
-    """
-    words, option = [""], ""
-    for word in args:
-        if word.startswith("-"):
-            option = word
-        elif option == "--log" != words[-1] and (
-            kind not in _YAML if (kind := Path(word).suffix) else Path(word).exists()
-        ):
-            words.append(option)
-        words.append(word)
-    return words[1:]
 
 
 def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
@@ -118,18 +102,12 @@ def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     app.callback()(_common)
-    for name, (module, _) in COMMANDS.items():
+    for name, (module, _, line) in COMMANDS.items():
         function: Any = _not_called
         if name in called:
             function = getattr(import_module(f"drake_safety.cli.{module}"), name)
-        app.command(name, cls=_Command, short_help=_line(module, name))(function)
+        app.command(name, cls=_Command, short_help=line)(function)
     return app
-
-
-def _line(module: str, name: str) -> str:
-    """First line of a command's help, whose module is not imported."""
-    source = (Path(__file__).parent / f"{module}.py").read_text(encoding="utf-8")
-    return re.findall(rf'^def {name}\(.*?"""(.*?)(?:"""|\n)', source, re.M | re.S)[0]
 
 
 def _not_called(scenario: console.ScenarioArgument) -> None:
@@ -147,10 +125,9 @@ def _called() -> list[str]:
 
 def _print_version(is_wanted: bool) -> None:
     if is_wanted:
-        found, python = installed_versions("drake"), sys.version.split()[0]
-        console.say(
-            f"drake-safety {found['drake_safety']}, drake {found['drake']}, Python {python}"
-        )
+        versions, python = installed_versions("drake"), sys.version.split()[0]
+        own, drake = versions["drake_safety"], versions["drake"]
+        console.say(f"drake-safety {own}, drake {drake}, Python {python}")
         raise typer.Exit()
 
 
@@ -171,14 +148,6 @@ def main() -> None:
     run_app(lambda *given, **options: make_app(_called())(*given, **options), "drake-safety")
 
 
-def _sentence(error: Exception) -> str:
-    """An error in words, also one of the operating system."""
-    if not isinstance(error, OSError) or not error.filename:
-        return str(error)
-    why = f"cannot be read or written: {error.strerror}"
-    return f"'{error.filename}' {'does not exist' if error.errno == errno.ENOENT else why}"
-
-
 def run_app(commands: Callable[..., Any], program: str) -> None:
     """Runs a command; user errors are printed as one line, with --debug as a traceback.
 
@@ -188,7 +157,8 @@ def run_app(commands: Callable[..., Any], program: str) -> None:
     log = console.console if console.console.is_terminal else Console(stderr=True)
     handler = RichHandler(console=log, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
-    logging.getLogger("drake").setLevel(logging.WARNING)  # Whoever serves a page that stays tells.
+    # Commands that keep a page open print its address themselves.
+    logging.getLogger("drake").setLevel(logging.WARNING)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     arguments = [argument for argument in sys.argv[1:] if argument != _DEBUG]
     name = next(iter(arguments), "")
@@ -214,3 +184,11 @@ def run_app(commands: Callable[..., Any], program: str) -> None:
             raise
         sys.exit(_ERRORS.get(name, 2))
     sys.exit(code)
+
+
+def _sentence(error: Exception) -> str:
+    """An error in words, also one of the operating system."""
+    if not isinstance(error, OSError) or not error.filename:
+        return str(error)
+    why = f"cannot be read or written: {error.strerror}"
+    return f"'{error.filename}' {'does not exist' if error.errno == errno.ENOENT else why}"

@@ -84,26 +84,23 @@ def calibrate(
         scenario_hash=loaded.simulation_hash(plant),
         variation=f"simulated {plant}" if is_of_logs else plant,
     )
-    found = {}
+    chosen = {}
     for mode, gamma in learned.items():
         score = assessment_scorer(mode, gamma).unsafe_score(segments)
-        found[mode] = [promised(*episode_scores(segments, score, k), kind=k) for k in KINDS]
+        chosen[mode] = [promised(*episode_scores(segments, score, k), kind=k) for k in KINDS]
+    rows = []
     for mode, gamma in learned.items():
-        gamma.adopt_calibrations(found[mode], fresh.info, len(fresh))
+        gamma.adopt_calibrations(chosen[mode], fresh.info, len(fresh))
         gamma.save(folders.assessment_file(folder.out, mode))
-    rows = [
-        (
-            label_of(f"{mode}.{one.kind}"),
-            f"{one.threshold:.4f}",
-            f"{one.unsafe_below:.4f}",
-            f"{one.num_missed} of {one.num_unsafe}",
-            f"{one.num_accepted} of {one.num_safe}",
-        )
-        for mode, both in found.items()
-        for one in both
-    ]
+        for one in chosen[mode]:
+            thresholds = f"{one.threshold:.4f}", f"{one.unsafe_below:.4f}"
+            counts = (
+                f"{one.num_missed} of {one.num_unsafe}",
+                f"{one.num_accepted} of {one.num_safe}",
+            )
+            rows.append((label_of(f"{mode}.{one.kind}"), *thresholds, *counts))
     columns = ("score", "safe from probability", "unsafe below", "misses", "safe recall")
-    title = f"Promised: {found[MODES[0]][0].promise}"
+    title = f"Promised: {chosen[MODES[0]][0].promise}"
     console.show(console.new_table(*columns, rows=rows, title=title))
     for mode in learned:
         console.say("calibrated", folders.assessment_file(folder.out, mode))

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import re
 import shlex
-import socket
 import sys
 from collections.abc import Iterable
 from functools import partial
@@ -27,8 +24,8 @@ if TYPE_CHECKING:
 
 def _scenario_names(incomplete: str) -> list[str]:
     """The package's scenarios that begin with a word; without Drake, so that a shell is quick."""
-    found = (Path(file.name) for file in files("drake_safety.diagrams").iterdir())
-    names = (one.stem for one in found if one.suffix == ".yaml")
+    paths = (Path(file.name) for file in files("drake_safety.diagrams").iterdir())
+    names = (path.stem for path in paths if path.suffix == ".yaml")
     return sorted(name for name in names if name.startswith(incomplete))
 
 
@@ -76,12 +73,12 @@ ClusterOption = Annotated[
 LOOPBACK = "127.0.0.1"
 """Address that only this machine reaches."""
 
-_UNSEEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
+_HIDDEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 
 
-def seen(text: str) -> str:
+def visible(text: str) -> str:
     """A text without characters that move the cursor or hide others: ESC is ␛."""
-    return _UNSEEN.sub(lambda one: chr(0x2400 + ord(one[0])) if one[0] < " " else "\ufffd", text)
+    return _HIDDEN.sub(lambda m: chr(0x2400 + ord(m[0])) if m[0] < " " else "\ufffd", text)
 
 
 class _Console(Console):
@@ -91,10 +88,8 @@ class _Console(Console):
         """Prints texts, and tables of :func:`new_table`."""
         for one in objects:
             if isinstance(one, Text):
-                one.plain = seen(one.plain)
-        plain = (
-            seen(f"{one}") if isinstance(one, (str, Path, Exception)) else one for one in objects
-        )
+                one.plain = visible(one.plain)
+        plain = (visible(f"{x}") if isinstance(x, (str, Path, Exception)) else x for x in objects)
         super().print(*plain, **options)
 
 
@@ -109,7 +104,7 @@ open_stages = partial(progress.open_stages, console)
 
 def new_table(*columns: str, rows: Iterable[Iterable[str]] = (), title: str | None = None) -> Table:
     """A table whose cells fold if they do not fit, columns of single words (names) last."""
-    table, cells = Table(title=title), [[*map(seen, row)] for row in rows]
+    table, cells = Table(title=title), [[*map(visible, row)] for row in rows]
     for name, *column in zip(columns, *cells, strict=True):
         table.add_column(name, overflow="fold", no_wrap=not any(" " in one for one in column))
     for row in cells:
@@ -128,29 +123,11 @@ def open_viewer(host: str = LOOPBACK, port: int | None = None, *, has_rate: bool
         raise ValueError(f"no page can be served at {place}: {error}") from error
 
 
-def open_recorder() -> Meshcat:
-    """Starts a Meshcat that records and serves nobody."""
-    viewer = open_viewer(port=0)
-    for place in Path("/dev/fd").iterdir():
-        number = int(place.name)
-        with contextlib.suppress(OSError):
-            one = socket.socket(fileno=number)
-            try:
-                is_its_own = one.getsockname()[1:] == (viewer.port(),)
-            finally:
-                one.detach()
-            # Drake has no Meshcat without a server: an empty file takes the place of its socket.
-            if is_its_own:
-                with Path(os.devnull).open() as nothing:
-                    os.dup2(nothing.fileno(), number, inheritable=False)
-    return viewer
-
-
 def warn_of_empty_scene(meshcat: Meshcat, task: str) -> None:
     """Prints a warning if a task has drawn nothing; only what was published counts as drawn."""
     if not meshcat.HasPath("/drake"):
-        told = f"warning: task '{task}' draws nothing in Meshcat (nothing is under /drake)"
-        say(told, style="yellow")
+        warning = f"warning: task '{task}' draws nothing in Meshcat (nothing is under /drake)"
+        say(warning, style="yellow")
 
 
 def given(**options: Any) -> dict[str, Any]:

@@ -72,17 +72,11 @@ class Evaluation:
         """The probability of either mode."""
         return [assessment_scorer(mode, one) for mode, one in self.assessments.items()]
 
-    @property
-    def plan_thresholds(self) -> dict[str, float]:
-        """Stored thresholds of plans by mode, of the unsafe score."""
-        stored = {mode: one.calibrations_.get(PLAN) for mode, one in self.assessments.items()}
-        return {mode: 1.0 - one.threshold for mode, one in stored.items() if one is not None}
-
-    def fresh(self, what: str, number: int, purpose: str, **options: str) -> Episodes:
+    def fresh(self, what: str, number: int, purpose: str) -> Episodes:
         """Fresh nominal episodes, kept in the run's folder."""
         progress, seed = partial(self.stages, what), self.seeds[purpose]
         return folders.run_fresh_episodes(
-            self.scenario, self.run_folder, number, seed, progress, self.workers, **options
+            self.scenario, self.run_folder, number, seed, progress, self.workers
         )
 
     def add(self, estimates: Mapping[Key, Estimate], **figures: Figure) -> None:
@@ -198,12 +192,13 @@ def add_verdicts(
 ) -> None:
     """Evaluates scorers on fresh plans with a goal, else on every segment and first rows."""
     if isinstance(evaluation.scenario.make_loop(), HasGoals):
-        thresholds = evaluation.plan_thresholds
-        found = evaluate_plans(scorers, calibration, test, thresholds)
+        stored = {m: g.calibrations_.get(PLAN) for m, g in evaluation.assessments.items()}
+        thresholds = {mode: 1.0 - one.threshold for mode, one in stored.items() if one}
+        estimates = evaluate_plans(scorers, calibration, test, thresholds)
     else:
-        found = evaluate_episodes(scorers, calibration, test)
+        estimates = evaluate_episodes(scorers, calibration, test)
     maps = {f"embedding_{m}": embedding_figure(g, test) for m, g in evaluation.assessments.items()}
-    evaluation.add(found, **maps)
+    evaluation.add(estimates, **maps)
 
 
 def add_reliability(evaluation: Evaluation, test: Episodes) -> None:

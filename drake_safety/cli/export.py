@@ -27,9 +27,10 @@ def export(
     folders.check_writable(out.parent)
     gamma.to_onnx(out)
     for one in gamma.calibrations_.values():
-        told = f"safe from {one.threshold:.4f}, unsafe below {one.unsafe_below:.4f}: {one.promise}"
-        console.say(f"{one.kind:<16}  {told}")
+        verdicts = f"safe from {one.threshold:.4f}, unsafe below {one.unsafe_below:.4f}"
+        console.say(f"{one.kind:<16}  {verdicts}: {one.promise}")
     if not gamma.calibrations_:
-        told = "none: `drake-safety calibrate` chooses them for a promised miss rate"
-        console.say(f"thresholds        {told}")
+        console.say(
+            "thresholds        none: `drake-safety calibrate` chooses them for a promised miss rate"
+        )
     console.say(f"written           {out.stat().st_size / 1e6:.2f} MB,", out)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 from xml.etree import ElementTree
 
 import numpy as np
@@ -26,15 +26,14 @@ from drake_safety.evaluation.gate_figure import gate_figure
 from drake_safety.evaluation.loop_comparison import (
     UNDECIDED,
     WORSE,
-    Loop,
+    ComparedPlant,
     Verdict,
     check_pair,
     compare_loops,
     make_paired,
 )
-from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.outcomes import BELIEFS, UNSAFE, Outcome
-from drake_safety.evaluation.results import Key, Results
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.tables import Column
 from drake_safety.files.atomic import write_file
 from drake_safety.files.reading import parse_yaml
@@ -45,15 +44,8 @@ from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import load_scenario
 
 _MOST_SHOWN = 10  # Of a table of episodes.
-_COLUMNS = (
-    *("candidate", "verdict", "pairs", "fail: both, only baseline, only candidate"),
-    *("difference [points]", "survival [s]"),
-)
-_OF_RATE = ("failure rate", "episodes", "failures", "random episodes of the same variance")
-_OF_COMMANDS = ("commanded", "from", "to", "pairs", "newly fail", "fail no longer")
-_OF_EPISODES = ("episode", "cause", "at [s]", "Γ at its start: safe, unsafe, unknown")
 _NOT_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-_POINTS = Column("", "", "points", digits=1)
+_POINTS, _SECONDS = Column("", "", "points", digits=1), Column("", "")
 _PANELS = """<!doctype html><meta charset="utf-8">
 <style>body { display: flex; height: 95vh } iframe { flex: 1 }</style>"""
 
@@ -96,24 +88,24 @@ def gate(
     """
     given = {Path(one).stem: (one, baseline) for one in candidates or []}
     for text in dict.fromkeys(candidate or []):
-        name = text if _short(text) in given else _short(text)
-        given[name] = (scenario, f"{baseline} {text}")
+        short = re.sub(r"(?<==)\S*/", "", text)  # Files without their folders.
+        given[text if short in given else short] = (scenario, f"{baseline} {text}")
     if len(given) < max(replay is None, len(candidates or []) + len(candidate or [])):
         raise ValueError("gate: name different candidates: YAML files, or --candidate KEY=VALUE")
-    found: dict[str, Verdict] = {}
+    verdicts: dict[str, Verdict] = {}
     wrong: dict[str, str] = {}
     under_way, gamma, first_error = "", None, None
     try:
-        first = changed_loop(scenario, baseline)
+        first = changed_plant(scenario, baseline)
         folder = out or Path("runs") / f"{first.scenario.name}-gate"
         folders.check_writable(folder, *([] if junit is None else [junit.parent]))
-        others: dict[str, Loop] = {}
+        others: dict[str, ComparedPlant] = {}
         for name, changed in given.items():
             try:
-                others[name] = changed_loop(*changed)
+                others[name] = changed_plant(*changed)
                 check_pair((first, others[name]), metric=metric, seed=seed)
             except (Exception, SystemExit) as error:  # Drake's failed assertions are SystemExit.
-                wrong[name], first_error = _told(error), first_error or error
+                wrong[name], first_error = _message(error), first_error or error
         if wrong:
             raise ValueError("; ".join(map(": ".join, wrong.items()))) from first_error
         if replay is not None:
@@ -135,20 +127,25 @@ def gate(
                     path=folder / "episodes",
                     progress=partial(stages, f"pairs, {under_way}"),
                     assessment=gamma,
-                    each_look=partial(found.__setitem__, under_way),
+                    each_look=partial(verdicts.__setitem__, under_way),
                 )
-                pairs = found[under_way].pairs
+                pairs = verdicts[under_way].pairs
                 stages(f"pairs, {under_way}", pairs, pairs)
     except (Exception, SystemExit) as error:
-        wrong = wrong or dict.fromkeys([under_way] if under_way else given, _told(error))
+        wrong = wrong or dict.fromkeys([under_way] if under_way else given, _message(error))
         raise
     finally:  # After Ctrl-C too.
         if junit is not None and replay is None:
-            _write_junit(junit, Path(scenario).stem, given, found, wrong)
-        if found:
-            _report(first, found, metric, folder, seed, alpha / len(others))
-    verdicts = {one.verdict for one in found.values()}
-    raise Exit(1 if WORSE in verdicts else 2 if UNDECIDED in verdicts else 0)
+            _write_junit(junit, Path(scenario).stem, given, verdicts, wrong)
+        if verdicts:
+            _report(first, verdicts, metric, alpha / len(others), worse_by)
+            candidates_ = {name: asdict(one) for name, one in verdicts.items()}
+            entries = {"seed": seed, "metric": metric, "candidates": candidates_}
+            _write(folder / "gate.json", first, Results({}, entries))
+            for picture in save(gate_figure(verdicts), folder / "gate"):
+                console.say("picture", picture)
+    known = {one.verdict for one in verdicts.values()}
+    raise Exit(1 if WORSE in known else 2 if UNDECIDED in known else 0)
 
 
 def rate(
@@ -173,7 +170,7 @@ def rate(
     folder = out or Path("runs") / f"{loaded.name}-rate"
     folders.check_writable(folder)
     with console.open_stages() as stages:
-        found = estimate_failure_rate(
+        estimated = estimate_failure_rate(
             loaded,
             gamma,
             variation=variation,
@@ -185,21 +182,18 @@ def rate(
             path=folder / "episodes",
             progress=stages,
         )
-    rate = Column("", "", "%", digits=2).text(found.rate)
-    row = (rate, found.rate.n, len(found.failures), round(found.plain_rollouts))
-    _show(f"{loaded.name}, {variation}: {metric}", _OF_RATE, [row])
-    _show_episodes("Failures", found.failures, metric, loaded.make_loop(variation).output_names)
-    entries = {"seed": seed, "metric": metric} | asdict(found)
-    estimates = {("", "", "failure_rate"): found.rate}
-    _write(
-        folder / "rate.json",
-        Loop(loaded, variation),
-        entries,
-        estimates,
-    )
+    failures, loop = estimated.failures, loaded.make_loop(variation)
+    text = Column("", "", "%", digits=2).text(estimated.rate)
+    row = (text, estimated.rate.n, len(failures), round(estimated.plain_rollouts))
+    columns = ("failure rate", "episodes", "failures", "random episodes of the same variance")
+    _show(f"{loaded.name}, {variation}: {metric}", columns, [row])
+    _show_episodes("Failures", failures, metric, loop.output_names)
+    figures = {("", "", "failure_rate"): estimated.rate}
+    entries = {"seed": seed, "metric": metric} | asdict(estimated)
+    _write(folder / "rate.json", ComparedPlant(loaded, variation), Results(figures, entries))
 
 
-def changed_loop(scenario: str, changes: str) -> Loop:
+def changed_plant(scenario: str, changes: str) -> ComparedPlant:
     """A scenario with KEY=VALUE pairs; files are relative to the working directory."""
     values, variation = {}, "nominal"
     for text in shlex.split(changes):
@@ -209,68 +203,64 @@ def changed_loop(scenario: str, changes: str) -> Loop:
         if key == "variation":
             variation = value
             continue
-        key = "parameters.policy" if key == "policy" else key
-        path = Path(value)
+        key, path = "parameters.policy" if key == "policy" else key, Path(value)
         values[key] = str(path.resolve()) if path.is_file() else parse_yaml(value, f"'{text}'")
     loaded = load_scenario(scenario, values)
-    loaded.variation(variation)  # There is one.
+    loaded.variation(variation)  # Raises if unknown.
     for text in network_kinds(loaded.task_class().model_files(loaded)):
         console.say(text)
-    return Loop(loaded, variation)
+    return ComparedPlant(loaded, variation)
 
 
-def _told(error: BaseException) -> str:
+def _message(error: BaseException) -> str:
     return f"{error}" if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
 
 
-def _short(changes: str) -> str:
-    """KEY=VALUE pairs with the names of files, without their folders."""
-    return re.sub(r"(?<==)\S*/", "", changes)
-
-
-def _record(first: Loop, others: Mapping[str, Loop], index: int, seed: int, file: Path) -> None:
+def _record(
+    first: ComparedPlant, others: Mapping[str, ComparedPlant], index: int, seed: int, file: Path
+) -> None:
     """Writes recordings of one episode in all loops, side by side."""
     panels = [_PANELS]
-    for side, (name, loop) in enumerate({"baseline": first, **others}.items()):
-        viewer = console.open_recorder()
-        diagram = make_paired((first, loop), min(side, 1), meshcat=viewer)
+    for side, (name, plant) in enumerate({"baseline": first, **others}.items()):
+        viewer = console.open_viewer()
+        loop = make_paired((first, plant), min(side, 1), meshcat=viewer)
         viewer.StartRecording()
-        camera = follow(diagram, viewer)
-        episode = run_episode(diagram, index, seed=seed, after_leaving_s=math.inf, monitor=camera)
+        camera = follow(loop, viewer)
+        episode = run_episode(loop, index, seed=seed, after_leaving_s=math.inf, monitor=camera)
         viewer.StopRecording()
         viewer.PublishRecording()
-        cause = spoken(episode.cause)
-        how = "stays in the safe set" if episode.is_safe else f"leaves the safe set: {cause}"
-        console.say(f"{name}: {how}")
+        end = f"leaves the safe set: {spoken(episode.cause)}"
+        console.say(f"{name}: {'stays in the safe set' if episode.is_safe else end}")
         panels.append(f'<iframe srcdoc="{html.escape(viewer.StaticHtml())}"></iframe>')
     write_file(file, "\n".join(panels))
     console.say("recording, in this order:", file)
 
 
 def _report(
-    first: Loop, found: Mapping[str, Verdict], metric: str, folder: Path, seed: int, alpha: float
+    first: ComparedPlant,
+    verdicts: Mapping[str, Verdict],
+    metric: str,
+    alpha: float,
+    worse_by: float,
 ) -> None:
-    """Prints and writes what is known."""
+    """Prints what is known."""
     rows = []
-    for name, one in found.items():
-        counts = (one.both, len(one.no_longer_failing), len(one.newly_failing))
-        ends = (_POINTS.text(one.difference[-1]), Column("", "").text(one.survival_s[-1]))
-        rows.append((name, one.verdict, one.pairs, ", ".join(map(str, counts)), *ends))
-    _show(f"{first.scenario.name}, {first.variation}: {metric}", _COLUMNS, rows)
-    for name, one in found.items():
+    for name, one in verdicts.items():
+        counts = f"{one.both}, {len(one.no_longer_failing)}, {len(one.newly_failing)}"
+        ends = (_POINTS.text(one.difference[-1]), _SECONDS.text(one.survival_s[-1]))
+        rows.append((name, one.verdict, one.pairs, counts, *ends))
+    failing = "fail: both, only baseline, only candidate"
+    columns = ("candidate", "verdict", "pairs", failing, "difference [points]", "survival [s]")
+    _show(f"{first.scenario.name}, {first.variation}: {metric}", columns, rows)
+    for name, one in verdicts.items():
         _show_changes(name, metric, one)
         if one.pairs_needed:
             console.say(f"{name}: a verdict would take about {one.pairs_needed} pairs like these")
     console.say(
         "a verdict, or an end of an interval, is wrong with a probability of at most "
         f"{100 * alpha:.3g} % a candidate, whenever one looks; 'not worse': by "
-        f"{100 * one.worse_by:g} points"
+        f"{100 * worse_by:g} points"
     )
-    candidates = {name: asdict(one) for name, one in found.items()}
-    entries = {"seed": seed, "metric": metric, "candidates": candidates}
-    _write(folder / "gate.json", first, entries, {})
-    for picture in save(gate_figure(found), folder / "gate"):
-        console.say("picture", picture)
 
 
 def _show_changes(name: str, metric: str, one: Verdict) -> None:
@@ -281,7 +271,7 @@ def _show_changes(name: str, metric: str, one: Verdict) -> None:
     names = list(dict.fromkeys(row[0] for row in one.by_command))
     _show_episodes(f"{name}: episodes that newly fail", new, metric, names)
     _show_episodes(f"{name}: episodes that fail no longer", old, metric, names)
-    rows, sides = [], BELIEFS if any(one.belief for one in new) else ()
+    rows, sides = [], BELIEFS if any(each.belief for each in new) else ()
     for cause in dict.fromkeys(each.cause for each in (*new, *old)):
         here = [each for each in new if each.cause == cause]
         believed = [BELIEFS[int(np.argmax(each.belief))] for each in here if each.belief]
@@ -290,7 +280,8 @@ def _show_changes(name: str, metric: str, one: Verdict) -> None:
     columns = ("cause", "newly fail", *(f"Γ: {what}" for what in sides), "fail no longer")
     _show(f"{name}: by cause", columns, rows)
     by_command = [(_with_unit(entry), *row) for entry, *row in one.by_command]
-    _show(f"{name}: by what was commanded", _OF_COMMANDS, by_command)
+    columns = ("commanded", "from", "to", "pairs", "newly fail", "fail no longer")
+    _show(f"{name}: by what was commanded", columns, by_command)
     index = [*new, *old][0].episode
     return console.say("to see one:", console.command_line(option=f"--replay={index}"))
 
@@ -307,16 +298,15 @@ def _show_episodes(
     """Prints episodes that failed, the first ones in full."""
     if len(episodes) > _MOST_SHOWN:
         title += f": the first {_MOST_SHOWN} of {len(episodes)}"
-    rows = [
-        (
-            *(one.episode, spoken(one.cause or metric), f"{one.time_s:.2f}"),
-            ", ".join(f"{value:.3g}" for value in one.commanded),
-            ", ".join(f"{mass:.2f}" for mass in one.belief or ()) or "–",
-        )
-        for one in episodes[:_MOST_SHOWN]
-    ]
-    commanded = "commanded: " + ", ".join(map(_with_unit, names))
-    _show(title, (*_OF_EPISODES[:3], commanded, _OF_EPISODES[3]), rows)
+    rows = []
+    for one in episodes[:_MOST_SHOWN]:
+        commanded = ", ".join(f"{value:.3g}" for value in one.commanded)
+        belief = ", ".join(f"{mass:.2f}" for mass in one.belief or ()) or "–"
+        cause = spoken(one.cause or metric)
+        rows.append((one.episode, cause, f"{one.time_s:.2f}", commanded, belief))
+    outputs = "commanded: " + ", ".join(map(_with_unit, names))
+    belief_title = "Γ at its start: safe, unsafe, unknown"
+    _show(title, ("episode", "cause", "at [s]", outputs, belief_title), rows)
 
 
 def _show(title: str, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
@@ -326,12 +316,11 @@ def _show(title: str, columns: Sequence[str], rows: Iterable[Iterable[object]]) 
         console.show(console.new_table(*columns, rows=cells, title=title))
 
 
-def _write(
-    file: Path, loop: Loop, entries: dict[str, Any], estimates: Mapping[Key, Estimate]
-) -> None:
-    """Writes results."""
-    made = console.made_by(loop.scenario.name) | {"variation": loop.variation}
-    Results(estimates, made | entries).write(file)
+def _write(file: Path, plant: ComparedPlant, results: Results) -> None:
+    """Writes results, and what made them."""
+    made = console.made_by(plant.scenario.name) | {"variation": plant.variation}
+    results.entries = made | results.entries
+    results.write(file)
     console.say("figures", file)
 
 
@@ -339,23 +328,21 @@ def _write_junit(
     file: Path,
     suite: str,
     names: Iterable[str],
-    found: Mapping[str, Verdict],
+    verdicts: Mapping[str, Verdict],
     wrong: Mapping[str, str],
 ) -> None:
     """Writes JUnit XML, a test case a candidate: worse is a failure, what is not known an error."""
     root = ElementTree.Element("testsuite", name=f"gate {suite}")
     for name in names:
         case, kind = ElementTree.SubElement(root, "testcase", classname=suite, name=name), "error"
+        what = message = "not reached"
         if name in wrong:
-            what, told = "error", wrong[name]
-        elif name in found:
-            one = found[name]
+            what, message = "error", wrong[name]
+        elif one := verdicts.get(name):
             what, kind = one.verdict, {WORSE: "failure", UNDECIDED: "error"}.get(one.verdict, "")
-            told = f"{what} after {one.pairs} pairs: {_POINTS.text(one.difference[-1])} points"
-        else:
-            what = told = "not reached"
+            message = f"{what} after {one.pairs} pairs: {_POINTS.text(one.difference[-1])} points"
         if kind:
-            ElementTree.SubElement(case, kind, type=what, message=told)
+            ElementTree.SubElement(case, kind, type=what, message=message)
     counts = {"tests": "testcase", "failures": "failure", "errors": "error"}
     root.attrib |= {key: f"{len([*root.iter(kind)])}" for key, kind in counts.items()}
     text = ElementTree.tostring(root, encoding="unicode", xml_declaration=True)

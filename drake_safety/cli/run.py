@@ -25,7 +25,7 @@ from drake_safety.evaluation.path_figure import path_figure
 from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
 from drake_safety.evaluation.timeline_figure import timeline_figure
 from drake_safety.files.atomic import write_file
-from drake_safety.files.reading import did_you_mean, parse_yaml
+from drake_safety.files.reading import parse_yaml
 from drake_safety.files.schema import load_typed
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.causes import cause_words, likely_cause
@@ -99,8 +99,6 @@ def run(
 
     If Γ refuses a target, nothing moves and the exit code is 1; --force goes there.
     """
-    if force and target is None:
-        raise ValueError("run: --force goes to a target that Γ refuses: pass that too")
     loaded, learned, gamma = folders.open_assessment(scenario, assessment, mode)
     folder = (out or learned.out) / "run"
     folders.check_writable(folder)
@@ -130,7 +128,7 @@ def run(
         simulated = partial(_throw, throws=parse_pushes(loaded, push or []))
     elif push:
         require(loop, HasBall, "run: --push")
-    viewer = console.open_viewer() if meshcat else console.open_recorder()
+    viewer = console.open_viewer()
     options |= console.given(guard=guard or None)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=viewer, **options)
     if meshcat:
@@ -150,7 +148,7 @@ class _Shown(NamedTuple):
     """What is shown of a motion.
 
     Attributes:
-        told: The threshold in words.
+        threshold_text: The threshold in words.
         timeline: Further arguments of the timeline.
         instants: Times of stills, besides `num_stills` others [s]; None for no stills.
         marked: Times marked on the path in the map, by name [s]; without them there is no figure.
@@ -159,7 +157,7 @@ class _Shown(NamedTuple):
     motion: Motion
     events: _Events
     threshold: float
-    told: str
+    threshold_text: str
     timeline: dict[str, Any]
     instants: Sequence[float] | None = None
     num_stills: int = 2
@@ -172,7 +170,11 @@ def _go(
     """Moves to a goal, pushed or not."""
     motion = run_to_goal(loop, goal, push=push, ports=_logged_ports(loop), **options)
     words, output = goal_words(loop), motion["output"]
-    threshold, origin = motion_threshold(loop.assessment, rule)
+    # A motion has many rows: its promise has its own threshold.
+    promise = loop.assessment.calibrations_.get("motion")
+    threshold, origin = rule.threshold, "that of the verdict"
+    if promise is not None:
+        threshold, origin = promise.threshold, promise.origin
     alarms_s = alarm_times(motion, threshold)
     timeline: dict[str, Any] = {"trigger_times_s": alarms_s}
     instants = [motion.leave_time_s, motion.fall_time_s]
@@ -181,15 +183,16 @@ def _go(
         if port not in motion.ports or not (motion[port] > 0).any():
             continue
         time_s = float(motion.time_s[np.argmax(motion[port][:, 0] > 0)])
-        events.append((time_s, happens))
         if port == "recovery_active":
             limit = loop.scenario.parameters.recovery.threshold
-            events[-1:] = reason_events(loop, motion, [time_s], limit, f"{happens}: ")
+            events += reason_events(loop, motion, [time_s], limit, f"{happens}: ")
+        else:
+            events.append((time_s, happens))
     if push is not None:
         timeline["pushes"] = [push]
         instants += [push.time_s, push.time_s + push.duration_s + _AFTER_PUSH_S]
-        told = f"{push.body} is pushed with {push.force_n} N for {push.duration_s:g} s"
-        events.append((push.time_s, told))
+        strength = f"{push.force_n} N for {push.duration_s:g} s"
+        events.append((push.time_s, f"{push.body} is pushed with {strength}"))
     place = "" if motion.has_left else ", inside the safe set throughout"
     if words.is_point:
         end = f"standing{place}; {words.distance(output[-1] - goal)} from the {words.goal}"
@@ -197,8 +200,8 @@ def _go(
         reached = np.round(output[len(output) // 2 :].mean(axis=0), 2)
         end = f"on its feet{place}; mean of the second half {words.value(reached)}"
     events += _outcome(loop, motion, alarms_s, threshold) + _end(motion, end)
-    told = f"alarm where the probability is below {threshold:.3f} in any row, {origin}"
-    return _Shown(motion, events, threshold, told, timeline, instants, _NUM_STILLS)
+    text = f"alarm where the probability is below {threshold:.3f} in any row, {origin}"
+    return _Shown(motion, events, threshold, text, timeline, instants, _NUM_STILLS)
 
 
 def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
@@ -211,16 +214,16 @@ def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
     for throw in throws:
         flight = f"{throw.speed_m_s:g} m/s towards {np.degrees(throw.direction_rad):.0f}°"
         events.append((throw.time_s, f"ball of {throw.mass_kg:g} kg at {flight}"))
-    told = "recovery triggered: "
-    events += reason_events(loop, motion, triggers, threshold, told) + _end(motion, "standing")
+    events += reason_events(loop, motion, triggers, threshold, "recovery triggered: ")
+    events += _end(motion, "standing")
     instants = [throw.time_s + after_s for throw in throws for after_s in _AROUND_IMPACT_S]
     instants += [trigger_s + _AFTER_TRIGGER_S for trigger_s in triggers[:1]]
     marked = {"start": 0.0} | {f"ball {i}": one.time_s for i, one in enumerate(throws, start=1)}
     marked |= {f"recovery {i}": start_s for i, start_s in enumerate(triggers, start=1)}
     name = loop.scenario.name
-    told = f"recovery where the probability is below {threshold:g}, that of scenario '{name}'"
+    text = f"recovery where the probability is below {threshold:g}, that of scenario '{name}'"
     timeline = {"throws": throws, "trigger_times_s": triggers, "trigger_label": "trigger"}
-    return _Shown(motion, events, threshold, told, timeline, instants, marked=marked)
+    return _Shown(motion, events, threshold, text, timeline, instants, marked=marked)
 
 
 def _move(
@@ -242,8 +245,8 @@ def _move(
         end = f"the simulation failed: {motion.failure}"
     outcome = _outcome(loop, motion, alarms_s, rule.threshold)
     events = [(0.0, "the episode starts"), *outcome, (float(motion.time_s[-1]), end)]
-    told = f"{rule.threshold:.3g}, {rule.origin}"
-    return _Shown(motion, events, rule.threshold, told, {"trigger_times_s": alarms_s})
+    text = f"{rule.threshold:.3g}, {rule.origin}"
+    return _Shown(motion, events, rule.threshold, text, {"trigger_times_s": alarms_s})
 
 
 def _outcome(loop: Any, motion: Motion, alarms_s: list[float], threshold: float) -> _Events:
@@ -274,15 +277,15 @@ def reason_events(
         row = int(np.abs(motion.time_s - time_s).argmin())
         margins, unit = motion["predicted_margins"][row], parameters.margin_unit
         alarms_s = [begin for begin, end in motion.intervals_s("alarm") if begin <= time_s <= end]
-        told = f"probability {probability[row, 0]:.3f} < {threshold:.3g}"
+        reason = f"probability {probability[row, 0]:.3f} < {threshold:.3g}"
         if is_unknown(belief[row], parameters.initial_uncertainty):
-            told = "don't know: unlike training"
+            reason = "don't know: unlike training"
             if alarms_s and not happens:
-                told = f"don't know: monitor's alarm since {alarms_s[0]:.2f} s"
+                reason = f"don't know: monitor's alarm since {alarms_s[0]:.2f} s"
         elif cause := likely_cause(names, motion["cause_probability"][row], margins, unit):
             margin = margins[names.index(cause)]
-            told += "; " + ": ".join(cause_words(cause, margin, loop.angular_constraints))
-        events.append((time_s, happens + told))
+            reason += "; " + ": ".join(cause_words(cause, margin, loop.angular_constraints))
+        events.append((time_s, happens + reason))
     return events
 
 
@@ -293,6 +296,7 @@ def _logged_ports(loop: ClosedLoop) -> tuple[str, ...]:
 
 
 def _times_below(motion: Motion, threshold: float) -> list[float]:
+    """First time with the probability below the threshold [s], or none."""
     is_below = ~(motion["safety_probability"][:, 0] >= threshold)
     return motion.time_s[is_below][:1].tolist()
 
@@ -300,15 +304,6 @@ def _times_below(motion: Motion, threshold: float) -> list[float]:
 def alarm_times(motion: Motion, threshold: float) -> list[float]:
     """First time with the probability below the threshold [s]; none if it was so at the start."""
     return [time_s for time_s in _times_below(motion, threshold) if time_s > motion.time_s[0]]
-
-
-def motion_threshold(gamma: SafetyAssessment, rule: folders.GoalThreshold) -> tuple[float, str]:
-    """Threshold of alarms during a motion, and its origin."""
-    # A motion has many rows: its promise has its own threshold.
-    promise = gamma.calibrations_.get("motion")
-    if promise is None:
-        return rule.threshold, "that of the verdict"
-    return promise.threshold, promise.origin
 
 
 def _timeline(loop: Any, shown: _Shown) -> Figure:
@@ -351,8 +346,8 @@ def event_rows(
     alarms = []
     is_on = motion.ports.get("alarm", np.zeros((len(time_s), 1)))[:, 0] > 0.5
     for k in np.flatnonzero(np.diff(is_on, prepend=False)).tolist():
-        told = f"{motion['alarm_cause'][k]}{withdrawn}" if is_on[k] else "the alarm ends"
-        alarms.append((float(time_s[k]), f"monitor: {told}"))
+        cause = f"{motion['alarm_cause'][k]}{withdrawn}" if is_on[k] else "the alarm ends"
+        alarms.append((float(time_s[k]), f"monitor: {cause}"))
     return [
         (f"{instant:.2f}", event, f"{probability[abs(time_s - instant).argmin()]:.2f}")
         for instant, event in sorted([*events, *alarms], key=lambda one: one[0])
@@ -371,7 +366,7 @@ def _save(folder: Path, viewer: Meshcat, loop: Any, shown: _Shown) -> None:
     content = console.made_by(loop.scenario.name) | {"columns": _COLUMNS, "rows": rows}
     write_file(folder / "run.json", json.dumps(content, indent=2, ensure_ascii=False) + "\n")
     console.show(console.new_table(*_COLUMNS, rows=rows))
-    console.say("threshold", shown.told)
+    console.say("threshold", shown.threshold_text)
     console.say("recording", recording)
     figures = {"timeline": _timeline(loop, shown)}
     if shown.marked is not None:
@@ -387,16 +382,13 @@ def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
     """The one push that ``--push`` names, if any."""
     if not names:
         return None
-    if len(names) > 1:
-        raise ValueError(f"--push: a motion to a target takes one push; got {names}")
-    (name,) = names
     pushes = require(loop, CanBePushed, "--push").pushes
-    if name not in pushes:
+    if len(names) > 1 or names[0] not in pushes:
         raise ValueError(
-            f"--push '{name}': scenario '{loop.scenario.name}' has no such push for a motion to a "
-            f"target{did_you_mean(name, pushes)}; it has {list(pushes)}"
+            f"--push: a motion to a target takes one push of scenario '{loop.scenario.name}', "
+            f"which has {list(pushes)}; got {names}"
         )
-    return pushes[name]
+    return pushes[names[0]]
 
 
 def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
@@ -407,13 +399,7 @@ def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
             throws += scenario.parameters.demonstration
             continue
         words = dict(pair.partition("=")[::2] for pair in shlex.split(text))
-        if unknown := [key for key in words if key not in _THROW_FIELDS]:
-            raise ValueError(
-                f"--push '{text}': unknown '{unknown[0]}'"
-                f"{did_you_mean(unknown[0], ['ball', *_THROW_FIELDS])}; give 'ball', or any of "
-                f"{[f'{key}=NUMBER' for key in _THROW_FIELDS]}"
-            )
-        values = {_THROW_FIELDS[key]: parse_yaml(word, key) for key, word in words.items()}
+        values = {_THROW_FIELDS.get(key, key): parse_yaml(x, key) for key, x in words.items()}
         throw = load_typed(Throw, values, f"--push '{text}'")
         if "direction" in words:
             throw.direction_rad = float(np.radians(throw.direction_rad))

@@ -20,9 +20,10 @@ from drake_safety.learning.learning_curve import describe, learning_curve
 from drake_safety.learning.seeds import FALLS, TRAINING
 from drake_safety.learning.segments import Episodes, training_segments
 from drake_safety.simulation.capabilities import CanFall, require
+from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.rollouts import motion_piece_s, run_episodes, run_motions
-from drake_safety.simulation.scenario import Scenario, load_scenario
+from drake_safety.simulation.scenario import load_scenario
 
 _WATCHED = 128  # Of the episodes, which the monitor watches too.
 
@@ -114,7 +115,7 @@ def train(
                 path=out / "watched",
                 progress=partial(stages, "episodes for the monitor"),
             )
-            # Those of one half, of which nothing is learned, say what the monitor knows.
+            # The half of which nothing is learned says what the monitor knows.
             known, fresh = (Episodes(watched.info, list(watched)[i::2]) for i in range(2))
             detector = ChangeDetector.fit(motions, stage_of(stages, "monitor"), episodes=known)
         num_falls = episodes // 4 if falls is None else falls
@@ -129,12 +130,28 @@ def train(
                 path=out / "falls",
                 progress=partial(stages, "episodes until a fall"),
             )
-        rows = [_learn(loaded, name, out, detector, fallen, stages) for name in modes]
+        rows = []
+        for name in modes:
+            started = time.process_time()
+            parameters = replace(loaded.assessment, mode=name)  # type: ignore[arg-type]  # Checked.
+            data = load_episodes(folders.episodes_folder(out, name))
+            # Γ is that of the scenario's diagram, whatever the options of its training episodes.
+            data.info = replace(data.info, scenario_hash=loaded.simulation_hash())
+            gamma = SafetyAssessment(parameters).fit(
+                data, partial(_report, stages, name), detector=detector
+            )
+            if fallen is not None and name == MODES[0]:
+                _fit_falls(gamma, fallen, loop)
+            gamma.save(folders.assessment_file(out, name))
+            num_segments = len(training_segments(data, parameters))
+            unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
+            cpu_time = f"{time.process_time() - started:.0f} s"
+            rows.append((name, f"{num_segments}", unsafe, cpu_time))
     console.show(console.new_table("mode", "segments", "unsafe episodes", "CPU time", rows=rows))
-    console.say(folders.load_assessment(out, modes[0]).detector_.describe())
+    console.say(gamma.detector_.describe())
     if detector is not None:
-        told, is_ok = detector.describe_alarms(fresh)
-        console.say(told, style=None if is_ok else "yellow")
+        text, is_ok = detector.describe_alarms(fresh)
+        console.say(text, style=None if is_ok else "yellow")
     console.say(describe(learning_curve(load_episodes(next(iter(sets))), loaded.assessment)))
     for folder in sets:
         console.say("episodes  ", folder)
@@ -142,39 +159,19 @@ def train(
         console.say("assessment", folders.assessment_file(out, name))
 
 
-def _learn(
-    scenario: Scenario,
-    mode: str,
-    out: Path,
-    detector: ChangeDetector | None,
-    fallen: Episodes | None,
-    stages: StageProgress,
-) -> tuple[str, str, str, str]:
-    """Trains and saves one mode; returns its row of the table.
+def _report(stages: StageProgress, mode: str, stage: str, done: int, total: int) -> None:
+    stages(f"{mode}: {stage}", done, total)
 
-    Without a detector, one is learned from the episodes; without episodes until a fall there is no
-    probability of a fall.
-    """
-    started = time.process_time()
-    parameters = replace(scenario.assessment, mode=mode)  # type: ignore[arg-type]  # Checked.
-    data = load_episodes(folders.episodes_folder(out, mode))
-    # Γ is that of the scenario's diagram, whatever the options of its training episodes.
-    data.info = replace(data.info, scenario_hash=scenario.simulation_hash())
-    assessment = SafetyAssessment(parameters).fit(
-        data, lambda stage, *done: stages(f"{mode}: {stage}", *done), detector=detector
-    )
-    if fallen is not None and mode == MODES[0]:
-        if 0 < fallen.num_unsafe < len(fallen):
-            watched = require(scenario.make_loop(), CanFall).watched_features.values()
-            names = data.info.feature_names
-            used = [one for one in names if one in watched or one.startswith("tracking_error_")]
-            assessment.fit_falls(fallen, used)
-        else:
-            console.say(
-                f"{fallen.num_unsafe} of {len(fallen)} episodes end in a fall: it takes both to "
-                "learn its probability; give more with --falls"
-            )
-    assessment.save(folders.assessment_file(out, mode))
-    unsafe = f"{data.num_unsafe} of {len(data)} ({data.num_diverged} diverged)"
-    num_segments = len(training_segments(data, parameters))
-    return mode, f"{num_segments}", unsafe, f"{time.process_time() - started:.0f} s"
+
+def _fit_falls(gamma: SafetyAssessment, fallen: Episodes, loop: ClosedLoop) -> None:
+    """Fits the probability of a fall to the features that tell of one."""
+    if not 0 < fallen.num_unsafe < len(fallen):
+        console.say(
+            f"{fallen.num_unsafe} of {len(fallen)} episodes end in a fall: it takes both to "
+            "learn its probability; give more with --falls"
+        )
+        return
+    watched = require(loop, CanFall).watched_features.values()
+    names = fallen.info.feature_names
+    used = [one for one in names if one in watched or one.startswith("tracking_error_")]
+    gamma.fit_falls(fallen, used)

@@ -109,7 +109,6 @@ def assessment_folder(
     """The given folder, or by default that of the shipped assessments of what is simulated."""
     if given is not None:
         return AssessmentFolder(given, given)
-    advice = "`drake-safety train` learns one, in a folder to be passed as --assessment"
     names = assessed_scenarios()
     # Its own name first: reading an assessment takes half a second.
     for name in sorted(names, key=lambda one: one != scenario.name):
@@ -119,7 +118,8 @@ def assessment_folder(
     else:
         raise ValueError(
             f"no assessment of what scenario '{scenario.name}' simulates comes with the package, "
-            f"which has those of {names}: {advice}"
+            f"which has those of {names}: `drake-safety train` learns one, in a folder to be "
+            "passed as --assessment"
         )
     if is_told:
         console.say("assessment        comes with the package,", shipped)
@@ -132,10 +132,10 @@ def load_assessment(folder: Path, mode: str) -> SafetyAssessment:
     path = assessment_file(folder, mode)
     if not path.is_file():
         there = sorted(file.stem for file in folder.glob("*.safetensors"))
-        holds = f"{folder} holds no '{mode}' assessment; it holds {there}"
-        if not folder.is_dir():
-            holds = f"there is no folder '{folder}'"
-        raise ValueError(f"{holds}: run `drake-safety train` first")
+        raise ValueError(
+            f"folder '{folder}' holds no '{mode}' assessment; it holds {there}: run "
+            "`drake-safety train` first"
+        )
     return SafetyAssessment.load(path)
 
 
@@ -154,15 +154,12 @@ def check_fresh(
     """
     trained = assessment.info_
     if not scenario.adopt(trained):
-        own, robot = scenario.simulation_hash(), scenario.robot_name
-        whose = f" of robot '{trained.robot}'" if trained.robot else ""
-        why = "as its file, its robot or its task has changed: train again"
-        if (trained.scenario, trained.robot or robot) != (scenario.name, robot):
-            why = f"and is one of robot '{robot}': " if robot else "and is another scenario: "
-            why += "name the folder that `drake-safety train` wrote for it, or train it"
+        own = scenario.simulation_hash()
         raise ValueError(
-            f"the assessment was trained on scenario '{trained.scenario}'{whose} with hash "
-            f"{trained.scenario_hash[:12]}; '{scenario.name}' now has hash {own[:12]}, {why}"
+            f"the assessment was trained on scenario '{trained.scenario}' of robot "
+            f"'{trained.robot}' with hash {trained.scenario_hash[:12]}; '{scenario.name}' of robot "
+            f"'{scenario.robot_name}' now has hash {own[:12]}: name the folder that `drake-safety "
+            "train` wrote for it, or train again"
         )
     assessment.check_unused(*seeds)
 
@@ -173,22 +170,21 @@ def check_writable(*folders: Path) -> None:
     Nothing is left behind; folders that do not exist are not made.
     """
     for folder in folders:
-        wanted = folder.absolute()
-        nearest = next(one for one in (wanted, *wanted.parents) if one.exists())
+        path = folder.absolute()
+        nearest = next(one for one in (path, *path.parents) if one.exists())
         try:
             with tempfile.TemporaryFile(dir=nearest):
                 pass
         except OSError as error:
-            where = "" if nearest == wanted else f" in '{nearest}'"
             raise ValueError(
-                f"folder '{folder}' cannot be written{where}: {error.strerror}; choose another"
+                f"folder '{folder}' cannot be written: {error.strerror}; choose another"
             ) from error
 
 
 def goal_threshold(folder: Path, assessment: SafetyAssessment) -> GoalThreshold:
     """The thresholds of verdicts on goals that `calibrate` has chosen; else the default."""
-    if (found := assessment.calibrations_.get("plan")) is not None:
-        return GoalThreshold(found.threshold, found.unsafe_below, found.origin)
+    if (stored := assessment.calibrations_.get("plan")) is not None:
+        return GoalThreshold(stored.threshold, stored.unsafe_below, stored.origin)
     origin = (
         "the default, which promises nothing: `drake-safety calibrate` chooses one with a promised "
         f"miss rate and keeps it in {folder}"

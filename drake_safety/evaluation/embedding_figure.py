@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PatchCollection
-from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgb
+from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
@@ -21,6 +21,10 @@ from drake_safety.learning.segments import Episodes, split
 
 _MAX_POINTS = 12000
 _LEAST_CAUSE = 0.05
+_PALE = ("#f0b48f", "#f2efe9", "#a3c4e2")
+_SAFETY = LinearSegmentedColormap.from_list(
+    "safety", ["#9c3209", style.UNSAFE_COLOUR, *_PALE, style.SAFE_COLOUR, "#1b4a80"]
+)  # From unsafe (0) through a pale middle to safe (1).
 
 
 def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure:
@@ -39,9 +43,7 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
         _draw_segments(fig, left, assessment, episodes)
         most = max(1.0 - assessment.parameters.initial_uncertainty, cells[:, SAFE].max())
         is_empty = cells[:, UNCERTAINTY] >= 1.0
-        colours = draw_values(
-            fig, middle, grid, cells[:, SAFE], is_empty, "belief: safe", Normalize(0.0, most)
-        )
+        colours = draw_values(fig, middle, grid, cells[:, SAFE], is_empty, "belief: safe", most)
         is_bright = colours[:, :3] @ [0.299, 0.587, 0.114] > 0.6
         ink = np.where(is_empty, style.FAINT_INK, np.where(is_bright, style.INK, "white"))
         place: dict[str, Any] = {"ha": "center", "va": "center_baseline", "fontsize": 6.5}
@@ -62,15 +64,15 @@ def _draw_segments(
     # Drawn in random order, so that neither class hides the other.
     order = np.random.default_rng(0).permutation(len(segments))[:_MAX_POINTS]
     segments = segments.take(order)
-    found = assessment.predict(segments.state, segments.desired_preview, segments.features)
-    draw_grid(axes, assessment.grid_)
-    shade = ScalarMappable(Normalize(0.0, 1.0), safety_colours().reversed())
+    result = assessment.predict(segments.state, segments.desired_preview, segments.features)
+    _draw_grid(axes, assessment.grid_)
+    shade = ScalarMappable(Normalize(0.0, 1.0), _SAFETY.reversed())
     dots: dict[str, Any] = {"s": 5.0, "linewidths": 0.0, "alpha": 0.85, "rasterized": True}
-    x, y = found.embedding.T
+    x, y = result.embedding.T
     axes.scatter(x, y, c=segments.score, cmap=shade.cmap, vmin=0.0, vmax=1.0, **dots)
     axes.set_title("Segments in the embedding")
     axes.set_xlabel(f"{len(segments)} segments of {len(episodes)} episodes")
-    add_colour_bar(fig, axes, shade, "unsafety score λ")
+    _add_colour_bar(fig, axes, shade, "unsafety score λ")
 
 
 def draw_values(
@@ -80,17 +82,13 @@ def draw_values(
     value: np.ndarray,
     is_empty: np.ndarray,
     label: str,
-    scale: Normalize | None = None,
-    ramp: Colormap | None = None,
+    most: float = 1.0,
 ) -> np.ndarray:
-    """Draws cells coloured by a value (R*R,), with a colour bar; returns the colours (R*R, 4).
-
-    The scale is 0 to 1, and the colours those of safety, by default.
-    """
-    shade = ScalarMappable(scale or Normalize(0.0, 1.0), ramp or safety_colours())
+    """Draws cells coloured by a value (R*R,), with a colour bar; returns the colours (R*R, 4)."""
+    shade = ScalarMappable(Normalize(0.0, most), _SAFETY)
     colours = shade.to_rgba(value)
     _draw_cells(axes, grid, colours, is_empty)
-    add_colour_bar(fig, axes, shade, label)
+    _add_colour_bar(fig, axes, shade, label)
     return colours
 
 
@@ -106,17 +104,12 @@ def _draw_causes(axes: Axes, grid: Grid, cells: np.ndarray, names: Sequence[str]
     colours[:, :3] *= 0.97
     _draw_cells(axes, grid, colours, is_empty)
     axes.set_title("Most likely cause")
-    axes.legend(
-        handles=[Patch(color=palette[i], label=style.spoken(n)) for i, n in enumerate(names)],
-        title="pale: unlikely",
-        loc="center left",
-        bbox_to_anchor=(1.0, 0.5),
-        handlelength=1.0,
-        handleheight=1.0,
-    )
+    handles = [Patch(color=palette[i], label=style.spoken(n)) for i, n in enumerate(names)]
+    look: dict[str, Any] = {"bbox_to_anchor": (1.0, 0.5), "handlelength": 1.0, "handleheight": 1.0}
+    axes.legend(handles=handles, title="pale: unlikely", loc="center left", **look)
 
 
-def draw_grid(axes: Axes, grid: Grid) -> None:
+def _draw_grid(axes: Axes, grid: Grid) -> None:
     """Draws the lines between the cells, and fits the axes to them."""
     half = grid.half_width
     edges = np.linspace(-half, half, grid.resolution + 1)
@@ -132,19 +125,11 @@ def _draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarra
     hollow, filled = squares[is_empty], squares[~is_empty]
     axes.add_collection(PatchCollection(hollow, fc="#f1f2f4", ec="#dadde1", lw=0.5, hatch="////"))
     axes.add_collection(PatchCollection(filled, fc=colours[~is_empty], ec="white", lw=0.8))
-    draw_grid(axes, grid)
+    _draw_grid(axes, grid)
     axes.set_xlabel(f"{len(filled)} of {grid.num_cells} cells hold a belief")
 
 
-def safety_colours() -> Colormap:
-    """Colour map from unsafe (0) through a pale middle to safe (1)."""
-    pale = ("#f0b48f", "#f2efe9", "#a3c4e2")
-    stops = ["#9c3209", style.UNSAFE_COLOUR, *pale, style.SAFE_COLOUR, "#1b4a80"]
-    return LinearSegmentedColormap.from_list("safety", stops)
-
-
-def add_colour_bar(fig: Figure, axes: Any, shade: ScalarMappable, label: str) -> None:
-    """Adds a colour bar beside one or several panels."""
+def _add_colour_bar(fig: Figure, axes: Axes, shade: ScalarMappable, label: str) -> None:
     bar = fig.colorbar(shade, ax=axes, shrink=0.8, pad=0.02, label=label)
     bar.outline.set_visible(False)
 

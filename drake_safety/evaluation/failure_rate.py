@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, Outcomes
+from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, OutcomeReader
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import RATE
@@ -83,7 +83,7 @@ def estimate_failure_rate(
         )
     options = scenario.options_for("pairs", variation)
     make = worker_loop(scenario, variation, **options)
-    outcomes = Outcomes(make(), metric, assessment)
+    reader = OutcomeReader(make(), metric, assessment)
 
     def collected(stage: str, indices: Sequence[int], **simulated: Any) -> Episodes:
         info = episodes_info(make(), seed, options | simulated)
@@ -104,11 +104,12 @@ def estimate_failure_rate(
     score = 1.0 - assessment.predict(*map(np.array, inputs)).probability
     stratum = strata_of(score, np.random.default_rng(seed))
     order = in_turns(stratum)[:num_rollouts]
-    found = [outcomes.of(one) for one in collected("episodes", order, **outcomes.simulated)]
-    chosen = stratum[[one.episode for one in found]]
-    failures = np.bincount(chosen, [one.value for one in found])
+    simulated = collected("episodes", order, **reader.simulated)
+    outcomes = [reader.read(one) for one in simulated]
+    chosen = stratum[[one.episode for one in outcomes]]
+    failures = np.bincount(chosen, [one.value for one in outcomes])
     rate, plain_rollouts = stratified_rate(np.bincount(stratum), np.bincount(chosen), failures)
-    failed = sorted((one for one in found if one.value), key=lambda one: one.time_s)
+    failed = sorted((one for one in outcomes if one.value), key=lambda one: one.time_s)
     return FailureRate(rate=rate, plain_rollouts=plain_rollouts, failures=failed)
 
 

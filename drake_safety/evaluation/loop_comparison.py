@@ -17,8 +17,8 @@ import numpy as np
 from pydrake.systems.framework import Context, EventStatus
 
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, Outcomes
-from drake_safety.evaluation.paired_test import look, pairs_needed
+from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, OutcomeReader
+from drake_safety.evaluation.paired_test import interim_estimate, pairs_needed
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import GATE
 from drake_safety.learning.segments import Episode, EpisodeError
@@ -35,8 +35,8 @@ _BATCH = 2  # Pairs sent to a worker at a time.
 _SAME = 1e-9  # Largest difference of two starts, by the rounding of two engines.
 
 
-class Loop(NamedTuple):
-    """A closed loop: a scenario and its plant."""
+class ComparedPlant(NamedTuple):
+    """A scenario, and the plant that is simulated."""
 
     scenario: Scenario
     variation: str = "nominal"
@@ -75,8 +75,8 @@ class Verdict:
 
 
 def compare_loops(
-    baseline: Loop | Scenario,
-    candidate: Loop | Scenario,
+    baseline: ComparedPlant | Scenario,
+    candidate: ComparedPlant | Scenario,
     *,
     metric: Metric = UNSAFE,
     worse_by: float = 0.02,
@@ -112,29 +112,32 @@ def compare_loops(
     if not (0.0 < worse_by < 1.0 and 0.0 < alpha < 1.0 and max_pairs > 0):
         got = f"{worse_by}, {alpha} and {max_pairs}"
         raise ValueError(f"worse_by and alpha must be in (0, 1), max_pairs at least 1; got {got}")
-    one, two = (Loop(x) if isinstance(x, Scenario) else x for x in (baseline, candidate))
-    check_pair((one, two), metric=metric, seed=seed)
-    hashes = [scenario.simulation_hash(variation) for scenario, variation in (one, two)]
+    first, second = (
+        ComparedPlant(one) if isinstance(one, Scenario) else one for one in (baseline, candidate)
+    )
+    pair = first, second
+    check_pair(pair, metric=metric, seed=seed)
+    hashes = [scenario.simulation_hash(variation) for scenario, variation in pair]
     # The texts say what the hashes leave out.
-    texts = (scenario.to_yaml() for scenario, _ in (one, two))
-    make = MadeOnce((*hashes, *texts), lambda: [make_paired((one, two), side) for side in (0, 1)])
+    texts = (scenario.to_yaml() for scenario, _ in pair)
+    make = MadeOnce((*hashes, *texts), lambda: [make_paired(pair, side) for side in (0, 1)])
     loops = make()
-    readers = [Outcomes(loops[0], metric, gamma) for gamma in (assessment, None)]
+    readers = [OutcomeReader(loops[0], metric, gamma) for gamma in (assessment, None)]
     simulated = {"seed": seed} | readers[0].simulated
     runs: list[dict[int, Outcome]] = [{}, {}]
     with ExitStack() as stack:
         writers = []
-        for side, found in enumerate(runs if path is not None else []):
-            known = _pair_options((one, two), side) | readers[0].simulated
-            if "starts_of" in known:
-                known["starts_of"] = hashes[0]
-            info = episodes_info(loops[side], seed, known)
+        for side, outcomes in enumerate(runs if path is not None else []):
+            options = _pair_options(pair, side) | readers[0].simulated
+            if "starts_of" in options:
+                options["starts_of"] = hashes[0]
+            info = episodes_info(loops[side], seed, options)
             folder = Path(path or "") / f"{info.scenario_hash[:12]}-{seed}"
             writers.append(stack.enter_context(EpisodeWriter(folder, info)))
             if kept := [episode for episode in load_episodes(folder) if episode.index < max_pairs]:
                 check_kept(folder, kept, partial(run_episode, loops[side], **simulated))
-            found.update({episode.index: readers[side].of(episode) for episode in kept})
-        missing = ((index, [index not in found for found in runs]) for index in range(max_pairs))
+            outcomes.update({episode.index: readers[side].read(episode) for episode in kept})
+        missing = ((index, [index not in known for known in runs]) for index in range(max_pairs))
         items = [item for item in missing if any(item[1])]
         results = map_items(
             partial(_run_pair, **simulated),
@@ -149,17 +152,18 @@ def compare_loops(
         stack.enter_context(closing(results))
         looks: tuple[list[Estimate], list[Estimate]] = ([], [])
         for number in sorted({*range(_LOOK, max_pairs, _LOOK), max_pairs}):
-            while not all(index in found for found in runs for index in range(number)):
+            while not all(index in known for known in runs for index in range(number)):
                 for side, episode in enumerate(next(results)):
                     if episode is not None:
-                        runs[side][episode.index] = readers[side].of(episode)
+                        runs[side][episode.index] = readers[side].read(episode)
                         if writers:
                             writers[side].append(episode)
             pairs = [(runs[0][index], runs[1][index]) for index in range(number)]
             apart = [after.value - before.value for before, after in pairs]
             later_s = [after.time_s - before.time_s for before, after in pairs]
-            looks[0].append(look(apart, looks[0], alpha))
-            looks[1].append(look(later_s, looks[1], alpha, one.scenario.episode_duration_s))
+            duration_s = first.scenario.episode_duration_s
+            looks[0].append(interim_estimate(apart, looks[0], alpha))
+            looks[1].append(interim_estimate(later_s, looks[1], alpha, duration_s))
             verdict = _verdict(pairs, looks, worse_by, loops[0].output_names)
             if verdict.verdict == UNDECIDED:
                 verdict = replace(verdict, pairs_needed=pairs_needed(apart, worse_by, alpha))
@@ -169,32 +173,31 @@ def compare_loops(
     return verdict
 
 
-def check_pair(pair: tuple[Loop, Loop], *, metric: Metric = UNSAFE, seed: int = GATE.first) -> None:
+def check_pair(
+    pair: tuple[ComparedPlant, ComparedPlant], *, metric: Metric = UNSAFE, seed: int = GATE.first
+) -> None:
     """Builds two loops and begins their first episode, before hours of simulations."""
-    (one, variation), (two, other) = pair
-    if (hash_ := one.simulation_hash(variation)) == two.simulation_hash(other):
-        who = f"scenario '{one.name}', variation '{variation}'"
-        raise ValueError(f"the candidate is the baseline: {who}, with hash {hash_[:12]}")
-    starts: list[dict[str, np.ndarray]] = []
+    hashes = [scenario.simulation_hash(variation) for scenario, variation in pair]
+    if hashes[0] == hashes[1]:
+        name, variation = pair[0].scenario.name, pair[0].variation
+        raise ValueError(
+            f"the candidate is the baseline: scenario '{name}', variation '{variation}', with hash "
+            f"{hashes[0][:12]}"
+        )
+    starts = []
     for side, who in enumerate(("baseline", "candidate")):
         loop = make_paired(pair, side)
-        Outcomes(loop, metric)
-
-        def at_start(context: Context, loop: ClosedLoop = loop) -> None:
-            starts.append(_start_of(loop, context))
-
+        OutcomeReader(loop, metric)
         try:
-            run_episode(
-                loop, 0, seed=seed, at_start=at_start, monitor=partial(_after_one_step, loop)
-            )
+            starts.append(_run_with_start(loop, 0, seed=seed, monitor=_after_one_step)[1])
         except EpisodeError as error:
             raise ValueError(f"the {who}: {error}") from error
     _check_alike(0, loop, *starts)
 
 
-def _after_one_step(loop: ClosedLoop, context: Context) -> EventStatus:
+def _after_one_step(context: Context) -> EventStatus:
     is_over = context.get_time() > 0.0
-    return EventStatus.ReachedTermination(loop, "") if is_over else EventStatus.DidNothing()
+    return EventStatus.ReachedTermination(None, "") if is_over else EventStatus.DidNothing()
 
 
 def _verdict(
@@ -237,13 +240,13 @@ def _by_command(
     return rows
 
 
-def make_paired(pair: tuple[Loop, Loop], side: int, **options: Any) -> ClosedLoop:
+def make_paired(pair: tuple[ComparedPlant, ComparedPlant], side: int, **options: Any) -> ClosedLoop:
     """Makes the baseline, side 0, or the candidate, side 1, whose starts are the baseline's."""
     scenario, variation = pair[side]
     return scenario.make_loop(variation, **(_pair_options(pair, side) | options))
 
 
-def _pair_options(pair: tuple[Loop, Loop], side: int) -> dict[str, Any]:
+def _pair_options(pair: tuple[ComparedPlant, ComparedPlant], side: int) -> dict[str, Any]:
     """Options of one of two loops, whose starts may be those of the other."""
     one, two = (scenario.options_for("pairs", variation) for scenario, variation in pair)
     # Whether a task's starts depend on its controller, and can be another's.
@@ -256,17 +259,25 @@ def _run_pair(
 ) -> list[Episode | None]:
     """The episodes of a pair that are missing; the starts of both are compared."""
     index, is_missing = item
-    starts: list[dict[str, np.ndarray]] = []
-    episodes = []
+    starts, episodes = [], []
     for loop, is_wanted in zip(loops, is_missing, strict=True):
         short: dict[str, Any] = {} if is_wanted else {"until_first_row": True}
-
-        def at_start(context: Context, loop: ClosedLoop = loop) -> None:
-            starts.append(_start_of(loop, context))
-
-        episodes.append(run_episode(loop, index, at_start=at_start, **options, **short))
+        episode, start = _run_with_start(loop, index, **options, **short)
+        episodes.append(episode if is_wanted else None)
+        starts.append(start)
     _check_alike(index, loops[0], *starts)
-    return [one if is_wanted else None for one, is_wanted in zip(episodes, is_missing, strict=True)]
+    return episodes
+
+
+def _run_with_start(
+    loop: ClosedLoop, index: int, **options: Any
+) -> tuple[Episode, dict[str, np.ndarray]]:
+    """An episode, and state, plan and disturbances at its start."""
+    start: dict[str, np.ndarray] = {}
+    episode = run_episode(
+        loop, index, at_start=lambda context: start.update(_start_of(loop, context)), **options
+    )
+    return episode, start
 
 
 def _start_of(loop: ClosedLoop, context: Context) -> dict[str, np.ndarray]:

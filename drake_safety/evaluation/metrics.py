@@ -105,8 +105,7 @@ def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> E
 
 def quantile(values: np.ndarray, share: float, *, bootstrap: Bootstrap) -> Estimate:
     """A quantile of independent values (N,), some infinite, with its bootstrap interval."""
-    statistic = partial(np.quantile, q=share, axis=-1, method="higher")
-    return bootstrap.over_values(statistic, values)
+    return bootstrap.over_values(partial(np.quantile, q=share, axis=-1, method="higher"), values)
 
 
 def rate_per_hour(count: float, duration_s: float, n: int) -> Estimate:
@@ -185,21 +184,18 @@ def segment_estimates(
     unsafe_score: np.ndarray,
     *,
     threshold: float,
-    bootstrap: Bootstrap = _BOOTSTRAP,
 ) -> dict[str, Estimate]:
-    """AUC, recalls and Brier score of a scorer on segments.
+    """AUC, recalls and Brier score of a scorer on segments, with intervals over episodes.
 
-    Intervals are over episodes: bootstraps, and those of :func:`share` for the recalls.
-    Segments are as `split(episodes, stride=1, ...)` gives them; scores (N,) are in [0, 1], and
-    unsafe above the threshold.
+    Scores (N,) are in [0, 1], and unsafe above the threshold.
     """
     score, label = _checked("segment_estimates", unsafe_score, segments.is_unsafe)
     episode, probability = segments.episode, np.minimum(score, 1.0)  # "Don't know" is infinite.
     return {
-        "auc": auc(score, label, episode, bootstrap=bootstrap),
-        "safe_recall": share((score <= threshold)[~label], episode[~label], bootstrap=bootstrap),
-        "unsafe_recall": share((score > threshold)[label], episode[label], bootstrap=bootstrap),
-        "brier": mean((probability - label) ** 2, episode, bootstrap=bootstrap),
+        "auc": auc(score, label, episode),
+        "safe_recall": share((score <= threshold)[~label], episode[~label]),
+        "unsafe_recall": share((score > threshold)[label], episode[label]),
+        "brier": mean((probability - label) ** 2, episode, bootstrap=_BOOTSTRAP),
     }
 
 

@@ -1,4 +1,4 @@
-"""What counts as the failure of an episode, and what is kept of one."""
+"""What counts as the failure of an episode, and what is kept of each."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_safety.files.reading import did_you_mean, is_number
+from drake_safety.files.reading import is_number
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.causes import is_outside
 from drake_safety.learning.segments import DIVERGED, Episode
@@ -49,7 +49,7 @@ class Outcome:
     belief: tuple[float, ...] | None
 
 
-class Outcomes:
+class OutcomeReader:
     """Reads what is kept of the episodes of a loop.
 
     Attributes:
@@ -60,12 +60,13 @@ class Outcomes:
         self._metric, self._gamma = metric, gamma
         self._duration_s = loop.scenario.episode_duration_s
         self._bad_rows = _bad_rows(loop, UNSAFE if callable(metric) else metric)
-        goes_on = not callable(metric) and metric != UNSAFE
-        self.simulated: dict[str, Any] = {"after_leaving_s": math.inf} if goes_on else {}
-        if (name := _constraint(loop, metric)) in loop.constraint_names:
-            self.simulated["until"] = name
+        self.simulated: dict[str, Any] = {}
+        if not callable(metric) and metric != UNSAFE:
+            self.simulated["after_leaving_s"] = math.inf
+            if (name := _constraint(loop, metric)) in loop.constraint_names:
+                self.simulated["until"] = name
 
-    def of(self, episode: Episode) -> Outcome:
+    def read(self, episode: Episode) -> Outcome:
         """What is kept of an episode."""
         is_held = episode.num_controller_failures > 0
         is_bad = self._bad_rows(episode) | _last_row(episode, is_held or episode.cause == DIVERGED)
@@ -92,24 +93,23 @@ def _bad_rows(loop: ClosedLoop, metric: str) -> Callable[[Episode], np.ndarray]:
     if metric == UNSAFE:
         return lambda one: _last_row(one, not one.is_safe)
     if kind == "tracking" and is_number(bound) and float(bound) > 0:
-        fall = names.index(loop.fall_name) if isinstance(loop, CanFall) else None
+        fall = [names.index(loop.fall_name)] if isinstance(loop, CanFall) else []
         return lambda one: (
             ~(np.linalg.norm(one.output - one.desired_output, axis=1) <= float(bound))
-            | (False if fall is None else one.margins[:, fall] < 0.0)
+            | (one.margins[:, fall] < 0.0).any(axis=1)
         )
     name = _constraint(loop, metric)
     if name not in names:
         known = [UNSAFE, "fall", "tracking=BOUND", *names]
         raise ValueError(
-            f"metric '{metric}'{did_you_mean(metric, known)}: expected one of {known}, or in "
-            "Python a function of an episode"
+            f"metric '{metric}': expected one of {known}, or in Python a function of an episode"
         )
     # The cause may be a constraint without a negative margin, by a task's own port ``safe``.
     k = names.index(name)
     return lambda one: is_outside(one.margins[:, [k]]) | _last_row(one, one.cause == name)
 
 
-def _constraint(loop: ClosedLoop, metric: Metric) -> Metric:
+def _constraint(loop: ClosedLoop, metric: str) -> str:
     """The metric, or the constraint of a fall."""
     return require(loop, CanFall, "metric 'fall'").fall_name if metric == "fall" else metric
 

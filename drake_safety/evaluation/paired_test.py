@@ -42,10 +42,10 @@ def betting_log_e(values: np.ndarray, counts: np.ndarray, mean: float) -> np.nda
     return log_e
 
 
-def look(
+def interim_estimate(
     outcomes: Sequence[float], before: Sequence[Estimate], alpha: float, bound: float = 1.0
 ) -> Estimate:
-    """One look of a confidence sequence: the mean of all outcomes so far, (N,), and its ends.
+    """A look at a confidence sequence: the mean of all outcomes so far, (N,), and its ends.
 
     Each end holds at all looks at once with a probability of at least 1 - alpha, and both with
     1 - 2 alpha.
@@ -68,7 +68,7 @@ def pairs_needed(outcomes: Sequence[float], bound: float, alpha: float) -> int |
     values, counts = np.unique(outcomes, return_counts=True)
     times = np.geomspace(1.0, _MOST_TIMES, 400)[:, None]
     bets = ((values, 0.0), (-values, 0.0), (-values, -bound))
-    log_e = [betting_log_e(of, times * counts, mean) for of, mean in bets]
+    log_e = [betting_log_e(signed, times * counts, mean) for signed, mean in bets]
     is_known = np.max(log_e, axis=0) >= -math.log(alpha)
     return math.ceil(len(outcomes) * times[np.argmax(is_known), 0]) if is_known.any() else None
 

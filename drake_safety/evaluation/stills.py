@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import (
@@ -57,6 +58,7 @@ class StillCamera:
         self._base = plant.GetBodyByName(loop.robot.base, self._instance)
         self.context = loop.CreateDefaultContext()  # The root Context that is rendered.
         self._plant_context = plant.GetMyMutableContextFromRoot(self.context)
+        self._scene_graph = loop.GetSubsystemByName("scene_graph")
         first, *others = np.atleast_2d(positions)
         self._pose(first)
         corners = self._corners()
@@ -73,29 +75,30 @@ class StillCamera:
             farthest = max(farthest, float(reach))
         narrow = 0.5 * _FIELD_OF_VIEW_RAD * min(1.0, width / height)
         self._eye = view.room * farthest / math.sin(narrow) * view.direction()
-        core = RenderCameraCore(
-            _RENDERER,
-            CameraInfo(width * SUPERSAMPLING, height * SUPERSAMPLING, _FIELD_OF_VIEW_RAD),
-            ClippingRange(0.05, 30.0 * max(farthest, 1.0)),
-            RigidTransform(),
+        size = width * SUPERSAMPLING, height * SUPERSAMPLING
+        clipping = ClippingRange(0.05, 30.0 * max(farthest, 1.0))
+        info = CameraInfo(*size, _FIELD_OF_VIEW_RAD)
+        self._camera = ColorRenderCamera(
+            RenderCameraCore(_RENDERER, info, clipping, RigidTransform())
         )
-        self._camera = ColorRenderCamera(core)
-        scene_graph = loop.GetSubsystemByName("scene_graph")
-        self._scene_graph, self._world = scene_graph, scene_graph.world_frame_id()
-        brightness = _PBR_BRIGHTNESS if self._meshes(".gltf") else 1.0
-        self._add_renderer(_lighting(centre, radius, brightness=brightness))
+        is_physical = any(path.endswith(".gltf") for path in self._meshes().values())
+        brightness = _PBR_BRIGHTNESS if is_physical else 1.0
+        self._add_renderer(_lighting(centre, radius, brightness))
 
     def render(self, positions: np.ndarray) -> np.ndarray:
         """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8."""
         self._pose(positions)
         target = self._target()
-        query = self._plant.get_geometry_query_input_port().Eval(self._plant_context)
         self._X_WC = _look_at(target + self._eye, target)
-        image = query.RenderColorImage(self._camera, self._world, self._X_WC)
+        world = self._scene_graph.world_frame_id()
+        image = self._query().RenderColorImage(self._camera, world, self._X_WC)
         pixels = np.asarray(image.data[..., :3], dtype=np.uint16)
         rows, columns = pixels.shape[0] // SUPERSAMPLING, pixels.shape[1] // SUPERSAMPLING
         blocks = pixels.reshape(rows, SUPERSAMPLING, columns, SUPERSAMPLING, 3)
         return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+    def _query(self) -> Any:
+        return self._plant.get_geometry_query_input_port().Eval(self._plant_context)
 
     def _target(self) -> np.ndarray:
         """Point of the world that the camera aims at, (3,)."""
@@ -113,41 +116,37 @@ class StillCamera:
         try:
             self._scene_graph.AddRenderer(context, _RENDERER, MakeRenderEngineVtk(lighting))
         except RuntimeError as error:
-            refused = [one for one, path in self._meshes().items() if path in str(error)]
+            refused = [mesh for mesh, path in self._meshes().items() if path in str(error)]
             if not refused:
                 raise
             _LOGGER.warning("the picture is without a mesh: %s", error)
-            for one in refused:
-                source = self._plant.get_source_id()
-                self._scene_graph.RemoveRole(context, source, one, Role.kPerception)
+            source = self._plant.get_source_id()
+            for mesh in refused:
+                self._scene_graph.RemoveRole(context, source, mesh, Role.kPerception)
             self._scene_graph.RemoveRenderer(context, _RENDERER)
             self._add_renderer(lighting)
 
-    def _meshes(self, suffix: str = "") -> dict[GeometryId, str]:
+    def _meshes(self) -> dict[GeometryId, str]:
         """The files of the scene's meshes."""
-        query = self._plant.get_geometry_query_input_port().Eval(self._plant_context)
-        inspector = query.inspector()
+        inspector = self._query().inspector()
         shapes = ((i, inspector.GetShape(i)) for i in inspector.GetAllGeometryIds(Role.kPerception))
-        found = {i: one.source() for i, one in shapes if isinstance(one, Mesh)}
-        return {i: str(one.path()) for i, one in found.items() if one.extension().endswith(suffix)}
+        return {i: str(one.source().path()) for i, one in shapes if isinstance(one, Mesh)}
 
     def _corners(self) -> np.ndarray:
         """Corners of boxes around the visible geometry of the robot in the world, (3, N) [m]."""
-        plant, context = self._plant, self._plant_context
-        query = plant.get_geometry_query_input_port().Eval(context)
+        query = self._query()
         inspector = query.inspector()
         signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1)
         corners = []
-        for index in plant.GetBodyIndices(self._instance):
-            frame = plant.GetBodyFrameIdOrThrow(index)
+        for index in self._plant.GetBodyIndices(self._instance):
+            frame = self._plant.GetBodyFrameIdOrThrow(index)
             for geometry in inspector.GetGeometries(frame, Role.kPerception):
-                box = inspector.GetObbInGeometryFrame(geometry)
                 X_WG = query.GetPoseInWorld(geometry)
-                if box is None:
+                if (box := inspector.GetObbInGeometryFrame(geometry)) is None:
                     corners.append(X_WG.translation()[:, None])
                 else:
-                    X_WB = X_WG @ box.pose()
-                    corners.append(X_WB.multiply(signs * np.reshape(box.half_width(), (3, 1))))
+                    corners_B = signs * np.reshape(box.half_width(), (3, 1))
+                    corners.append((X_WG @ box.pose()).multiply(corners_B))
         if not corners:
             raise ValueError("stills: the robot has no visible geometry")
         return np.hstack(corners)
@@ -174,7 +173,7 @@ def still_times(
 ) -> list[float]:
     """Logged instants [s] of stills: those of events, and ``num_stills`` others between them.
 
-    Of the others, those close to an event are dropped.
+    Others that are close to an event are dropped.
     """
     kept = [*events_s]
     for instant in np.linspace(time_s[0], time_s[-1], num_stills).tolist():
@@ -215,7 +214,7 @@ def _look_at(p_WC: np.ndarray, p_WT: np.ndarray) -> RigidTransform:
     return RigidTransform(R_WC, p_WC)
 
 
-def _lighting(centre: np.ndarray, radius: float, *, brightness: float) -> RenderEngineVtkParams:
+def _lighting(centre: np.ndarray, radius: float, brightness: float) -> RenderEngineVtkParams:
     """A light that casts shadows and soft fill lights, scaled to the robot."""
 
     def lamp(x: float, y: float, z: float, intensity: float, kind: str = "point") -> LightParameter:
@@ -230,16 +229,11 @@ def _lighting(centre: np.ndarray, radius: float, *, brightness: float) -> Render
             color=Rgba(1.0, 0.99, 0.97, 1.0),
         )
 
+    fill = [(6.0, -8.0, 3.2, 0.42), (-6.0, 8.0, 3.2, 0.42), (6.0, 8.0, 5.0, 0.22)]
+    fill += [(-6.0, -8.0, 3.0, 0.22), (0.0, 0.0, 12.0, 0.12)]
     return RenderEngineVtkParams(
         default_clear_color=_BACKGROUND,
         cast_shadows=True,
         shadow_map_size=2048,
-        lights=[
-            lamp(2.0, -2.6, 6.8, 0.55, "spot"),
-            lamp(6.0, -8.0, 3.2, 0.42),
-            lamp(-6.0, 8.0, 3.2, 0.42),
-            lamp(6.0, 8.0, 5.0, 0.22),
-            lamp(-6.0, -8.0, 3.0, 0.22),
-            lamp(0.0, 0.0, 12.0, 0.12),
-        ],
+        lights=[lamp(2.0, -2.6, 6.8, 0.55, "spot"), *(lamp(*one) for one in fill)],
     )
