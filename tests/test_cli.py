@@ -226,7 +226,7 @@ def test_pushes_are_the_scenarios_own_balls_or_described_in_degrees(scenario):
 @pytest.mark.parametrize(
     ("push", "message"),
     [
-        ("mas=3", r"push 'mas=3': unknown key 'mas' \(did you mean 'mass_kg'\?\)"),
+        ("mas=3", "push 'mas=3': unknown key 'mas'; keys there are"),
         ("mass=heavy", "push 'mass=heavy': 'mass_kg' must be a valid number; got 'heavy'"),
     ],
 )

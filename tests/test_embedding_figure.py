@@ -71,13 +71,3 @@ def test_empty_cells_are_hatched_the_others_show_their_belief_and_causes_are_nam
     safe = assessment.beliefs_[0, ~is_empty, 0]
     assert colours[np.argmax(safe), 2] > colours[np.argmax(safe), 0]
     assert colours[np.argmin(safe), 0] > colours[np.argmin(safe), 2]
-
-
-def test_causes_are_left_out_where_there_is_but_one(assessment, fresh, monkeypatch):
-    beliefs = assessment.beliefs_.copy()
-    beliefs[..., 3] += beliefs[..., 4]
-    beliefs[..., 4] = 0.0
-    monkeypatch.setattr(assessment, "beliefs_", beliefs)
-    titles = [axes.get_title(loc="left") for axes in embedding_figure(assessment, fresh).axes]
-    assert "Belief of each cell: safe" in titles
-    assert "Most likely cause" not in titles

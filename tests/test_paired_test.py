@@ -42,7 +42,7 @@ def first_looks(log_e, looks):
 
 
 @pytest.mark.parametrize("is_above", [True, False])
-@pytest.mark.parametrize("mean", [-0.6, 0.0, 0.02, 0.9])
+@pytest.mark.parametrize("mean", [-0.6, 0.02])
 def test_the_capital_is_that_of_one_bet_after_the_other(mean, is_above):
     outcomes = np.random.default_rng(1).choice([-1.0, -0.3, 0.0, 0.25, 1.0], 60)
     values, counts = np.unique(outcomes, return_counts=True)
@@ -123,13 +123,6 @@ def test_capital_and_ends_are_those_of_confseq(num_pairs, capitals, low, high, t
     assert found.high - found.low < theirs
 
 
-@pytest.mark.parametrize("value", [-1.0, 0.0, 1.0])
-def test_equal_outcomes_have_an_interval_too(value):
-    found = interim_estimate(np.full(200, value), [], ALPHA)
-    assert found.low <= value <= found.high
-    assert found.high - found.low < 0.06
-
-
 @pytest.mark.parametrize(("rate", "shared"), [(0.02, 0.0), (0.3, 0.0), (0.3, 0.8)])
 def test_two_equal_loops_are_rarely_called_different_however_often_one_looks(rate, shared):
     every = np.arange(1, 2001)
@@ -162,8 +155,9 @@ def test_either_end_excludes_the_true_mean_in_at_most_a_share_alpha_of_replays(k
         assert np.isfinite(first_looks(log_e, looks)).mean() <= ALPHA
 
 
-@pytest.mark.parametrize("shared", [0.0, 0.5, 0.9])
-@pytest.mark.parametrize(("baseline", "num_pairs"), [(0.01, 2016), (0.05, 416)])
+@pytest.mark.parametrize(
+    ("baseline", "num_pairs", "shared"), [(0.01, 2016, 0.0), (0.05, 416, 0.0), (0.05, 416, 0.9)]
+)
 def test_a_verdict_takes_about_as_many_pairs_as_with_a_mixture_of_all_shares(
     baseline, num_pairs, shared
 ):
@@ -177,13 +171,6 @@ def test_a_verdict_takes_about_as_many_pairs_as_with_a_mixture_of_all_shares(
         # A batch test of the same power needs 2529 episodes of each loop, and 473.
         assert np.median(found) == pytest.approx(num_pairs, rel=0.15)
     assert np.median(found) <= num_pairs * (1 - shared / 2)
-
-
-def test_evidence_is_that_of_a_mixture_of_all_shares_but_for_a_factor():
-    for more, less in ((5, 0), (12, 1), (30, 10), (9, 9), (60, 30)):
-        counts = np.array([less, 0, more])
-        found = betting_log_e(OUTCOMES, counts, 0.0)
-        assert abs(found - naive.mixture_log_e(more, less)) < math.log(2.5)
 
 
 def test_it_is_soon_known_that_a_loop_which_never_fails_more_is_not_worse():

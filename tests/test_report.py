@@ -88,24 +88,13 @@ def test_every_picture_is_in_the_page_and_the_recording_beside_it(whole):
     assert whole.page.all("a", "href") == ["run/recording.html"]
 
 
-@pytest.mark.parametrize(
-    ("gone", "absent"),
-    [
-        (["episodes"], "Trained with"),
-        (["evaluation.json"], "How it did"),
-        (["sharpened.safetensors", "paper.safetensors"], "What was learned"),
-        (["run"], "Recorded motion"),
-    ],
-)
-def test_what_a_half_finished_run_lacks_is_left_out_and_the_rest_shown(whole, copy, gone, absent):
-    for name in gone:
-        path = copy / name
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-    assert absent in whole.page.words
-    page = Page(page_of(copy))
-    assert absent not in page.words
-    if "evaluation.json" not in gone:
-        assert "0.900 (0.795–0.962)" in page.words
+def test_what_a_half_finished_run_lacks_is_left_out_and_the_rest_shown(copy):
+    shutil.rmtree(copy / "episodes")
+    shutil.rmtree(copy / "run")
+    (copy / "evaluation.json").unlink()
+    words = Page(page_of(copy)).words
+    assert "What was learned" in words
+    assert not any(one in words for one in ("Trained with", "How it did", "Recorded motion"))
 
 
 def test_a_folder_that_is_no_run_or_is_damaged_and_a_missing_extra_are_named(

@@ -79,8 +79,6 @@ def test_the_text_between_the_markers_is_rewritten_and_no_other(tmp_path):
     ("text", "message"),
     [
         ("nothing", "no block of results"),
-        ("<!-- results: lip -->\n", "no block of results"),
-        (BLOCK + "<!-- results: lip -->\n", r"comes only after \['lip'\]"),
         (BLOCK.replace("lip", "other"), r"no results 'other' in .*there are \['lip'\]"),
     ],
 )

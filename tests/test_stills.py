@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from drake_safety.evaluation.stills import StillCamera, render_stills, stack_positions, still_times
-from drake_safety.simulation.legged_loop import View
 from drake_safety.simulation.scenario import load_scenario
 from studies.moving_pictures import SceneCamera
 
@@ -56,14 +55,11 @@ def test_a_still_is_an_rgb_image_with_the_dark_robot_in_the_middle_of_a_light_sc
     assert not is_dark[[0, -1]].any() and not is_dark[:, [0, -1]].any()
 
 
-@pytest.mark.parametrize(
-    ("turned", "height_m"),
-    [([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0], 0.12), ([0.0, 1.0, 0.0, 0.0], 0.1)],
-)
-def test_a_robot_that_fell_is_in_the_picture(loop, standing, turned, height_m):
+def test_a_robot_that_fell_is_in_the_picture(loop, standing):
     fallen = standing.copy()
     start = loop.plant.GetBodyByName(loop.robot.base).floating_positions_start()
-    fallen[start : start + 4], fallen[start + 4 : start + 7] = turned, [1.0, 2.0, height_m]
+    fallen[start : start + 4] = [np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]
+    fallen[start + 4 : start + 7] = [1.0, 2.0, 0.12]
     log, time_s = np.array([standing, fallen]), np.arange(2.0)
     for _, image in render_stills(loop, time_s, log, time_s, **SIZE):
         is_dark = image.max(axis=-1) < 90
@@ -79,14 +75,6 @@ def test_the_camera_follows_the_base_over_the_ground_but_not_up(loop, camera, st
     assert np.abs(along - reference).mean() < 6.0
     lowered = np.nonzero(up.max(axis=-1) < 90)[0].mean()
     assert lowered < np.nonzero(reference.max(axis=-1) < 90)[0].mean() - 5
-
-
-def test_a_ball_beside_the_robot_is_seen_and_a_parked_one_is_not(loop, camera, standing):
-    assert share_of_orange(camera.render(standing)) == 0.0
-    ball = standing.copy()
-    start = loop.plant.GetBodyByName("ball").floating_positions_start()
-    ball[start + 4 : start + 7] = [0.1, -0.5, 0.4]
-    assert share_of_orange(camera.render(ball)) > 0.005
 
 
 def test_stills_show_the_nearest_logged_instants(loop, standing):
@@ -126,13 +114,6 @@ def test_points_of_the_world_are_found_in_the_still(loop, standing):
     assert base[2] == pytest.approx(loop.kinematics.standing_height, abs=0.1)
 
 
-def test_a_view_with_more_room_shows_the_robot_smaller(loop, camera, standing, monkeypatch):
-    monkeypatch.setattr(loop, "view", View(room=2 * loop.view.room))
-    far = StillCamera(loop, standing, **SIZE)
-    small, large = (np.mean(c.render(standing).max(axis=-1) < 90) for c in (far, camera))
-    assert small == pytest.approx(large / 4, rel=0.25)
-
-
 def test_logged_states_of_robot_and_ball_make_up_the_plants_positions(loop):
     plant, name = loop.plant, loop.robot.name
     q = np.random.default_rng(0).normal(size=(4, plant.num_positions()))
@@ -146,17 +127,3 @@ def test_logged_states_of_robot_and_ball_make_up_the_plants_positions(loop):
     np.testing.assert_array_equal(stack_positions(loop, states), q)
     with pytest.raises(ValueError, match=rf"states of \['ball'\], expected those of .*{name}"):
         stack_positions(loop, {"ball": states["ball"]})
-
-
-def test_a_robot_that_is_nowhere_is_not_drawn(camera, standing):
-    with pytest.raises(ValueError, match="not finite"):
-        camera.render(standing * np.nan)
-
-
-def test_meshes_that_are_shaded_physically_are_lit_as_brightly(camera, standing):
-    pytest.importorskip("trimesh")
-    published = load_scenario("a1_balancing").make_loop(ball=True)
-    corner = np.s_[-8:, -8:]  # The ground.
-    plain = camera.render(standing)[corner].mean()
-    lit = StillCamera(published, standing, **SIZE).render(standing)[corner].mean()
-    assert abs(lit - plain) < 30

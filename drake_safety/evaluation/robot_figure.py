@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -25,14 +27,15 @@ from drake_safety.evaluation import figure_style as style
 from drake_safety.evaluation.stills import StillCamera
 from drake_safety.simulation.legged_loop import LeggedLoop
 
-_COLOURS: dict[type[Shape], tuple[str, str]] = {
-    Box: ("boxes", style.SAFE_COLOUR),
-    Capsule: ("capsules", style.RECOVERY_COLOUR),
-    Cylinder: ("cylinders", style.SERIES_COLOURS[3]),
-    Sphere: ("spheres", style.UNSAFE_COLOUR),
-    Ellipsoid: ("ellipsoids", style.SERIES_COLOURS[5]),
-    Convex: ("convex hulls", style.FALSE_ALARM_COLOUR),
+_KINDS: dict[type[Shape], str] = {
+    Box: "boxes",
+    Sphere: "spheres",
+    Capsule: "capsules",
+    Cylinder: "cylinders",
+    Convex: "convex hulls",
+    Ellipsoid: "ellipsoids",
 }
+_COLOURS = dict(zip(_KINDS.values(), style.SERIES_COLOURS, strict=True))
 _SIZE = {"width": 900, "height": 1000}  # Of a still [pixels].
 _VISUAL_SHARE = 0.25  # Of the robot's look in the picture of its shapes.
 
@@ -44,33 +47,32 @@ def robot_figure(loop: LeggedLoop) -> Figure:
     positions = loop.plant.GetPositions(loop.plant.GetMyContextFromRoot(context))
     look = StillCamera(loop, positions, **_SIZE).render(positions)
     camera = StillCamera(loop, positions, **_SIZE)
-    kinds = show_shapes(loop, camera.context)
+    kinds = _show_shapes(loop, camera.context)
     shapes = camera.render(positions)
     both = np.round(_VISUAL_SHARE * look + (1 - _VISUAL_SHARE) * shapes).astype(np.uint8)
     with style.drawing_style():
         fig = style.new_figure(9.0, 5.6)
         panels = fig.subplots(1, 2)
-        titles = f"{loop.robot.name}, standing", f"{sum(kinds.values())} collision shapes"
+        titles = f"{loop.robot.name}, standing", f"{kinds.total()} collision shapes"
         for axes, image, title in zip(panels, (look, both), titles, strict=True):
             axes.imshow(image)
             axes.set_title(title)
             axes.set_axis_off()
-        for name, colour in _COLOURS.values():
-            if name in kinds:
-                panels[1].scatter([], [], c=colour, marker="s", label=f"{name}: {kinds[name]}")
-        panels[1].legend(
-            loc="upper left", framealpha=0.8, frameon=True, edgecolor="none", handletextpad=0.2
-        )
+        for name in filter(kinds.__contains__, _COLOURS):
+            label = f"{name}: {kinds[name]}"
+            panels[1].scatter([], [], c=_COLOURS[name], marker="s", label=label)
+        box = {"framealpha": 0.8, "frameon": True, "edgecolor": "none"}
+        panels[1].legend(loc="upper left", handletextpad=0.2, **box)
     return fig
 
 
-def show_shapes(loop: LeggedLoop, context: Context) -> dict[str, int]:
+def _show_shapes(loop: LeggedLoop, context: Context) -> Counter[str]:
     """Shows a robot's collision shapes, coloured by kind, for its visuals, and counts them."""
     plant, scene_graph = loop.plant, loop.GetSubsystemByName("scene_graph")
     source = plant.get_source_id()
     scene_context = scene_graph.GetMyMutableContextFromRoot(context)
     inspector = scene_graph.get_query_output_port().Eval(scene_context).inspector()
-    kinds: dict[str, int] = {}
+    kinds: Counter[str] = Counter()
     for index in plant.GetBodyIndices(loop.robot_instance):
         frame = plant.GetBodyFrameIdOrThrow(index)
         for visual in inspector.GetGeometries(frame, Role.kPerception):
@@ -80,13 +82,11 @@ def show_shapes(loop: LeggedLoop, context: Context) -> dict[str, int]:
             if isinstance(shape, Mesh):
                 # Drake's contacts are those of its convex hull.
                 shape = Convex(shape.source(), shape.scale3())
-            name, colour = _COLOURS[type(shape)]
-            kinds[name] = kinds.get(name, 0) + 1
-            shown = GeometryInstance(
-                inspector.GetPoseInFrame(shape_id), shape, f"shown {inspector.GetName(shape_id)}"
-            )
+            kind, name = _KINDS[type(shape)], f"shown {inspector.GetName(shape_id)}"
+            kinds[kind] += 1
+            shown = GeometryInstance(inspector.GetPoseInFrame(shape_id), shape, name)
             properties = PerceptionProperties()
-            properties.AddProperty("phong", "diffuse", Rgba(*to_rgb(colour)))
+            properties.AddProperty("phong", "diffuse", Rgba(*to_rgb(_COLOURS[kind])))
             shown.set_perception_properties(properties)
             scene_graph.RegisterGeometry(scene_context, source, frame, shown)
     return kinds
