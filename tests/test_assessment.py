@@ -168,7 +168,7 @@ def test_features_enter_a_second_time_with_a_feature_unit(held_out):
     state, preview, features = inputs(held_out, slice(0, 20))
     x = doubled.inputs_of(state, preview, features)
     np.testing.assert_array_equal(
-        x[:, num_raw:], np.hstack([features, np.arcsinh(features / unit)])
+        x[:, num_raw:], np.hstack([features, np.arcsinh(features / 0.05)])
     )
     features[:] = np.nan
     assert np.all(doubled.predict(state, preview, features).belief == EMPTY)

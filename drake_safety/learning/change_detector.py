@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -45,7 +44,7 @@ _ADAPTED = ("deviation", "limits", "settings", *_LINEAR)
 
 
 class Alarm(NamedTuple):
-    """First row of an alarm, the row after its last one, and what was seen at its begin."""
+    """First row of an alarm, the row after its last one, and its cause."""
 
     begin: int
     end: int
@@ -56,18 +55,18 @@ class Alarm(NamedTuple):
 class ChangeDetector:
     """Charts of the innovation, the error of predicting the next measured state.
 
-    A plant or a sensor that changed cannot be seen in one input: it lies among those of training.
-    It is seen in how the state follows from the last two inputs. Each state's innovation, in its
-    standard deviations and clipped, has exponentially weighted means of itself and of its square,
-    with three memories. The largest of the six, each in units of its limit, is the state's level;
+    A changed plant or sensor does not show in one input, which lies among those of training. It
+    shows in the error of predicting the next state from the last two inputs. Each state's
+    innovation, in its standard deviations and clipped, has exponentially weighted means of itself
+    and of its square, with three memories. The largest of the six, each in units of its limit, is the state's level;
     an alarm is a level above 1. The limits are those of motion that the predictor did not see,
     extrapolated to a rate of false alarms by the exponential tail of the maxima of blocks (peaks
     over threshold; Coles 2001, section 4), first of each chart and then of the levels. Nothing is
     learned from failures.
 
     Attributes:
-        columns: Which entries of (state, desired preview, features) it sees, (n_u,).
-        watched: Which states it predicts, (n_w,).
+        columns: Entries of (state, desired preview, features) that are its inputs, (n_u,).
+        watched: States that it predicts, (n_w,).
         deviation: Standard deviations of the innovations, (n_w,).
         limits: Of the charts, (6, n_w): of the means, then of the squares.
         alarm_level: 1, or infinite where there was too little motion for limits.
@@ -100,30 +99,30 @@ class ChangeDetector:
     def describe(self) -> str:
         """What the limits were learned from, and what they promise."""
         nominal, needed = self.nominal or self, f"{LEAST_MOTION_S / 60.0:.0f} are needed"
-        told = f"monitor: {_minutes(nominal.motion_s)} of motion for its limits"
+        learned = f"monitor: {_minutes(nominal.motion_s)} of motion for its limits"
         promise = f"extrapolated to one false alarm in {1 / FALSE_ALARMS_PER_HOUR:.0f} h"
-        own = f"; {_minutes(self.motion_s)} of an actual robot's correct its prediction"
-        own *= self.nominal is not None
+        own = ""
+        if self.nominal is not None:
+            own = f"; {_minutes(self.motion_s)} of an actual robot's correct its prediction"
         if not math.isfinite(self.alarm_level):
-            return f"{told}, {needed}: it reports levels and never alarms{own}"
+            return f"{learned}, {needed}: it reports levels and never alarms{own}"
         if self.nominal is None:
-            return f"{told}, {promise}"
+            return f"{learned}, {promise}"
         if self.motion_s < LEAST_MOTION_S:
             kept = f"{needed} to widen limits: no rate of false alarms is promised on it"
-            return f"{told}{own}, {kept}"
-        median, most = np.median(self.widening()), self.widening().max()
-        widened = f"widen limits, {median:.2f} times in the median and {most:.2f} at most"
+            return f"{learned}{own}, {kept}"
+        wider = self.widening()
+        widened = f"widen limits, {np.median(wider):.2f} times in the median and {wider.max():.2f}"
         kept = f"{self.longest_repeat} repeated inputs are no alarm"
-        return f"{told}{own} and {widened}, {promise}; {kept}"
+        return f"{learned}{own} and {widened} at most, {promise}; {kept}"
 
     def widening(self) -> np.ndarray:
         """Limits in units of the nominal ones, (6, n_w): of the error, or of its deviation."""
         sizes = []
-        for one in (self, self.nominal or self):
-            means, squares = np.split(one.limits, 2)
-            sizes.append(one.deviation * np.concatenate([means, np.sqrt(1.0 + squares)]))
-        ratio: np.ndarray = sizes[0] / sizes[1]
-        return ratio
+        for detector in (self, self.nominal or self):
+            means, squares = np.split(detector.limits, 2)
+            sizes.append(detector.deviation * np.concatenate([means, np.sqrt(1.0 + squares)]))
+        return np.divide(*sizes)
 
     @classmethod
     def fit(
@@ -144,11 +143,6 @@ class ChangeDetector:
             progress: Called with the fraction done.
             episodes: Nominal episodes with rows as far apart, which may be less calm. The safe ones
                 belong to the motions.
-
-        Raises:
-            MissingExtraError: The extra "train" is not installed.
-            ValueError: Fewer than two motions have three rows, a name is unknown, or motions and
-                episodes are of different diagrams.
         """
         require_extra("train", "ChangeDetector.fit", "torch")
         info = motions.info
@@ -158,25 +152,24 @@ class ChangeDetector:
         plan = num_states + np.arange(min(NUM_PREVIEWED, info.horizon) * num_outputs)
         features += num_states + info.horizon * num_outputs
         columns = np.concatenate([watched, plan, features])
-        safe = safe_rows(episodes or [])
         for what in ("state_names", "output_names", "feature_names", "horizon", "step_s"):
-            found, expected = getattr((episodes or motions).info, what), getattr(info, what)
-            if found != expected:
+            other, expected = getattr((episodes or motions).info, what), getattr(info, what)
+            if other != expected:
                 raise ValueError(
-                    f"ChangeDetector: motions and episodes differ in {what}: {expected} and {found}"
+                    f"ChangeDetector: motions and episodes differ in {what}: {expected} and {other}"
                 )
-        rows = [one for one in [*usual_rows(motions), *safe] if len(one) > 2]
-        seen, states = [one[:, columns] for one in rows], [one[:, watched] for one in rows]
-        if len(seen) < 2:
+        every = [*usual_rows(motions), *safe_rows(episodes or [])]
+        inputs, states = _split_rows(every, columns, watched)
+        if len(inputs) < 2:
             raise ValueError(
-                f"ChangeDetector: {len(seen)} motions have three rows; two are needed, one for the "
-                "prediction and one for the limits"
+                f"ChangeDetector: {len(inputs)} motions have three rows; two are needed, one for "
+                "the prediction and one for the limits"
             )
         with threadpool_limits(1, user_api="blas"):
             # Motions alternate, so that both parts are alike.
-            every = max(2, math.ceil(info.step_s * sum(map(len, seen)) / MOST_PREDICTOR_S))
-            of_limits = [i for i in range(len(seen)) if i % every]
-            predictor = StatePredictor.fit(seen[::every], states[::every], progress)
+            stride = max(2, math.ceil(info.step_s * sum(map(len, inputs)) / MOST_PREDICTOR_S))
+            of_limits = [i for i in range(len(inputs)) if i % stride]
+            predictor = StatePredictor.fit(inputs[::stride], states[::stride], progress)
             unlimited = cls(
                 predictor=predictor,
                 columns=columns,
@@ -184,29 +177,33 @@ class ChangeDetector:
                 deviation=np.full(len(watched), 1e-9),
                 limits=np.ones((2 * len(TIME_CONSTANTS_S), len(watched))),
                 alarm_level=math.inf,
-                longest_repeat=_free_repeats(seen),
+                longest_repeat=_free_repeats(inputs),
                 step_s=float(info.step_s),
                 motion_s=0.0,
             )
-            return unlimited._limited([seen[i] for i in of_limits], [states[i] for i in of_limits])
+            return unlimited._limited(
+                [inputs[i] for i in of_limits], [states[i] for i in of_limits]
+            )
 
     def describe_alarms(self, episodes: Episodes) -> tuple[str, bool]:
         """Says how many safe episodes have an alarm, and whether these are few."""
         safe = safe_rows(episodes)
-        alarms = sum(bool(self.watch([one])[1]) for one in safe)
-        told, is_ok = f"monitor: alarms in {alarms} of {len(safe)} safe episodes", True
+        alarms = sum(bool(self.watch([rows])[1]) for rows in safe)
+        text = f"monitor: alarms in {alarms} of {len(safe)} safe episodes"
         if alarms > _MOST_ALARMS * len(safe):
-            told, is_ok = f"{told}: train with more, or choose on_alarm: report", False
-        return told, is_ok
+            return f"{text}: train with more, or choose on_alarm: report", False
+        return text, True
 
-    def _limited(self, seen: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> ChangeDetector:
+    def _limited(
+        self, inputs: Sequence[np.ndarray], states: Sequence[np.ndarray]
+    ) -> ChangeDetector:
         """Chooses deviations and limits from inputs (K, n_u) and states (K, n_w) of motions."""
-        errors = [self.predictor.errors(*one) for one in zip(seen, states, strict=True)]
+        errors = [self.predictor.errors(*motion) for motion in zip(inputs, states, strict=True)]
         if len(errors) == 1 and len(errors[0]) > 1:
             errors = np.array_split(errors[0], 2)
         deviation = np.maximum(np.concatenate(errors).std(axis=0), self.deviation)
-        charts = [_sizes(self._charts(np.clip(one / deviation, -_CLIP, _CLIP))) for one in errors]
-        blocks = [_block_maxima(one, self.step_s) for one in charts]
+        charts = [_sizes(self._charts(e / deviation)) for e in errors]
+        blocks = [_block_maxima(chart, self.step_s) for chart in charts]
         motion_s = self.step_s * sum(map(len, errors))
         least = _LEAST_LIMIT * np.sqrt(self.rates / (2.0 - self.rates))
         least = np.concatenate([least, math.sqrt(2.0) * least])[:, None]
@@ -220,7 +217,7 @@ class ChangeDetector:
         folds = [blocks[i::_NUM_FOLDS] for i in range(min(_NUM_FOLDS, len(blocks)))]
         levels = []
         for i, fold in enumerate(folds):
-            others = [one for other in folds[:i] + folds[i + 1 :] for one in other]
+            others = [block for other in folds[:i] + folds[i + 1 :] for block in other]
             levels.append((np.concatenate(fold) / tails(others or fold)).max(axis=(1, 2)))
         limit = _tail_limit(np.concatenate(levels), probability)
         return replace(
@@ -233,25 +230,20 @@ class ChangeDetector:
 
     def _charts(self, innovations: np.ndarray) -> np.ndarray:
         """The charts, signed, after each of consecutive innovations (K, n_w), (K, 6, n_w)."""
-        found = [
-            _smoothed(values, rate)
-            for values in (innovations, np.square(innovations) - 1.0)
-            for rate in self.rates
-        ]
-        return np.stack(found, axis=1)
+        innovations = np.clip(innovations, -_CLIP, _CLIP)
+        both = innovations, np.square(innovations) - 1.0
+        return np.stack([_smoothed(v, rate) for v in both for rate in self.rates], axis=1)
 
     def innovation(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
         """The innovation (n_w,) of a change of the state after two inputs (n_u,), clipped."""
         error = self.predictor.error(x, previous, change)
-        clipped: np.ndarray = np.minimum(np.maximum(error / self.deviation, -_CLIP), _CLIP)
-        return clipped
+        return np.minimum(np.maximum(error / self.deviation, -_CLIP), _CLIP)
 
     def updated(self, charts: np.ndarray, innovation: np.ndarray) -> np.ndarray:
         """The charts (6, n_w), signed, after one more innovation (n_w,)."""
         values = np.array((innovation, innovation * innovation - 1.0))
         old = charts.reshape(2, len(TIME_CONSTANTS_S), -1)
-        found = old + self.rates[:, None] * (values[:, None] - old)
-        return found.reshape(charts.shape)
+        return (old + self.rates[:, None] * (values[:, None] - old)).reshape(charts.shape)
 
     def levels(
         self,
@@ -266,7 +258,7 @@ class ChangeDetector:
             repeats: Length of the run of repeated inputs, which concerns all states, (..., 1).
             judged: Share of inputs that could be judged, which concerns all states, (..., 1).
         """
-        levels: np.ndarray = (_sizes(charts) / self.limits).max(axis=-2)
+        levels = (_sizes(charts) / self.limits).max(axis=-2)
         blind = (1.0 - judged) / (1.0 - LEAST_JUDGED)
         return np.maximum(levels, np.maximum(repeats / self.longest_repeat, blind))
 
@@ -282,34 +274,33 @@ class ChangeDetector:
         # Of no row, then of each judged one.
         errors, repeats = [np.zeros((0, len(self.watched)))], [np.zeros(1)]
         lost, judged = [], []
-        for one in motions:
-            x, states, row = one[:, self.columns], one[:, self.watched], np.arange(len(one))
+        for rows in motions:
+            x, states, row = rows[:, self.columns], rows[:, self.watched], np.arange(len(rows))
             is_gap = ~np.isfinite(x).all(axis=1)
-            last = np.maximum.accumulate(np.where(is_gap, row, -3))
-            lost.append(row - last < 3)
+            last_gap = np.maximum.accumulate(np.where(is_gap, row, -3))
+            lost.append(row - last_gap < 3)
             judged.append((row > 1) & ~lost[-1])
             if judged[-1].any():
                 every = self.predictor.errors(np.where(is_gap[:, None], 0.0, x), states)
                 errors.append(every[judged[-1][2:]])
                 repeats.append(_repeats(x)[1:][judged[-1][2:]])
         is_lost, is_judged = np.concatenate(lost), np.concatenate(judged)
-        innovations = np.concatenate(errors) / self.deviation
-        charts = self._charts(np.clip(innovations, -_CLIP, _CLIP))
+        charts = self._charts(np.concatenate(errors) / self.deviation)
         charts, runs = np.insert(charts, 0, 0.0, axis=0), np.concatenate(repeats)
-        rate, newest = self.rates[-1], np.cumsum(is_judged)
-        share = 1.0 - _smoothed(is_lost.astype(float), rate)
+        newest = np.cumsum(is_judged)
+        share = 1.0 - _smoothed(is_lost.astype(float), self.rates[-1])
         levels = self.levels(charts[newest], runs[newest, None], share[:, None])
-        rows = [*np.flatnonzero(is_judged | is_lost).tolist(), len(levels)]
-        alarms = [(0.0, 0.0)]
-        for level in levels[rows[:-1]].max(axis=1):
-            alarms.append(self.next_alarm(*alarms[-1], level))
-        changes = np.flatnonzero(np.diff([alarm for alarm, _ in alarms], append=0.0)).tolist()
-        names, found = state_names or [""] * len(self.watched), []
+        places = [*np.flatnonzero(is_judged | is_lost).tolist(), len(levels)]
+        states_of_alarm = [(0.0, 0.0)]
+        for level in levels[places[:-1]].max(axis=1):
+            states_of_alarm.append(self.next_alarm(*states_of_alarm[-1], level))
+        changes = np.flatnonzero(np.diff([on for on, _ in states_of_alarm], append=0.0)).tolist()
+        names, alarms = state_names or [""] * len(self.watched), []
         for begin, end in zip(changes[::2], changes[1::2], strict=True):
-            first, last = rows[begin], newest[rows[begin]]
+            first, last = places[begin], newest[places[begin]]
             cause = self.cause(charts[last], runs[last], names, float(share[first]))
-            found.append(Alarm(first, rows[end], cause))
-        return levels, found
+            alarms.append(Alarm(first, places[end], cause))
+        return levels, alarms
 
     def next_alarm(self, alarm: float, calm_s: float, level: float) -> tuple[float, float]:
         """Alarm (0 or 1), and time for which all levels have been low [s], after one more level."""
@@ -326,14 +317,13 @@ class ChangeDetector:
         The prediction gets a linear correction. With `LEAST_MOTION_S` of motion limits widen to it,
         and none becomes lower; with less they stay, as they would only say how little was seen.
         """
-        nominal, rows = self.nominal or self, [one for one in motions if len(one) > 2]
-        if not rows:
+        nominal = self.nominal or self
+        inputs, states = _split_rows(motions, self.columns, self.watched)
+        if not inputs:
             return nominal
-        seen = [one[:, self.columns] for one in rows]
-        states = [one[:, self.watched] for one in rows]
-        predictor = nominal.predictor.corrected(seen, states)
+        predictor = nominal.predictor.corrected(inputs, states)
         corrected = replace(nominal, predictor=predictor, nominal=nominal)
-        limited = corrected._limited(seen, states)
+        limited = corrected._limited(inputs, states)
         corrected = replace(corrected, motion_s=limited.motion_s)
         if limited.motion_s < LEAST_MOTION_S:
             return corrected
@@ -341,7 +331,7 @@ class ChangeDetector:
             corrected,
             deviation=limited.deviation,
             limits=np.maximum(limited.limits, nominal.limits),
-            longest_repeat=max(nominal.longest_repeat, _free_repeats(seen)),
+            longest_repeat=max(nominal.longest_repeat, _free_repeats(inputs)),
         )
 
     def cause(
@@ -351,7 +341,7 @@ class ChangeDetector:
         state_names: Sequence[str],
         judged: float = 1.0,
     ) -> str:
-        """Says what an alarm saw: which state, for how long, and of what kind.
+        """Says in which state an alarm shows, for how long, and of what kind it is.
 
         Args:
             charts: Their values at the alarm, (6, n_w).
@@ -369,37 +359,42 @@ class ChangeDetector:
         is_mean = chart < len(TIME_CONSTANTS_S)
         joint = name.removesuffix("_rate")
         if joint in state_names and f"{joint}_rate" in state_names:
-            seen = f"joint {joint} answers unlike in training"
+            what = f"joint {joint} answers unlike in training"
         elif is_mean and name.startswith(("velocity_", "base_")) and name[-1] in _SIDES:
-            seen = f"pushed steadily {_SIDES[name[-1]][int(value < 0.0)]}"
+            what = f"pushed steadily {_SIDES[name[-1]][int(value < 0.0)]}"
         else:
-            seen = f"{name} changes unlike in training"
-        if is_mean:
-            return f"{seen} ({name} {value:+.1f} standard deviations over {memory_s:g} s)"
-        times = math.sqrt(value + 1.0)
-        return f"{seen} ({name} {times:.1f} times as irregular over {memory_s:g} s)"
+            what = f"{name} changes unlike in training"
+        size = f"{value:+.1f} standard deviations"
+        if not is_mean:
+            size = f"{math.sqrt(value + 1.0):.1f} times as irregular"
+        return f"{what} ({name} {size} over {memory_s:g} s)"
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns all that `from_arrays` needs, by name."""
-        found = {"deviation": self.deviation, "limits": self.limits}
-        found |= {name: getattr(self, name).astype(np.int32) for name in ("columns", "watched")}
-        found["settings"] = np.array([getattr(self, name) for name in _SETTINGS], dtype=float)
-        found |= {f"predictor.{k}": v for k, v in self.predictor.arrays().items()}
-        before = {} if self.nominal is None else self.nominal.arrays()
-        return found | {f"nominal.{k}": before[k] for k in _ADAPTED if before}
+        own = {f"predictor.{k}": v for k, v in self.predictor.arrays().items()} | {
+            "deviation": self.deviation,
+            "limits": self.limits,
+            "columns": self.columns.astype(np.int32),
+            "watched": self.watched.astype(np.int32),
+            "settings": np.array([getattr(self, name) for name in _SETTINGS], dtype=float),
+        }
+        nominal = {} if self.nominal is None else self.nominal.arrays()
+        return own | {f"nominal.{k}": nominal[k] for k in _ADAPTED if nominal}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ChangeDetector:
         """Makes the detector of arrays written by `arrays`."""
         alarm_level, longest_repeat, step_s, motion_s = arrays["settings"].tolist()
-        of_predictor, before = (
-            {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
-            for prefix in ("predictor.", "nominal.")
-        )
-        own = {k: v for k, v in arrays.items() if not k.startswith("nominal.")}
+        groups: dict[str, dict[str, np.ndarray]] = {"predictor": {}, "nominal": {}}
+        for name, array in arrays.items():
+            group, _, rest = name.partition(".")
+            if rest:
+                groups[group][rest] = array
+        own = {name: array for name, array in arrays.items() if not name.startswith("nominal.")}
+        nominal = cls.from_arrays(own | groups["nominal"]) if groups["nominal"] else None
         return cls(
-            nominal=cls.from_arrays(own | before) if before else None,
-            predictor=StatePredictor.from_arrays(of_predictor),
+            nominal=nominal,
+            predictor=StatePredictor.from_arrays(groups["predictor"]),
             columns=arrays["columns"].astype(int),
             watched=arrays["watched"].astype(int),
             deviation=arrays["deviation"].astype(float),
@@ -430,20 +425,27 @@ def rows_of(motion: Episode) -> np.ndarray:
 def usual_rows(motions: Episodes) -> list[np.ndarray]:
     """(state, desired preview, features) of motions (K, n), until shortly before they leave."""
     lost = math.ceil(_BEFORE_LEAVING_S / motions.info.step_s)
-    return [rows_of(one)[one.first_step : None if one.is_safe else -lost] for one in motions]
+    return [rows_of(m)[m.first_step : None if m.is_safe else -lost] for m in motions]
 
 
 def _smoothed(values: np.ndarray, rate: float) -> np.ndarray:
     """Exponentially weighted means of values (K, ...) until each, from zero on."""
     from scipy.signal import lfilter
 
-    found: np.ndarray = lfilter([rate], [1.0, rate - 1.0], values, axis=0)
-    return found
+    return np.asarray(lfilter([rate], [1.0, rate - 1.0], values, axis=0))
 
 
 def safe_rows(episodes: Iterable[Episode]) -> list[np.ndarray]:
     """Rows of safe episodes (K, n) whose future is undisturbed."""
-    return [rows_of(one)[one.first_step :] for one in episodes if one.is_safe]
+    return [rows_of(episode)[episode.first_step :] for episode in episodes if episode.is_safe]
+
+
+def _split_rows(
+    motions: Iterable[np.ndarray], columns: np.ndarray, watched: np.ndarray
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Inputs (K, n_u) and states (K, n_w) of motions of at least three rows."""
+    rows = [motion for motion in motions if len(motion) > 2]
+    return [motion[:, columns] for motion in rows], [motion[:, watched] for motion in rows]
 
 
 def _sizes(charts: np.ndarray) -> np.ndarray:
@@ -484,18 +486,15 @@ def _tail_limit(levels: np.ndarray, probability: float) -> float:
 
 def _repeats(x: np.ndarray) -> np.ndarray:
     """Length of the run of repeated inputs, from the second input on, (K - 1,)."""
-    is_same = np.all(x[1:] == x[:-1], axis=1)
-    runs = itertools.accumulate(
-        is_same.tolist(), lambda run, same: run + 1 if same else 0, initial=0
-    )
-    return np.array([*runs][1:], dtype=float)
+    row, is_same = np.arange(1, len(x)), np.all(x[1:] == x[:-1], axis=1)
+    last_new = np.maximum.accumulate(np.where(is_same, 0, row))
+    return (row - last_new).astype(float)
 
 
-def _free_repeats(seen: Sequence[np.ndarray]) -> int:
+def _free_repeats(inputs: Sequence[np.ndarray]) -> int:
     """Length of a run of repeated inputs that is no alarm after motions (K, n_u)."""
-    return int(max(_repeats(x).max(initial=0.0) for x in seen)) + _FREE_REPEATS
+    return int(max(_repeats(x).max(initial=0.0) for x in inputs)) + _FREE_REPEATS
 
 
 def _minutes(duration_s: float) -> str:
-    # Rounded down: a little too little is too little.
-    return f"{math.floor(duration_s / 60.0)} min"
+    return f"{math.floor(duration_s / 60.0)} min"  # Rounded down: a little too little.

@@ -55,11 +55,11 @@ class StatePredictor:
 
         every = np.concatenate(inputs)
         mean, scale = every.mean(axis=0), np.maximum(every.std(axis=0), _SMALLEST_SPREAD)
-        change = np.concatenate([np.diff(one, axis=0)[1:] for one in states])
+        change = np.concatenate([np.diff(rows, axis=0)[1:] for rows in states])
         unit = np.maximum(change.std(axis=0), 1e-9)
         low, high = np.quantile((every - mean) / scale, [_OUTSIDE, 1.0 - _OUTSIDE], axis=0)
         start = cls(mean=mean, scale=scale, low=low, high=high, unit=unit, weights={})
-        x = torch.tensor(np.concatenate([start._pairs(one) for one in inputs]))
+        x = torch.tensor(np.concatenate([start._pairs(rows) for rows in inputs]))
         y = torch.tensor((change / unit).astype(np.float32))
         with one_torch_thread():
             torch.manual_seed(0)
@@ -95,10 +95,9 @@ class StatePredictor:
         return np.concatenate([z[1:-1], z[:-2]], axis=1).astype(np.float32)
 
     def _divisor(self, z: np.ndarray) -> np.ndarray:
-        """Of errors after standardised inputs (..., n_u)."""
+        """Divisor of errors after standardised inputs (..., n_u); grows outside the range."""
         beyond = np.maximum(z - self.high, self.low - z).max(axis=-1)
-        divisor: np.ndarray = np.sqrt(1.0 + np.maximum(beyond, 0.0))
-        return divisor
+        return np.sqrt(1.0 + np.maximum(beyond, 0.0))
 
     def _evaluated(self, z: np.ndarray) -> np.ndarray:
         """Predicted changes in their units of standardised pairs, (..., n_w)."""
@@ -106,9 +105,7 @@ class StatePredictor:
         for i in range(len(HIDDEN_SIZES)):
             hidden = hidden @ w[f"hidden.{i}.weight"] + w[f"hidden.{i}.bias"]
             hidden = hidden / (1.0 + np.exp(-np.maximum(hidden, -80.0)))
-        linear = z @ w["linear.weight"] + w["linear.bias"]
-        found: np.ndarray = hidden @ w["output.weight"] + linear
-        return found
+        return hidden @ w["output.weight"] + (z @ w["linear.weight"] + w["linear.bias"])
 
     def errors(self, inputs: np.ndarray, states: np.ndarray) -> np.ndarray:
         """Errors of the predicted states of a motion from the third row on, (K - 2, n_w)."""
@@ -117,8 +114,7 @@ class StatePredictor:
 
     def _residuals(self, inputs: np.ndarray, states: np.ndarray) -> np.ndarray:
         predicted = self.unit * self._evaluated(self._pairs(inputs))
-        residuals: np.ndarray = np.diff(states, axis=0)[1:] - predicted
-        return residuals
+        return np.diff(states, axis=0)[1:] - predicted
 
     def error(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
         """The error (n_w,) of a change (n_w,) after an input and the one before, (n_u,) each."""
@@ -127,9 +123,8 @@ class StatePredictor:
         z /= self.scale
         np.maximum(z, -_LARGEST_INPUT, out=z)  # Twice as fast as `np.clip`.
         np.minimum(z, _LARGEST_INPUT, out=z)
-        error: np.ndarray = change - self.unit * self._evaluated(z.ravel().astype(np.float32))
-        error /= self._divisor(z[0])
-        return error
+        error = change - self.unit * self._evaluated(z.ravel().astype(np.float32))
+        return error / self._divisor(z[0])
 
     def corrected(
         self, inputs: Sequence[np.ndarray], states: Sequence[np.ndarray]
@@ -137,8 +132,8 @@ class StatePredictor:
         """Returns the predictor with its linear map fitted to another plant's motions."""
         from sklearn.linear_model import Ridge
 
-        z = np.concatenate([self._pairs(one) for one in inputs])
-        errors = np.concatenate([self._residuals(*one) for one in zip(inputs, states, strict=True)])
+        z = np.concatenate([self._pairs(rows) for rows in inputs])
+        errors = np.concatenate([*map(self._residuals, inputs, states)])
         # Few rows: what they do not determine stays as it was.
         ridge = Ridge(alpha=len(z) / 10.0).fit(z, errors / self.unit)
         weights = dict(self.weights)
@@ -175,7 +170,6 @@ def _network(num_inputs: int, num_outputs: int):  # type: ignore[no-untyped-def]
             hidden = x
             for layer in self.hidden:
                 hidden = torch.nn.functional.silu(layer(hidden))
-            found: torch.Tensor = self.output(hidden) + self.linear(x)
-            return found
+            return self.output(hidden) + self.linear(x)
 
     return Network()
