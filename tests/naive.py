@@ -93,10 +93,12 @@ def prediction(assessment, x):
         belief += empty * (1.0 - weights.sum()) + weights @ assessment.beliefs_[k]
         guards += [weights @ correction.guard[k]] * bool(weights.any())
     margins = np.mean(margins, axis=0)
-    distances = whitened_distances(novelty._known, x[None], novelty.plan)[0]
+    known = novelty.training
+    known = known if novelty.feedback is None else known.joined(novelty.feedback)
+    distances = whitened_distances(known, x[None], novelty.plan)[0]
     distance = max(distances / novelty.limits[:3])
     if len(novelty.limits) > 3:
-        low, high = novelty._known.least, novelty._known.largest
+        low, high = known.least, known.largest
         offset = np.abs(x - (low + high) / 2) / np.maximum((high - low) / 2, 0.05)
         distance = max(distance, offset.max() / novelty.limits[3])
     belief = belief / maps.num_members if distance <= 1.0 else empty

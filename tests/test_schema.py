@@ -214,9 +214,7 @@ CASES = {
         "adaptation: {offset_std: 0.0}": "offset_std' must be greater than 0; got",
         "adaptation: {slope_std: 0.0}": "slope_std' must be greater than 0; got",
     },
-    Calibration: {
-        "kind: walk": "'kind' must be 'plan' or 'motion'; got 'walk'",
-    },
+    Calibration: {"kind: walk": "'kind' must be 'plan' or 'motion'; got 'walk'"},
     LogMap: {
         "base_position: {columns: [a, b]}": "'base_position': columns must be 3 names",
         "base_position: {columns: [a, b, a]}": "names a column twice",

@@ -51,12 +51,7 @@ from drake_safety.learning.trained_maps import Embedding
 from drake_safety.learning.training_scores import TrainingScores, prior_beliefs
 from drake_safety.learning.trees import Trees
 
-__all__ = [
-    "AdaptationParameters",
-    "AssessmentParameters",
-    "Prediction",
-    "SafetyAssessment",
-]
+__all__ = ["AdaptationParameters", "AssessmentParameters", "Prediction", "SafetyAssessment"]
 
 _LOGGER = logging.getLogger("drake_safety")
 _OF_MODEL = (

@@ -43,31 +43,24 @@ def from_scores(
         score: Unsafety scores lambda in [0, 1], (N,).
         uncertainty: mu in [0, 1], scalar or (N,).
         cause: Column of the constraint that each unsafe mass is assigned to, -1 for none, (N,).
-
-    Raises:
-        ValueError: A score or an uncertainty lies outside [0, 1], `cause` is missing although
-            `num_causes` > 0, or an unsafe score has no cause.
     """
     score = np.asarray(score, dtype=float)
     uncertainty = np.broadcast_to(np.asarray(uncertainty, dtype=float), score.shape)
     for name, values in (("score", score), ("uncertainty", uncertainty)):
         if not np.all((values >= 0.0) & (values <= 1.0)):
             raise ValueError(f"from_scores: every {name} must lie in [0, 1], got {values}")
-    if num_causes and cause is None:
-        raise ValueError(f"from_scores: got no `cause`, expected one of {num_causes} causes each")
     beliefs = np.zeros((*score.shape, 3 + num_causes))
     # Eq. (bba_training_data)
     beliefs[..., SAFE] = (1.0 - uncertainty) * (1.0 - score)
     beliefs[..., UNSAFE] = (1.0 - uncertainty) * score
     beliefs[..., UNCERTAINTY] = uncertainty
-    if num_causes and cause is not None:
-        has_cause = np.asarray(cause) >= 0
-        if np.any(~has_cause & (score > 0.0)) or np.any(np.asarray(cause) >= num_causes):
-            raise ValueError(
-                f"from_scores: every unsafe score needs a cause in 0..{num_causes - 1}"
-            )
+    if num_causes:
+        column = np.full(score.shape, -1) if cause is None else np.asarray(cause)
+        has_cause = column >= 0
+        if np.any(~has_cause & (score > 0.0)) or np.any(column >= num_causes):
+            raise ValueError(f"from_scores: an unsafe score needs a cause in 0..{num_causes - 1}")
         rows = np.flatnonzero(has_cause)
-        beliefs[rows, 3 + np.asarray(cause)[rows]] = beliefs[rows, UNSAFE]
+        beliefs[rows, 3 + column[rows]] = beliefs[rows, UNSAFE]
     return beliefs
 
 
@@ -104,12 +97,8 @@ def fuse_cells(
         num_cells: Number of cells V.
         min_count: k_min, the number of beliefs below which a cell stays empty.
         multiplicity: Number of equal beliefs that each stands for, (N,); one by default.
-
-    Raises:
-        ValueError: `cells` and `beliefs` differ in length.
     """
-    beliefs = np.asarray(beliefs, dtype=float)
-    cells = np.asarray(cells)
+    beliefs, cells = np.asarray(beliefs, dtype=float), np.asarray(cells)
     if cells.shape != beliefs.shape[:1]:
         raise ValueError(
             f"fuse_cells: got {cells.shape} cells for beliefs of shape {beliefs.shape}"
@@ -157,14 +146,7 @@ def average_cells(beliefs: np.ndarray, cells: np.ndarray, uncertainty: np.ndarra
 
     Returns:
         Beliefs (V, 3 + n_c); cells without beliefs are empty.
-
-    Raises:
-        ValueError: `cells` and `beliefs` differ in length.
     """
-    if cells.shape != beliefs.shape[:1]:
-        raise ValueError(
-            f"average_cells: got {cells.shape} cells for beliefs of shape {beliefs.shape}"
-        )
     num_cells, num_columns = len(uncertainty), beliefs.shape[1]
     is_inside = cells >= 0
     beliefs, cells = beliefs[is_inside], cells[is_inside]

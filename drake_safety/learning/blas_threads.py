@@ -60,7 +60,7 @@ class OneBlasThread:
 
 
 ONE_BLAS_THREAD = OneBlasThread()
-"""The one of this process."""
+"""Process-wide instance."""
 
 
 def one_blas_thread(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -78,14 +78,14 @@ def one_blas_thread(function: Callable[_P, _R]) -> Callable[_P, _R]:
 def _libraries(has_scipy: bool) -> list[tuple[Callable[[], int], Callable[[int], Any]]]:
     """Functions that get and set the number of threads, of every loaded BLAS."""
     del has_scipy
-    found = []
+    libraries = []
     for library in ThreadpoolController().select(user_api="blas").lib_controllers:
         functions = (library.get_num_threads, library.set_num_threads)
         if library.internal_api == "openblas" and library.threading_layer == "pthreads":
             # threadpoolctl looks the symbols up anew at each call, ten times the cost of it.
             functions = _openblas_functions(library.dynlib) or functions
-        found.append(functions)
-    return found
+        libraries.append(functions)
+    return libraries
 
 
 def _openblas_functions(library: Any) -> tuple[Callable[[], int], Callable[[int], Any]] | None:

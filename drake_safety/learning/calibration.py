@@ -3,12 +3,10 @@
 Every episode has one score, because only episodes are independent. The threshold lies below the
 k-th lowest score of n unsafe episodes, so that k - 1 of them are missed. Two rules choose k:
 
-- Conformal: among n + 1 exchangeable episodes every rank is equally likely. With
-  k = ⌊miss rate (n + 1)⌋ a new unsafe episode is missed with a probability of at most the miss
-  rate, on average over calibration sets.
-- With a confidence ("PAC"): k is the largest for which Clopper and Pearson's upper bound of the
-  miss rate, with k - 1 of n missed, does not exceed the promise: P(Binomial(n, miss rate) ≤ k - 1)
-  ≤ 1 - confidence. The promise then holds for this calibration set with that confidence.
+- Conformal, k = ⌊miss rate (n + 1)⌋: a new unsafe episode is missed with a probability of at most
+  the miss rate, on average over calibration sets, as every rank is equally likely.
+- With a confidence ("PAC"), the largest k with P(Binomial(n, miss rate) ≤ k - 1) ≤ 1 - confidence,
+  Clopper and Pearson's bound: the promise holds for this calibration set with that confidence.
 
 Both rules use one class alone and hold for any share of unsafe episodes.
 """
@@ -79,9 +77,11 @@ class Calibration:
     @property
     def promise(self) -> str:
         """The promised miss rate in words."""
-        how = "on average" if self.confidence is None else f"{100 * self.confidence:g} % confidence"
+        basis = "on average"
+        if self.confidence is not None:
+            basis = f"{100 * self.confidence:g} % confidence"
         return (
-            f"at most {100 * self.miss_rate:g} % of unsafe episodes called safe, {how}, "
+            f"at most {100 * self.miss_rate:g} % of unsafe episodes called safe, {basis}, "
             f"on the plant '{self.variation}' as long as it behaves as in its episodes"
         )
 
@@ -155,32 +155,24 @@ def score_threshold(
     confidence: float | None = None,
     whose: str = "unsafe",
 ) -> float:
-    """Returns the highest score with the verdict "safe" for a promised miss rate.
+    """Returns the highest score with the verdict "safe"; arguments are those of `calibrate`.
 
-    Args:
-        unsafe_score: Unsafe scores, (N,); NaN counts as most unsafe.
-        is_unsafe: Labels, (N,).
-        miss_rate: Promised share of unsafe samples that score at most the threshold, in (0, 1).
-        confidence: Confidence of the promise, in (0, 1); None for a rate on average.
-        whose: Name of the labelled class in an error message.
-
-    Returns:
-        The midpoint between the k-th lowest unsafe score and the next lower score of either label;
-        just below the former if there is none.
+    It is the midpoint between the k-th lowest unsafe score and the next lower score of either
+    label; just below the former if there is none. `whose` names the labelled class in an error.
     """
     score, label = _checked(unsafe_score, is_unsafe)
     if not np.isfinite(score).any():
         raise ValueError(f"calibration: none of the {len(score)} scores is finite")
-    found = np.sort(score[label])
-    rank = allowed_misses(found.size, miss_rate, confidence=confidence) + 1
+    unsafe = np.sort(score[label])
+    rank = allowed_misses(unsafe.size, miss_rate, confidence=confidence) + 1
     if rank < 1:
         needed = episodes_needed(miss_rate, confidence=confidence)
-        how = "on average" if confidence is None else f"with a confidence of {confidence:g}"
+        basis = "on average" if confidence is None else f"with a confidence of {confidence:g}"
         raise ValueError(
-            f"calibration: a rate of {miss_rate:g} {how} needs at least {needed} {whose} episodes; "
-            f"of {len(score)} episodes {found.size} are {whose}"
+            f"calibration: a rate of {miss_rate:g} {basis} needs at least {needed} {whose} "
+            f"episodes; of {len(score)} episodes {unsafe.size} are {whose}"
         )
-    bound = found[rank - 1]
+    bound = unsafe[rank - 1]
     lower = score[np.isfinite(score) & (score < bound)]
     if math.isinf(bound):
         return float(lower.max()) if bound > 0.0 and lower.size else float(bound)
@@ -188,7 +180,7 @@ def score_threshold(
 
 
 def allowed_misses(num_unsafe: int, miss_rate: float, *, confidence: float | None = None) -> int:
-    """How many of n unsafe episodes may be missed, see `score_threshold`; -1 if n is too small."""
+    """Number of n unsafe episodes that may be missed, k - 1; -1 if n is too small."""
     check_share("miss_rate", miss_rate)
     if confidence is None:
         return math.floor(miss_rate * (num_unsafe + 1) + 1e-9) - 1
@@ -218,14 +210,10 @@ def least_miss_rate(num_unsafe: int) -> float:
 def episode_scores(
     segments: Segments, unsafe_score: np.ndarray, kind: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Reduces the scores of segments to score and label (M,) of each episode with segments.
+    """Reduces unsafe scores of segments (N,), from every row, to score and label of each episode.
 
     A plan is assessed once, by its first row. A motion is monitored and unsafe as soon as one row
     is, so its score is the largest of all rows.
-
-    Args:
-        segments: The N segments of some episodes, from every row.
-        unsafe_score: Unsafe score of each, (N,); NaN counts as most unsafe.
     """
     if kind not in KINDS:
         raise ValueError(f"calibration: unknown kind '{kind}'; the kinds are {list(KINDS)}")
@@ -240,12 +228,10 @@ def episode_scores(
 
 def _checked(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     score, label = np.asarray(unsafe_score, dtype=float), np.asarray(is_unsafe)
-    if label.dtype != bool:
-        raise ValueError(f"calibration: labels must be boolean, got {label.dtype}")
-    if score.ndim != 1 or score.shape != label.shape:
+    if label.dtype != bool or score.ndim != 1 or score.shape != label.shape:
         raise ValueError(
-            f"calibration: scores and labels must be of equal length, got {score.shape} and "
-            f"{label.shape}"
+            f"calibration: expected scores and boolean labels, (N,) both; got {score.shape} and "
+            f"{label.shape} of {label.dtype}"
         )
     return np.where(np.isnan(score), math.inf, score), label
 

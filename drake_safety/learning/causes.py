@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 NO_CAUSE = -1
-"""Where nothing speaks for any constraint."""
+"""Column of a cause without evidence."""
 
 
 def is_on(flag: float) -> bool:
@@ -40,8 +40,7 @@ def likely_causes(
 
     Args:
         cause_probability: b_unsafe split by constraint, (N, n_c).
-        predicted_margins: Predicted smallest margin of each constraint [m, rad], (N, n_c); NaN
-            where none is predicted.
+        predicted_margins: Predicted margins [m, rad], (N, n_c); NaN where there are none.
         margin_unit: Unit of the margins [m, rad], scalar or (n_c,).
 
     Returns:
@@ -71,10 +70,9 @@ def likely_cause(
 def cause_words(
     name: str, margin: float, angular_constraints: Collection[str], *, is_known: bool = True
 ) -> tuple[str, str]:
-    """What a cause is to a motion, and text of its margin [m, rad]; "" and "" without a name.
+    """Returns "likely cause" and text of its margin [m, rad]; "" and "" without a name.
 
-    It is the "likely cause" of a violation; if its margin is positive, or the belief is not known,
-    "nearest to its limit".
+    If the margin is positive, or the belief is not known, the first is "nearest to its limit".
     """
     if not name:
         return "", ""
@@ -83,11 +81,7 @@ def cause_words(
 
 
 def describe_margin(name: str, margin: float, angular_constraints: Collection[str]) -> str:
-    """Text of a constraint and its margin, such as ``collision, -1.2 cm``.
-
-    Args:
-        margin: Its margin [m, rad]; the text is the name alone if it is not finite.
-    """
+    """Text of a constraint and its margin [m, rad], if it is finite: ``collision, -1.2 cm``."""
     if not math.isfinite(margin):
         return name
     if name in angular_constraints:

@@ -55,14 +55,13 @@ class Alarm(NamedTuple):
 class ChangeDetector:
     """Charts of the innovation, the error of predicting the next measured state.
 
-    A changed plant or sensor does not show in one input, which lies among those of training. It
-    shows in the error of predicting the next state from the last two inputs. Each state's
-    innovation, in its standard deviations and clipped, has exponentially weighted means of itself
-    and of its square, with three memories. The largest of the six, each in units of its limit, is the state's level;
-    an alarm is a level above 1. The limits are those of motion that the predictor did not see,
-    extrapolated to a rate of false alarms by the exponential tail of the maxima of blocks (peaks
-    over threshold; Coles 2001, section 4), first of each chart and then of the levels. Nothing is
-    learned from failures.
+    A changed plant or sensor shows in the error of predicting the next state from the last two
+    inputs. Each state's innovation, in its standard deviations and clipped, has exponentially
+    weighted means of itself and of its square, with three memories. The largest of the six, each in
+    units of its limit, is the state's level; an alarm is a level above 1. The limits are from
+    motion that the predictor has not learned, extrapolated to a rate of false alarms by the
+    exponential tail of the maxima of blocks (peaks over threshold; Coles 2001, section 4), first of
+    each chart and then of the levels. Nothing is learned from failures.
 
     Attributes:
         columns: Entries of (state, desired preview, features) that are its inputs, (n_u,).
@@ -335,11 +334,7 @@ class ChangeDetector:
         )
 
     def cause(
-        self,
-        charts: np.ndarray,
-        repeats: float,
-        state_names: Sequence[str],
-        judged: float = 1.0,
+        self, charts: np.ndarray, repeats: float, state_names: Sequence[str], judged: float = 1.0
     ) -> str:
         """Says in which state an alarm shows, for how long, and of what kind it is.
 

@@ -21,9 +21,8 @@ class FallLogit:
     often does without a fall.
 
     Attributes:
-        columns: The columns of x that it reads.
-        weights: Those of the n_c predicted margins, of the logit of an unsafe end, and of the
-            columns.
+        columns: Columns of x that are inputs.
+        weights: Weights of the n_c predicted margins, the logit of an unsafe end, and the columns.
     """
 
     columns: tuple[NonNegativeInt, ...]
@@ -34,16 +33,7 @@ class FallLogit:
     def fit(
         cls, inputs: Sequence[np.ndarray], has_fallen: Sequence[bool], columns: Sequence[int]
     ) -> FallLogit:
-        """Fits it to the rows of episodes.
-
-        Args:
-            inputs: Rows of each episode, as many columns as weights; those that are not finite are
-                left out.
-            has_fallen: Whether each episode ended in a fall.
-
-        Raises:
-            ValueError: No episode ends in a fall, or every one does.
-        """
+        """Fits it to the rows of episodes, of which those that are not finite are left out."""
         from sklearn.linear_model import LogisticRegression
         from sklearn.preprocessing import StandardScaler
 
@@ -53,12 +43,12 @@ class FallLogit:
                 f"FallLogit: {num_falls} of {len(has_fallen)} episodes end in a fall; the fit "
                 "takes both: give more episodes"
             )
-        rows = np.concatenate(inputs)
-        labels = np.repeat(has_fallen, [len(one) for one in inputs])
-        is_used = np.isfinite(rows).all(axis=1)
-        scaler = StandardScaler().fit(rows[is_used])
+        every = np.concatenate(inputs)
+        labels = np.repeat(has_fallen, [len(rows) for rows in inputs])
+        is_used = np.isfinite(every).all(axis=1)
+        scaler = StandardScaler().fit(every[is_used])
         model = LogisticRegression(C=_INVERSE_PENALTY, max_iter=500)
-        model.fit(scaler.transform(rows[is_used]), labels[is_used])
+        model.fit(scaler.transform(every[is_used]), labels[is_used])
         weights = model.coef_[0] / scaler.scale_
         offset = model.intercept_[0] - weights @ scaler.mean_
         return cls(columns=tuple(columns), weights=tuple(weights.tolist()), offset=float(offset))

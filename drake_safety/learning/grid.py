@@ -70,9 +70,6 @@ class Grid:
 
         Departure: the extent of a t-SNE embedding grows with the number of points, so a cell length
         in its units is not comparable across data sets.
-
-        Raises:
-            ValueError: The points are not finite or all coincide.
         """
         centred = points - points.mean(axis=0)
         extent = float(np.abs(centred).max())
@@ -127,5 +124,5 @@ class Grid:
         """Reads values of the cells that contain points; see `interpolate`."""
         cells = self.locate(points)
         is_inside = cells != OUTSIDE
-        found = np.take_along_axis(values, np.maximum(cells, 0)[..., None], axis=1)
-        return found * is_inside[..., None], is_inside
+        of_cells = np.take_along_axis(values, np.maximum(cells, 0)[..., None], axis=1)
+        return of_cells * is_inside[..., None], is_inside

@@ -57,12 +57,12 @@ def describe(area: np.ndarray) -> str:
     values = np.array([*area, area[2] - area[0], area[2] - area[1]])
     spread = 2 * values.std(axis=1, ddof=1) / math.sqrt(area.shape[1])
     quarter, half, every, twice, doubling = values.mean(axis=1)
-    told = "too few episodes to tell whether more would help"
+    answer = "too few episodes to tell whether more would help"
     if doubling > _MATTERS * (1.0 - every) and twice > spread[3]:
-        told = "more episodes would help"
+        answer = "more episodes would help"
     elif doubling + spread[4] < 2 * _MATTERS * (1.0 - every):
-        told = "more episodes would hardly help"
+        answer = "more episodes would hardly help"
     return (
-        f"{told}: gradient boosting has an AUC of {quarter:.3f}, {half:.3f} and {every:.3f} (± "
+        f"{answer}: gradient boosting has an AUC of {quarter:.3f}, {half:.3f} and {every:.3f} (± "
         f"{spread[2]:.3f}) on held-out episodes, with a quarter, half and all of the others"
     )

@@ -190,11 +190,7 @@ def one_torch_thread() -> Iterator[None]:
 
 
 def train_map(
-    data: MapData,
-    parameters: AssessmentParameters,
-    *,
-    seed: int,
-    progress: _Report = ignore,
+    data: MapData, parameters: AssessmentParameters, *, seed: int, progress: _Report = ignore
 ) -> dict[str, np.ndarray]:
     """Trains one map Psi, the same for a seed and a machine; names its arrays as in `Embedding`.
 

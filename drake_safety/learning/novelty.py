@@ -9,8 +9,7 @@ import numpy as np
 
 NUM_QUADRATIC = 3
 """Distances that are quadratic forms."""
-NUM_FOLDS = 5
-"""Folds of the episodes for the limits: every distance is from the inputs of other episodes."""
+_NUM_FOLDS = 5  # Of the episodes, so that every distance is from the inputs of other episodes.
 _SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column]; constant ones would be divided by zero.
 # Variances of the standardised inputs along an axis:
 _REDUNDANT_VARIANCE = 1e-7  # Below this, the axis is a redundancy of the inputs.
@@ -27,7 +26,7 @@ class Moments:
 
     Attributes:
         least: Smallest value of each column, (n_x,); None where it is not known.
-        largest: Largest one.
+        largest: Largest value, like `least`.
     """
 
     count: int
@@ -57,8 +56,7 @@ class Moments:
         least = largest = None
         if self.least is not None and other.least is not None:
             least = np.minimum(self.least, other.least)
-        if self.largest is not None and other.largest is not None:
-            largest = np.maximum(self.largest, other.largest)
+            largest = np.maximum(self.largest, other.largest)  # type: ignore[arg-type]
         return Moments(
             count=count,
             mean=self.mean + share * shift,
@@ -66,14 +64,6 @@ class Moments:
             least=least,
             largest=largest,
         )
-
-    def widened(self, factor: np.ndarray) -> Moments:
-        """Returns the same with the width of each column's range times a factor, (n_x,)."""
-        assert self.least is not None and self.largest is not None
-        added = (
-            0.5 * (factor - 1.0) * np.maximum(self.largest - self.least, 2.0 * _LEAST_HALF_WIDTH)
-        )
-        return replace(self, least=self.least - added, largest=self.largest + added)
 
     @property
     def scale(self) -> np.ndarray:
@@ -115,17 +105,16 @@ class Distances:
         self.mean = known.mean
         self.axes = np.concatenate(parts, axis=1) / known.scale[:, None]
         # The distances are sums of squares of the offset's entries and of those along the axes.
-        num_inputs, squared_scale = len(axes), known.scale**2
-        self.terms = np.zeros((num_inputs + self.axes.shape[1], NUM_QUADRATIC))
-        self.terms[:num_inputs, 0] = 1.0 / (_LEAST_VARIANCE * squared_scale)
+        start, squared_scale = len(axes), known.scale**2
+        self.terms = np.zeros((start + self.axes.shape[1], NUM_QUADRATIC))
+        self.terms[:start, 0] = 1.0 / (_LEAST_VARIANCE * squared_scale)
         self.terms[plan, 2] = 1.0 / (_LEAST_PLAN_VARIANCE * squared_scale[plan])
-        start = num_inputs
         for distance, (part, sign) in enumerate(zip(parts, (-1.0, 1.0, -1.0), strict=True)):
             self.terms[start : start + part.shape[1], distance] = sign
             start += part.shape[1]
 
     def squared(self, x: np.ndarray, terms: np.ndarray) -> np.ndarray:
-        """Those of inputs (N, n_x), by `terms` or multiples: all of it, redundancies, plan, (N, 3).
+        """Squares of all of x (N, n_x), along redundancies, of the plan, (N, 3), by their `terms`.
 
         One product for each row: those of many rows at once would round differently.
         """
@@ -134,8 +123,7 @@ class Distances:
         offset = np.subtract(x, self.mean, out=entries[:, 0, :num_inputs])
         np.matmul(offset[:, None], self.axes, out=entries[:, :, num_inputs:])
         np.multiply(entries, entries, out=entries)
-        found: np.ndarray = (entries @ terms)[:, 0]
-        return found
+        return (entries @ terms)[:, 0]
 
     def precision(self) -> np.ndarray:
         """The matrix of the sum of the three as a quadratic form of the offset, (n_x, n_x)."""
@@ -145,8 +133,7 @@ class Distances:
 
 def _above(variance: np.ndarray, axes: np.ndarray, least: float) -> np.ndarray:
     is_above = variance > least
-    above: np.ndarray = axes[:, is_above] * np.sqrt(1.0 / least - 1.0 / variance[is_above])
-    return above
+    return axes[:, is_above] * np.sqrt(1.0 / least - 1.0 / variance[is_above])
 
 
 class Novelty:
@@ -159,8 +146,7 @@ class Novelty:
     these axes. The two are known in process monitoring as T^2 and SPE. The third is that of the
     plan alone: a planner asks for what it always did, or for something new, whatever the state.
     The range is that of every column, in half widths from its centre: one entry far from all that
-    training had is novel even where the sum over many others hides it.
-    The object is immutable.
+    training had is novel even where the sum over many others hides it. The object is immutable.
 
     Attributes:
         centre: Centre of each column's range, (n_x,).
@@ -180,7 +166,7 @@ class Novelty:
         self.training, self.limits, self.feedback = training, np.asarray(limits), feedback
         self.plan = plan
         known = training if feedback is None else training.joined(feedback)
-        self._known, self.quadratic = known, Distances(known, plan)
+        self.quadratic = Distances(known, plan)
         self.centre, self.inverse_half_width = known.mean, np.zeros(len(known.mean))
         if known.least is not None and len(self.limits) > NUM_QUADRATIC:
             half_width = 0.5 * (known.largest - known.least)
@@ -215,14 +201,13 @@ class Novelty:
         episodes exceeds that of the others: columns with rare large values have wider ones.
 
         Args:
-            is_unsafe: Whether it ended unsafely, (N,).
+            is_unsafe: Whether its episode ended unsafely, (N,).
             rate: Share of episodes with a novel input, in (0, 1).
             range_limit: Largest distance of a column from the centre of its range [half widths].
         """
-        fold = np.unique(episode, return_inverse=True)[1] % NUM_FOLDS
-        distances = np.full((len(x), NUM_QUADRATIC), np.inf)
-        growth = np.ones(x.shape[1])
-        for part in range(NUM_FOLDS):
+        fold = np.unique(episode, return_inverse=True)[1] % _NUM_FOLDS
+        distances, growth = np.full((len(x), NUM_QUADRATIC), np.inf), np.ones(x.shape[1])
+        for part in range(_NUM_FOLDS):
             is_part = fold == part
             if is_part.any() and not is_part.all():
                 known = Moments.of(x[~is_part])
@@ -237,13 +222,14 @@ class Novelty:
             np.maximum.at(farthest, position, distances[~is_unsafe])
             of_safe = np.quantile(farthest, 1.0 - rate, axis=0, method="higher")
             limits = np.maximum(limits, of_safe)
-        training = Moments.of(x).widened(growth)
+        training, least, largest = Moments.of(x), x.min(axis=0), x.max(axis=0)
+        added = 0.5 * (growth - 1.0) * np.maximum(largest - least, 2.0 * _LEAST_HALF_WIDTH)
+        training = replace(training, least=least - added, largest=largest + added)
         num_redundancies = np.sum(training.axes(slice(None))[0] < _REDUNDANT_VARIANCE)
-        least = [1.0, max(1.0, _LEAST_LIMIT * np.sqrt(num_redundancies)), 1.0]
+        smallest = [1.0, max(1.0, _LEAST_LIMIT * np.sqrt(num_redundancies)), 1.0]
         of_range = range_limit if fold.any() else np.inf
-        return cls(
-            training=training, limits=np.append(np.maximum(limits, least), of_range), plan=plan
-        )
+        limits = np.append(np.maximum(limits, smallest), of_range)
+        return cls(training=training, limits=limits, plan=plan)
 
     def with_feedback(self, x: np.ndarray, rate: float) -> Novelty:
         """Returns the novelty for which an actual robot's inputs are known as well.
@@ -251,26 +237,23 @@ class Novelty:
         They replace those of earlier feedback. If at most a share of `rate` of them is beyond the
         training inputs, as of a robot without a reality gap, these alone describe the robot.
         """
-        alone = Novelty(training=self.training, limits=self.limits, plan=self.plan)
-        if np.mean(alone.of(x) > 1.0) <= rate:
-            return alone
-        return Novelty(
-            training=self.training, limits=self.limits, plan=self.plan, feedback=Moments.of(x)
+        own: dict[str, Any] = dict(training=self.training, limits=self.limits, plan=self.plan)
+        alone = Novelty(**own)
+        return (
+            alone if np.mean(alone.of(x) > 1.0) <= rate else Novelty(**own, feedback=Moments.of(x))
         )
 
     def distances(self, x: np.ndarray) -> np.ndarray:
         """Returns the distances of inputs (N, n_x) in the order of `limits`, (N, 3) or (N, 4).
 
-        Those of an input that is not finite are infinite.
+        An input that is not finite has infinite ones.
         """
         with np.errstate(invalid="ignore", over="ignore"):
             # Rounding may make a small square negative.
             quadratic = np.sqrt(np.maximum(self.quadratic.squared(x, self.quadratic.terms), 0.0))
-            offset = self.offsets(x).max(axis=1)
-            found = np.column_stack([quadratic, offset])[:, : len(self.limits)]
+            every = np.column_stack([quadratic, self.offsets(x).max(axis=1)])
             # `fmin` chooses the number beside NaN.
-            distances: np.ndarray = np.fmin(found, np.inf)
-        return distances
+            return np.fmin(every[:, : len(self.limits)], np.inf)
 
     def offsets(self, x: np.ndarray) -> np.ndarray:
         """Returns how far inputs are from the centre of the range, in half widths, (N, n_x)."""
@@ -282,13 +265,12 @@ class Novelty:
         An input is novel above 1; that of an input that is not finite is infinite.
         """
         with np.errstate(invalid="ignore", over="ignore"):
-            found = np.maximum.reduce(self.quadratic.squared(x, self._shares), axis=1)
+            largest = np.maximum.reduce(self.quadratic.squared(x, self._shares), axis=1)
             if len(self.limits) > NUM_QUADRATIC:
                 offset = (x - self.centre) * self._range_share
                 offset *= offset
-                found = np.maximum(found, np.maximum.reduce(offset, axis=1))
-            distance: np.ndarray = np.fmin(np.sqrt(np.maximum(found, 0.0)), np.inf)
-        return distance
+                largest = np.maximum(largest, np.maximum.reduce(offset, axis=1))
+            return np.fmin(np.sqrt(np.maximum(largest, 0.0)), np.inf)
 
     def contradictions(self, x: np.ndarray) -> np.ndarray:
         """Returns how far each column is from what the other columns say, (n_x,).
@@ -296,4 +278,4 @@ class Novelty:
         The unit is the standard deviation of that prediction by linear regression.
         """
         precision = self.quadratic.precision()
-        return precision @ (x - self._known.mean) / np.sqrt(np.diag(precision))
+        return precision @ (x - self.quadratic.mean) / np.sqrt(np.diag(precision))

@@ -79,8 +79,7 @@ BLOCKS = (
 
 def use_of(seed: int) -> str:
     """Returns "development", or "release" with the version whose figures a seed is for."""
-    version = _version(seed)
-    return f"release {version}" if version else "development"
+    return f"release {version}" if (version := _version(seed)) else "development"
 
 
 def _version(seed: int) -> str:
@@ -120,14 +119,12 @@ class UsedEpisodes:
 def check_unused(used: Sequence[UsedEpisodes], seeds: Iterable[int], who: str) -> None:
     """Raises ValueError if a seed was used, with its purpose and the next free seed."""
     wanted = sorted(seeds)
-    spent = {one.seed: one for one in used if one.seed != NOT_DRAWN}
-    found = next((seed for seed in wanted if seed in spent), None)
-    if found is None:
-        return
-    shift = 1
-    while any(seed + shift in spent for seed in wanted):
-        shift += 1
-    raise ValueError(
-        f"{who}: seed {found} gives episodes that start as {spent[found]}; "
-        f"choose another seed, such as {wanted[0] + shift}"
-    )
+    spent = {episodes.seed: episodes for episodes in used if episodes.seed != NOT_DRAWN}
+    for seed in (seed for seed in wanted if seed in spent):
+        shift = 1
+        while any(other + shift in spent for other in wanted):
+            shift += 1
+        raise ValueError(
+            f"{who}: seed {seed} gives episodes that start as {spent[seed]}; "
+            f"choose another seed, such as {wanted[0] + shift}"
+        )

@@ -6,7 +6,7 @@ import contextlib
 import importlib.metadata
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
@@ -19,13 +19,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 RECORDED = (
-    "state",
-    "true_state",
-    "output",
-    "desired_output",
-    "desired_preview",
-    "features",
-    "margins",
+    *("state", "true_state", "output", "desired_output"),
+    *("desired_preview", "features", "margins"),
 )
 """Arrays that an episode holds per row, besides its time."""
 LARGEST = 1e12
@@ -45,12 +40,12 @@ class EpisodeError(RuntimeError):
 
 
 def installed_versions(*packages: str) -> dict[str, str]:
-    """Versions of this package and of those others that are installed, by name."""
-    found = {"drake_safety": "0+uninstalled"}
+    """Versions of this package and of the installed ones of some others, by name."""
+    versions = {"drake_safety": "0+uninstalled"}
     for name in ("drake_safety", *packages):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            found[name] = importlib.metadata.version(name)
-    return found
+            versions[name] = importlib.metadata.version(name)
+    return versions
 
 
 @dataclass(kw_only=True)
@@ -63,11 +58,7 @@ class EpisodesInfo:
         seed: Seed of the set; episode i draws from SeedSequence(seed, spawn_key=(i,)).
         step_s: Time between two rows of an episode [s].
         horizon: The safety assessment horizon H [samples of the preview].
-        constraint_names: The n_c safety constraints: the columns of `margins` and the possible
-            causes.
-        state_names: Names of the n_s columns of `state`.
-        output_names: Names of the n_z columns of `output`.
-        feature_names: Names of the n_f columns of `features`.
+        constraint_names: The n_c safety constraints: columns of `margins` and possible causes.
         num_steps: T, rows after the first one of a complete episode; 0 if unknown.
         preview_stride: Rows between two of the H samples of a preview or a segment.
         monitored_states: States that a `ChangeDetector` predicts; None for all of them.
@@ -95,16 +86,14 @@ class EpisodesInfo:
     until: str = ""
 
     def __post_init__(self) -> None:
-        for name, is_valid, expected in (
-            ("horizon", 1 <= self.horizon <= MOST_SAMPLES, f"1..{MOST_SAMPLES}"),
-            ("step_s", self.step_s > 0.0, "> 0"),
-            ("preview_stride", self.preview_stride >= 1, ">= 1"),
-        ):
-            if not is_valid:
-                raise ValueError(
-                    f"episodes of '{self.scenario}': {name} is {getattr(self, name)}, expected "
-                    f"{expected}"
-                )
+        who = f"episodes of '{self.scenario}'"
+        if not 1 <= self.horizon <= MOST_SAMPLES:
+            raise ValueError(f"{who}: horizon is {self.horizon}, expected 1..{MOST_SAMPLES}")
+        if not (self.step_s > 0.0 and self.preview_stride >= 1):
+            raise ValueError(
+                f"{who}: step_s is {self.step_s} and preview_stride {self.preview_stride}, "
+                "expected > 0"
+            )
 
     @property
     def preview_step_s(self) -> float:
@@ -191,10 +180,9 @@ class Episode:
 
 
 class Episodes(Sequence[Episode]):
-    """A set of episodes that share one `EpisodesInfo`; a slice is a set."""
+    """A set of episodes that share one `EpisodesInfo` and fit it; a slice is a set."""
 
     def __init__(self, info: EpisodesInfo, episodes: Iterable[Episode]):
-        """Checks every episode against `info`."""
         self.info = info
         self._is_warned = False
         self._episodes = list(episodes)
@@ -226,7 +214,7 @@ class Episodes(Sequence[Episode]):
         counts = [len(episode.time_s) for episode in episodes]
 
         def repeated(name: str) -> np.ndarray:
-            return np.repeat(np.array([getattr(one, name) for one in episodes]), counts)
+            return np.repeat(np.array([getattr(e, name) for e in episodes]), counts)
 
         columns = {
             "episode": repeated("index"),
@@ -234,18 +222,17 @@ class Episodes(Sequence[Episode]):
             "time_s": np.concatenate([np.empty(0), *(episode.time_s for episode in episodes)]),
         }
         for array, names in info.columns.items():
-            rows = (getattr(one, array) for one in episodes)
+            rows = (getattr(episode, array) for episode in episodes)
             table = np.concatenate([np.empty((0, len(names))), *rows])
             columns |= {f"{array}.{name}": table[:, i] for i, name in enumerate(names)}
-        of_episodes = {name: repeated(name) for name in ("is_safe", "cause", "first_step")}
-        return pa.table(columns | of_episodes)
+        columns |= {name: repeated(name) for name in ("is_safe", "cause", "first_step")}
+        return pa.table(columns)
 
     @overload
     def __getitem__(self, key: int) -> Episode: ...
     @overload
     def __getitem__(self, key: slice) -> Episodes: ...
     def __getitem__(self, key: int | slice) -> Episode | Episodes:
-        """Returns one episode, or the set of a slice."""
         if isinstance(key, slice):
             return Episodes(self.info, self._episodes[key])
         return self._episodes[key]
@@ -267,7 +254,7 @@ class Episodes(Sequence[Episode]):
 
     def warn(self) -> None:
         """Logs, once, why little can be learned from these episodes, if so."""
-        known = [] if self._is_warned else [one for one in self if one.cause != DIVERGED]
+        known = [] if self._is_warned else [e for e in self if e.cause != DIVERGED]
         self._is_warned, who = True, self.info.scenario
         for k, name in enumerate(self.info.constraint_names if known else ()):
             first = [e.margins[0, k] < 0.0 or (e.cause == name and not e.num_steps) for e in known]
@@ -277,39 +264,33 @@ class Episodes(Sequence[Episode]):
                     "nothing is learned; draw starts inside the safe set",
                     *(share, who, name),
                 )
-        seen = {one.is_safe for one in known if one.num_steps > one.first_step}
-        if known and len(seen) < 2:
-            what, starts = ("safe", "calmer") if True not in seen else ("unsafe", "wider")
+        labels = {e.is_safe for e in known if e.num_steps > e.first_step}
+        if known and len(labels) < 2:
+            what, starts = ("safe", "calmer") if True not in labels else ("unsafe", "wider")
             text = "none of %d episodes of '%s' is %s after its first row, so that Γ learns no "
             _LOGGER.warning(text + "difference; draw %s starts", len(known), who, what, starts)
 
 
 def _check_episode(info: EpisodesInfo, episode: Episode) -> None:
-    who = f"episode {episode.index} of '{info.scenario}'"
-    num_rows = len(episode.time_s)
+    who, num_rows = f"episode {episode.index} of '{info.scenario}'", len(episode.time_s)
     for name, width in info.widths.items():
         shape = np.shape(getattr(episode, name))
         if shape != (num_rows, width):
             raise ValueError(f"{who}: {name} has shape {shape}, expected {(num_rows, width)}")
-    if num_rows == 0:
-        raise ValueError(f"{who}: it has no rows, expected at least one")
     if not 0 <= episode.first_step < num_rows:
-        raise ValueError(f"{who}: first_step is {episode.first_step}, expected 0..{num_rows - 1}")
-    if episode.is_safe != (episode.cause == ""):
-        raise ValueError(f"{who}: is_safe is {episode.is_safe} but the cause is '{episode.cause}'")
-    if episode.cause not in ("", DIVERGED, *info.constraint_names):
+        raise ValueError(f"{who}: first_step is {episode.first_step} of {num_rows} rows")
+    causes = [""] if episode.is_safe else [DIVERGED, *info.constraint_names]
+    if episode.cause not in causes:
         raise ValueError(
-            f"{who}: unknown cause '{episode.cause}'; the constraints are {info.constraint_names}"
+            f"{who}: is_safe is {episode.is_safe} and the cause '{episode.cause}', expected one of "
+            f"{causes}"
         )
 
 
 def unsafety_score(
     remaining_steps: np.ndarray, is_unsafe: np.ndarray, discount: float
 ) -> np.ndarray:
-    """The unsafety score lambda = gamma^R if a trajectory is unsafe, else 0, (N,), in [0, 1].
-
-    R are the steps from the segment's start to the termination, (N,).
-    """
+    """Returns lambda = gamma^R if a trajectory is unsafe, else 0, (N,); R are the steps left."""
     return np.where(is_unsafe, float(discount) ** np.asarray(remaining_steps, dtype=float), 0.0)
 
 
@@ -319,20 +300,15 @@ class Segments:
 
     Attributes:
         episode: Position of the episode in its set, (N,).
-        start_row: Row of the episode at which the segment starts, (N,).
+        start_row: Row of the episode at which the segment starts, (N,); state, preview and features
+            are those of that row.
         is_first: Whether the segment starts at its episode's `first_step`, (N,).
         remaining_steps: Rows until the episode ends, (N,).
         is_unsafe: Whether the episode ended unsafely, (N,).
         score: Unsafety score lambda, (N,).
         cause: Column of the constraint that ended the episode, -1 when safe, (N,).
-        state: Measured starting state, (N, n_s).
-        true_state: Starting state without observation noise, (N, n_s).
-        desired_preview: Desired outputs over the horizon, (N, H*n_z).
-        features: Features at the start, (N, n_f).
-        future_margins: Smallest margin of each constraint from the start to the episode's end, (N,
-            n_c).
-        error: Tracking errors z* - z [m], the last one repeated beyond the segment's length, (N,
-            H, n_z).
+        future_margins: Smallest margins from the start to the episode's end, (N, n_c).
+        error: Tracking errors z* - z [m], the last one repeated at the end, (N, H, n_z).
         length: Number of recorded samples of `error`, (N,): H, or less at an episode's end.
     """
 
@@ -386,16 +362,14 @@ def split(
         discount: gamma of the unsafety score.
         shortest: Least number of samples left of a complete episode; H by default.
     """
-    if stride < 1:
-        raise ValueError(f"split: stride is {stride}, expected >= 1")
-    horizon = episodes.info.horizon
+    horizon, sample = episodes.info.horizon, episodes.info.preview_stride
     shortest = horizon if shortest is None else shortest
-    if not 1 <= shortest <= horizon:
-        raise ValueError(f"split: shortest is {shortest}, expected 1..{horizon}")
-    sample = episodes.info.preview_stride
-    offsets = sample * np.arange(horizon)
-    names = episodes.info.constraint_names
-    pieces: dict[str, list[np.ndarray]] = {field.name: [] for field in fields(Segments)}
+    if not (1 <= shortest <= horizon and stride >= 1):
+        raise ValueError(
+            f"split: shortest is {shortest}, stride {stride}; expected 1..{horizon}, >= 1"
+        )
+    offsets, names = sample * np.arange(horizon), episodes.info.constraint_names
+    parts = []
     # If T is unknown, the longest episode is taken as complete.
     whole = episodes.info.num_steps or max((e.num_steps for e in episodes), default=0)
     for position, episode in enumerate(episodes):
@@ -410,30 +384,29 @@ def split(
         remaining = num_steps - rows
         is_unsafe = np.full(rows.size, not episode.is_safe)
         error = episode.desired_output - episode.output
-        piece = {
-            "episode": np.full(rows.size, position),
-            "start_row": rows,
-            "is_first": rows == episode.first_step,
-            "remaining_steps": remaining,
-            "is_unsafe": is_unsafe,
-            "score": unsafety_score(remaining / sample, is_unsafe, discount),
-            "cause": np.full(rows.size, -1 if episode.is_safe else names.index(episode.cause)),
-            "state": episode.state[rows],
-            "true_state": episode.true_state[rows],
-            "desired_preview": episode.desired_preview[rows],
-            "features": episode.features[rows],
-            "future_margins": np.minimum.accumulate(episode.margins[::-1], axis=0)[::-1][rows],
-            "error": error[np.minimum(rows[:, None] + offsets, num_steps)],
-            "length": np.minimum(horizon, remaining // sample + 1),
-        }
-        for name, values in piece.items():
-            pieces[name].append(values)
-    if not pieces["score"]:
+        part = Segments(
+            episode=np.full(rows.size, position),
+            start_row=rows,
+            is_first=rows == episode.first_step,
+            remaining_steps=remaining,
+            is_unsafe=is_unsafe,
+            score=unsafety_score(remaining / sample, is_unsafe, discount),
+            cause=np.full(rows.size, -1 if episode.is_safe else names.index(episode.cause)),
+            state=episode.state[rows],
+            true_state=episode.true_state[rows],
+            desired_preview=episode.desired_preview[rows],
+            features=episode.features[rows],
+            future_margins=np.minimum.accumulate(episode.margins[::-1], axis=0)[::-1][rows],
+            error=error[np.minimum(rows[:, None] + offsets, num_steps)],
+            length=np.minimum(horizon, remaining // sample + 1),
+        )
+        parts.append(part)
+    if not parts:
         raise ValueError(
             f"split: none of the {len(episodes)} episodes of '{episodes.info.scenario}' gives "
             f"a segment of {shortest} samples ({episodes.num_diverged} diverged)"
         )
-    return Segments(**{name: np.concatenate(values) for name, values in pieces.items()})
+    return joined(parts)
 
 
 def training_segments(episodes: Episodes, parameters: AssessmentParameters) -> Segments:
@@ -447,8 +420,5 @@ def training_segments(episodes: Episodes, parameters: AssessmentParameters) -> S
             )
     settings = mode_settings(parameters)
     return split(
-        episodes,
-        stride=settings.stride,
-        discount=parameters.discount,
-        shortest=settings.shortest,
+        episodes, stride=settings.stride, discount=parameters.discount, shortest=settings.shortest
     )

@@ -75,23 +75,17 @@ class Embedding:
         heads = ["safety.0", "safety.1"] if self.has_safety_head else []
         expected = {f"{name}.{kind}" for name in names + heads for kind in ("weight", "bias")}
         if expected != self.weights.keys() or self.num_layers == 0:
-            missing, surplus = expected - self.weights.keys(), self.weights.keys() - expected
             raise ValueError(
-                f"Embedding: a map of {self.num_layers} hidden layers has the arrays "
-                f"{sorted(expected)}; missing {sorted(missing)}, unexpected {sorted(surplus)}"
+                f"Embedding: the arrays are {sorted(self.weights)}, expected {sorted(expected)}"
             )
         self._layers = [self._layer(name) for name in names]
         self.num_members, self.num_inputs, _ = self._layers[0][0].shape
         self.num_activations = self._layers[-1][0].shape[1]
-        self.input_range = np.full((2, self.num_inputs), np.inf, dtype=np.float32)
-        self.input_range[0] = -np.inf
-        if input_range is not None:
-            if np.shape(input_range) != self.input_range.shape:
-                raise ValueError(
-                    f"Embedding: the range of inputs has the shape {np.shape(input_range)}, "
-                    f"expected {self.input_range.shape}"
-                )
-            self.input_range[:] = input_range
+        unlimited = np.tile([[-np.inf], [np.inf]], self.num_inputs)
+        limits = unlimited if input_range is None else input_range
+        self.input_range = np.array(limits, dtype=np.float32)
+        if self.input_range.shape != unlimited.shape:
+            raise ValueError(f"Embedding: the range of inputs has the shape {np.shape(limits)}")
         self.input_range.setflags(write=False)
         self._prepare()
 
@@ -177,8 +171,8 @@ class Embedding:
                 logit = (np.maximum(z[..., width:], 0.0) @ weight)[..., 0, 0] + bias[:, 0, 0]
             else:
                 logit = np.full(z.shape[:2], np.nan)
-        found = z[:, :, 0, :width].astype(float)
-        return EmbeddingOutput(found[..., :2], logit.astype(float), found[..., 2:])
+        output = z[:, :, 0, :width].astype(float)
+        return EmbeddingOutput(output[..., :2], logit.astype(float), output[..., 2:])
 
     def activations(self, x: np.ndarray) -> np.ndarray:
         """Returns the last hidden layers at finite inputs (N, n_x), (K, N, num_activations)."""
@@ -197,25 +191,23 @@ class Embedding:
         """
         if not self.has_safety_head:
             raise ValueError("Embedding.logit_gradient: the maps have no safety head")
-        w = self.weights
         x = np.asarray(x, dtype=float)
         clipped = np.clip(x, *self.input_range)
         logit, gradient = np.zeros(len(x)), np.zeros(np.shape(x))
         for k in range(self.num_members):
-            z = clipped
-            is_active = []
+            w = {name: array[k] for name, array in self.weights.items()}
+            z, is_active = clipped, []
             for i in range(self.num_layers):
-                z = z @ w[f"trunk.{i}.weight"][k] + w[f"trunk.{i}.bias"][k]
+                z = z @ w[f"trunk.{i}.weight"] + w[f"trunk.{i}.bias"]
                 is_active.append(z > 0.0)
                 z = np.maximum(z, 0.0)
-            y = z @ w["output.weight"][k][:, :2] + w["output.bias"][k][:2]
-            hidden = y @ w["safety.0.weight"][k] + w["safety.0.bias"][k]
-            member = np.maximum(hidden, 0.0) @ w["safety.1.weight"][k] + w["safety.1.bias"][k]
-            logit += member[:, 0]
-            back = (hidden > 0.0) * w["safety.1.weight"][k][:, 0]
-            back = back @ w["safety.0.weight"][k].T @ w["output.weight"][k][:, :2].T
+            y = z @ w["output.weight"][:, :2] + w["output.bias"][:2]
+            hidden = y @ w["safety.0.weight"] + w["safety.0.bias"]
+            logit += (np.maximum(hidden, 0.0) @ w["safety.1.weight"] + w["safety.1.bias"])[:, 0]
+            back = (hidden > 0.0) * w["safety.1.weight"][:, 0]
+            back = back @ w["safety.0.weight"].T @ w["output.weight"][:, :2].T
             for i in reversed(range(self.num_layers)):
-                back = (back * is_active[i]) @ w[f"trunk.{i}.weight"][k].T
+                back = (back * is_active[i]) @ w[f"trunk.{i}.weight"].T
             gradient += back * (clipped == x)
         return logit / self.num_members, gradient / self.num_members
 
