@@ -1,4 +1,3 @@
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -25,25 +24,19 @@ def worst(rows, detector=None):
     return (detector or learned()).watch([rows])[0].max(axis=1)
 
 
-@pytest.mark.parametrize("monitored", [None, ["knee_rate"]])
-def test_levels_are_those_of_the_recursion_over_consecutive_motions(monitored):
-    detector = learned()
-    if monitored is not None:
-        info = replace(INFO, monitored_states=monitored, monitored_features=None)
-        detector = ChangeDetector.fit(recorded([motion(5.0, seed) for seed in range(2)], info))
+def test_levels_are_those_of_the_recursion_over_consecutive_motions():
     rows = [motion(2.0, seed, ALWAYS) for seed in range(4)]
     rows[1] = rows[1][:2]  # Too short for an innovation: the charts keep their values.
     rows[2][20:30] = rows[2][20]
-    levels, charts = naive.charts(detector, rows)
-    np.testing.assert_allclose(detector.watch(rows)[0], levels, rtol=1e-4, atol=1e-4)
-    assert levels.shape[1] == len(monitored or INFO.state_names)
+    levels, charts = naive.charts(learned(), rows)
+    np.testing.assert_allclose(learned().watch(rows)[0], levels, rtol=1e-4, atol=1e-4)
     assert not levels[:2].any() and levels[2:].min() > 0.0
-    np.testing.assert_allclose(detector.levels(charts[-1]), levels[-1])
-    assert not detector.watch([rows[1]])[0].any()
+    np.testing.assert_allclose(learned().levels(charts[-1]), levels[-1])
+    assert not learned().watch([rows[1]])[0].any()
 
 
 def test_hours_of_the_same_plant_raise_no_more_alarms_than_promised():
-    hours = 3.0
+    hours = 2.0
     usual = (motion(MOTION_S, 1000 + seed) for seed in range(round(hours * 3600 / MOTION_S)))
     alarms = sum(len(learned().watch([rows])[1]) for rows in usual)
     assert alarms <= 1 + hours * FALSE_ALARMS_PER_HOUR
@@ -58,50 +51,40 @@ def test_hours_of_the_same_plant_raise_no_more_alarms_than_promised():
         ({"noise": 0.05}, 1.0),
     ],
 )
-def test_a_changed_plant_or_sensor_is_noticed(change, within_s):
+def test_changed_plant_or_sensor_is_noticed(change, within_s):
     assert worst(motion(within_s, 3, **change)).max() > 1.0
 
 
 def test_one_impact_is_no_lasting_change():
     rows = motion(20.0, 4)
     rows[200, 1] += 5.0
-    found = np.flatnonzero(worst(rows) > 1.0)
-    assert 200 <= found.min() <= found.max() < 200 + 3.0 / STEP_S
+    alarms = np.flatnonzero(worst(rows) > 1.0)
+    assert 200 <= alarms.min() <= alarms.max() < 200 + 3.0 / STEP_S
 
 
-def test_a_frozen_input_is_noticed_after_few_repeats():
+def test_frozen_input_is_noticed_after_few_repeats():
     rows = motion(20.0, 5)
     rows[215:] = rows[215]
-    (alarm,) = learned().watch([rows])[1]
+    (alarm,) = learned().watch([rows], INFO.state_names)[1]
     assert 215 < alarm.begin <= 215 + learned().longest_repeat + 1
-    assert alarm.end == len(rows)
-    _, charts = naive.charts(learned(), [rows])
-    repeats = learned().longest_repeat + 1
-    assert learned().cause(charts[-1], repeats, INFO.state_names) == "inputs frozen"
-
-
-def test_the_cause_names_the_state_that_is_pushed():
-    _, charts = naive.charts(learned(), [motion(5.0, 6, ALWAYS, -0.03)])
-    said = learned().cause(charts[-1], 0.0, INFO.state_names)
-    assert said.startswith("joint knee answers unlike in training (knee_rate -")
+    assert (alarm.end, alarm.cause) == (len(rows), "inputs frozen")
 
 
 @pytest.mark.parametrize(
-    ("names", "value", "is_square", "said"),
+    ("names", "value", "is_square", "cause"),
     [
         (["base_x", "velocity_y"], [0.0, 7.0], False, "pushed steadily to the left (velocity_y +7"),
-        (["base_x", "velocity_y"], [-9.0, 7.0], False, "pushed steadily backward (base_x -9.0 sta"),
         (["base_x", "velocity_y"], [0.0, 8.0], True, "velocity_y changes unlike in training (velo"),
         (["knee", "knee_rate"], [0.0, 8.0], True, "joint knee answers unlike in training (knee_r"),
         (["angle", "speed"], [0.0, -7.0], False, "speed changes unlike in training (speed -7.0 st"),
     ],
 )
-def test_an_alarm_says_what_it_saw(names, value, is_square, said):
+def test_cause_of_an_alarm(names, value, is_square, cause):
     charts = np.zeros((6, 2))
     charts[3 * is_square + 1] = value
-    cause = replace(learned(), limits=np.ones((6, 2))).cause(charts, 0.0, names)
-    assert cause.startswith(said) and cause.endswith(f"over {2 * TIME_CONSTANTS_S[1]:g} s)")
-    assert not is_square or "3.0 times as irregular" in cause
+    text = replace(learned(), limits=np.ones((6, 2))).cause(charts, 0.0, names)
+    assert text.startswith(cause) and text.endswith(f"over {2 * TIME_CONSTANTS_S[1]:g} s)")
+    assert not is_square or "3.0 times as irregular" in text
 
 
 def test_too_little_motion_gives_levels_and_no_alarm():
@@ -110,14 +93,13 @@ def test_too_little_motion_gives_levels_and_no_alarm():
     assert np.isinf(detector.alarm_level) and learned().alarm_level == 1.0
     levels, alarms = detector.watch([motion(5.0, 12, ALWAYS)])
     assert levels.max() > 1.0 and alarms == []
-    assert "never alarms" in detector.describe()
     assert "never alarms; 3 min of" in detector.with_motions(rows).describe()
     assert "extrapolated to one false alarm in" in learned().describe()
     with pytest.raises(ValueError, match="1 motions have three rows; two are needed"):
-        ChangeDetector.fit(recorded([one[: 2 + i] for i, one in enumerate(rows[:2])]))
+        ChangeDetector.fit(recorded([few[: 2 + i] for i, few in enumerate(rows[:2])]))
 
 
-def test_what_an_actual_robot_does_is_no_alarm_after_its_motion_is_known():
+def test_actual_robot_raises_no_alarm_after_its_motion_is_known():
     adapted = learned().with_motions([motion(MOTION_S, seed, ALWAYS, 0.1) for seed in range(7)])
     same, other = motion(300.0, 9, ALWAYS, 0.1), motion(5.0, 10, ALWAYS, -0.1)
     assert worst(same).max() > 1.0
@@ -137,44 +119,35 @@ def wild(duration_s, seed):
     return rows
 
 
-@pytest.mark.parametrize("num_pieces", [1, 5, 30])
-@pytest.mark.parametrize("make", [motion, wild])
-def test_little_motion_of_an_actual_robot_widens_no_limit(num_pieces, make):
+@pytest.mark.parametrize("num_pieces", [1, 30])
+def test_little_motion_of_an_actual_robot_widens_no_limit(num_pieces):
     duration_s = 0.8 * LEAST_MOTION_S
     adapted = learned().with_motions(
-        [make(duration_s / num_pieces, seed) for seed in range(num_pieces)]
+        [wild(duration_s / num_pieces, seed) for seed in range(num_pieces)]
     )
     for name in ("limits", "deviation", "longest_repeat", "alarm_level"):
         np.testing.assert_array_equal(getattr(adapted, name), getattr(learned(), name))
-    assert (adapted.widening() == 1.0).all()
     assert "4 min of an actual robot's correct its prediction, 6 are needed" in adapted.describe()
-    assert "no rate of false alarms is promised" in adapted.describe()
     assert worst(motion(5.0, 10, ALWAYS, -0.4), adapted).max() > 1.0
 
 
-def test_an_adapted_detector_says_how_much_its_limits_were_widened():
-    rows = [wild(MOTION_S, seed) for seed in range(8)]
-    adapted = learned().with_motions(rows)
-    assert adapted.widening().min() >= 1.0 and np.median(adapted.widening()) > 1.0
+def test_adapted_detector_says_how_much_its_limits_were_widened():
+    adapted = learned().with_motions([wild(MOTION_S, seed) for seed in range(8)])
+    widening = adapted.widening()
+    assert widening.min() >= 1.0 and np.median(widening) > 1.0
     assert adapted.longest_repeat == 4 + 3  # As of a fitted one.
-    told = adapted.describe()
-    assert "11 min of motion for its limits; 7 min of an actual robot's correct" in told
-    assert f"widen limits, {np.median(adapted.widening()):.2f} times in the median and " in told
-    assert "7 repeated inputs are no alarm" in told
-
-
-@pytest.mark.parametrize("is_read", [False, True])
-@pytest.mark.parametrize("num_motions", [1, 8])
-def test_each_adaptation_starts_from_the_nominal_detector(num_motions, is_read):
-    first = learned().with_motions([wild(MOTION_S, seed) for seed in range(8)])
-    again = ChangeDetector.from_arrays(first.arrays()) if is_read else first
-    rows = [motion(MOTION_S, seed, ALWAYS, 0.1) for seed in range(num_motions)]
-    found, expected = again.with_motions(rows).arrays(), learned().with_motions(rows).arrays()
-    assert found.keys() == expected.keys()
-    for name, values in found.items():
+    text = adapted.describe()
+    assert f"widen limits, {np.median(widening):.2f} times in the median and " in text
+    assert "7 repeated inputs are no alarm" in text
+    # A detector that is read, and its adaptation, are the same to the bit.
+    again = ChangeDetector.from_arrays(adapted.arrays())
+    assert again.describe() == text and again.nominal.describe() == learned().describe()
+    rows = [motion(MOTION_S, seed, ALWAYS, 0.1) for seed in range(8)]
+    np.testing.assert_array_equal(worst(rows[0], again), worst(rows[0], adapted))
+    other, expected = again.with_motions(rows).arrays(), learned().with_motions(rows).arrays()
+    assert other.keys() == expected.keys()
+    for name, values in other.items():
         np.testing.assert_array_equal(values, expected[name], err_msg=name)
-    assert again.describe() == first.describe()
-    assert again.nominal.describe() == learned().describe()
 
 
 def lively(first_seed, num=40, info=INFO, **changes):
@@ -183,32 +156,34 @@ def lively(first_seed, num=40, info=INFO, **changes):
     return recorded(rows, info, first_step=6, **changes)
 
 
-def test_a_monitor_knows_safe_episodes_that_are_livelier_than_its_motion():
-    told, is_ok = learned().describe_alarms(lively(2000))
-    assert not is_ok and re.match(r"monitor: alarms in (2\d|3\d|40) of 40 safe episodes: tr", told)
-    calm = recorded([motion(MOTION_S, seed) for seed in range(10)])
-    both = ChangeDetector.fit(calm, episodes=lively(1000, 60))
-    told, is_ok = both.describe_alarms(lively(2000))
-    assert is_ok and re.fullmatch(r"monitor: alarms in [0-4] of 40 safe episodes", told)
+def test_monitor_learns_safe_episodes_that_are_livelier_than_its_motion():
+    assert not learned().describe_alarms(lively(2000))[1]
+    undisturbed = recorded([motion(MOTION_S, seed) for seed in range(10)])
+    both = ChangeDetector.fit(undisturbed, episodes=lively(1000, 60))
+    assert both.describe_alarms(lively(2000))[1]
     assert worst(motion(5.0, 10, ALWAYS, -0.8), both).max() > 1.0
     # Unsafe episodes do not count.
-    unsafe = lively(1000, 60, is_safe=False, cause="reach")
-    told = ("monitor: alarms in 0 of 0 safe episodes", True)
-    assert learned().describe_alarms(unsafe) == told
+    unsafe = lively(1000, 3, is_safe=False, cause="reach")
+    expected = ("monitor: alarms in 0 of 0 safe episodes", True)
+    assert learned().describe_alarms(unsafe) == expected
 
 
 @pytest.mark.parametrize(
-    "change", [{"state_names": ["hip", "hip_rate"]}, {"step_s": 0.1}, {"output_names": ["end"]}]
+    ("change", "message"),
+    [
+        ({"step_s": 0.1}, "motions and episodes differ in step_s"),
+        ({"output_names": ["end"]}, "motions and episodes differ in output_names"),
+        ({"monitored_states": ["wing"]}, r"monitored_states has \['wing'\], which are none of"),
+    ],
 )
-def test_motions_of_another_diagram_than_the_episodes_are_refused(change):
-    other = lively(0, 3, replace(INFO, **change))
-    with pytest.raises(ValueError, match=f"motions and episodes differ in {''.join(change)}: "):
-        SafetyAssessment().fit(other, motions=recorded([motion(3.0, 0), motion(3.0, 1)]))
+def test_motions_of_another_diagram_and_unknown_names_are_refused(change, message):
+    motions = recorded([motion(3.0, 0), motion(3.0, 1)], replace(INFO, **change))
+    with pytest.raises(ValueError, match=message):
+        SafetyAssessment().fit(lively(0, 3), motions=motions)
 
 
 def test_fit_warns_of_a_monitor_that_never_alarms(monkeypatch, caplog):
-    learned_of = lambda self, episodes, progress, detector: {"detector_": detector}  # noqa: E731
-    monkeypatch.setattr(SafetyAssessment, "_learned", learned_of)
+    monkeypatch.setattr(SafetyAssessment, "_learned", lambda *given: {})
     with caplog.at_level("WARNING"):
         SafetyAssessment().fit(lively(0, 3))
         assert "0 min of motion for its limits, 6 are needed: it reports levels" in caplog.text
@@ -224,18 +199,3 @@ def test_motion_counts_from_its_first_step_until_shortly_before_it_leaves():
     (kept,) = usual_rows(recorded([rows], is_safe=False, cause="reach"))
     assert 0.1 < STEP_S * (len(rows) - len(kept)) < 2.0
     np.testing.assert_array_equal(kept, rows[: len(kept)])
-
-
-def test_a_detector_is_made_of_its_arrays():
-    arrays, rows = learned().arrays(), motion(5.0, 15)
-    again = ChangeDetector.from_arrays(arrays)
-    np.testing.assert_array_equal(worst(rows, again), worst(rows))
-    assert again.describe() == learned().describe()
-    assert (again.alarm_level, again.longest_repeat) == (1.0, learned().longest_repeat)
-
-
-@pytest.mark.parametrize("name", ["monitored_states", "monitored_features"])
-def test_names_that_are_none_of_the_loops_are_refused(name):
-    info = replace(INFO, **{name: ["wing"]})
-    with pytest.raises(ValueError, match=rf"{name} has \['wing'\], which are none of"):
-        ChangeDetector.fit(recorded([motion(1.0, seed) for seed in range(2)], info))
