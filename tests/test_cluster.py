@@ -85,9 +85,7 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed(two_workers):
     with connected(address):
         glided = run_episodes(own_task, 8)
         found = run_episodes(pendulum, NUM_EPISODES, progress=kill_one)
-        with pytest.raises(
-            ValueError, match="DaskDistributedBackend has its own number"
-        ):
+        with pytest.raises(ValueError, match="DaskDistributedBackend has its own number"):
             run_episodes(pendulum, 8, num_workers=2)
     assert workers[0].poll() == -signal.SIGKILL
     assert seen == sorted(seen)
