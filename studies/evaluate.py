@@ -28,7 +28,7 @@ from drake_safety.cli.evaluate import (
     evaluating,
 )
 from drake_safety.cli.training_folder import check_writable, episodes_folder
-from drake_safety.diagrams.balancing.throws import run_throws
+from drake_safety.diagrams.balancing.throws import HasBall, run_throws
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Key, Results
 from drake_safety.evaluation.scorers import Scorer
@@ -37,7 +37,6 @@ from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
 from drake_safety.learning.seeds import EVALUATION, RELEASE
 from drake_safety.simulation.capabilities import (
     CanFall,
-    HasBall,
     require,
 )
 from drake_safety.simulation.closed_loop import ClosedLoop

@@ -6,9 +6,19 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
+from drake_safety.diagrams.pendulum.task import (
+    PendulumController,
+    PendulumObserver,
+    PendulumParameters,
+    PendulumSafeSet,
+    bob_position,
+)
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import run_episode
+from system_doubles import Bench
+
+LENGTH_M, PERIOD_S = 0.5, 0.01
 
 
 @pytest.fixture(scope="module")
@@ -28,15 +38,15 @@ def start(loop, angle, rate, goal=0.0):
 def test_the_pendulum_follows_its_plan(loop):
     episode = run_episode(loop, start=start(loop, 0.0, 0.0, goal=0.2))
     assert episode.is_safe
-    length = loop.scenario.parameters.length_m
-    expected = length * np.array([math.sin(0.2), 0.0, math.cos(0.2)])
+    expected = LENGTH_M * np.array([math.sin(0.2), 0.0, math.cos(0.2)])
     np.testing.assert_allclose(episode.desired_output[-1], expected, atol=1e-9)
     np.testing.assert_allclose(episode.output[-1], expected, atol=2e-3)
 
 
-def test_beyond_the_angle_that_the_motor_holds_there_is_no_way_back(loop):
-    hold = loop.scenario.parameters.hold_angle_rad
-    assert run_episode(loop, start=start(loop, hold - 0.02, 0.0)).is_safe
+def test_beyond_the_angle_that_the_motor_holds_there_is_no_way_back(scenario, loop):
+    hold, heavy = loop.scenario.parameters.hold_angle_rad, scenario.make_loop("actual")
+    assert run_episode(loop, start=start(loop, hold - 0.015, 0.0)).is_safe
+    assert not run_episode(heavy, start=start(heavy, hold - 0.015, 0.0)).is_safe
     lost = run_episode(loop, start=start(loop, hold + 0.02, 0.0))
     assert (lost.is_safe, lost.cause) == (False, "front")
     assert run_episode(loop, start=start(loop, -hold - 0.02, 0.0)).cause == "back"
@@ -48,33 +58,22 @@ def test_at_rest_and_upright_gravity_accelerates_what_leans(loop):
     # The motor's torque is at its limit, m g l share: φ̈ = (sin φ - share) g / l.
     loop.reset_to(context, None, start(loop, 0.5, 0.0))
     simulator.AdvanceTo(0.04)
-    parameters = loop.scenario.parameters
-    acceleration = (math.sin(0.5) - parameters.effort_share) * 9.81 / parameters.length_m
+    acceleration = (math.sin(0.5) - loop.scenario.parameters.effort_share) * 9.81 / LENGTH_M
     rate = loop.GetOutputPort("state").Eval(context)[1]
     assert rate == pytest.approx(0.04 * acceleration, rel=0.03)
-
-
-def test_a_heavier_pendulum_is_lost_where_the_nominal_one_is_held(scenario, loop):
-    angle = loop.scenario.parameters.hold_angle_rad - 0.015
-    heavy = scenario.make_loop("actual")
-    assert run_episode(loop, start=start(loop, angle, 0.0)).is_safe
-    assert not run_episode(heavy, start=start(heavy, angle, 0.0)).is_safe
 
 
 def test_what_a_plan_asks_of_the_motor_is_that_of_its_minimum_jerk(loop):
     context = loop.CreateDefaultContext()
     plan = loop.plan(-0.24, 0.24, 1.0)
     loop.reset_to(context, None, EpisodeStart(q=np.zeros(1), v=np.zeros(1), plan=plan))
-    values = dict(
-        zip(loop.feature_names, loop.GetOutputPort("features").Eval(context), strict=True)
-    )
-    length_m, sine = 0.5, math.sin(0.24)
+    features = loop.GetOutputPort("features").Eval(context)
+    values = dict(zip(loop.feature_names, features, strict=True))
     t = np.linspace(0.0, 1.0, 2001)
-    x = length_m * sine * (2.0 * (10 * t**3 - 15 * t**4 + 6 * t**5) - 1.0)
-    z = length_m * math.cos(0.24)
-    angle = np.arctan2(x, z)
+    share = 2.0 * (10 * t**3 - 15 * t**4 + 6 * t**5) - 1.0
+    angle = np.arctan2(LENGTH_M * math.sin(0.24) * share, LENGTH_M * math.cos(0.24))
     rate = np.gradient(angle, t)
-    time_s = math.sqrt(length_m / 9.81)
+    time_s = math.sqrt(LENGTH_M / 9.81)
     capture = angle + time_s * rate
     effort = time_s**2 * np.gradient(rate, t) - np.sin(angle)
     hold = math.asin(0.35)
@@ -103,3 +102,59 @@ def test_gamma_finds_the_true_safe_set_from_few_episodes(scenario, loop):
     assert np.sum(is_safe & is_accepted) / np.sum(is_safe | is_accepted) >= 0.75
     # The pendulum is the same in the mirror, and so is what becomes of it.
     np.testing.assert_array_equal(is_safe, is_safe[::-1])
+
+
+@pytest.mark.parametrize(
+    ("angle", "bob"),
+    [
+        (math.pi, [0.0, 0.0, LENGTH_M]),
+        (math.pi + math.pi / 6, [0.25, 0.0, 0.5 * math.sqrt(0.75)]),
+        (0.0, [0.0, 0.0, -LENGTH_M]),
+    ],
+)
+def test_the_observer_counts_from_upright_and_places_the_bob(angle, bob):
+    observer = PendulumObserver(LENGTH_M, PendulumSafeSet(PendulumParameters(), 0.05))
+    bench = Bench(observer, pendulum_state=[angle, 0.7])
+    np.testing.assert_allclose(bench.get("plant_state"), [angle - math.pi, 0.7], atol=1e-15)
+    np.testing.assert_allclose(bench.get("output"), bob, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("effort_share", "state", "angle", "rate", "expected"),
+    [
+        # 20 (0.1 - 0.05) + 3 (0.4 - 0.2) - 1 * 9.81 * 0.5 sin(0.05) [N·m].
+        (0.999, [0.05, 0.2], 0.1, 0.4, 20.0 * 0.05 + 3.0 * 0.2 - 4.905 * math.sin(0.05)),
+        (0.999, [0.0, 0.0], 0.0, 0.0, 0.0),
+        # At its limit.
+        (0.35, [0.0, 0.0], 0.3, 0.0, 0.35 * 4.905),
+        (0.35, [0.0, 0.0], -0.3, 0.0, -0.35 * 4.905),
+    ],
+)
+def test_the_torque_is_of_both_errors_less_the_weights_within_its_limit(
+    effort_share, state, angle, rate, expected
+):
+    parameters = PendulumParameters(effort_share=effort_share)
+    velocity = rate * LENGTH_M * np.array([math.cos(angle), 0.0, -math.sin(angle)])
+    bench = Bench(PendulumController(parameters, PERIOD_S), plant_state=state)
+    bench.fix(desired_output=bob_position(angle, LENGTH_M), desired_output_rate=velocity)
+    bench.advance(0.1 * PERIOD_S)
+    assert bench.get("torque")[0] == pytest.approx(expected, abs=1e-12)
+
+
+def test_features_of_a_plan_that_holds_still_are_worked_by_hand():
+    safe_set = PendulumSafeSet(PendulumParameters(), 0.05)
+    preview = np.tile(bob_position(0.1, LENGTH_M), (5, 1))
+    values = safe_set.features(np.array([0.02]), np.array([0.3]), preview)
+    hold, capture = math.asin(0.35), 0.02 + 0.3 * math.sqrt(0.5 / 9.81)
+    reserves = {  # To the front and to the back.
+        "now_margin": (0.58, 0.62),
+        "capture_reserve": (hold - capture, hold + capture),
+        "goal_reserve": (hold - 0.1, hold + 0.1),
+        "plan_reserve": (hold - 0.1, hold + 0.1),
+        "plan_capture_reserve": (hold - 0.1, hold + 0.1),
+        "plan_effort_reserve": (0.35 - math.sin(0.1), 0.35 + math.sin(0.1)),
+    }
+    expected = {f"{name}_front": front for name, (front, _) in reserves.items()}
+    expected |= {f"{name}_back": back for name, (_, back) in reserves.items()}
+    expected |= {"tracking_error": 0.08, "goal_from_capture": 0.1 - capture}
+    assert dict(zip(safe_set.feature_names, values, strict=True)) == pytest.approx(expected)

@@ -87,26 +87,15 @@ def test_what_is_left_out_has_its_default():
 
 @pytest.mark.train
 def test_a_folder_goes_on_with_its_own_set_and_refuses_others(tmp_path):
-    record(4, path=tmp_path)
+    record(4, path=tmp_path, reset=lambda *start: np.int32(reset_glider(*start)))
     assert completed(tmp_path) == {0, 1, 2, 3}
     assert_identical(record(10, path=tmp_path), record(10))
     assert_identical(load_episodes(tmp_path), record(10))
-    others = [
-        {"seed": 1},
-        {"duration_s": 2.0},
-        {"parameters": {"failure": KeyError("bug")}},
-        {"make": lambda: make_glider()},
-        {"constraint_names": ["right", "left"]},
-    ]
+    others = [{"seed": 1}, {"duration_s": 2.0}, {"parameters": {"wall_m": 0.9}}]
+    others += [{"make": lambda: make_glider()}, {"constraint_names": ["right", "left"]}]
     for other in others:
         with pytest.raises(ValueError, match="of another set"):
             record(10, path=tmp_path, **other)
-
-
-@pytest.mark.train
-def test_a_first_row_of_any_type_of_integer_is_the_same_when_it_is_read(tmp_path):
-    options = {"path": tmp_path, "reset": lambda *start: np.int32(reset_glider(*start))}
-    assert_identical(record(4, **options), record(4, **options))
 
 
 @pytest.mark.train
@@ -157,8 +146,9 @@ class Keeper(LeafSystem):
         output.SetFromVector([kept.get(self.kind, drawn) - x])
 
 
-@pytest.mark.parametrize("num_workers", [1, 2])
-@pytest.mark.parametrize("kind", ["none", "memory", "random generator", "cache"])
+@pytest.mark.parametrize(
+    ("kind", "num_workers"), [("none", 1), ("memory", 2), ("random generator", 1), ("cache", 1)]
+)
 def test_state_that_a_system_keeps_in_an_attribute_is_found_and_named(kind, num_workers):
     def make():
         builder = DiagramBuilder()
@@ -191,8 +181,7 @@ def test_state_that_a_system_keeps_in_an_attribute_is_found_and_named(kind, num_
         record(8, **options)
 
 
-@pytest.mark.parametrize("num_workers", [1, 2])
-def test_state_that_a_reset_keeps_is_an_error(num_workers):
+def test_state_that_a_reset_keeps_is_an_error():
     def make():
         diagram = make_glider()
         diagram.num_resets = 0
@@ -203,19 +192,7 @@ def test_state_that_a_reset_keeps_is_an_error(num_workers):
         context.SetDiscreteState([0.01 * diagram.num_resets, 0.0])
 
     with pytest.raises(ValueError, match="0 of 'make', simulated a second time, differs, first at"):
-        record(8, make=make, reset=reset, num_workers=num_workers)
-
-
-def test_what_is_built_is_built_anew_for_every_call():
-    limits = {"failure": None}
-
-    def make():
-        return make_glider(**limits)
-
-    sound = record(make=make)
-    limits["failure"] = DivergenceError("now it fails")
-    assert sound.num_diverged == 0
-    assert record(make=make).num_diverged > 0
+        record(8, make=make, reset=reset)
 
 
 def test_a_diverged_simulation_is_counted_and_a_mistake_is_an_error(caplog):
@@ -227,9 +204,6 @@ def test_a_diverged_simulation_is_counted_and_a_mistake_is_an_error(caplog):
     assert f"{episodes.num_diverged} of 10 simulations of 'make_glider'" in caplog.text
     with pytest.raises(EpisodeError, match=r"episode \d of 'make_glider' \(seed 0\): KeyError"):
         record(parameters={"failure": KeyError("bug")})
-
-
-def test_a_reset_that_fails_names_its_episode():
     with pytest.raises(EpisodeError, match=r"episode 0 of 'make_glider' \(seed 0\), reset: Type"):
         record(reset=lambda diagram, context, rng: context + 1)
 
@@ -239,18 +213,10 @@ def test_a_reset_that_fails_names_its_episode():
     [
         ({"ports": {}}, r"exports no port \['state'\] for \['state'\]; it exports .*'margins'"),
         ({"ports": {"where": "output"}}, r"ports has \['where'\]; expected some of"),
-        (
-            {"ports": {"state": "output", "safe": "nowhere"}},
-            r"no port \['nowhere'\] for \['safe'\]",
-        ),
-        (
-            {"ports": {"state": "output", "true_state": "margins"}},
-            "'margins' for true_state has size 2; expected 1",
-        ),
+        ({"ports": {"state": "output", "true_state": "margins"}}, "for true_state has size 2; exp"),
         ({"ports": {"state": "output", "output": "margins"}}, "size 5; expected H times .* 2"),
         ({"constraint_names": ["wall"]}, "constraint_names has 1 names, the port has 2"),
         ({"duration_s": 0.01}, "an episode has at least one step"),
-        ({"monitor_period_s": 0.0}, "monitor_period_s must be positive"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_what_there_is(options, message):
@@ -317,18 +283,7 @@ def test_what_a_script_or_notebook_defines_reaches_the_workers(tmp_path):
     assert ended.returncode == 0, ended.stderr
 
 
-def test_nothing_of_python_is_changed_by_the_import():
-    code = (
-        "import copyreg, sys, pydrake.systems.framework as framework\n"
-        "metaclass = type(framework.LeafSystem).__module__\n"
-        "before = set(copyreg.dispatch_table), metaclass in sys.modules\n"
-        "import drake_safety.simulation.worker_processes\n"
-        "assert before == (set(copyreg.dispatch_table), metaclass in sys.modules)\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-@pytest.mark.parametrize("begin_s", [0.07, 3.0, 123.4, 1.76e9])
+@pytest.mark.parametrize("begin_s", [0.07, 123.4, 1.76e9])
 def test_rows_count_from_the_time_that_reset_sets(begin_s):
     def reset(diagram, context, rng):
         context.SetTime(begin_s)
@@ -341,11 +296,9 @@ def test_rows_count_from_the_time_that_reset_sets(begin_s):
         np.testing.assert_array_equal(episode.time_s[:-1], usual.time_s[:-1])
 
 
-@pytest.mark.parametrize("begin_s", [-1.0, np.nan, np.inf])
+@pytest.mark.parametrize("begin_s", [-1.0, np.nan])
 def test_a_reset_to_no_time_of_a_simulation_is_an_error(begin_s):
-    with pytest.raises(
-        EpisodeError, match=r"\(seed 0\): ValueError: it starts at (-1.0|nan|inf) s"
-    ):
+    with pytest.raises(EpisodeError, match=r"\(seed 0\): ValueError: it starts at (-1.0|nan) s"):
         record(1, reset=lambda diagram, context, rng: context.SetTime(begin_s))
 
 
@@ -384,8 +337,7 @@ def reset_refereed(diagram, context, rng):
 
 
 @pytest.mark.parametrize(
-    ("kind", "end_s"),
-    [("step", 0.25), ("publish", 0.255), ("update", 0.3), ("start", 0.0), ("step", 0.0)],
+    ("kind", "end_s"), [("step", 0.25), ("publish", 0.255), ("update", 0.3), ("start", 0.0)]
 )
 def test_an_episode_ends_where_a_system_ends_the_simulation(caplog, kind, end_s):
     make, usual = lambda: make_refereed(kind, end_s), record(6)
@@ -400,10 +352,9 @@ def test_an_episode_ends_where_a_system_ends_the_simulation(caplog, kind, end_s)
     assert f"a system of '{make.__name__}' ended" in caplog.text
 
 
-@pytest.mark.parametrize(("kind", "end_s"), [("step", 0.25), ("update", 0.3), ("start", 0.0)])
-def test_an_event_that_fails_is_an_error_with_system_and_reason(kind, end_s):
+def test_an_event_that_fails_is_an_error_with_system_and_reason():
     def make():
-        return make_refereed(kind, end_s, lambda one: EventStatus.Failed(one, "the gear broke"))
+        return make_refereed("update", 0.3, lambda one: EventStatus.Failed(one, "the gear broke"))
 
     failed = EventStatus.Failed
     told = r"episode 0 .*\(seed 0\): RuntimeError: system 'referee' failed: the gear broke"
@@ -420,12 +371,7 @@ def outside(diagram, context, rng):
     ("options", "told"),
     [
         ({"reset": outside}, r"\d\d % of the starts of 'make_glider' violate 'constraint_0' in"),
-        ({"reset": outside}, "none of 10 episodes of 'make_glider' is unsafe after its first row"),
         ({"parameters": {"wall_m": 9.0}}, "is unsafe after its first row.* draw wider starts"),
-        (
-            {"parameters": {"wall_m": 0.3}, "duration_s": 9.0},
-            "is safe after its first row.* draw calmer starts",
-        ),
         ({"duration_s": 0.4}, "episodes of 4 steps are shorter than the preview of 5"),
     ],
 )
@@ -437,23 +383,7 @@ def test_what_teaches_nothing_is_said_once_at_recording(caplog, options, told):
     assert not caplog.records
 
 
-def test_sampled_ports_are_named_before_anything_is_simulated(caplog):
-    from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
-
-    def make():
-        builder, inner = DiagramBuilder(), DiagramBuilder()
-        plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01), inner)
-        plant.Finalize()
-        builder.AddNamedSystem("inside", inner.Build())
-        return builder.Build()
-
-    with pytest.raises(ValueError, match="exports no port"):
-        record(make=make)
-    assert "record_episodes: plant 'plant' steps before what updates" in caplog.text
-
-
-@pytest.mark.parametrize("num_workers", [1, 2])
-def test_noise_of_drakes_random_sources_depends_on_seed_and_index_alone(num_workers):
+def test_noise_of_drakes_random_sources_depends_on_seed_and_index_alone():
     def make():
         builder, inner = DiagramBuilder(), DiagramBuilder()
         for distribution in (RandomDistribution.kGaussian, RandomDistribution.kUniform):
@@ -472,36 +402,14 @@ def test_noise_of_drakes_random_sources_depends_on_seed_and_index_alone(num_work
         return builder.Build()
 
     options = {"make": make, "reset": lambda *start: None, "ports": None, "name": "noisy"}
-    episodes = record(8, num_workers=num_workers, **options)
-    assert_identical(episodes, record(8, num_workers=1, **options))
+    episodes = record(8, num_workers=2, **options)
+    assert_identical(episodes, record(8, **options))
     drawn = [one.state.tobytes() for one in (*episodes, *record(2, seed=1, **options))]
     assert len(set(drawn)) == 10
     assert np.abs(episodes[0].output - episodes[0].state).min() > 0.0
 
 
-@pytest.mark.parametrize("far_m", [np.inf, 1e13])
-def test_a_margin_of_infinity_is_an_error_that_names_its_constraint(far_m):
-    def make():
-        builder = DiagramBuilder()
-        glider = builder.AddNamedSystem("glider", Glider(None, 1.0))
-        far = builder.AddNamedSystem("far", LeafSystem())
-        far.DeclareVectorOutputPort(
-            "margins",
-            2,
-            lambda context, output: output.SetFromVector(
-                [1.0, 1.0 if context.get_time() < 0.25 else far_m]
-            ),
-        )
-        for name in ("position_and_speed", "output", "desired_preview"):
-            builder.ExportOutput(glider.GetOutputPort(name), name)
-        builder.ExportOutput(far.GetOutputPort("margins"), "margins")
-        return builder.Build()
-
-    def reset(diagram, context, rng):
-        return 0
-
-    told = (
-        r"constraint 'gap' has a margin of (inf|10+.0) at 0\.2[56] s; cap it at a finite distance"
-    )
+def test_a_margin_of_infinity_is_an_error_that_names_its_constraint():
+    told = "constraint 'gap' has a margin of inf at 0 s; cap it at a finite distance"
     with pytest.raises(EpisodeError, match=told):
-        record(1, make=make, reset=reset, constraint_names=["wall", "gap"])
+        record(1, parameters={"wall_m": np.inf}, constraint_names=["gap", "wall"])

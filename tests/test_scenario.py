@@ -1,8 +1,7 @@
-import importlib
 import os
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,9 +13,7 @@ import gliding_task
 from command_line import invoked
 from drake_safety import load_scenario
 from drake_safety.cli.training_folder import check_fresh
-from drake_safety.models import load_robot
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import episodes_info
 from drake_safety.simulation.scenario import (
     parse_scenario,
@@ -25,7 +22,7 @@ from drake_safety.simulation.scenario import (
     task_names,
 )
 from drake_safety.simulation.scenario_check import check_scenario
-from gliding_task import SCENARIO, Gliding, GlidingParameters
+from gliding_task import SCENARIO, gliding
 from legged_robots import write_hexapod
 
 BALANCING = "task: drake_safety.diagrams.balancing:Balancing\nrobot: laikago\n"
@@ -70,24 +67,16 @@ def test_values_of_a_file_are_replaced_by_their_keys():
 
 
 @pytest.mark.parametrize(
-    ("control_period_s", "monitor_step_s"),
-    [(0.01, 0.02), (0.02, 0.02), (0.004, 0.02), (0.006, 0.024), (0.05, 0.05)],
+    ("control_period_s", "monitor_step_s"), [(0.01, 0.02), (0.006, 0.024), (0.05, 0.05)]
 )
 def test_the_monitor_steps_whole_control_periods_of_at_least_20_ms(
     control_period_s, monitor_step_s
 ):
-    scenario = laikago()
-    scenario.control_period_s = control_period_s
+    scenario = replace(laikago(), control_period_s=control_period_s)
     assert scenario.monitor_step_s == pytest.approx(monitor_step_s)
-
-
-def test_an_own_task_in_an_own_folder_needs_no_line_in_the_package(tmp_path):
-    path = tmp_path / "sliding.yaml"
-    path.write_text(SCENARIO)
-    scenario = load_scenario(path)
-    assert scenario.name == "sliding"
-    assert scenario.task_class() is Gliding
-    assert isinstance(scenario.make_loop(), Gliding)
+    assert gliding().watch_period_s == gliding().control_period_s
+    reaching = load_scenario("atlas_reaching", {"parameters.monitor_period_s": 0.05})
+    assert reaching.watch_period_s == 0.05 > reaching.control_period_s
 
 
 @pytest.fixture
@@ -166,21 +155,14 @@ def test_a_task_beside_its_scenario_is_not_imported_where_its_code_is_not_to_run
     ("text", "message"),
     [
         ("task: [", "scenario 'mine' is not YAML"),
-        ("- a", "must be a mapping with the key 'task'"),
         ("robot: none", "must be a mapping with the key 'task'"),
         (SCENARIO + "bogus: 1", "unknown key 'bogus'; keys there are .*episode_duration_s"),
-        (BALANCING + "variations: {nominal: }", "'variations.nominal' must be a mapping"),
         (BALANCING + "parameters: {push: {sharee: 1}}", "push.sharee' .* keys there are .*'share'"),
-        (BALANCING + "parameters: 3", "'mine', parameters: this must be a mapping"),
         (BALANCING + "step_s: fast", "'mine': 'step_s' must be a valid number; got 'fast'"),
         (with_parameters("{failure: sneeze}"), "gliding: unknown failure 'sneeze'"),
         (task("nowhere:X"), r"no module 'nowhere'.*drake_safety\.diagrams\.balancing"),
-        (task("drake_safety.diagrams.juggling:X"), r"no module 'drake_safety\.diagrams\.juggling'"),
-        (task("drake_safety.diagrams.balancing:Nope"), r"no task 'Nope'; it has \['Balancing'\]"),
         (task("drake_safety.diagrams.balancing:Throw"), r"no task 'Throw'; it has \['Balancing'\]"),
-        (task("drake_safety.diagrams.balancing:Balancig"), r"\(did you mean 'Balancing'\?\)"),
         (task("gliding_task"), "task must be 'package.module:Class'; got 'gliding_task'"),
-        (task(":X"), "task must be 'package.module:Class'; got ':X'"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused_with_what_would(text, message):
@@ -192,14 +174,10 @@ def test_a_file_that_does_not_fit_is_refused_with_what_would(text, message):
     ("ask", "message"),
     [
         (lambda: load_scenario("nobody"), r"'nobody' does not exist; scenarios are \[.*'laikago_"),
-        (lambda: load_scenario("laikago_balncing"), r"did you mean 'laikago_balancing'\?"),
         (lambda: load_scenario(Path("gone.yaml")), r"scenario file '.*gone\.yaml' does not exist"),
         (lambda: parsed(SCENARIO).make_loop("dream"), r"'dream'; it has \['nominal', 'actual'\]"),
-        (lambda: laikago().variation("actul"), r"no variation 'actul' \(did you mean 'actual'\?"),
         (lambda: parsed(SCENARIO).make_loop(ball=1), r"'Gliding' has no .*\['ball'\]; it has \[\]"),
-        (lambda: laikago().make_loop(ball=1, target=3), r"no options .*; it has .*'ball'\]"),
-        (lambda: laikago().make_loop(recovry=False), r"\['recovry'\] \(did you mean 'recovery'\?"),
-        (lambda: load_robot("laikgo"), r"'laikgo' does not exist \(did you mean 'laikago'"),
+        (lambda: laikago().make_loop(target=3), r"no options \['target'\]; it has .*'ball'\]"),
         (lambda: parsed(NOBODY).make_loop(), "robot 'nobody' does not exist; robots are"),
     ],
 )
@@ -222,20 +200,10 @@ def test_a_horizon_as_long_as_the_episode_is_allowed_in_spite_of_rounding():
     assert parsed(text).num_steps == 3
 
 
-def test_task_names_are_modules_of_the_package_that_have_a_task():
-    assert "drake_safety.diagrams.balancing" in task_names()
-    for name in task_names():
-        tasks = [
-            value
-            for value in vars(importlib.import_module(name)).values()
-            if isinstance(value, type) and issubclass(value, ClosedLoop)
-        ]
-        assert any(hasattr(task, "Parameters") for task in tasks)
-
-
 @pytest.mark.parametrize("name", scenario_names())
 def test_every_scenario_loads_and_is_read_again_from_its_canonical_text(name):
     scenario = load_scenario(name)
+    assert scenario.task.partition(":")[0] in task_names()
     assert scenario.name == name
     assert "nominal" in scenario.variations
     assert isinstance(scenario.parameters, scenario.task_class().Parameters)
@@ -284,18 +252,6 @@ def test_an_assessment_of_a_changed_scenario_names_both_and_their_robots(tmp_pat
         ValueError, match=r"of robot 'ours' with hash .* of robot 'hexapod' now has"
     ):
         check_fresh(SimpleNamespace(info_=learned), scenario)
-
-
-def test_a_default_that_changes_is_another_simulation(monkeypatch):
-    before = parsed(SCENARIO).simulation_hash()
-
-    @dataclass
-    class Faster(GlidingParameters):
-        speed_m_s: float = 2.5
-
-    monkeypatch.setattr(Gliding, "Parameters", Faster)
-    assert parsed(SCENARIO).parameters.speed_m_s == 2.5
-    assert parsed(SCENARIO).simulation_hash() != before
 
 
 def test_another_plant_does_not_change_the_hash_of_this_one():
@@ -390,8 +346,6 @@ def test_a_strangers_scenario_is_checked_without_running_its_code(tmp_path, monk
         ("name", "\x1b[2J\nOK  ready", "␛[2J\n    OK  ready"),
         ("name", "b\u202eyb", "b\ufffdyb"),
         ("requires", "x; rm -rf ~", "must be a package"),
-        ("requires", "x --no-deps", "must be a package"),
-        ("requires", "$(id)", "must be a package"),
     ],
 )
 def test_texts_of_strangers_print_nothing_but_themselves(tmp_path, key, text, seen):

@@ -16,6 +16,7 @@ from drake_safety.diagrams.pendulum.task import (
     PendulumController,
     PendulumObserver,
     PendulumParameters,
+    PendulumSafeSet,
 )
 from drake_safety.diagrams.walking.safe_set import WalkingLimits, WalkingSafeSet
 from drake_safety.robots.robot import ObservationNoise
@@ -25,7 +26,6 @@ from drake_safety.systems.change_monitor import ChangeMonitor
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
 from drake_safety.systems.monitored_assessor import MonitoredSafetyAssessor
-from drake_safety.systems.plan_features import PlanFeatures
 from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
 from drake_safety.systems.recovery_switch import RecoverySwitch
 from drake_safety.systems.recovery_trigger import RecoveryTrigger
@@ -97,8 +97,9 @@ CASES = {
         "num_failures 1, memory 28",
     ),
     "PendulumObserver": (
-        lambda: PendulumObserver(0.5),
-        "pendulum_state 2 -> plant_state 2 < *, output 3 < *",
+        lambda: PendulumObserver(0.5, PendulumSafeSet(PendulumParameters(), 0.05)),
+        "pendulum_state 2, desired_outlook 123 -> plant_state 2 < pendulum_state, "
+        "output 3 < pendulum_state, features 14 < *",
     ),
     "PendulumController": (
         lambda: PendulumController(PendulumParameters(), 0.01),
@@ -140,10 +141,6 @@ def add_robot(name):
             lambda: RecoverySwitch(k, STEPS, threshold=0.6, offset_s=0.0005, **ROWS),
             f"{x}, safety_probability 1, belief? 3, {', '.join(ends)} -> "
             f"{', '.join(switched)}, {stance}, recovery_active 1",
-        ),
-        (
-            lambda: PlanFeatures(safe_set, n_q, n_v, horizon=2),
-            f"{x}, desired_preview 6 -> features {len(safe_set.feature_names)} < *",
         ),
         (
             lambda: SafetyMonitor(safe_set, n_q, n_v),
@@ -248,7 +245,6 @@ SYMBOLS = {
         "n": 4,
     },
     "PolicyController": {"n_q": 9, "n_v": 8, "n_j": 2, "n_m": 10, "n": 28},
-    "PlanFeatures": {"M": 2},
     "AssessorInputs": {"M": 2, "n_m": 1},
 }
 LEARNED_SIZES = {"n_s": N_S, "n_w": N_S, "n_z": 3, "H": N_P // 3, "n_f": N_F, "n_c": N_C}
@@ -321,8 +317,6 @@ NOT_FINITE = {
     ("SafetyMonitor laikago", "plant_state"): {"safe": 0.0, "margins": -np.inf},
     ("StateObserver laikago", "plant_state"): {"state": np.nan},
     ("AssessorInputs laikago", "plant_state"): {"state": np.nan, "margins": -np.inf},
-    ("PlanFeatures laikago", "plant_state"): {"features": np.nan},
-    ("PlanFeatures laikago", "desired_preview"): {"features": np.nan},
     ("SafetyAssessor", "state"): {"belief": [0.0, 0.0, 1.0], "safety_probability": 0.0},
     ("CommandGuard", "command"): {"desired_output": 0.0, "is_changed": 1.0},
 }
@@ -407,6 +401,3 @@ def test_a_masked_margin_or_feature_is_not_a_number():
     inputs = AssessorInputs(k, safe_set, num_outlook=2)
     given = {"plant_state": x, "desired_outlook": np.zeros(6)}
     assert np.isnan(Bench(inputs, **given).get("features")).all()
-    features = PlanFeatures(safe_set, 19, 18, horizon=2)
-    given = {"plant_state": x, "desired_preview": np.zeros(6)}
-    assert np.isnan(Bench(features, **given).get("features")).all()

@@ -35,13 +35,10 @@ def assessment(scenario, episodes, tmp_path_factory):
     return SafetyAssessment.load(path)
 
 
-def test_episodes_hold_both_outcomes(episodes):
-    assert 0.2 < episodes.num_unsafe / len(episodes) < 0.8
-    assert episodes.num_diverged == 0
+def test_gamma_tells_unsafe_episodes_from_safe_ones_shortly_before_the_end(
+    scenario, episodes, assessment
+):
     assert any(episode.first_step == 1 for episode in episodes), "some begin as a ball hits"
-
-
-def test_gamma_tells_unsafe_episodes_from_safe_ones_shortly_before_the_end(scenario, assessment):
     fresh = run_episodes(scenario, 24, seed=4)
     last = []
     for episode in fresh:

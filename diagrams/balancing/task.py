@@ -95,30 +95,22 @@ class Balancing(LeggedLoop):
             builder.Connect(stance_pose, planner.GetInputPort("stance_pose"))
             for name in ("desired_foot_positions", "desired_yaw"):
                 builder.Connect(switch.GetOutputPort(name), controller.GetInputPort(name))
-            builder.ExportOutput(switch.GetOutputPort("recovery_active"), "recovery_active")
         builder.Connect(measured, controller.GetInputPort("plant_state"))
         builder.Connect(desired["desired_output"], controller.GetInputPort("desired_output"))
         joint_state = controller.GetOutputPort("desired_joint_state")
         received = self._servo_command(builder, joint_state)
         physics.connect_servos(builder, kinematics.joint_names, received)
-        self._watch(
+        self._assess(
             builder,
             BalanceSafeSet(kinematics, parameters.safe_set),
-            outlook=desired.pop("desired_outlook"),
-            command=joint_state,
-            has_gravity=True,
-        )
-        self.monitored = {"features": self.feature_names[-kinematics.num_joints :]}
-        assessor = self.export(
-            builder,
             desired,
             period_s=parameters.recovery.assessment_period_s,
+            command=joint_state,
+            has_gravity=True,
+            recovery=switch,
             hold=switch and switch.GetOutputPort("recovery_active"),
         )
-        if switch is not None and assessor is not None:
-            assessor.connect_recovery(builder, switch)
-        elif switch is not None:
-            builder.ExportInput(switch.GetInputPort("safety_probability"), "safety_probability")
+        self.monitored = {"features": self.feature_names[-kinematics.num_joints :]}
         builder.BuildInto(self)
 
     @classmethod

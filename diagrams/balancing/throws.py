@@ -17,9 +17,12 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
+# Those of Python 3.11 evaluate properties when a loop is asked for a protocol.
+from typing_extensions import Protocol, runtime_checkable
+
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
 from drake_safety.plants.balls import Throw
-from drake_safety.simulation.capabilities import HasBall, require
+from drake_safety.simulation.capabilities import require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.motion import End, Motion, simulate
@@ -33,6 +36,20 @@ _FLIGHT_S = 0.1  # From the ball's release to its impact.
 _EARLIEST_S, _LATEST_S = 0.4, 1.2  # Impact of a random ball.
 _AFTER_S = 5.0  # From the first impact to the end.
 _PORTS = ("state", "desired_preview", "features", "margins", "plant_state")
+
+
+@runtime_checkable
+class HasBall(Protocol):
+    """A ball can be thrown at the robot, and recovery can be triggered."""
+
+    def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
+        """Samples an undisturbed motion, during which a ball is thrown."""
+
+    def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
+        """Samples a ball with a given time of impact [s]."""
+
+    def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> None:
+        """Sets a ball in flight that hits a robot at rest after ``lead_s`` [s]."""
 
 
 class Violations:

@@ -14,7 +14,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_safety.files.schema import Bounds, Positive, schema
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.robots.robot_size import GRAVITY_M_S2
-from drake_safety.simulation.episode_start import EpisodeStart, StatePlane
+from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.periodic_update import declare_update
@@ -104,33 +104,46 @@ def bob_position(angle: float, length_m: float) -> np.ndarray:
 
 
 class PendulumObserver(LeafSystem):
-    """Computes the pendulum's state relative to upright, and the bob's position.
+    """Computes the pendulum's state relative to upright, the bob's position and the features.
 
     .. pydrake_system::
 
         name: PendulumObserver
         input_ports:
         - pendulum_state
+        - desired_outlook
         output_ports:
         - plant_state
         - output
+        - features
 
     ``pendulum_state`` is Drake's, from hanging; ``plant_state`` is [φ, φ̇] from upright [rad,
-    rad/s], and ``output`` the bob's position relative to the hinge, (3,) [m].
+    rad/s], and ``output`` the bob's position relative to the hinge, (3,) [m]. The safe set's
+    features are of the plan's points from now to its end.
     """
 
-    def __init__(self, length_m: float):
+    def __init__(self, length_m: float, safe_set: PendulumSafeSet):
         super().__init__()
         port = self.DeclareVectorInputPort("pendulum_state", 2)
+        outlook = self.DeclareVectorInputPort("desired_outlook", 3 * _NUM_OUTLOOK)
+
+        def upright(context: Context) -> np.ndarray:
+            return port.Eval(context) - [math.pi, 0.0]
 
         def calc_state(context: Context, output: BasicVector) -> None:
-            output.SetFromVector(port.Eval(context) - [math.pi, 0.0])
+            output.SetFromVector(upright(context))
 
         def calc_output(context: Context, output: BasicVector) -> None:
-            output.SetFromVector(bob_position(port.Eval(context)[0] - math.pi, length_m))
+            output.SetFromVector(bob_position(upright(context)[0], length_m))
 
-        self.DeclareVectorOutputPort("plant_state", 2, calc_state)
-        self.DeclareVectorOutputPort("output", 3, calc_output)
+        def calc_features(context: Context, output: BasicVector) -> None:
+            (q, v), plan = np.split(upright(context), 2), outlook.Eval(context).reshape(-1, 3)
+            output.SetFromVector(safe_set.features(q, v, plan))
+
+        ticket = {self.input_port_ticket(port.get_index())}
+        self.DeclareVectorOutputPort("plant_state", 2, calc_state, ticket)
+        self.DeclareVectorOutputPort("output", 3, calc_output, ticket)
+        self.DeclareVectorOutputPort("features", len(safe_set.feature_names), calc_features)
 
 
 class PendulumController(LeafSystem):
@@ -196,20 +209,24 @@ class Pendulum(PlannedLoop):
         outlook_s = scenario.episode_duration_s
         builder = DiagramBuilder()
         pendulum = self._pendulum = builder.AddNamedSystem("pendulum", PendulumPlant())
-        observer = builder.AddNamedSystem("observer", PendulumObserver(parameters.length_m))
-        builder.Connect(pendulum.get_state_output_port(), observer.get_input_port())
+        planner = self._add_planner(builder, outlook_s=outlook_s, num_outlook=_NUM_OUTLOOK)
+        safe_set = PendulumSafeSet(parameters, outlook_s / (_NUM_OUTLOOK - 1))
+        observer = builder.AddNamedSystem(
+            "observer", PendulumObserver(parameters.length_m, safe_set)
+        )
+        pendulum_state, outlook = map(observer.get_input_port, range(2))
+        builder.Connect(pendulum.get_state_output_port(), pendulum_state)
+        builder.Connect(planner.GetOutputPort("desired_outlook"), outlook)
         state = observer.GetOutputPort("plant_state")
-        self._add_planner(builder, outlook_s=outlook_s, num_outlook=_NUM_OUTLOOK)
         controller = builder.AddNamedSystem("controller", PendulumController(parameters, period_s))
         self._connect_controller(builder, controller, state)
         builder.Connect(controller.get_output_port(), pendulum.get_input_port())
-        safe_set = PendulumSafeSet(parameters, outlook_s / (_NUM_OUTLOOK - 1))
-        self._add_monitor(builder, safe_set, (1, 1), state)
-        self._add_features(builder, safe_set)
         self.state_names = ["angle", "angle_rate"]
         self.output_names = [f"bob_{axis}" for axis in "xyz"]
-        output = observer.GetOutputPort("output")
-        self.export(builder, {"state": state, "output": output}, period_s=period_s)
+        self.feature_names = safe_set.feature_names
+        ports = {"state": state, "plant_state": state}
+        ports |= {name: observer.GetOutputPort(name) for name in ("output", "features")}
+        self._finish(builder, safe_set, ports, sizes=(1, 1), period_s=period_s)
         if meshcat is not None:
             scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
             PendulumGeometry.AddToBuilder(builder, pendulum.get_state_output_port(), scene_graph)
@@ -230,27 +247,6 @@ class Pendulum(PlannedLoop):
         length_m = self.scenario.parameters.length_m
         ends = [bob_position(angle, length_m) for angle in (start_rad, goal_rad)]
         return interpolate(*ends, duration_s)
-
-    @property
-    def state_planes(self) -> dict[str, StatePlane]:
-        """Planes of 95 % of the starts' ranges, for a constant plan and two that move."""
-        parameters = self.scenario.parameters
-        # The bounds of the starts may be those of the safe set, where rounding decides.
-        angle, rate = 0.95 * parameters.start_angle_rad, 0.95 * parameters.start_rate_rad_s
-        duration_s = float(np.mean(parameters.plan_duration_s))
-
-        def plane(*angles: float) -> StatePlane:
-            plan = self.plan(*angles, duration_s)
-            return StatePlane(
-                axes=("angle [rad]", "rate [rad/s]"),
-                lowest=(-angle, -rate),
-                highest=(angle, rate),
-                start=lambda point: EpisodeStart(q=point[:1], v=point[1:], plan=plan),
-            )
-
-        far = 0.8 * parameters.plan_angle_rad
-        ends = {"hold": (0.0, 0.0), "lean forward": (0.0, far), "from back to front": (-far, far)}
-        return {name: plane(*angles) for name, angles in ends.items()}
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:
         parameters, variation = self.scenario.parameters, self._plant_variation

@@ -25,7 +25,6 @@ from drake_safety.control.safe_sets import (
 from drake_safety.control.whole_body_model import WholeBodyModel
 from drake_safety.diagrams.reaching.kinematic_preview import KinematicPreview, chain_joints
 from drake_safety.files.schema import NotNegative, schema
-from drake_safety.learning.inputs import is_rate
 from drake_safety.plants.obstacles import Clearance
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 
@@ -121,11 +120,6 @@ class ReachingSafeSet:
             *(f"capture_point_margin_{name}" for name in DIRECTION_NAMES),
             "soon_support_polygon",
             "soon_joint_limits",
-        ]
-        self.rate_features = [
-            name
-            for name in self.feature_names
-            if is_rate(name) or name.startswith(("capture_point_", "soon_"))
         ]
 
     def _joint_margins(self, q: np.ndarray) -> np.ndarray:

@@ -109,15 +109,15 @@ class Reaching(LeggedLoop):
             is_mirrored=self.mirror is not None,
         )
         self.angular_constraints = self.safe_set.angular_names
-        outlook = planner.GetOutputPort("desired_outlook")
-        self._watch(builder, self.safe_set, outlook=outlook, has_gravity=True)
         self.monitored = {"features": []}  # Its controller follows the preview.
         ports = {
+            "desired_outlook": planner.GetOutputPort("desired_outlook"),
             "desired_preview": preview,
             "solver_status": controller.GetOutputPort("solver_status"),
             "num_controller_failures": controller.GetOutputPort("num_failures"),
         }
-        self.export(builder, ports, period_s=parameters.assessment_period_s)
+        period_s = parameters.assessment_period_s
+        self._assess(builder, self.safe_set, ports, period_s=period_s, has_gravity=True)
         builder.BuildInto(self)
 
     @classmethod

@@ -98,11 +98,6 @@ class WalkingSafeSet:
             "capture_point_y",
             *(f"foot_height_{i}" for i in range(kinematics.num_contacts)),
         ]
-        self.rate_features = [
-            "tilt_rate",
-            *(f"tracking_error_{axis}" for axis in _AXES),
-            *(name for name in self.feature_names if name.startswith("capture_point")),
-        ]
 
     def _joint_margin(self, q: np.ndarray) -> float:
         lowest, highest = self.kinematics.position_limits.T

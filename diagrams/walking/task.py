@@ -139,12 +139,6 @@ class Walking(LeggedLoop):
         joint_state = self._servo_command(builder, controller.GetOutputPort("desired_joint_state"))
         physics.connect_servos(builder, self.kinematics.joint_names, joint_state)
         self._add_push_source(builder)
-        self._watch(
-            builder,
-            safe_set,
-            outlook=desired.pop("desired_outlook"),
-            memory=(controller.GetOutputPort("action_state"), controller.action_names),
-        )
         ports = {
             **desired,
             "controller_status": controller.GetOutputPort("status"),
@@ -153,16 +147,15 @@ class Walking(LeggedLoop):
         }
         if self._guard is not None:
             ports["guard_active"] = self._guard.GetOutputPort("is_changed")
-            for name in ("state", "features"):
-                builder.Connect(self._seen[name], self._guard.GetInputPort(name))
-        assessor = self.export(builder, ports, period_s=parameters.assessment_period_s)
-        if self._guard is not None and assessor is not None:
-            learned = assessor.GetOutputPort("learned")
-            builder.Connect(learned, self._guard.GetInputPort("learned"))
-        if trigger is not None and assessor is not None:
-            assessor.connect_recovery(builder, trigger)
-        elif trigger is not None:
-            builder.ExportInput(trigger.GetInputPort("safety_probability"), "safety_probability")
+        self._assess(
+            builder,
+            safe_set,
+            ports,
+            period_s=parameters.assessment_period_s,
+            memory=(controller.GetOutputPort("action_state"), controller.action_names),
+            recovery=trigger,
+            guard=self._guard,
+        )
         # What the policy sees: its last actions, its phase and the command.
         self.memory_features = controller.action_names
         self.memory_period_s = self.policy.parameters.period_s
@@ -187,7 +180,6 @@ class Walking(LeggedLoop):
                 offset_s=self.tick_s,
             ),
         )
-        builder.ExportOutput(trigger.GetOutputPort("recovery_active"), "recovery_active")
         share = recovery.slower_share if recovery.branch == "slower" else 0.0
         slower = builder.AddNamedSystem("slower_command", Gain(share, nominal.size()))
         switch = builder.AddNamedSystem("command_switch", PortSwitch(nominal.size()))

@@ -11,10 +11,11 @@ from typer import Exit, Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
+from drake_safety.diagrams.balancing.throws import HasBall
 from drake_safety.files.reading import did_you_mean, is_number
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
-from drake_safety.simulation.capabilities import HasBall, HasGoals, goal_words, require
+from drake_safety.simulation.capabilities import HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 _SEARCH_SEED = 0  # Fixed, so that results are reproducible.

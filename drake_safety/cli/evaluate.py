@@ -21,6 +21,7 @@ from drake_safety.diagrams.balancing.throw_study import (
     TriggerRule,
     evaluate_throws,
 )
+from drake_safety.diagrams.balancing.throws import HasBall
 from drake_safety.evaluation import shift_study
 from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.episode_study import evaluate_episodes, evaluate_plans
@@ -38,7 +39,7 @@ from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import PLAN, episode_scores
 from drake_safety.learning.seeds import EVALUATION, FRESH_MOTION, SHIFTS, SeedBlock, use_of
 from drake_safety.learning.segments import Episodes, split
-from drake_safety.simulation.capabilities import HasBall, HasGoals, require
+from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario

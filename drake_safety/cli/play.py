@@ -13,9 +13,10 @@ from typer import Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
+from drake_safety.diagrams.balancing.throws import HasBall
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.live.session import LiveSession
-from drake_safety.simulation.capabilities import FollowsCommands, HasBall, HasGoals
+from drake_safety.simulation.capabilities import FollowsCommands, HasGoals
 
 _FIRST_PORT = 7000
 

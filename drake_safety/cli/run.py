@@ -19,7 +19,7 @@ from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.ask import judge_target, parse_target, print_verdict
 from drake_safety.cli.training_folder import MODES
-from drake_safety.diagrams.balancing.throws import run_throw
+from drake_safety.diagrams.balancing.throws import HasBall, run_throw
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.path_figure import path_figure
 from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
@@ -34,7 +34,7 @@ from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.live.following_camera import follow
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.pushes import Push
-from drake_safety.simulation.capabilities import CanBePushed, HasBall, HasGoals, goal_words, require
+from drake_safety.simulation.capabilities import CanBePushed, HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.motion import End, Motion, simulate

@@ -148,7 +148,6 @@ class BalanceSafeSet:
         self.feature_names += [f"clearance_{i}" for i in range(kinematics.num_contacts)]
         self.feature_names += ["height_over_lowest", "height_under_highest", "yaw_error"]
         self.feature_names += [f"tracking_error_{axis}" for axis in "xyz"]
-        self.rate_features = [n for n in self.feature_names if n.startswith("capture_point_")]
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Returns the signed margins (3,) [m] of a state; minus infinity without one."""

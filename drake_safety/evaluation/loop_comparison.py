@@ -22,7 +22,7 @@ from drake_safety.evaluation.paired_test import interim_estimate, pairs_needed
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import GATE
 from drake_safety.learning.segments import Episode, EpisodeError
-from drake_safety.simulation.capabilities import CanStartAnywhere, HasDisturbances
+from drake_safety.simulation.capabilities import CanStartAnywhere
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, load_episodes
 from drake_safety.simulation.rollouts import check_kept, episodes_info, run_episode
@@ -288,7 +288,7 @@ def _start_of(loop: ClosedLoop, context: Context) -> dict[str, np.ndarray]:
         plan, scenario = loop.start_of(context).plan, loop.scenario
         times_s = scenario.step_s * np.arange(scenario.num_steps + 1)
         start["plan"] = np.concatenate([plan.value(time_s).ravel() for time_s in times_s])
-    return start | (loop.disturbances(context) if isinstance(loop, HasDisturbances) else {})
+    return start | loop.disturbances(context)
 
 
 def _check_alike(

@@ -17,6 +17,7 @@ from pydrake.geometry import Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
+from drake_safety.diagrams.balancing.throws import HasBall
 from drake_safety.learning.causes import cause_words, is_on, is_outside, likely_cause, violated
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import DivergenceError
@@ -29,7 +30,6 @@ from drake_safety.simulation.capabilities import (
     CanBePushed,
     CanFall,
     FollowsCommands,
-    HasBall,
     HasGoals,
     goal_words,
     require,
@@ -111,7 +111,7 @@ class LiveSession:
     ):
         if loop.assessment is None:
             raise ValueError("live session: the loop was built without an assessment")
-        require_ports(loop, _PORTS, "live session: ")
+        require_ports(loop, _PORTS)
         self.loop: Any = loop  # What it can do is asked below.
         self.assessment, self.meshcat = loop.assessment, meshcat
         self.threshold, self.unsafe_below = threshold, unsafe_below

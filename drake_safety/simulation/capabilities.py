@@ -18,19 +18,10 @@ from typing_extensions import Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from drake_safety.learning.segments import Episode
-    from drake_safety.plants.balls import Throw
     from drake_safety.plants.pushes import Push
     from drake_safety.simulation.episode_start import EpisodeStart
 
 _Capability = TypeVar("_Capability")
-
-
-@runtime_checkable
-class HasDisturbances(Protocol):
-    """A reset draws what will act on the robot, beside its start and plan."""
-
-    def disturbances(self, context: Context) -> dict[str, np.ndarray]:
-        """What acts from the present state on, in SI units, (n,) each by name."""
 
 
 @runtime_checkable
@@ -118,24 +109,6 @@ class MovesUndisturbed(Protocol):
 
 
 @runtime_checkable
-class HasBall(Protocol):
-    """A ball can be thrown at the robot, and recovery can be triggered."""
-
-    def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
-        """Samples an undisturbed motion, during which a ball is thrown."""
-
-    def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
-        """Samples a ball with a given time of impact [s]."""
-
-    def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> None:
-        """Sets a ball in flight that hits a robot at rest after ``lead_s`` [s].
-
-        Raises:
-            ValueError: The loop was built without its ball.
-        """
-
-
-@runtime_checkable
 class CanBePushed(Protocol):
     """Forces can act on the robot's bodies."""
 
@@ -182,28 +155,23 @@ class CanStartAnywhere(Protocol):
         """State and plan of a Context, as a start for :meth:`reset_to`."""
 
 
-_DESCRIPTIONS: dict[type, str] = {
-    HasGoals: "plans with a goal",
-    HasBall: "a ball to throw",
-    MovesUndisturbed: "long undisturbed motion",
-    CanFall: "a fall",
-    CanBePushed: "pushes on its robot",
-    FollowsCommands: "commands that change while it moves",
-    CanStartAnywhere: "episodes from a given start",
+_DESCRIPTIONS = {
+    "HasGoals": "plans with a goal",
+    "HasBall": "ball to throw",
+    "MovesUndisturbed": "long undisturbed motion",
+    "CanFall": "fall",
+    "CanBePushed": "pushes on its robot",
+    "FollowsCommands": "commands that change while it moves",
+    "CanStartAnywhere": "episodes from a given start",
 }
-"""Descriptions for messages."""
 
 
 def require(loop: object, capability: type[_Capability], who: str = "") -> _Capability:
     """Returns the loop if it has a capability."""
     if isinstance(loop, capability):
         return loop
-    present = [text for protocol, text in _DESCRIPTIONS.items() if isinstance(loop, protocol)]
-    missing = _DESCRIPTIONS[capability].removeprefix("a ")
-    raise ValueError(
-        f"{who + ': ' if who else ''}task '{type(loop).__name__}' has no {missing}; "
-        f"it has {', '.join(present) or 'no optional features'}"
-    )
+    missing = _DESCRIPTIONS.get(capability.__name__, capability.__name__)
+    raise ValueError(f"{who}{who and ': '}task '{type(loop).__name__}' has no {missing}")
 
 
 def goal_words(loop: HasGoals) -> GoalWords:

@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.segments import RECORDED
+from drake_safety.learning.segments import RECORDED, EpisodesInfo
 from drake_safety.systems.monitored_assessor import AddSafetyAssessor, MonitoredSafetyAssessor
 
 REQUIRED_PORTS = (*RECORDED, "safe")
@@ -55,26 +55,22 @@ class ClosedLoop(Diagram):
     ``controller_memory`` is what the controller remembers, ``EpisodeStart.controller_state``.
 
     Attributes:
+        Parameters: Schema of the task's part of the scenario file, a dataclass. It may also have
+            ``online``, names of parameters on which no episode depends, which the scenario's hash
+            leaves out, and a class method ``completed(stated, robot)``, which adds defaults that
+            depend on the robot to the parameters in the file.
+        angular_constraints: Constraints whose margins are angles [rad]; others are lengths [m].
+        fall_name: The constraint whose violation is a fall, which ends a motion; "" for none.
+        monitored: What the change monitor reads: ``states`` that it predicts, such as those that a
+            real robot measures, and ``features`` by which it predicts them beside the desired
+            preview, such as what the controller commands; by default all states and all features.
         state_names, output_names, feature_names, constraint_names: Names of the ports' entries.
     """
 
     Parameters: type
-    """Schema of the task's part of the scenario file, a dataclass. It may also have ``online``,
-    names of parameters on which no episode depends, which the scenario's hash leaves out, and a
-    class method ``completed(stated, robot)``, which adds defaults that depend on the robot to the
-    parameters in the file."""
-
     angular_constraints: tuple[str, ...] = ()
-    """Constraints whose margins are angles [rad]; the others are lengths [m]."""
-
     fall_name: str = ""
-    """The constraint whose violation is a fall, which ends a motion; "" if nothing can fall."""
-
     monitored: Mapping[str, list[str]] = {}
-    """What the change monitor reads: ``states`` that it predicts, such as those that a real robot
-    measures, and ``features`` by which it predicts them beside the desired preview, such as what
-    the controller commands; without one of the two, all states or all features."""
-
     state_names: list[str]
     output_names: list[str]
     feature_names: list[str]
@@ -104,24 +100,25 @@ class ClosedLoop(Diagram):
         del scenario
         return []
 
+    # A root Context that pydrake returns as its own part keeps itself alive for ever.
+
     def GetMyContextFromRoot(self, root_context: Context) -> Context:
         """Finds this diagram's Context in that of the outermost diagram."""
-        # A root Context that pydrake returns as its own part keeps itself alive for ever.
-        if self._is_outermost():
-            return root_context
-        return super().GetMyContextFromRoot(root_context)
+        is_outermost = str(self.GetSystemPathname()).count("::") == 1
+        return root_context if is_outermost else super().GetMyContextFromRoot(root_context)
 
     def GetMyMutableContextFromRoot(self, root_context: Context) -> Context:
         """See :meth:`GetMyContextFromRoot`."""
-        if self._is_outermost():
-            return root_context
-        return super().GetMyMutableContextFromRoot(root_context)
-
-    def _is_outermost(self) -> bool:
-        return str(self.GetSystemPathname()).count("::") == 1
+        is_outermost = str(self.GetSystemPathname()).count("::") == 1
+        return root_context if is_outermost else super().GetMyMutableContextFromRoot(root_context)
 
     def prepare(self, context: Context) -> None:
         """Removes from the root Context what only pictures need, before a simulation."""
+
+    def disturbances(self, context: Context) -> dict[str, np.ndarray]:
+        """Returns what will act on the robot beside its start and plan, in SI units, (n,) each."""
+        del context
+        return {}
 
     def reset(self, context: Context, rng: np.random.Generator) -> int:
         """Samples an initial state and a plan into the root Context.
@@ -160,7 +157,7 @@ class ClosedLoop(Diagram):
             builder.ExportOutput(port, name)
         if self.assessment is None:
             return None
-        self._check_assessment(self.assessment)
+        self._check_assessment(self.assessment.info_)
         assessor = AddSafetyAssessor(
             builder,
             self.assessment,
@@ -174,26 +171,22 @@ class ClosedLoop(Diagram):
             builder.ExportOutput(port, port.get_name())
         return assessor
 
-    def _check_assessment(self, assessment: SafetyAssessment) -> None:
-        info, scenario = assessment.info_, self.scenario
-        sides = {
-            "horizon": (info.horizon, scenario.assessment.horizon),
-            "preview_stride": (info.preview_stride, scenario.assessment.preview_stride),
-            "step_s": (info.step_s, scenario.step_s),
-            "state": (list(info.state_names), list(self.state_names)),
-            "output": (list(info.output_names), list(self.output_names)),
-            "features": (list(info.feature_names), list(self.feature_names)),
-            "constraints": (list(info.constraint_names), list(self.constraint_names)),
-            "scenario hash": (
-                info.scenario_hash,
-                scenario.simulation_hash(info.variation, name=info.scenario),
-            ),
+    def _check_assessment(self, info: EpisodesInfo) -> None:
+        """Checks that an assessment was learned from episodes of this diagram."""
+        scenario = self.scenario
+        here: dict[str, Any] = {
+            "horizon": scenario.assessment.horizon,
+            "preview_stride": scenario.assessment.preview_stride,
+            "step_s": scenario.step_s,
+            **{name: list(getattr(self, name)) for name in _NAMES},
+            "scenario_hash": scenario.simulation_hash(info.variation, name=info.scenario),
         }
-        for what, (learned, here) in sides.items():
-            if learned != here:
-                texts = _describe_difference(learned, here), _describe_difference(here, learned)
+        for name, own in here.items():
+            learned = getattr(info, name)
+            if (learned := list(learned) if name in _NAMES else learned) != own:
+                texts = _describe_difference(learned, own), _describe_difference(own, learned)
                 raise ValueError(
-                    f"assessment and diagram differ in {what}: the assessment was learned with "
+                    f"assessment and diagram differ in {name}: the assessment was learned with "
                     f"{texts[0]}, the diagram has {texts[1]}"
                 )
 
@@ -212,12 +205,11 @@ def port_sizes(diagram: Diagram) -> dict[str, int]:
     return {port.get_name(): port.size() for port in ports}
 
 
-def require_ports(diagram: Diagram, names: Iterable[str], who: str = "") -> None:
+def require_ports(diagram: Diagram, names: Iterable[str]) -> None:
     """Checks that a task's diagram, or another one, has output ports."""
-    missing = [name for name in names if not diagram.HasOutputPort(name)]
-    if missing:
+    if missing := [name for name in names if not diagram.HasOutputPort(name)]:
         task, ports = type(diagram).__name__, list(port_sizes(diagram))
-        raise ValueError(f"{who}task '{task}' exports no port {missing}; it exports {ports}")
+        raise ValueError(f"task '{task}' exports no port {missing}; it exports {ports}")
 
 
 def check_ports(loop: ClosedLoop) -> None:
@@ -228,20 +220,9 @@ def check_ports(loop: ClosedLoop) -> None:
         raise ValueError(f"{task} does not set {missing}, lists of names of the ports' entries")
     ports = port_sizes(loop)
     states, outputs, features, constraints = (len(getattr(loop, name)) for name in _NAMES)
-    sizes = {
-        "state": states,
-        "true_state": states,
-        "output": outputs,
-        "desired_output": outputs,
-        "desired_preview": outputs * loop.scenario.assessment.horizon,
-        "features": features,
-        "margins": constraints,
-        "safe": 1,
-    }
-    wrong = [
-        f"'{name}' has size {ports[name]}, expected {n}"
-        for name, n in sizes.items()
-        if ports[name] != n
-    ]
-    if wrong:
-        raise ValueError(f"{task} has ports whose sizes do not fit their names: {'; '.join(wrong)}")
+    sizes = {"state": states, "true_state": states, "output": outputs, "desired_output": outputs}
+    sizes["desired_preview"] = outputs * loop.scenario.assessment.horizon
+    sizes |= {"features": features, "margins": constraints, "safe": 1}
+    if wrong := {name: ports[name] for name, size in sizes.items() if ports[name] != size}:
+        expected = {name: sizes[name] for name in wrong}
+        raise ValueError(f"{task} has ports of sizes {wrong}; by their names expected {expected}")

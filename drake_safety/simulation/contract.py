@@ -33,12 +33,12 @@ class Finding:
 
 
 def passed(item: str, message: str, remedy: str = "") -> Finding:
-    """A finding of a check that passed; with a warning, if there is a remedy."""
+    """Returns the finding of a check that passed; with a warning, if there is a remedy."""
     return Finding(item=item, is_ok=True, message=message, remedy=remedy)
 
 
 def failed(item: str, message: str, remedy: str) -> Finding:
-    """A finding of a check that failed."""
+    """Returns the finding of a check that failed."""
     return Finding(item=item, is_ok=False, message=message, remedy=remedy)
 
 
@@ -46,57 +46,41 @@ def check_contract(diagram: ClosedLoop, *, seed: int = 0) -> list[Finding]:
     """Checks that a task's diagram keeps the contract of :class:`ClosedLoop`.
 
     Its ports exist and have the sizes of its names, `reset` samples a start, and the ports' values
-    are finite at the start and one assessment step later.
-
-    Returns:
-        One finding per check; checks that depend on a failed one are left out.
+    are finite at the start and one assessment step later. Checks that depend on a failed one are
+    left out.
     """
+    return list(_findings(diagram, seed))
+
+
+def _findings(diagram: ClosedLoop, seed: int) -> Iterator[Finding]:
+    item, remedy = "ports", "set the names and export the ports in __init__; one name per entry"
     try:
         check_ports(diagram)
-    except ValueError as error:
-        remedy = (
-            "set the names and export the ports in __init__; one name per entry; the preview is "
-            "H·n_z, row-major in time"
-        )
-        return [failed("ports", str(error), remedy)]
-    found = passed("ports", "complete, with the sizes of their names")
-    return [found, *_values(diagram, seed)]
-
-
-def _values(diagram: ClosedLoop, seed: int) -> Iterator[Finding]:
-    simulator = Simulator(diagram)
-    context = simulator.get_mutable_context()
-    try:
-        first_step = diagram.reset(context, np.random.default_rng(seed))
-    except (RuntimeError, TypeError, ValueError) as error:
-        remedy = "reset(context, rng) samples a start and a plan into the Context"
-        yield failed("reset", str(error), remedy)
-        return
-    is_step = isinstance(first_step, int | np.integer)
-    if is_step:
-        yield passed("reset", "samples a start")
-    else:
-        remedy = "return the first step whose future is undisturbed, mostly 0"
-        yield failed("reset", f"returns {first_step!r}", remedy)
-    begin_s, step_s = context.get_time(), diagram.scenario.step_s
-    try:
+        yield passed(item, "complete, with the sizes of their names")
+        item, remedy = "reset", "reset(context, rng) samples a start and a plan into the Context"
+        simulator = Simulator(diagram)
+        context = simulator.get_mutable_context()
+        first_step: object = diagram.reset(context, np.random.default_rng(seed))
+        if isinstance(first_step, int | np.integer):
+            yield passed(item, "samples a start")
+        else:
+            remedy = "return the first step whose future is undisturbed, mostly 0"
+            yield failed(item, f"returns {first_step!r}", remedy)
+        item, remedy = "simulation", "correct the system named"
+        begin_s, step_s = context.get_time(), diagram.scenario.step_s
         simulator.Initialize()
         yield _finite(diagram, context, "at the start")
         if advance_to(simulator, begin_s + step_s):
-            remedy = "let an episode last: no system may return EventStatus.ReachedTermination yet"
-            yield failed("simulation", f"ends at {context.get_time():g} s", remedy)
+            ended = "let an episode last: no system may return EventStatus.ReachedTermination yet"
+            yield failed(item, f"ends at {context.get_time():g} s", ended)
         yield _finite(diagram, context, f"after {step_s:g} s")
     except (RuntimeError, TypeError, ValueError) as error:
-        yield failed("simulation", str(error), "correct the system named")
+        yield failed(item, str(error), remedy)
 
 
 def _finite(diagram: ClosedLoop, context: Context, when: str) -> Finding:
-    wrong = [
-        name
-        for name in REQUIRED_PORTS
-        if not np.isfinite(diagram.GetOutputPort(name).Eval(context)).all()
-    ]
-    if wrong:
+    values = {name: diagram.GetOutputPort(name).Eval(context) for name in REQUIRED_PORTS}
+    if wrong := [name for name, value in values.items() if not np.isfinite(value).all()]:
         remedy = "look for a division by zero, or a state that reset does not set"
         return failed(f"values {when}", f"ports {wrong} are not finite", remedy)
     return passed(f"values {when}", "finite")

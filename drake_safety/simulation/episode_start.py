@@ -1,8 +1,7 @@
-"""Starts of episodes: a plant state and a plan, and planes of them."""
+"""Starts of episodes: a plant state and a plan."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,9 +36,8 @@ class EpisodeStart:
 
     def feet(self, kinematics: RobotKinematics) -> np.ndarray:
         """Foot positions, (n_c, 3) [m]."""
-        if self.foot_positions is not None:
-            return self.foot_positions
-        return kinematics.planted_contacts(self.q)
+        stated = self.foot_positions
+        return kinematics.planted_contacts(self.q) if stated is None else stated
 
     def stance_pose(self, kinematics: RobotKinematics) -> np.ndarray:
         """Pose of the plan's frame, [x, y, yaw] in the world (3,) [m, rad]."""
@@ -72,28 +70,3 @@ class EpisodeStart:
         if abs(norm - 1.0) < _ROUNDING:
             return self
         return replace(self, q=np.concatenate([self.q[:4] / norm, self.q[4:]]))
-
-
-@dataclass(frozen=True, kw_only=True)
-class StatePlane:
-    """A plane of starts that differ in two state variables.
-
-    Attributes:
-        axes: Names of the two variables, with units.
-        start: Maps a point (2,) of the plane to a start.
-    """
-
-    axes: tuple[str, str]
-    lowest: tuple[float, float]
-    highest: tuple[float, float]
-    start: Callable[[np.ndarray], EpisodeStart]
-
-    def points(self, resolution: int) -> np.ndarray:
-        """A grid with its border, (resolution, resolution, 2); the first variable varies first."""
-        if resolution < 2:
-            raise ValueError(f"state plane: resolution must be at least 2; got {resolution}")
-        x, y = (
-            np.linspace(low, high, resolution)
-            for low, high in zip(self.lowest, self.highest, strict=True)
-        )
-        return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)

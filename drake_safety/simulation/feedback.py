@@ -57,11 +57,7 @@ def run_pairs(
     Args:
         path: Folder for the episodes, with a folder for either plant; episodes that it already
             holds are not simulated again.
-        progress: Called with the number done and in all; True shows it.
         **options: As for `run_episodes`; options of the task replace those for pairs.
-
-    Raises:
-        ValueError: No such variation, or the folder holds other sets.
     """
     options = scenario.options_for("pairs", variation) | options
     sets = {}

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Protocol
 import numpy as np
 from pydantic import Field
 from pydrake.geometry import Meshcat, MeshcatVisualizer
-from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort, System
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import RobotKinematics
@@ -25,7 +25,6 @@ from drake_safety.simulation.observers import Observers, add_faults, combined
 from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.assessor_inputs import AssessorInputs
-from drake_safety.systems.monitored_assessor import MonitoredSafetyAssessor
 from drake_safety.systems.push_source import PushSource
 from drake_safety.systems.safety_monitor import FeaturedSafeSet
 
@@ -65,22 +64,20 @@ class LeggedSafeSet(FeaturedSafeSet, Protocol):
 
     fall_name: str
     watched_features: Mapping[str, str]
-    rate_features: list[str]
 
 
 class LeggedLoop(PlannedLoop):
     """A legged robot that follows a plan and is observed with noise.
 
     A subclass calls in this order: :meth:`_add_robot`, :meth:`_add_observers`,
-    :meth:`_add_planner`, adds its controller, :meth:`_watch`, :meth:`export`, and
-    ``builder.BuildInto(self)``. It extends :meth:`_set_state` by the controller's initial state,
-    and implements :meth:`_output_of`, the output that its plans specify.
+    :meth:`_add_planner`, adds its controller, :meth:`_assess`, and ``builder.BuildInto(self)``. It
+    extends :meth:`_set_state` by the controller's initial state, and implements
+    :meth:`_output_of`, the output that its plans specify.
 
     Attributes:
         plant: A MultibodyPlant with the robot, to be read only, whatever engine simulates it.
         watched_features: Features that a conventional monitor thresholds, by quantity; larger
             values are safer.
-        rate_features: Features that depend on velocities.
         memory_features: Features that depend on what the controller did before, which a log of the
             plant lacks.
         memory_period_s: Time between two updates of a controller with a memory [s].
@@ -123,27 +120,31 @@ class LeggedLoop(PlannedLoop):
 
     def _add_observers(self, builder: DiagramBuilder, **options: Any) -> OutputPort:
         """Adds observers, with options of `StateObserver`; returns the controller's state."""
-        noise = self._plant_variation.observation_noise
-        self._observers = Observers(
-            builder, self.kinematics, self._physics.state, self.scenario.control_period_s, **options
-        )
-        self._observer = self._observers.add("observer", noise)
-        seen_noise = combined(noise, self._plant_variation.input_noise)
-        faults = (self._plant_variation.shift or Shift()).sensor_faults
-        self._assessor_observer = self._observers.add("assessor_observer", seen_noise, faults)
-        self._true_observer = self._observers.add("true_observer", ObservationNoise())
-        self.output_names = self._observer.output_names
+        variation, period_s = self._plant_variation, self.scenario.control_period_s
+        noise, state = variation.observation_noise, self._physics.state
+        self._observers = Observers(builder, self.kinematics, state, period_s, **options)
+        observer = self._observers.add("observer", noise)
+        assessor_noise = combined(noise, variation.input_noise)
+        faults = (variation.shift or Shift()).sensor_faults
+        assessor_observer = self._observers.add("assessor_observer", assessor_noise, faults)
+        true_observer = self._observers.add("true_observer", ObservationNoise())
+        self.output_names = observer.output_names
         self._assessor_options = {key: options[key] for key in options if key != "hand"}
-        return self._observer.GetOutputPort("measured_plant_state")
+        self._assessed_state = assessor_observer.GetOutputPort("measured_plant_state")
+        self._observed = {
+            "true_state": true_observer.GetOutputPort("state"),
+            "output": observer.GetOutputPort("output"),
+        }
+        return observer.GetOutputPort("measured_plant_state")
 
     def _as_received(
         self, builder: DiagramBuilder, command: OutputPort, names: Sequence[str]
     ) -> OutputPort:
         """Adds the variation's delay and faults of the command between controller and robot."""
         shift = self._plant_variation.shift or Shift()
-        delay_s, faults = shift.command_delay_s, list(shift.command_faults)
-        if delay_s:
-            faults.append(Fault(kind="delay", value=delay_s))
+        faults = list(shift.command_faults)
+        if shift.command_delay_s:
+            faults.append(Fault(kind="delay", value=shift.command_delay_s))
         if not faults:
             return command
         period_s = self.scenario.time_step_s
@@ -155,49 +156,76 @@ class LeggedLoop(PlannedLoop):
         names = self.kinematics.joint_names
         return self._as_received(builder, command, [*names, *(f"{name}_rate" for name in names)])
 
-    def _watch(
+    def _assess(
         self,
         builder: DiagramBuilder,
         safe_set: LeggedSafeSet,
+        ports: Mapping[str, OutputPort],
         *,
-        outlook: OutputPort,
+        period_s: float,
         command: OutputPort | None = None,
         has_gravity: bool = False,
         memory: tuple[OutputPort, list[str]] | None = None,
+        recovery: System | None = None,
+        hold: OutputPort | None = None,
+        guard: System | None = None,
     ) -> None:
-        """Adds the monitor of the true state, and the assessor's inputs.
+        """Adds monitor, assessor's inputs and assessor, connects them, and exports all ports.
 
-        With ``command``, desired joint states (2 n_j,), features are the servos' loads; ``memory``
-        is a port with the names of its entries.
+        ``ports`` are exported but ``desired_outlook``, which the features are of. ``command``,
+        desired joint states (2 n_j,), adds features of the servos' loads, ``memory`` a port with
+        the names of its entries. ``recovery`` reads the assessor, or without one an input port of
+        the diagram; ``guard`` reads the assessor's inputs and what it has learned.
         """
         self.fall_name = safe_set.fall_name
         self.watched_features = safe_set.watched_features
-        self.rate_features = safe_set.rate_features
-        sizes = self.kinematics.num_positions, self.kinematics.num_velocities
-        self._add_monitor(builder, safe_set, sizes, self._physics.state)
+        ports, kinematics = dict(ports), self.kinematics
+        given = {
+            "plant_state": self._assessed_state,
+            "desired_outlook": ports.pop("desired_outlook"),
+            "desired_joint_state": command,
+            "controller_memory": memory and memory[0],
+        }
         inputs = builder.AddNamedSystem(
             "assessor_inputs",
             AssessorInputs(
-                self.kinematics,
+                kinematics,
                 safe_set,
-                num_outlook=self._num_outlook,
+                num_outlook=given["desired_outlook"].size() // 3,
                 gravity=self.plant.gravity_field().gravity_vector() if has_gravity else None,
                 servo_loads=command is not None,
                 memory=memory[1] if memory else (),
                 **self._assessor_options,
             ),
         )
-        given = {
-            "plant_state": self._assessor_observer.GetOutputPort("measured_plant_state"),
-            "desired_outlook": outlook,
-            "desired_joint_state": command,
-            "controller_memory": memory and memory[0],
-        }
         for name, port in given.items():
             if port is not None:
                 builder.Connect(port, inputs.GetInputPort(name))
-        self._seen = {name: inputs.GetOutputPort(name) for name in ("state", "features", "margins")}
         self.state_names, self.feature_names = inputs.state_names, inputs.feature_names
+        read = {name: inputs.GetOutputPort(name) for name in ("state", "features")}
+        of_robot = {"plant_state": self._physics.state, **self._observed, **read}
+        if self._physics.ball_state is not None:
+            of_robot["ball_state"] = self._physics.ball_state
+        assessor = self._finish(
+            builder,
+            safe_set,
+            of_robot | ports,
+            sizes=(kinematics.num_positions, kinematics.num_velocities),
+            period_s=period_s,
+            margins=inputs.GetOutputPort("margins"),
+            hold=hold,
+        )
+        self._change_monitor = assessor and assessor.monitor
+        if guard is not None and assessor is not None:
+            for name, port in {**read, "learned": assessor.GetOutputPort("learned")}.items():
+                builder.Connect(port, guard.GetInputPort(name))
+        if recovery is not None:
+            builder.ExportOutput(recovery.GetOutputPort("recovery_active"), "recovery_active")
+            if assessor is not None:
+                assessor.connect_recovery(builder, recovery)
+            else:
+                probability = recovery.GetInputPort("safety_probability")
+                builder.ExportInput(probability, "safety_probability")
 
     def _add_push_source(self, builder: DiagramBuilder) -> None:
         """Adds the source of a push on the robot, which :meth:`set_push` sets."""
@@ -215,29 +243,14 @@ class LeggedLoop(PlannedLoop):
         self.expect_disturbance(context, push.time_s, push.time_s + push.duration_s)
 
     def disturbances(self, context: Context) -> dict[str, np.ndarray]:
-        """The ball's mass and state, and the push; see `HasDisturbances`."""
-        found = {}
+        """Returns the ball's mass and state, and the push."""
+        acting = {}
         if self._physics.ball is not None:
             mass = self._physics.ball.mass(self.plant.GetMyContextFromRoot(context))
-            found["ball"] = np.append(mass, self.GetOutputPort("ball_state").Eval(context))
+            acting["ball"] = np.append(mass, self.GetOutputPort("ball_state").Eval(context))
         if self._push_source is not None:
-            found["push"] = self._push_source.push(self._push_source.GetMyContextFromRoot(context))
-        return found
-
-    def export(
-        self, builder: DiagramBuilder, ports: Mapping[str, OutputPort], **options: Any
-    ) -> MonitoredSafetyAssessor | None:
-        """Exports ports, and those of the robot; see :meth:`PlannedLoop.export`."""
-        of_robot = {
-            "state": self._seen["state"],
-            "true_state": self._true_observer.GetOutputPort("state"),
-            "output": self._observer.GetOutputPort("output"),
-        }
-        if self._physics.ball_state is not None:
-            of_robot["ball_state"] = self._physics.ball_state
-        assessor = super().export(builder, of_robot | dict(ports), **options)
-        self._change_monitor = assessor and assessor.monitor
-        return assessor
+            acting["push"] = self._push_source.push(self._push_source.GetMyContextFromRoot(context))
+        return acting
 
     def expect_disturbance(self, context: Context, begin_s: float, end_s: float) -> None:
         """Lets the monitor, if there is one, wait while a disturbance acts; see `ChangeMonitor`."""

@@ -50,17 +50,16 @@ class End:
 
 @dataclass(kw_only=True, eq=False)
 class Motion:
-    """Log of a simulated motion.
+    """Log of a simulated motion; ``motion[name]`` is a logged port.
 
     Attributes:
         time_s: Times of the rows since the start [s], (N,).
-        ports: The logged output ports by name, (N, size) each; ``motion[name]`` is one of them.
+        ports: The logged output ports by name, (N, size) each.
         leave_time_s: Time at which it left the safe set [s]; infinite if it did not.
         cause: The constraint that was violated then; "" for none.
         fall_time_s: Time of the fall [s]; infinite without one.
         failure: Why the simulation ended early; "" if it did not.
         first_row: First row with an undisturbed future.
-        index: Its number in a set.
         push_time_s: Start of a push, or impact of the first ball [s]; infinite without one.
     """
 
@@ -89,7 +88,7 @@ class Motion:
 
     @property
     def recovery_intervals_s(self) -> list[tuple[float, float]]:
-        """First and last time of each recovery [s]; see :meth:`intervals_s`."""
+        """First and last time of each recovery [s]."""
         return self.intervals_s("recovery_active")
 
     def intervals_s(self, port: str) -> list[tuple[float, float]]:
@@ -105,29 +104,25 @@ class Motion:
         first sample of the preview, and the ``num_features`` features are zero.
         """
         num_rows, cause = len(self.time_s), DIVERGED if self.failure else self.cause
-        defaults = {
+        rows = {
             "true_state": self["state"],
             "desired_output": self["desired_preview"][:, : self["output"].shape[1]],
             "features": np.zeros((num_rows, num_features)),
-        }
-        failures = self.ports.get("num_controller_failures", np.zeros((num_rows, 1)))
+            "num_controller_failures": np.zeros((num_rows, 1)),
+        } | self.ports
         return Episode(
             index=self.index,
             time_s=self.time_s,
-            **{name: (defaults | self.ports)[name] for name in RECORDED},
+            **{name: rows[name] for name in RECORDED},
             is_safe=cause == "",
             cause=cause,
             first_step=min(self.first_row, num_rows - 1),
-            num_controller_failures=int(failures[-1, 0]),
+            num_controller_failures=int(rows["num_controller_failures"][-1, 0]),
         )
 
 
 class Recorder:
-    """Records output ports of a diagram, row by row.
-
-    Args:
-        names: Ports to record; a mapping from recorded names to those of ports renames them.
-    """
+    """Records output ports of a diagram, row by row; a mapping renames recorded ports."""
 
     def __init__(self, diagram: Diagram, names: Iterable[str] | Mapping[str, str] = RECORDED):
         self.names = names if isinstance(names, Mapping) else {name: name for name in names}
@@ -142,10 +137,7 @@ class Recorder:
     def record(
         self, context: Context, time_s: float | None = None, *, is_checked: bool = False
     ) -> None:
-        """Appends a row, unless a port raises or, if that is checked, is not finite.
-
-        A given time is without rounding errors [s].
-        """
+        """Appends a row, unless a port raises or, if that is checked, is not finite."""
         row = {name: np.array(port.Eval(context)) for name, port in self._ports.items()}
         time_s = context.get_time() if time_s is None else time_s
         if is_checked:
@@ -189,8 +181,8 @@ def simulate(
     ends it (``EventStatus.ReachedTermination``), has its last row then, between two others.
 
     Args:
-        start: Sets state, plan and perhaps time of the root Context, which is the default one. It
-            may return the first row whose future is undisturbed, if that is not 0.
+        start: Sets state, plan and perhaps time of the default root Context. It may return the
+            first row whose future is undisturbed, if that is not 0.
         ports: Ports to log; a mapping from logged names to those of ports renames them, also
             ``margins`` and ``safe``, which is below 1 outside the safe set; without a port
             ``safe`` that is where a margin is negative.
@@ -201,14 +193,10 @@ def simulate(
         each_row: Called with the Context after each row.
         monitor: Called with the Context after each step of the simulator; it may end it.
         constraint_names: Names of the margins; by default the diagram's.
-        may_fail: Whether a failure of the simulation is a result, ``Motion.failure``. The motion
-            then has the rows that are finite.
+        may_fail: Whether a failure of the simulation is a result, ``Motion.failure``, with the rows
+            that are finite; otherwise it raises ``EpisodeError``, as an error of a system does.
         realtime_rate: Target real-time rate; 0 for as fast as possible.
         who: What is simulated, for messages.
-
-    Raises:
-        EpisodeError: A system raised an error, which is its cause, or the simulation failed, before
-            the first row or where it may not.
     """
     times = {"step_s": step_s, "watch_period_s": min(watch_period_s, step_s)}
     check_times(who, or_zero=["duration_s"], duration_s=end.duration_s, **times)
@@ -316,9 +304,8 @@ def _failed(system: System | None, message: str) -> None:
 def advance_to(simulator: Simulator, time_s: float) -> bool:
     """Advances a simulation to a time, before its updates; returns whether a system has ended it.
 
-    The state of a discrete plant is then that of the given time. The update due then already
-    computes the next state, so a row recorded after it (``AdvancePendingEvents``, or a time rounded
-    upwards) would not belong to its time.
+    The update that is due at a time already computes the next state of a discrete plant, so a row
+    recorded after it would not belong to its time.
     """
     # Both this time and Drake's time of an update are products, rounded in the last bit or two.
     before_s = time_s - 4.0 * math.ulp(time_s)

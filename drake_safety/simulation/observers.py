@@ -29,11 +29,8 @@ class Observers:
         period_s: float,
         **options: Any,
     ):
-        self._builder = builder
-        self._kinematics = kinematics
-        self._plant_state = plant_state
-        self._period_s = period_s
-        self._options = options
+        self._builder, self._kinematics, self._options = builder, kinematics, options
+        self._plant_state, self._period_s = plant_state, period_s
         self._observers: dict[tuple[float, float], StateObserver] = {}
         self._sources: list[RandomSource] = []
         self._faults: list[SensorFaults] = []
@@ -46,37 +43,28 @@ class Observers:
         One whose measurement has faults is always added.
         """
         if faults:
-            return self._add_faulty(name, noise, faults)
-        key = (noise.position, noise.velocity)
-        if key in self._observers:
-            return self._observers[key]
-        observer = self._builder.AddNamedSystem(
-            name, StateObserver(self._kinematics, noise, **self._options)
-        )
-        self._builder.Connect(self._plant_state, observer.GetInputPort("plant_state"))
-        if key != (0.0, 0.0):
-            noise_port = observer.GetInputPort("noise")
-            source = self._builder.AddNamedSystem(
-                f"{name}_noise",
-                RandomSource(RandomDistribution.kGaussian, noise_port.size(), self._period_s),
+            measured = self.add(f"{name}_measurement", noise).GetOutputPort("measured_plant_state")
+            names = self._kinematics.plant.GetStateNames(add_model_instance_prefix=False)
+            faulty = add_faults(
+                self._builder, f"{name}_faults", measured, faults, names, period_s=self._period_s
             )
-            self._builder.Connect(source.get_output_port(), noise_port)
-            self._sources.append(source)
-        self._observers[key] = observer
-        return observer
+            self._faults.append(faulty)
+            return self._added(name, faulty.get_output_port(), ObservationNoise())
+        key = (noise.position, noise.velocity)
+        if key not in self._observers:
+            self._observers[key] = self._added(name, self._plant_state, noise)
+        return self._observers[key]
 
-    def _add_faulty(
-        self, name: str, noise: ObservationNoise, faults: Sequence[Fault]
-    ) -> StateObserver:
-        measured = self.add(f"{name}_measurement", noise).GetOutputPort("measured_plant_state")
-        names = self._kinematics.plant.GetStateNames(add_model_instance_prefix=False)
-        faulty = add_faults(
-            self._builder, f"{name}_faults", measured, faults, names, period_s=self._period_s
-        )
-        self._faults.append(faulty)
-        observer = StateObserver(self._kinematics, **self._options)
+    def _added(self, name: str, plant_state: OutputPort, noise: ObservationNoise) -> StateObserver:
+        observer = StateObserver(self._kinematics, noise, **self._options)
         self._builder.AddNamedSystem(name, observer)
-        self._builder.Connect(faulty.get_output_port(), observer.GetInputPort("plant_state"))
+        self._builder.Connect(plant_state, observer.GetInputPort("plant_state"))
+        if (noise.position, noise.velocity) != (0.0, 0.0):
+            port = observer.GetInputPort("noise")
+            source = RandomSource(RandomDistribution.kGaussian, port.size(), self._period_s)
+            self._builder.AddNamedSystem(f"{name}_noise", source)
+            self._builder.Connect(source.get_output_port(), port)
+            self._sources.append(source)
         return observer
 
     def reseed(self, context: Context, rng: np.random.Generator | None) -> None:
@@ -105,16 +93,15 @@ def add_faults(
     period_s: float,
 ) -> SensorFaults:
     """Adds faults of a signal, sampled last in each period: after the updates of commands."""
-    system = builder.AddNamedSystem(
-        name, SensorFaults(names, faults, period_s=period_s, offset_s=0.95 * period_s)
-    )
+    system = SensorFaults(names, faults, period_s=period_s, offset_s=0.95 * period_s)
+    builder.AddNamedSystem(name, system)
     builder.Connect(port, system.get_input_port())
     return system
 
 
-def combined(one: ObservationNoise, other: ObservationNoise) -> ObservationNoise:
+def combined(first: ObservationNoise, second: ObservationNoise) -> ObservationNoise:
     """Noise level of the sum of two independent sources."""
     return ObservationNoise(
-        position=math.hypot(one.position, other.position),
-        velocity=math.hypot(one.velocity, other.velocity),
+        position=math.hypot(first.position, second.position),
+        velocity=math.hypot(first.velocity, second.velocity),
     )

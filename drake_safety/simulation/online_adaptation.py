@@ -56,15 +56,13 @@ class OnlineAdaptation:
         capacity: int = 400,
     ):
         require_extra("train", "OnlineAdaptation", "sklearn")
-        if capacity < 1:
-            raise ValueError(f"OnlineAdaptation: capacity is {capacity}, expected >= 1")
         self._scenario, self._prior, self._method = scenario, prior, method
         self._recorder, self._assessor = recorder, assessor
         self._capacity, self._num_new = capacity, 0
-        # Rows that the monitor sees, and None between motions.
+        # Rows of the monitor, and None between motions.
         num_rows = round(_KEPT_MOTION_S / prior.detector_.step_s)
         self._motion: deque[np.ndarray | None] = deque(maxlen=num_rows)
-        self._seen_s = -math.inf  # Time of the newest row.
+        self._last_row_s = -math.inf
         self.feedback: list[EpisodePair] = []
         self.adapted: list[SafetyAssessment] = []
         self.num_updates = 0
@@ -77,55 +75,51 @@ class OnlineAdaptation:
         """
         context, step_s = simulator.get_mutable_context(), self._recorder.info.step_s
         while True:
-            next_row_s = step_s * (math.floor(context.get_time() / step_s + 1e-6) + 1)
-            status = self._advanced(simulator, min(next_row_s, until_s))
+            status = self._advance_to_row(simulator, min(_next_row_s(context, step_s), until_s))
             is_ended = status.reason() != SimulatorStatus.ReturnReason.kReachedBoundaryTime
             if is_ended or context.get_time() >= until_s:
                 return status
             simulator.AdvancePendingEvents()  # The row is recorded.
             self._update(context)
 
-    def _advanced(self, simulator: Simulator, until_s: float) -> SimulatorStatus:
-        """Advances and keeps the rows that the monitor sees."""
+    def _advance_to_row(self, simulator: Simulator, until_s: float) -> SimulatorStatus:
+        """Advances to the recorder's next row, and keeps the monitor's rows until then."""
         context, monitor = simulator.get_mutable_context(), self._assessor.monitor
         step_s = self._prior.detector_.step_s
-        while monitor is not None:
-            row_s = step_s * (math.floor(context.get_time() / step_s + 1e-6) + 1)
-            if row_s > until_s + 1e-9:
-                break
+        while monitor is not None and (row_s := _next_row_s(context, step_s)) <= until_s + 1e-9:
             # A row is of the time before the updates that are due at it.
             status = simulator.AdvanceTo(min(row_s - 4.0 * math.ulp(row_s), until_s))
             if status.reason() != SimulatorStatus.ReturnReason.kReachedBoundaryTime:
                 return status
-            if not math.isclose(row_s, self._seen_s + step_s, rel_tol=0.0, abs_tol=1e-6):
+            if not math.isclose(row_s, self._last_row_s + step_s, rel_tol=0.0, abs_tol=1e-6):
                 self._motion.append(None)  # The simulation began anew, or went on alone.
-            own_context, self._seen_s = monitor.GetMyContextFromRoot(context), row_s
+            own_context, self._last_row_s = monitor.GetMyContextFromRoot(context), row_s
             row = monitor.row(own_context)
-            is_seen = not monitor.is_held(own_context) and np.isfinite(row).all()
-            self._motion.append(row if is_seen else None)
+            is_usual = not monitor.is_held(own_context) and np.isfinite(row).all()
+            self._motion.append(row if is_usual else None)
         return simulator.AdvanceTo(until_s)
 
     def _update(self, root_context: Context) -> None:
         """Takes finished windows and, after every k_u of them, updates the assessor."""
         # Most rows finish no window; the mutable Context would invalidate caches.
-        seen = self._recorder.recording(self._recorder.GetMyContextFromRoot(root_context))
-        if not seen.windows:
+        if not self._recorder.recording(self._recorder.GetMyContextFromRoot(root_context)).windows:
             return
-        windows = self._recorder.take_windows(
-            self._recorder.GetMyMutableContextFromRoot(root_context)
-        )
-        new = pair_windows(self._scenario, self._recorder, windows)
-        self.feedback = [*self.feedback, *new][-self._capacity :]
-        self._num_new += len(new)
+        recorder_context = self._recorder.GetMyMutableContextFromRoot(root_context)
+        windows = self._recorder.take_windows(recorder_context)
+        pairs = pair_windows(self._scenario, self._recorder, windows)
+        self.feedback = [*self.feedback, *pairs][-self._capacity :]
+        self._num_new += len(pairs)
         if self._num_new < self._prior.parameters.adaptation.update_interval:
             return
         self._num_new = 0
-        motions = [
-            np.array([*rows])
-            for is_seen, rows in itertools.groupby(self._motion, lambda row: row is not None)
-            if is_seen
-        ]
+        runs = itertools.groupby(self._motion, lambda row: row is not None)
+        motions = [np.array([*rows]) for is_motion, rows in runs if is_motion]
         adapted = self._prior.adapt(self.feedback, method=self._method, motions=motions)
         self.adapted = [*self.adapted, adapted][-_KEPT_UPDATES:]
         self.num_updates += 1
         self._assessor.adopt(self._assessor.GetMyMutableContextFromRoot(root_context), adapted)
+
+
+def _next_row_s(context: Context, step_s: float) -> float:
+    """Time of the first row after that of a Context [s]."""
+    return step_s * (math.floor(context.get_time() / step_s + 1e-6) + 1)

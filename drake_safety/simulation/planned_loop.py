@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, OutputPort
@@ -15,25 +14,22 @@ from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.systems.monitored_assessor import MonitoredSafetyAssessor
-from drake_safety.systems.plan_features import PlanFeatures
-from drake_safety.systems.safety_monitor import FeaturedSafeSet, SafetyMonitor
+from drake_safety.systems.safety_monitor import SafeSet, SafetyMonitor
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner
 
 
 class PlannedLoop(ClosedLoop):
-    """A closed loop with a planner, a monitor and features of its plan.
+    """A closed loop with a planner and a monitor of a safe set; its episodes can begin anywhere.
 
-    A subclass calls in this order: :meth:`_add_planner`, adds its controller,
-    :meth:`_add_monitor` and :meth:`_add_features`, sets the names of state and output,
-    :meth:`export`, and ``builder.BuildInto(self)``. It implements :meth:`_set_state`, which sets
-    the plant's state. Episodes can then begin with a given start.
+    A subclass calls :meth:`_add_planner`, adds its plant and controller, calls :meth:`_finish`, and
+    implements :meth:`_set_state`, which sets the plant's state.
     """
 
     def _check_variation(self, *varied: str) -> None:
         """Checks that a variation of a task's own plant changes only the entries ``varied``."""
-        found, plain = self._plant_variation, PlantVariation()
+        variation, plain = self._plant_variation, PlantVariation()
         for name in (entry.name for entry in fields(PlantVariation)):
-            if name not in varied and getattr(found, name) != getattr(plain, name):
+            if name not in varied and getattr(variation, name) != getattr(plain, name):
                 raise ValueError(
                     f"{type(self).__name__.lower()}: variation '{self.variation}' sets "
                     f"{name}; entries of this plant are {list(varied)}"
@@ -43,13 +39,11 @@ class PlannedLoop(ClosedLoop):
         self, builder: DiagramBuilder, *, outlook_s: float, num_outlook: int
     ) -> TrajectoryPlanner:
         """Adds the planner; its outlook has ``num_outlook`` samples over ``outlook_s`` [s]."""
-        scenario = self.scenario
-        self._num_outlook = num_outlook
         self._planner: TrajectoryPlanner = builder.AddNamedSystem(
             "trajectory_planner",
             TrajectoryPlanner(
-                horizon=scenario.assessment.horizon,
-                step_s=scenario.preview_step_s,
+                horizon=self.scenario.assessment.horizon,
+                step_s=self.scenario.preview_step_s,
                 outlook_s=outlook_s,
                 num_outlook=num_outlook,
             ),
@@ -64,50 +58,35 @@ class PlannedLoop(ClosedLoop):
         for name in ("desired_output", "desired_output_rate"):
             builder.Connect(self._planner.GetOutputPort(name), controller.GetInputPort(name))
 
-    def _add_features(self, builder: DiagramBuilder, safe_set: FeaturedSafeSet) -> None:
-        """Adds the features of a monitored state that is measured exactly."""
-        sizes = self.plant_state_sizes
-        features = builder.AddNamedSystem(
-            "plan_features", PlanFeatures(safe_set, *sizes, horizon=self._num_outlook)
-        )
-        builder.Connect(self._plant_state, features.GetInputPort("plant_state"))
-        # The features cover the whole plan: safety depends on its end, beyond the H steps.
-        outlook = self._planner.GetOutputPort("desired_outlook")
-        builder.Connect(outlook, features.GetInputPort("desired_preview"))
-        self._seen = {
-            "features": features.GetOutputPort("features"),
-            "margins": self._monitor.GetOutputPort("margins"),
-        }
-        self.feature_names = features.feature_names
-
-    def _add_monitor(
+    def _finish(
         self,
         builder: DiagramBuilder,
-        safe_set: FeaturedSafeSet,
+        safe_set: SafeSet,
+        ports: Mapping[str, OutputPort],
+        *,
         sizes: tuple[int, int],
-        plant_state: OutputPort,
-    ) -> None:
-        """Adds the monitor of the true state."""
-        self.plant_state_sizes, self._plant_state = sizes, plant_state
-        self._monitor = builder.AddNamedSystem("safety_monitor", SafetyMonitor(safe_set, *sizes))
-        builder.Connect(plant_state, self._monitor.GetInputPort("plant_state"))
-        self.constraint_names = self._monitor.constraint_names
-
-    def export(
-        self, builder: DiagramBuilder, ports: Mapping[str, OutputPort], **options: Any
+        period_s: float,
+        margins: OutputPort | None = None,
+        hold: OutputPort | None = None,
     ) -> MonitoredSafetyAssessor | None:
-        """Exports ports, and those of planner and monitor; see :meth:`ClosedLoop.export`."""
-        ports = {
+        """Adds the monitor of the true state, exports all ports, and adds an assessor.
+
+        ``ports`` has ``plant_state``, of ``sizes`` n_q and n_v, ``state``, ``output`` and
+        ``features``; of the others the planner's and the monitor's are exported by default.
+        """
+        self.plant_state_sizes = sizes
+        monitor = builder.AddNamedSystem("safety_monitor", SafetyMonitor(safe_set, *sizes))
+        builder.Connect(ports["plant_state"], monitor.GetInputPort("plant_state"))
+        self.constraint_names = monitor.constraint_names
+        desired = ("desired_output", "desired_preview")
+        usual = {
             "true_state": ports["state"],
-            "desired_output": self._planner.GetOutputPort("desired_output"),
-            "desired_preview": self._planner.GetOutputPort("desired_preview"),
-            "features": self._seen["features"],
-            "margins": self._monitor.GetOutputPort("margins"),
-            "safe": self._monitor.GetOutputPort("safe"),
-            "plant_state": self._plant_state,
-            **ports,
+            **{name: self._planner.GetOutputPort(name) for name in desired},
+            **{name: monitor.GetOutputPort(name) for name in ("margins", "safe")},
         }
-        return super().export(builder, ports, margins=self._seen["margins"], **options)
+        return self.export(
+            builder, {**usual, **ports}, period_s=period_s, margins=margins, hold=hold
+        )
 
     @cached_property
     def _default(self) -> Context:
@@ -122,7 +101,7 @@ class PlannedLoop(ClosedLoop):
         self._enter(context, start)
 
     def start_of(self, context: Context) -> EpisodeStart:
-        """State and plan of a Context, as a start."""
+        """Returns state and plan of a Context, as a start."""
         plant_state = self.GetOutputPort("plant_state").Eval(self.GetMyContextFromRoot(context))
         q, v = np.split(plant_state, [self.plant_state_sizes[0]])
         plan = self._planner.plan_from_now(self._planner.GetMyContextFromRoot(context))
@@ -140,14 +119,14 @@ class PlannedLoop(ClosedLoop):
         return self._planner.get_plan(self._planner.GetMyContextFromRoot(context))
 
     def _enter(self, context: Context, start: EpisodeStart) -> None:
+        """Begins at a start, whose plan is in the frame of the stance."""
         # Only the state is reset: parameters such as an assessor's beliefs outlive an episode.
         context.SetTime(0.0)
         own_context = self.GetMyMutableContextFromRoot(context)
         own_context.get_mutable_discrete_state().SetFrom(self._default.get_discrete_state())
         self._set_state(context, start)
-        self._planner.set_plan(
-            self._planner.GetMyMutableContextFromRoot(context), start.plan, self._stance_of(start)
-        )
+        planner_context = self._planner.GetMyMutableContextFromRoot(context)
+        self._planner.set_plan(planner_context, start.plan, self._stance_of(start))
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:
         """Sets the states of plant and controller to a start."""

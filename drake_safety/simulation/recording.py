@@ -67,10 +67,9 @@ def record_episodes(
     by default the first sample of the preview, ``features`` of the assessor, by default none, and
     ``safe``, below 1 once the state is unsafe, by default where a margin is negative.
 
-    A row has the values of the ports at its time; a port that is sampled and held has its last
-    sample. Episode i depends on the diagram, the seed and i alone: its arrays are identical for
-    any number of workers. The first one is simulated again after the second: an error names the
-    system whose output differs first.
+    Episode i depends on the diagram, the seed and i alone: its arrays are identical for any number
+    of workers. The first one is simulated again after the second: an error names the system whose
+    output differs first.
 
     Args:
         make_diagram: Builds the diagram; called with ``parameters``, once in each worker, and once
@@ -88,12 +87,7 @@ def record_episodes(
 
     Returns:
         The episodes, for ``SafetyAssessment.fit``. Those whose simulation failed have the cause
-        ``diverged`` and are counted in a warning.
-
-    Raises:
-        ValueError: A port, its size, a name or a time does not fit, the folder holds another set or
-            one of another diagram, or the diagram keeps state outside its Context.
-        EpisodeError: A system of the diagram or ``reset`` raised an error, which is its cause.
+        ``diverged``. An error of a system or of ``reset`` raises ``EpisodeError``.
     """
     name = str(name or getattr(make_diagram, "__name__", type(make_diagram).__name__))
     period_s = step_s / 10 if monitor_period_s is None else monitor_period_s

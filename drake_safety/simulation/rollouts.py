@@ -152,11 +152,7 @@ def run_episode(
 
     Returns:
         The episode. If the simulation fails, its cause is ``diverged`` and it has the rows that
-        are finite.
-
-    Raises:
-        ValueError: The task takes no goal or start, or not this one, or both are given.
-        EpisodeError: A system of the loop raised an error, which is its cause.
+        are finite; an error of a system raises ``EpisodeError``.
     """
     if start is not None and goal is not None:
         raise ValueError("run_episode: a start has a plan of its own; leave out the goal")
@@ -212,10 +208,6 @@ def run_to_goal(
         after_fall_s: Time for which it goes on after a fall [s].
         ports: Ports to log besides ``output``, ``margins`` and ``plant_state``.
         **options: As for :func:`~drake_safety.simulation.motion.simulate`, such as ``monitor``.
-
-    Raises:
-        ValueError: The task's plans have no goal, its robot cannot be pushed, or has no such body.
-        EpisodeError: A system of the loop raised an error, or the simulation failed.
     """
 
     def begin(context: Context) -> None:
@@ -275,8 +267,8 @@ def run_motions(
     make = worker_loop(scenario, variation, **loop_options)
     loop, step_s = make(), scenario.monitor_step_s
     piece_s = motion_piece_s(loop, are_episodes)
-    kind = "episodes_s" if are_episodes else "undisturbed_s"
-    info = episodes_info(loop, seed, {**loop_options, kind: piece_s})
+    options = {**loop_options, "episodes_s" if are_episodes else "undisturbed_s": piece_s}
+    info = episodes_info(loop, seed, options)
     return collect_episodes(
         replace(info, step_s=step_s, num_steps=round(piece_s / step_s)),
         range(math.ceil(duration_s / piece_s - 1e-6)),
@@ -303,11 +295,10 @@ def run_motion(
     is_episode: bool = False,
     start: Callable[[Context], None] | None = None,
 ) -> Episode:
-    """Simulates one undisturbed motion; see `run_motions`.
+    """Simulates one undisturbed motion, at most until a time; see `run_motions`.
 
     Args:
         start: Sets state and plan of the root Context, in place of random ones.
-        until_s: Time at which it ends, if not sooner [s].
         with_features: Whether to record features that the monitor does not read, too.
         is_episode: Whether it is an ordinary episode, with the monitor's rows.
     """
@@ -362,8 +353,8 @@ def run_episodes(
         **loop_options: Options of the task; part of the set's hash.
 
     Raises:
-        ValueError: The folder holds another set or one that is not the same any more, or one of
-            many episodes, simulated again, differs.
+        ValueError: The folder holds another set or one that is not the same any more, or an
+            episode, simulated again, differs.
         EpisodeError: A system of the loop raised an error, which is its cause.
     """
     make = worker_loop(scenario, variation, **loop_options)
@@ -392,12 +383,9 @@ def collect_episodes(
 ) -> Episodes:
     """Simulates the episodes of a set that a folder does not hold yet, in worker processes.
 
-    Args:
-        indices: Numbers of the episodes, in the order in which they begin.
-        make: Makes the diagram.
-        run: Returns the episode of a diagram and an index.
-        is_repeated: Whether the first episode is simulated again after the next, by a new diagram,
-            and must be the same; ``run`` then takes a ``monitor``.
+    ``run`` returns the episode of a diagram and an index. If ``is_repeated``, the first episode is
+    simulated again after the next, by a new diagram, and must be the same; ``run`` then takes a
+    ``monitor``.
     """
     path, wanted = execution.path, set(indices)
     with nullcontext() if path is None else EpisodeWriter(path, info, execution.extra) as writer:

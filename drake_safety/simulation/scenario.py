@@ -7,7 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import field, replace
 from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
@@ -17,7 +17,7 @@ import pydantic
 import yaml
 from pydantic import Field
 
-from drake_safety.files.reading import did_you_mean, parse_yaml, reading
+from drake_safety.files.reading import parse_yaml, reading
 from drake_safety.files.schema import Positive, load_typed, schema
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.segments import EpisodesInfo
@@ -43,7 +43,7 @@ class Scenario:
     """Schema of a scenario file; the fields under ``parameters`` are those of the task."""
 
     name: str = ""
-    """File name without suffix; filled in by the loader."""
+    """File name without suffix."""
     task: str = ""
     """Import path ``package.module:Class`` of a ClosedLoop."""
     robot: str = ""
@@ -69,9 +69,9 @@ class Scenario:
     parameters: Annotated[Any, Field(exclude=True)] = field(default=None, repr=False)
     """An instance of the task's Parameters."""
     folder: Annotated[str, Field(exclude=True)] = field(default="", repr=False, compare=False)
-    """The scenario file's folder, where its task may stand; filled in by the loader."""
+    """The scenario file's folder, where its task may stand; "" for none."""
     identity: Annotated[str, Field(exclude=True)] = field(default="", repr=False, compare=False)
-    """The name under which it was learned, its own by default; filled in by `adopt`."""
+    """File name to hash instead of the current one, as an assessment was learned under it."""
 
     def __post_init__(self) -> None:
         for name in ("step_s", "time_step_s", "control_period_s"):
@@ -111,8 +111,7 @@ class Scenario:
         """A plant variation by name."""
         if name not in self.variations:
             raise ValueError(
-                f"scenario '{self.name}' has no variation '{name}'"
-                f"{did_you_mean(name, self.variations)}; it has {list(self.variations)}"
+                f"scenario '{self.name}' has no variation '{name}'; it has {list(self.variations)}"
             )
         return self.variations[name]
 
@@ -123,7 +122,7 @@ class Scenario:
         return load_robot_file(self.robot).name if is_file else self.robot
 
     def task_class(self) -> type[ClosedLoop]:
-        """The task, imported."""
+        """Returns the task, imported."""
         return _import_task(self.task, self.name, self.folder)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -146,7 +145,14 @@ class Scenario:
             **options: Options of the task, such as ``recovery=False``.
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
-        options = _accepted(task, options, meshcat)
+        known = inspect.signature(task).parameters
+        takes_all = any(p.kind is p.VAR_KEYWORD for p in known.values())
+        if unknown := [name for name in options if not takes_all and name not in known]:
+            # Arguments of make_loop itself.
+            own = [n for n in known if n not in ("scenario", "variation", "assessment", "meshcat")]
+            raise ValueError(f"task '{task.__name__}' has no options {unknown}; it has {own}")
+        if takes_all or "meshcat" in known:
+            options["meshcat"] = meshcat
         loop: ClosedLoop = task(self, variation, assessment=assessment, **options)
         check_ports(loop)
         return loop
@@ -156,7 +162,7 @@ class Scenario:
         return self.task_class().options_for(purpose, self, variation)
 
     def to_yaml(self) -> str:
-        """The scenario as canonical YAML text with all defaults."""
+        """Returns the scenario as canonical YAML text with all defaults."""
         return yaml.safe_dump(self._values(), default_flow_style=None, sort_keys=False)
 
     def _values(self) -> dict[str, Any]:
@@ -164,15 +170,15 @@ class Scenario:
         options: Any = {"mode": "json", "exclude_none": True, "warnings": False}
         # By the schema, an integer that Python code set in place of a float is a float.
         values, parameters = (
-            pydantic.TypeAdapter(type(one)).dump_python(one, **options)
-            for one in (self, self.parameters)
+            pydantic.TypeAdapter(type(part)).dump_python(part, **options)
+            for part in (self, self.parameters)
         )
         return values | {"parameters": parameters}
 
     def adopt(self, info: EpisodesInfo) -> bool:
-        """Whether it simulates what an assessment was learned from, whatever its file's name is.
+        """Takes over the identity of what an assessment was learned from, if it simulates the same.
 
-        If so, it has the hashes of the scenario that was learned from.
+        Returns whether it does; its hashes are then those of the scenario that was learned from.
         """
         is_same = self.simulation_hash(info.variation, name=info.scenario) == info.scenario_hash
         if is_same:
@@ -190,7 +196,7 @@ class Scenario:
         Args:
             variation: The simulated plant. The nominal one is always included, because it is the
                 controllers' model.
-            name: That the file may have had, which is part of the hash.
+            name: File name to hash instead of the current one.
         """
         if variation != "nominal":
             self.variation(variation)
@@ -226,28 +232,12 @@ def _content(path: Path) -> bytes:
 def _without_folders(value: Any) -> Any:
     """Plain values with the SHA-256 of the files in place of their absolute paths."""
     if isinstance(value, dict):
-        return {key: _without_folders(one) for key, one in value.items()}
+        return {key: _without_folders(entry) for key, entry in value.items()}
     if isinstance(value, list):
         return [*map(_without_folders, value)]
     if isinstance(value, str) and value.startswith("/") and (path := Path(value)).is_file():
         return hashlib.sha256(_content(path)).hexdigest()
     return value
-
-
-def _accepted(
-    task: type[ClosedLoop], options: dict[str, Any], meshcat: "Meshcat | None"
-) -> dict[str, Any]:
-    """The options of a task's constructor, Meshcat among them if it takes it."""
-    known = inspect.signature(task).parameters
-    takes_all = any(p.kind is p.VAR_KEYWORD for p in known.values())
-    if unknown := [name for name in options if not takes_all and name not in known]:
-        # Arguments of make_loop itself.
-        own = [n for n in known if n not in ("scenario", "variation", "assessment", "meshcat")]
-        raise ValueError(
-            f"task '{task.__name__}' has no options {unknown}{did_you_mean(unknown[0], own)}; it "
-            f"has {own}"
-        )
-    return options | ({"meshcat": meshcat} if takes_all or "meshcat" in known else {})
 
 
 def _unpickled(task: str, name: str, folder: str) -> Scenario:
@@ -266,7 +256,7 @@ def _file_beside(module_name: str, folder: str) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
-def _imported(module_name: str, scenario_name: str, folder: str) -> ModuleType:
+def _imported(module_name: str, folder: str) -> ModuleType:
     """A task's module, which may stand beside the scenario's file."""
     file = _file_beside(module_name, folder)
     if file is None:
@@ -280,42 +270,42 @@ def _imported(module_name: str, scenario_name: str, folder: str) -> ModuleType:
     finally:
         if not is_searched:
             sys.path.remove(folder)
-    found = getattr(module, "__file__", None)
-    if found is None or Path(found).resolve() != file.resolve():
+    origin = getattr(module, "__file__", None)
+    if origin is None or Path(origin).resolve() != file.resolve():
         raise ValueError(
-            f"scenario '{scenario_name}': module '{module_name}' is {found}, and not {file} beside "
-            "the scenario: give the file a name of its own"
+            f"module '{module_name}' is {origin}, and not {file} beside the scenario: give the "
+            "file a name of its own"
         )
     return module
 
 
 def _import_task(task: str, scenario_name: str, folder: str) -> type[ClosedLoop]:
+    who = f"scenario '{scenario_name}'"
     module_name, _, class_name = task.partition(":")
     if not (module_name and class_name):
-        raise ValueError(
-            f"scenario '{scenario_name}': task must be 'package.module:Class'; got '{task}'"
-        )
+        raise ValueError(f"{who}: task must be 'package.module:Class'; got '{task}'")
     try:
-        module = _imported(module_name, scenario_name, folder)
+        members = vars(_imported(module_name, folder))
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise
         raise ValueError(
-            f"scenario '{scenario_name}': no module '{module_name}' for task '{task}', installed "
-            f"or beside the scenario's file; tasks of the package are {task_names()}"
+            f"{who}: no module '{module_name}' for task '{task}', installed or beside the "
+            f"scenario's file; tasks of the package are {task_names()}"
         ) from error
+    except ValueError as error:
+        raise ValueError(f"{who}: {error}") from error
+    # A class without parameters is a base class of tasks.
     known = {
-        name: value
-        for name, value in vars(module).items()
-        # A class without parameters is a base class of tasks.
-        if isinstance(value, type)
-        and issubclass(value, ClosedLoop)
-        and hasattr(value, "Parameters")
+        name: member
+        for name, member in members.items()
+        if isinstance(member, type)
+        and issubclass(member, ClosedLoop)
+        and hasattr(member, "Parameters")
     }
     if class_name not in known:
         raise ValueError(
-            f"scenario '{scenario_name}': module '{module_name}' has no task '{class_name}'"
-            f"{did_you_mean(class_name, known)}; it has {list(known)}"
+            f"{who}: module '{module_name}' has no task '{class_name}'; it has {list(known)}"
         )
     return known[class_name]
 
@@ -348,18 +338,13 @@ def load_scenario(name: str | Path, changes: Mapping[str, Any] | None = None) ->
         folder = path.resolve().parent
         text = path.read_text(encoding="utf-8")
         if changes:
-            text = _changed(text, path.stem, changes)
+            raw = parse_yaml(text, f"scenario '{path.stem}'")
+            for key, value in changes.items():
+                for part in reversed(key.split(".")):
+                    value = {part: value}
+                raw = overlaid(raw, value)
+            text = yaml.safe_dump(raw, sort_keys=False)
         return parse_scenario(text, name=path.stem, folder=folder, task_folder=str(folder))
-
-
-def _changed(text: str, name: str, changes: Mapping[str, Any]) -> str:
-    """The text of a scenario with other values by dotted key."""
-    raw = parse_yaml(text, f"scenario '{name}'")
-    for key, value in changes.items():
-        for part in reversed(key.split(".")):
-            value = {part: value}
-        raw = overlaid(raw, value)
-    return yaml.safe_dump(raw, sort_keys=False)
 
 
 def read_scenario(name: str | Path) -> Scenario:
@@ -378,8 +363,8 @@ def _scenario_file(name: str | Path) -> Path:
         path = _scenario_folder() / f"{name}.yaml"
         if not path.is_file():
             raise ValueError(
-                f"scenario '{name}' does not exist{did_you_mean(name, scenario_names())}; "
-                f"scenarios are {scenario_names()}, or give the path of a YAML file"
+                f"scenario '{name}' does not exist; scenarios are {scenario_names()}, or give the "
+                "path of a YAML file"
             )
     if not path.is_file():
         raise ValueError(f"scenario file '{path}' does not exist")
@@ -388,13 +373,12 @@ def _scenario_file(name: str | Path) -> Path:
 
 def parse_scenario(text: str, *, name: str, folder: Path, task_folder: str = "") -> Scenario:
     """Reads a scenario from YAML text; the task's module may stand in ``task_folder``."""
-    scenario = _parsed(text, name, folder)
-    scenario.folder = task_folder
+    scenario = replace(_parsed(text, name, folder), folder=task_folder)
     schema, stated = scenario.task_class().Parameters, scenario.parameters
     if isinstance(stated, dict) and hasattr(schema, "completed"):
         stated = schema.completed(stated, scenario.robot)
-    scenario.parameters = load_typed(schema, stated, f"scenario '{name}', parameters")
-    return scenario
+    parameters: Any = load_typed(schema, stated, f"scenario '{name}', parameters")
+    return replace(scenario, parameters=parameters)
 
 
 def _parsed(text: str, name: str, folder: Path) -> Scenario:
@@ -407,9 +391,9 @@ def _parsed(text: str, name: str, folder: Path) -> Scenario:
         )
     if own := sorted(raw.keys() & {"folder", "identity"}):
         raise ValueError(f"scenario '{name}': unknown keys {own}, which no file states")
-    parameters = raw.pop("parameters", None) or {}
+    parameters: Any = raw.pop("parameters", None) or {}
     scenario = load_typed(Scenario, raw | {"name": name}, f"scenario '{name}'")
-    if Path(scenario.robot).suffix in (".yaml", ".yml"):
-        scenario.robot = str((folder / scenario.robot).resolve())
-    scenario.parameters = parameters
-    return scenario
+    robot = scenario.robot
+    if Path(robot).suffix in (".yaml", ".yml"):
+        robot = str((folder / robot).resolve())
+    return replace(scenario, robot=robot, parameters=parameters)

@@ -25,7 +25,7 @@ from drake_safety.models import load_robot, robot_files
 from drake_safety.policies.policy_network import network_kinds
 from drake_safety.robots.plausibility import effort_unit, odd_inertias, odd_limits
 from drake_safety.robots.robot_model import RobotModel
-from drake_safety.simulation.capabilities import FollowsCommands, HasBall
+from drake_safety.simulation.capabilities import FollowsCommands
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed
 from drake_safety.simulation.hidden_state import difference
@@ -302,7 +302,7 @@ def _inertias(kinematics: RobotKinematics) -> _Check:
 
 def _target(loop: LeggedLoop) -> _Check:
     """Checks that a thrown ball can hit the base."""
-    if not isinstance(loop, HasBall):
+    if not hasattr(loop, "throw_ball"):
         return
     plant, robot = loop.plant, loop.robot
     base = plant.GetBodyByName(robot.base, loop.robot_instance)

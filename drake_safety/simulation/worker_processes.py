@@ -71,23 +71,15 @@ def map_items(
     """Calls a function of each item in worker processes; yields results as batches finish.
 
     Within ``joblib.parallel_config`` of another backend than loky, or :func:`cluster.connected`,
-    that backend's workers are used.
-
-    Every call has one BLAS thread, so that results do not depend on the number of workers. On
-    Ctrl-C or any error the workers end; when this process is killed they end within a second or
-    two.
+    that backend's workers are used. Every call has one BLAS thread, so that results do not depend
+    on the number of workers. On Ctrl-C or any error the workers end; when this process is killed
+    they end within a second or two.
 
     Args:
         make: If given, the function is called with the worker's diagram and an item.
         num_workers: Number of processes; that of cores by default. 1 runs in this process.
-        progress: Called with the number done and in all, at the start and after each batch; True
-            shows it.
+        progress: Called with the number done and in all; True shows it.
         num_done: Number that had been done before.
-
-    Raises:
-        ChildProcessError: A worker was killed.
-        ValueError: A number of processes is given, but the backend has its own, or a worker has
-            other versions of Python, Drake, NumPy or this package.
     """
     import joblib
     from joblib.externals.loky import get_reusable_executor
