@@ -1,13 +1,11 @@
 """The command line: every command is listed, and what a user did wrong is one line."""
 
 import errno
-import inspect
 import math
 import os
 import re
 import subprocess
 import sys
-from importlib import import_module
 from types import SimpleNamespace
 
 import pytest
@@ -18,8 +16,6 @@ from command_line import call
 from drake_safety.assessments import assessed_scenarios
 from drake_safety.cli import COMMANDS, main, make_app
 from drake_safety.cli.run import parse_pushes
-from drake_safety.cli.training_folder import MODES
-from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.learning.segments import EpisodeError
 from drake_safety.plants.balls import Throw
 from gliding_task import SCENARIO
@@ -69,40 +65,8 @@ def test_a_table_of_scenarios_and_the_version_are_printed(monkeypatch, capsys):
     assert printed.startswith(f"drake-safety {drake_safety.__version__}, drake ")
 
 
-@pytest.mark.parametrize("command", ["run", "play"])
-def test_what_is_shown_runs_by_default_on_the_plant_that_was_learned(command):
-    function = getattr(import_module(f"drake_safety.cli.{command}"), command)
-    assert inspect.signature(function).parameters["variation"].default == "nominal"
-
-
 SCENE = "laikago_balancing"
 MISSING = "error folder 'x' holds no 'sharpened' assessment; it holds []: run `drake-safety train`"
-
-
-@pytest.mark.train
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["train", "nothing", "--out", "x"], "error scenario 'nothing' does not exist"),
-        (["train", SCENE, "--out", "x", "--mode", "both ways"], "error train: mode must be one of"),
-        (["calibrate", SCENE, "--miss-rate", "2"], "error calibration: --miss-rate is 2.0"),
-        (["run", SCENE, "--assessment", "x"], MISSING),
-    ],
-)
-def test_what_a_user_did_wrong_is_one_line_and_no_traceback(
-    monkeypatch, capsys, tmp_path, arguments, message
-):
-    monkeypatch.chdir(tmp_path)
-    assert call(monkeypatch, *arguments) == 2
-    (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith(message)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_unknown_option_is_answered_with_the_usage(monkeypatch, capsys):
-    assert call(monkeypatch, "scenarios", "--colour") == 2
-    printed = capsys.readouterr()
-    assert "Usage: drake-safety scenarios" in printed.out + printed.err
 
 
 @pytest.fixture
@@ -113,31 +77,6 @@ def stopped(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("drake_safety.simulation.rollouts.collect_episodes", stop)
-
-
-@pytest.mark.train
-def test_a_training_that_is_stopped_says_what_continues_it(monkeypatch, capsys, stopped, tmp_path):
-    out = tmp_path / "my run"
-    assert call(monkeypatch, "train", "pendulum", "--out", out, "--mode", "paper") == 130
-    line = f"continue with: drake-safety train pendulum --out '{out}' --mode paper --resume"
-    assert capsys.readouterr().out.splitlines() == ["stopped; finished episodes are kept", line]
-    # The option is not added twice.
-    assert call(monkeypatch, "train", "pendulum", "--out", out, "--resume") == 130
-    assert capsys.readouterr().out.splitlines()[1].endswith(f"--out '{out}' --resume")
-    # What keeps its episodes anyway is continued by the same command.
-    monkeypatch.chdir(tmp_path)
-    assert call(monkeypatch, "calibrate", "laikago_balancing", "--episodes", 7) == 130
-    line = "continue with: drake-safety calibrate laikago_balancing --episodes 7"
-    assert capsys.readouterr().out.splitlines()[-1] == line
-
-
-def test_a_command_that_keeps_nothing_is_not_continued(monkeypatch, capsys):
-    def stop(arguments, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("drake_safety.cli.make_app", lambda called: stop)
-    assert call(monkeypatch, "scenarios") == 130
-    assert capsys.readouterr().out == "stopped; finished episodes are kept\n"
 
 
 def test_a_shell_completes_commands_and_scenarios_without_drake():
@@ -194,18 +133,6 @@ def test_motion_for_one_piece_is_refused_before_anything_is_simulated(
         told = f"error train: --motion {minutes} gives one motion, and the monitor needs one for"
         assert told in capsys.readouterr().out
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.train
-def test_training_is_not_mixed_with_episodes_that_are_there_already(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr("drake_safety.cli.train.completed", lambda path: {0, 1, 2})
-    (tmp_path / "episodes").mkdir()
-    assert call(monkeypatch, "train", "laikago_balancing", "--out", tmp_path) == 2
-    assert "already holds 3 episodes: pass --resume" in capsys.readouterr().out
-
-
-def test_the_mode_trained_first_is_the_default_one():
-    assert MODES[0] == AssessmentParameters().mode
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from drake_safety.evaluation.figure_style import BALL_COLOUR, RECOVERY_COLOUR, UNSAFE_COLOUR
+from drake_safety.evaluation.figure_style import BALL_COLOUR, UNSAFE_COLOUR
 from drake_safety.evaluation.timeline_figure import timeline_figure
 from drake_safety.plants.pushes import Push
 
@@ -27,34 +27,6 @@ def run():
         "margins": margins,
         "constraint_names": ["support_polygon", "height"],
     }
-
-
-def test_the_timeline_joins_each_still_to_its_instant_on_the_curve(run):
-    fig = timeline_figure(**run)
-    fig.draw_without_rendering()
-    stills, gamma = fig.axes[:2], fig.axes[2]
-    lines = [artist for artist in fig.artists if hasattr(artist, "coords2")]
-    assert len(lines) == 2
-    for line, axes, instant, value in zip(lines, stills, (0.5, 1.2), (0.9, 0.2), strict=True):
-        assert line.coords2 is gamma.transData
-        assert line.coords1 is axes.transAxes
-        np.testing.assert_allclose(line.xy2, (instant, gamma.get_ylim()[1]))
-        down = [
-            c.get_segments()[0] for c in gamma.collections if c.get_segments()[0][0, 0] == instant
-        ]
-        np.testing.assert_allclose(down, [[(instant, value), (instant, gamma.get_ylim()[1])]])
-    assert stills[0].get_title(loc="left") == "(a)  0.50 s"
-    assert [axes.images[0].get_array().max() for axes in stills] == [0, 255]
-
-
-def test_the_timeline_marks_throw_threshold_trigger_and_recovery(run):
-    gamma = timeline_figure(**run).axes[2]
-    labels = [text.get_text() for text in gamma.texts]
-    assert {"threshold 0.6", "3.0 kg, 8.0 m/s", "trigger", "recovery"} <= set(labels)
-    marks = [line.get_xydata()[0].tolist() for line in gamma.lines if len(line.get_xydata()) == 1]
-    assert [1.0, 0.6] in marks
-    (span,) = [p for p in gamma.patches if to_hex(p.get_facecolor()) == RECOVERY_COLOUR]
-    assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx((1.0, 1.6))
 
 
 @pytest.mark.parametrize("times_s", [(0.3, 1.9, 1.96)])

@@ -70,11 +70,6 @@ def estimate_failure_rate(
         num_rollouts: Number of them that are simulated.
         path: Folder in which starts and episodes are kept and continued.
         progress: Called with the name of a stage, the number done and the number wanted.
-
-    Raises:
-        ValueError: There is no such metric, or there are fewer rollouts than ten strata, or fewer
-            starts than rollouts.
-        EpisodeError: A system of the loop raised an error, which is its cause.
     """
     if not _NUM_STRATA <= num_rollouts <= num_starts:
         raise ValueError(

@@ -103,11 +103,6 @@ def compare_loops(
         path: Folder in which episodes are kept; those that it holds are not simulated again.
         assessment: Γ of the baseline's scenario, which says whether a change was foreseen.
         each_look: Called with what is known at each look.
-
-    Raises:
-        ValueError: Both are the same, there is no such metric, or the starts, plans or disturbances
-            of a pair differ.
-        EpisodeError: A system of a loop raised an error, which is its cause.
     """
     if not (0.0 < worse_by < 1.0 and 0.0 < alpha < 1.0 and max_pairs > 0):
         got = f"{worse_by}, {alpha} and {max_pairs}"

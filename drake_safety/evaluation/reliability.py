@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -39,8 +38,7 @@ def verdict_shares(
     }
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Reliability:
+class Reliability(NamedTuple):
     """Predicted probabilities against observed frequencies, in bins of equal numbers of rows.
 
     Attributes:

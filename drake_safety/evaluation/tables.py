@@ -92,15 +92,12 @@ class Table:
 
     def better_baselines(self) -> list[str]:
         """Describes each column in which another row is better than "sharpened"."""
-        ours = next((i for i, row in enumerate(self.rows) if row.method == _OURS), None)
-        if ours is None:
-            return []
-        described = []
-        for k, column in enumerate(self.columns):
-            best = self.best(k)
+        methods, described = [row.method for row in self.rows], []
+        for k, column in enumerate(self.columns if _OURS in methods else ()):
+            best, ours = self.best(k), methods.index(_OURS)
             first = min(best, default=ours)
             mine, other = (self.rows[i].estimates[k] for i in (ours, first))
-            if ours in best or mine is None or other is None or first == ours:
+            if not best or ours in best or mine is None or other is None:
                 continue
             is_clear = other.low > mine.high if column.better > 0 else other.high < mine.low
             certainty = "beyond both intervals" if is_clear else "the intervals overlap"
