@@ -65,6 +65,8 @@ _STYLE: dict[Any, Any] = {
 _LABELS = {
     "auc": "AUC",
     "mlp": "MLP",
+    "reachability": "inverse kinematics",
+    "reachability_free": "inverse kinematics, free base",
     "support_margin": "support-polygon margin",
     "capture_point_margin": "capture-point margin",
     "smallest_margin": "smallest margin (true state)",
