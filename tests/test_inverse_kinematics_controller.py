@@ -124,35 +124,3 @@ def test_commands_stay_within_the_joints_limits(name, height):
     lowest, highest = kinematics.position_limits.T
     assert np.all((position >= lowest) & (position <= highest))
     assert np.all(np.abs(rate) <= kinematics.velocity_limits)
-
-
-def test_the_stiffness_is_that_of_the_robots_description_by_default():
-    kinematics = robot_kinematics("laikago")
-    default, given = (
-        Bench(InverseKinematicsController(kinematics, stiffness, period_s=PERIOD_S))
-        for stiffness in (
-            None,
-            [kinematics.robot.gains_of(n).stiffness for n in kinematics.joint_names],
-        )
-    )
-    q = kinematics.standing_positions()
-    for bench in (default, given):
-        bench.fix(plant_state=np.append(q, np.zeros(kinematics.num_velocities)))
-        bench.fix(desired_output=q[4:7])
-        bench.begin()
-    np.testing.assert_array_equal(
-        default.get("desired_joint_state"), given.get("desired_joint_state")
-    )
-
-
-@pytest.mark.parametrize("stiffness", [np.zeros(12), np.ones(3), -np.ones(12)])
-def test_a_stiffness_that_is_not_positive_for_every_joint_is_refused(stiffness):
-    kinematics = robot_kinematics("laikago")
-    with pytest.raises(ValueError, match="stiffness must be 12 positive numbers, in the order of"):
-        InverseKinematicsController(kinematics, stiffness, period_s=PERIOD_S)
-
-
-def test_an_input_that_is_not_finite_is_an_error_not_a_crash():
-    bench = Commanded("laikago", desired=np.array([np.nan, 0.0, 0.4]))
-    with pytest.raises((ValueError, RuntimeError)):
-        bench.simulator.Initialize()

@@ -97,7 +97,7 @@ def test_less_is_said_by_an_argument(assessment, inputs):
         MonitoredSafetyAssessor(assessment, on_alarm="stop")
 
 
-def test_the_margins_are_not_left_out_by_mistake(assessment, inputs):
+def test_a_port_that_is_needed_is_not_left_out_by_mistake(assessment, inputs):
     with pytest.raises(TypeError, match="margins"):
         added(assessment, {name: inputs[name] for name in INPUTS[:3]})
     with pytest.raises(ValueError, match="was fitted with features"):

@@ -6,7 +6,7 @@ from drake_safety.control.kinematics import fit_stance
 from drake_safety.control.recovery_step import RecoveryStepParameters, capture_point, gait_groups
 from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
 from drake_safety.systems.trajectory_planner import to_world
-from legged_robots import ROBOT_NAMES, robot_kinematics
+from legged_robots import robot_kinematics
 from system_doubles import Bench
 
 PERIOD_S = 0.01
@@ -52,16 +52,17 @@ class Stepping(Bench):
         return gait_groups(np.array([contacts[rows].mean(axis=0) for rows in slices]))
 
 
-@pytest.mark.parametrize("name", ROBOT_NAMES)
+@pytest.mark.parametrize("name", ["laikago", "hexapod"])
 def test_at_rest_the_feet_stay_where_they_were_seen_first(name):
     bench = Stepping(name, stance_pose=(1.0, 2.0, 0.5), active=0.0)
     bench.advance(0.3)
     np.testing.assert_allclose(bench.feet_now(), bench.feet, atol=1e-12)
     np.testing.assert_allclose(bench.get("stance_pose"), [1.0, 2.0, 0.5], atol=1e-12)
+    assert bench.get("desired_yaw")[0] == bench.get("stance_pose")[2]
     assert bench.get("recovery_done")[0] == 0
 
 
-@pytest.mark.parametrize("name", ROBOT_NAMES)
+@pytest.mark.parametrize("name", ["laikago", "hexapod"])
 def test_one_group_swings_at_a_time_and_the_groups_alternate(name):
     bench = Stepping(name, speed=(0.5, 0.0), min_steps=4)
     swung = []
@@ -73,15 +74,6 @@ def test_one_group_swings_at_a_time_and_the_groups_alternate(name):
     assert swung[0] == swung[2]
     assert swung[1] == swung[3]
     assert sorted(swung[0] + swung[1]) == list(range(len(bench.kinematics.foot_names)))
-
-
-def test_a_swing_rises_by_its_lift():
-    bench = Stepping(speed=(0.5, 0.0))
-    heights = []
-    for _ in range(round(bench.parameters.step_duration_s / PERIOD_S)):
-        bench.advance(PERIOD_S)
-        heights.append((bench.feet_now()[:, 2] - bench.kinematics.foot_radii).max())
-    assert max(heights) == pytest.approx(bench.parameters.lift_m, rel=0.1)
 
 
 @pytest.mark.parametrize("speed", [(0.6, 0.0), (0.0, 0.6), (-0.4, 0.4)])
@@ -113,27 +105,18 @@ def test_the_preview_is_the_set_point_held_in_the_stance_frame():
     np.testing.assert_allclose(world, bench.get("desired_output"), atol=1e-9)
 
 
-def test_at_rest_the_base_is_told_the_yaw_of_its_stance():
-    bench = Stepping(stance_pose=(1.0, 2.0, 0.5), active=0.0)
-    bench.see(bench.base, turned=0.2)
-    bench.advance(0.1)
-    assert bench.get("desired_yaw")[0] == bench.get("stance_pose")[2]
-    assert bench.get("stance_pose")[2] == pytest.approx(0.5, abs=1e-12)
-
-
-@pytest.mark.parametrize("heading", [0.0, 0.5, 3.1, -3.1])
-@pytest.mark.parametrize("turned", [0.1, -0.2])
+@pytest.mark.parametrize(("heading", "turned"), [(0.5, 0.1), (3.1, 0.1), (-3.1, -0.2)])
 def test_a_base_that_has_turned_is_told_the_heading_in_which_the_recovery_began(heading, turned):
     bench = Stepping(stance_pose=(0.0, 0.0, heading), speed=(1.0, 0.0), max_twist_rad=0.3)
     for _ in range(3):  # Footholds turn with the base; the heading does not.
         bench.see(bench.base, turned=turned)
         bench.advance(bench.parameters.step_duration_s)
-        told = np.remainder(bench.get("desired_yaw")[0] - heading + np.pi, 2 * np.pi) - np.pi
-        assert told == pytest.approx(0.0, abs=1e-9)
+        error = np.remainder(bench.get("desired_yaw")[0] - heading + np.pi, 2 * np.pi) - np.pi
+        assert error == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("damping_s", "twist", "turned", "rate", "told"),
+    ("damping_s", "twist", "turned", "rate", "yaw"),
     [
         (0.1, 0.3, 0.0, 1.0, -0.1),  # Against the turning.
         (0.1, 0.3, 0.0, -0.5, 0.05),
@@ -141,20 +124,12 @@ def test_a_base_that_has_turned_is_told_the_heading_in_which_the_recovery_began(
         (None, 0.0, 0.5, 3.0, 0.0),  # A blow has not turned the feet.
     ],
 )
-def test_a_turning_base_is_told_a_yaw_against_it(damping_s, twist, turned, rate, told):
+def test_a_turning_base_is_told_a_yaw_against_it(damping_s, twist, turned, rate, yaw):
     options = {} if damping_s is None else {"yaw_damping_s": damping_s}
     bench = Stepping(speed=(1.0, 0.0), max_twist_rad=twist, **options)
     bench.see(bench.base, turned=turned, yaw_rate=rate)
     bench.advance(2 * PERIOD_S)
-    assert bench.get("desired_yaw")[0] == pytest.approx(told, abs=1e-9 if twist else 0.1)
-
-
-def test_a_robot_that_holds_no_heading_stops_wherever_it_has_turned_to():
-    bench = Stepping(max_twist_rad=0.0)
-    bench.see(bench.base, turned=1.5)
-    settled(bench)
-    assert bench.get("recovery_done")[0] == 1
-    assert bench.get("stance_pose")[2] == pytest.approx(1.5, abs=0.05)
+    assert bench.get("desired_yaw")[0] == pytest.approx(yaw, abs=1e-9 if twist else 0.1)
 
 
 def test_a_robot_far_from_its_heading_steps_on():
@@ -190,53 +165,13 @@ def test_the_base_comes_to_rest_over_its_capture_point_before_it_returns():
     np.testing.assert_allclose(bench.get("desired_output")[:2], point, atol=2e-3)
 
 
-def test_a_fast_robot_goes_on_stepping_until_its_last_step():
-    bench = Stepping(speed=(1.0, 0.0), max_steps=6)
-    bench.advance(5.5 * bench.parameters.step_duration_s)
-    assert bench.lifted()
-    bench.advance(1.0 * bench.parameters.step_duration_s)
-    assert not bench.lifted()
-
-
-@pytest.mark.parametrize("name", ROBOT_NAMES)
-def test_a_robot_at_rest_settles_after_the_fewest_steps_and_hands_over(name):
-    bench = Stepping(name, min_steps=2, settle_margin_m=0.01, resume_margin_m=0.0)
-    bench.advance(2 * bench.parameters.step_duration_s + 2 * PERIOD_S)
-    assert not bench.lifted()
-    assert bench.get("recovery_done")[0] == 0
-    bench.advance(bench.parameters.return_duration_s + 3 * PERIOD_S)
-    assert bench.get("recovery_done")[0] == 1
-
-
 def settled(bench):
     steps = 20 * bench.parameters.step_duration_s
     bench.advance(steps + bench.parameters.return_duration_s + 0.2)
     return bench
 
 
-def test_the_return_ends_at_the_nominal_set_point():
-    bench = Stepping(stance_pose=(1.0, 1.0, -0.7))
-    goal = bench.base + [0.03, 0.02, 0.01]
-    bench.fix(nominal_desired_output=goal)
-    settled(bench)
-    np.testing.assert_allclose(bench.get("desired_output"), goal, atol=1e-9)
-
-
-def test_the_base_set_point_never_jumps_during_the_return():
-    bench = Stepping()
-    bench.fix(nominal_desired_output=bench.base + [0.05, 0.0, 0.0])
-    previous, largest = bench.base, 0.0
-    for _ in range(100):
-        bench.advance(PERIOD_S)
-        if bench.context.get_time() > 3 * PERIOD_S:
-            largest = max(largest, np.abs(bench.get("desired_output") - previous).max())
-        previous = bench.get("desired_output")
-    # A minimum-jerk motion's top speed is 15/8 of its mean.
-    bound = 15 / 8 * 0.05 / bench.parameters.return_duration_s * PERIOD_S
-    assert largest <= 1.05 * bound
-
-
-@pytest.mark.parametrize("name", ROBOT_NAMES)
+@pytest.mark.parametrize("name", ["laikago", "hexapod"])
 def test_the_stance_pose_becomes_that_of_the_new_footholds(name):
     bench = Stepping(
         name, stance_pose=(0.5, 0.0, 0.3), min_steps=2, settle_margin_m=0.01, resume_margin_m=0.0
@@ -250,11 +185,6 @@ def test_the_stance_pose_becomes_that_of_the_new_footholds(name):
     np.testing.assert_allclose(stance, fitted, atol=1e-9)
 
 
-def test_feet_stand_on_the_ground_after_recovery():
-    bench = settled(Stepping(speed=(0.1, 0.0)))
-    np.testing.assert_allclose(bench.feet_now()[:, 2], bench.kinematics.foot_radii, atol=1e-9)
-
-
 def test_done_lasts_until_the_trigger_lets_go_and_then_it_can_step_again():
     bench = settled(Stepping())
     assert bench.get("recovery_done")[0] == 1
@@ -265,6 +195,23 @@ def test_done_lasts_until_the_trigger_lets_go_and_then_it_can_step_again():
     bench.fix(recovery_active=1.0)
     bench.advance(0.5 * bench.parameters.step_duration_s)
     assert bench.lifted()
+
+
+def test_the_base_returns_to_the_nominal_set_point_without_a_jump_and_the_feet_stand():
+    bench = Stepping()
+    goal = bench.base + [0.05, 0.0, 0.0]
+    bench.fix(nominal_desired_output=goal)
+    previous, largest = bench.base, 0.0
+    for _ in range(100):
+        bench.advance(PERIOD_S)
+        if bench.context.get_time() > 3 * PERIOD_S:
+            largest = max(largest, np.abs(bench.get("desired_output") - previous).max())
+        previous = bench.get("desired_output")
+    # A minimum-jerk motion's top speed is 15/8 of its mean.
+    bound = 15 / 8 * 0.05 / bench.parameters.return_duration_s * PERIOD_S
+    assert largest <= 1.05 * bound
+    np.testing.assert_allclose(settled(bench).get("desired_output"), goal, atol=1e-9)
+    np.testing.assert_allclose(bench.feet_now()[:, 2], bench.kinematics.foot_radii, atol=1e-9)
 
 
 def test_setting_the_stance_puts_it_to_rest():

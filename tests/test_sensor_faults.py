@@ -54,16 +54,8 @@ def true(time_s):
 def test_without_faults_and_before_their_start_the_bits_pass(faults):
     bench = Bench(*faults)
     for time_s in (0.0, 0.05, 0.1, 1.0, 1.03, 7.9):
-        seen, passed = bench.at(time_s)
-        assert passed.tobytes() == seen.tobytes()
-
-
-def test_without_faults_nothing_is_updated():
-    bench = Bench()
-    assert bench.system.HasAnyDirectFeedthrough()
-    bench.at(1.0)
-    assert bench.simulator.get_num_discrete_updates() == 0
-    assert bench.own.num_discrete_state_groups() == 0
+        sent, passed = bench.at(time_s)
+        assert passed.tobytes() == sent.tobytes()
 
 
 @pytest.mark.parametrize(
@@ -72,14 +64,12 @@ def test_without_faults_nothing_is_updated():
         (Fault(kind="bias", value=0.5), true(1.25) + 0.5),
         (Fault(kind="drift", value=0.5, start_s=1.0), true(1.25) + 0.125),
         (Fault(kind="zero"), np.zeros(3)),
-        (Fault(kind="scale", value=0.5), 0.5 * true(1.25)),
         (Fault(kind="scale", value=2.0, entries=["slow"]), true(1.25) * [2.0, 1.0, 1.0]),
         (Fault(kind="swap", entries=["slow", "fast_2"]), true(1.25)[[2, 1, 0]]),
         # Samples at multiples of 0.1 s; a reader between two finds the earlier one.
         (Fault(kind="delay", value=0.3), true(1.0)),
         (Fault(kind="half_rate"), true(1.2)),
         (Fault(kind="freeze", start_s=0.85), true(0.8)),
-        (Fault(kind="freeze"), true(0.0)),
     ],
 )
 def test_each_fault_by_hand(fault, expected):
@@ -102,7 +92,11 @@ def test_at_the_samples_a_fault_shows_an_input_of_exact_age(fault, ages):
         np.testing.assert_allclose(bench.at(k * PERIOD_S)[1], true((k - age) * PERIOD_S))
 
 
-def test_a_delay_between_two_samples_is_refused():
+def test_a_delay_between_two_samples_and_an_entry_that_is_not_there_are_refused():
+    with pytest.raises(ValueError, match="no entry 'slov'; they are"):
+        Bench(Fault(kind="zero", entries=["slov"]))
+    with pytest.raises(ValueError, match="a swap is of two entries"):
+        Bench(Fault(kind="swap", entries=["slow"]))
     delay = Fault(kind="delay", value=0.004)
     with pytest.raises(ValueError, match=r"multiple of the period 0\.01 s"):
         Bench(delay, period_s=0.01)
@@ -132,18 +126,6 @@ def test_noise_is_normal_is_held_for_a_period_and_follows_from_the_seed():
     np.testing.assert_allclose(np.ptp(held, axis=1), 0.0, atol=1e-12)
     assert np.std(held[:, 0]) == pytest.approx(0.5, rel=0.2)
     assert np.mean(held[:, 0]) == pytest.approx(0.0, abs=0.15)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Bench(Fault(kind="zero", entries=["slov"])), r"no entry 'slov'"),
-        (lambda: Bench(Fault(kind="swap", entries=["slow"])), "a swap is of two entries"),
-    ],
-)
-def test_a_fault_of_entries_that_cannot_be_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
 
 
 def test_the_example_of_the_documentation_runs():

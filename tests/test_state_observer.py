@@ -50,9 +50,9 @@ def test_every_output_sees_the_same_noise():
     assert np.all(values["output"] != x[4:7])
 
 
-@pytest.mark.parametrize(("name", "hand"), [("porter", "left"), ("porter", "right")])
-def test_with_a_hand_the_output_is_where_the_measured_hand_is(name, hand):
-    kinematics = robot_kinematics(name)
+@pytest.mark.parametrize("hand", ["left", "right"])
+def test_with_a_hand_the_output_is_where_the_measured_hand_is(hand):
+    kinematics = robot_kinematics("porter")
     frame = kinematics.robot.reaching_frame(hand)
     x, n_q = plant_state(kinematics), kinematics.num_positions
     draws = np.random.default_rng(0).normal(size=2 * kinematics.num_velocities)
@@ -82,9 +82,8 @@ def test_a_mirror_reflects_the_state_and_nothing_else():
     assert np.abs(mirrored["state"] - plain["state"]).max() > 0.1
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("entry", [0, 4, 10, -1])
-def test_of_a_plant_state_that_is_not_finite_a_hand_is_nowhere(value, entry):
+@pytest.mark.parametrize(("entry", "value"), [(0, np.nan), (10, np.inf)])
+def test_a_plant_state_that_is_not_finite_has_no_hand(entry, value):
     kinematics = robot_kinematics("porter")
     x = plant_state(kinematics)
     x[entry] = value

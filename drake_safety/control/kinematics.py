@@ -37,13 +37,13 @@ _LEAST_QUATERNION = 1e-3  # Norm of a quaternion that is an orientation.
 
 def is_state(q: np.ndarray, *others: np.ndarray) -> bool:
     """Whether all entries are finite, and the base has an orientation: a dead sensor has none."""
-    size = math.hypot(*(one for part in (q, *others) for one in part.ravel().tolist()))
+    size = math.hypot(*(x for part in (q, *others) for x in part.ravel().tolist()))
     return size * size < math.inf and math.hypot(*q[:4].tolist()) > _LEAST_QUATERNION
 
 
 @dataclass(eq=False)
 class _Instant:
-    """A scratch Context, and the contact points of the positions they were last computed for."""
+    """A scratch Context, with the positions of which contact points were last computed."""
 
     context: Context
     positions: bytes = b""
@@ -71,9 +71,7 @@ class RobotKinematics:
         ):
             raise ValueError(
                 f"robot '{robot.name}': base '{robot.base}' must be the floating body and every "
-                f"joint must have one degree of freedom; the plant has "
-                f"{self.plant.num_positions()} positions and "
-                f"{self.plant.num_velocities()} velocities"
+                f"joint must have one degree of freedom"
             )
         model = self.plant.CreateDefaultContext()
         if variation is not None:
@@ -81,7 +79,7 @@ class RobotKinematics:
         self._scratch = Scratch(lambda: _Instant(model.Clone()))
         self.num_positions = self.plant.num_positions()
         self.num_velocities = self.plant.num_velocities()
-        self.num_states = self.num_positions + self.num_velocities
+        self.num_states = self.plant.num_multibody_states()
         self.num_joints = self.num_velocities - NUM_BASE_VELOCITIES
         instance = self.plant.GetModelInstanceByName(robot.name)
         self.joint_names = servo_joints(self.plant, robot)
@@ -109,8 +107,7 @@ class RobotKinematics:
         self.total_mass = self.plant.CalcTotalMass(self.context)
         q = self.positions_at(RigidTransform(), self.posture)
         p_WC = self.contact_positions(q)
-        lowest = np.min(p_WC[:, 2] - self.foot_radii)
-        self.standing_height = -float(lowest)
+        self.standing_height = -float(np.min(p_WC[:, 2] - self.foot_radii))
         """Height of the base in the standing posture [m]."""
         centroid = p_WC.mean(axis=0)
         self.nominal_contacts = p_WC[:, :2] - centroid[:2]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
-from pydrake.multibody.tree import PrismaticJoint, RevoluteJoint
+from pydrake.multibody.tree import Joint, PrismaticJoint, RevoluteJoint
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, RobotKinematics
 
@@ -25,60 +25,54 @@ class Mirror:
     def __init__(self, kinematics: RobotKinematics):
         self._kinematics = kinematics
         names = kinematics.joint_names
-        partners = kinematics.robot.mirror_partners(names)
-        self.joint_order = np.array([names.index(partners[name]) for name in names], dtype=int)
-        """Partner of every joint: mirrored joint i has the value of joint ``joint_order[i]``,"""
-        self.joint_signs = self._signs()
-        """times this, (n_j,)."""
-        n_j, order = kinematics.num_joints, self.joint_order
-        base = np.concatenate([_POLAR, _AXIAL, _AXIAL, _POLAR])
-        self._state_order = np.concatenate([np.arange(12), 12 + order, 12 + n_j + order])
-        self._state_signs = np.concatenate([base, self.joint_signs, self.joint_signs])
+        self._partners = kinematics.robot.mirror_partners(names)
+        order = np.array([names.index(self._partners[name]) for name in names], dtype=int)
+        # Mirrored joint i has the value of joint `order[i]`, times its sign.
+        signs = self._signs(order)
+        self._joint_order, self._joint_signs = order, signs
+        self._state_order = np.concatenate([np.arange(12), 12 + order, 12 + len(order) + order])
+        self._state_signs = np.concatenate([_POLAR, _AXIAL, _AXIAL, _POLAR, signs, signs])
 
-    def _signs(self) -> np.ndarray:
-        kinematics = self._kinematics
-        plant = kinematics.plant
-        kinematics.set_positions(
-            np.concatenate([[1.0, 0.0, 0.0, 0.0], np.zeros(3 + kinematics.num_joints)])
-        )
+    def _signs(self, order: np.ndarray) -> np.ndarray:
+        kinematics, plant = self._kinematics, self._kinematics.plant
+        q = np.zeros(kinematics.num_positions)
+        q[0] = 1.0
+        kinematics.set_positions(q)
         instance = plant.GetModelInstanceByName(kinematics.robot.name)
-        axes = []
-        for name in kinematics.joint_names:
-            joint = plant.GetJointByName(name, instance)
-            X_WJ = joint.frame_on_parent().CalcPoseInWorld(kinematics.context)
-            if isinstance(joint, RevoluteJoint):
-                axes.append((X_WJ.rotation() @ joint.revolute_axis(), X_WJ.translation(), True))
-            elif isinstance(joint, PrismaticJoint):
-                axes.append((X_WJ.rotation() @ joint.translation_axis(), X_WJ.translation(), False))
-            else:
-                raise ValueError(
-                    f"robot '{kinematics.robot.name}': joint '{name}' must be revolute or "
-                    f"prismatic; it is {joint.type_name()}"
-                )
-        signs = np.zeros(kinematics.num_joints)
-        for i, (axis, point, turns) in enumerate(axes):
-            partner = self.joint_order[i]
-            partner_axis, partner_point, partner_turns = axes[partner]
-            signs[i] = np.sign((_AXIAL if turns else _POLAR) * axis @ partner_axis)
-            reflected = signs[i] * (_AXIAL if turns else _POLAR) * axis
-            apart = np.cross(_POLAR * point - partner_point, partner_axis) if turns else 0.0
-            if (
-                turns != partner_turns
-                or np.linalg.norm(reflected - partner_axis) > _SAME_AXIS
-                or np.linalg.norm(apart) > _SAME_AXIS
-            ):
-                names = kinematics.joint_names
+        names = kinematics.joint_names
+        axes = [self._axis(plant.GetJointByName(name, instance)) for name in names]
+        signs = np.zeros(len(names))
+        for i, (axis, point, is_revolute) in enumerate(axes):
+            partner_axis, partner_point, is_partner_revolute = axes[order[i]]
+            reflection = _AXIAL if is_revolute else _POLAR
+            signs[i] = np.sign(reflection * axis @ partner_axis)
+            apart = signs[i] * reflection * axis - partner_axis
+            if is_revolute:
+                apart = np.append(apart, np.cross(_POLAR * point - partner_point, partner_axis))
+            if is_revolute != is_partner_revolute or np.abs(apart).max() > _SAME_AXIS:
                 raise ValueError(
                     f"robot '{kinematics.robot.name}': mirror pairs joint '{names[i]}' with "
-                    f"'{names[partner]}', which is not its reflection: axis {axis} through "
+                    f"'{names[order[i]]}', which is not its reflection: axis {axis} through "
                     f"{point} against {partner_axis} through {partner_point}; its patterns are "
                     f"{kinematics.robot.mirror}"
                 )
         return signs
 
+    def _axis(self, joint: Joint) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Direction, a point, and whether the joint turns about it, in the world."""
+        X_WJ = joint.frame_on_parent().CalcPoseInWorld(self._kinematics.context)
+        if isinstance(joint, RevoluteJoint):
+            return X_WJ.rotation() @ joint.revolute_axis(), X_WJ.translation(), True
+        if isinstance(joint, PrismaticJoint):
+            return X_WJ.rotation() @ joint.translation_axis(), X_WJ.translation(), False
+        raise ValueError(
+            f"robot '{self._kinematics.robot.name}': joint '{joint.name()}' must be revolute or "
+            f"prismatic; it is {joint.type_name()}"
+        )
+
     def joints(self, values: np.ndarray) -> np.ndarray:
         """Reflects joint positions, rates or torques, (..., n_j)."""
-        return self.joint_signs * values[..., self.joint_order]
+        return self._joint_signs * values[..., self._joint_order]
 
     def points(self, p: np.ndarray) -> np.ndarray:
         """Reflects positions or velocities in the stance frame, (..., 3): y becomes -y."""
@@ -92,44 +86,31 @@ class Mirror:
         self, q: np.ndarray, v: np.ndarray, stance_pose: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Reflects (q, v) in the x-z plane of a stance ``[x, y, yaw]``, by default of ``q``."""
-        kinematics = self._kinematics
         if stance_pose is None:
-            stance_pose = kinematics.stance_pose(q)
+            stance_pose = self._kinematics.stance_pose(q)
         x, y, yaw = stance_pose
-        R_WS = RotationMatrix.MakeZRotation(yaw)
-        across = (R_WS.matrix() * _POLAR) @ R_WS.matrix().T  # Reflection in the world.
+        R_WS = RotationMatrix.MakeZRotation(yaw).matrix()
+        across = (R_WS * _POLAR) @ R_WS.T  # Reflection in the world.
         origin = np.array([x, y, 0.0])
-        half = 0.5 * yaw
         # The base's orientation is reflected in the stance frame.
-        turn = Quaternion([np.cos(half), 0.0, 0.0, np.sin(half)])
+        turn = Quaternion([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw)])
         w, a, b, c = turn.inverse().multiply(Quaternion(q[:4] / np.linalg.norm(q[:4]))).wxyz()
         quaternion = turn.multiply(Quaternion([w, -a, b, -c])).wxyz()
-        mirrored_q = np.concatenate(
-            [
-                quaternion,
-                origin + across @ (q[4:NUM_BASE_POSITIONS] - origin),
-                self.joints(q[NUM_BASE_POSITIONS:]),
-            ]
-        )
-        mirrored_v = np.concatenate(
-            [
-                -across @ v[:3],
-                across @ v[3:NUM_BASE_VELOCITIES],
-                self.joints(v[NUM_BASE_VELOCITIES:]),
-            ]
-        )
-        return mirrored_q, mirrored_v
+        position = origin + across @ (q[4:NUM_BASE_POSITIONS] - origin)
+        mirrored_q = [quaternion, position, self.joints(q[NUM_BASE_POSITIONS:])]
+        velocity = across @ v[3:NUM_BASE_VELOCITIES]
+        mirrored_v = [-across @ v[:3], velocity, self.joints(v[NUM_BASE_VELOCITIES:])]
+        return np.concatenate(mirrored_q), np.concatenate(mirrored_v)
 
     def hand(self, name: str) -> str:
         """Returns the name of the mirrored reaching frame."""
-        robot, names = self._kinematics.robot, self._kinematics.joint_names
-        partners = robot.mirror_partners(names)
-        wanted = {partners[joint] for joint in robot.reaching_frame(name).joints}
-        for other, frame in robot.reaching_frames.items():
-            if set(frame.joints) == wanted:
+        robot = self._kinematics.robot
+        arms = {other: set(frame.joints) for other, frame in robot.reaching_frames.items()}
+        wanted = {self._partners[joint] for joint in robot.reaching_frame(name).joints}
+        for other, joints in arms.items():
+            if joints == wanted:
                 return other
-        arms = {other: frame.joints for other, frame in robot.reaching_frames.items()}
         raise ValueError(
             f"robot '{robot.name}': no reaching frame has the joints {sorted(wanted)} opposite "
-            f"hand '{name}'; there are {arms}"
+            f"hand '{name}'; there are {list(arms)}"
         )

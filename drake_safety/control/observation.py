@@ -30,11 +30,13 @@ def rotation_vector(R: RotationMatrix) -> np.ndarray:
 
 def state_names(kinematics: RobotKinematics) -> list[str]:
     """Returns the names of the entries of :func:`stance_state`."""
-    names = [f"base_{axis}" for axis in "xyz"] + [f"rotation_{axis}" for axis in "xyz"]
-    names += [f"angular_velocity_{axis}" for axis in "xyz"]
-    names += [f"velocity_{axis}" for axis in "xyz"]
-    names += list(kinematics.joint_names)
-    return names + [f"{name}_rate" for name in kinematics.joint_names]
+    base = [f"{quantity}_{axis}" for quantity in ("base", "rotation") for axis in "xyz"]
+    return base + _rate_and_joint_names(kinematics)
+
+
+def _rate_and_joint_names(kinematics: RobotKinematics) -> list[str]:
+    names = [f"{rate}_{axis}" for rate in ("angular_velocity", "velocity") for axis in "xyz"]
+    return names + kinematics.joint_names + [f"{name}_rate" for name in kinematics.joint_names]
 
 
 def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -63,11 +65,8 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
 
 def walking_state_names(kinematics: RobotKinematics) -> list[str]:
     """Returns the names of the entries of :func:`walking_state`."""
-    names = ["base_height", "gravity_x", "gravity_y", "gravity_z"]
-    names += [f"angular_velocity_{axis}" for axis in "xyz"]
-    names += [f"velocity_{axis}" for axis in "xyz"]
-    names += list(kinematics.joint_names)
-    return names + [f"{name}_rate" for name in kinematics.joint_names]
+    base = ["base_height", "gravity_x", "gravity_y", "gravity_z"]
+    return base + _rate_and_joint_names(kinematics)
 
 
 def walking_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -44,15 +44,11 @@ class RecoveryStepParameters:
     """Duration of the base's return over its feet before balancing resumes [s]."""
 
     def __post_init__(self) -> None:
-        if not self.resume_margin_m <= self.settle_margin_m:
-            raise ValueError(
-                f"resume_margin_m must not exceed settle_margin_m; got "
-                f"{self.resume_margin_m}, {self.settle_margin_m}"
-            )
-        if not self.min_steps <= self.max_steps:
-            raise ValueError(
-                f"min_steps must not exceed max_steps; got {self.min_steps}, {self.max_steps}"
-            )
+        for low, high in (("resume_margin_m", "settle_margin_m"), ("min_steps", "max_steps")):
+            if not getattr(self, low) <= getattr(self, high):
+                raise ValueError(
+                    f"{low} must not exceed {high}; got {getattr(self, low)}, {getattr(self, high)}"
+                )
 
 
 def gait_groups(foot_positions: np.ndarray) -> list[list[int]]:
@@ -84,19 +80,17 @@ def minimum_jerk(s: float) -> float:
     return s**3 * (10 - 15 * s + 6 * s**2)
 
 
-def distance_to_feet(point: np.ndarray, feet: np.ndarray) -> float:
-    """Returns the distance of a point to the segment between the first and the last foot [m]."""
-    a, b = feet[0], feet[-1]
-    edge = b - a
-    length_squared = edge @ edge
-    s = 0.0 if length_squared == 0 else np.clip((point - a) @ edge / length_squared, 0.0, 1.0)
-    return float(np.linalg.norm(point - a - s * edge))
-
-
 def first_group(groups: list[list[int]], feet: np.ndarray, point: np.ndarray) -> int:
     """The group whose swing leaves the other's stance line nearest the capture point (2,) [m]."""
-    distances = [distance_to_feet(point, feet[groups[1 - swing]]) for swing in (0, 1)]
-    return int(np.argmin(distances))
+
+    def distance_to_line(foot: int, other: int) -> float:
+        a, edge = feet[foot], feet[other] - feet[foot]
+        length_squared = edge @ edge
+        s = 0.0 if length_squared == 0 else np.clip((point - a) @ edge / length_squared, 0.0, 1.0)
+        return float(np.linalg.norm(point - a - s * edge))
+
+    # While one group swings, the other stands.
+    return int(np.argmin([distance_to_line(group[0], group[-1]) for group in groups[::-1]]))
 
 
 def foothold(
@@ -116,8 +110,6 @@ def foothold(
     cross.
 
     Args:
-        p_WB: Base position (3,) [m].
-        v_WB: Base velocity (3,) [m/s].
         yaw: Yaw of the heading frame [rad].
         hip_offset: The foot's position in the standing posture, in the heading frame, (2,) [m].
         remaining_s: Time to touchdown [s].
@@ -138,15 +130,13 @@ def foothold(
     return p_WB[:2] + v_WB[:2] * remaining_s + R_WS @ place
 
 
-def swing_position(
-    start: np.ndarray, target: np.ndarray, phase: float, lift_m: float
-) -> np.ndarray:
+def swing_position(start: np.ndarray, goal: np.ndarray, phase: float, lift_m: float) -> np.ndarray:
     """A point of the swing trajectory (3,) [m] at a phase in [0, 1].
 
-    Horizontally it follows a minimum-jerk profile from start to target; vertically it rises over
-    the line between them by ``lift_m`` at mid-swing and reaches the target with zero speed.
+    It follows a minimum-jerk profile from start to goal, and rises over the line between them by
+    ``lift_m`` at mid-swing.
     """
     s = min(max(phase, 0.0), 1.0)
-    point = start + minimum_jerk(s) * (target - start)
+    point = start + minimum_jerk(s) * (goal - start)
     point[2] += lift_m * math.sin(math.pi * s) ** 2
     return point

@@ -166,12 +166,9 @@ class BalanceSafeSet:
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
         """Returns the margins in eight directions, now, at the capture point and at the goal.
 
-        Directional margins are the support function of the polygon relative to a point: positive if
-        the polygon extends beyond the point in that direction. Their number does not depend on the
-        number of feet.
-
-        ``preview`` has the desired base positions from now to the goal, in the stance frame, (M, 3)
-        [m]. All are NaN if an argument is not finite, or the quaternion zero.
+        A directional margin is positive if the support polygon extends beyond the point in that
+        direction. ``preview`` has the desired base positions from now to the goal, in the stance
+        frame, (M, 3) [m]. All are NaN if an argument is not finite, or the quaternion zero.
         """
         if not is_state(q, v, preview):
             return np.full(len(self.feature_names), np.nan)

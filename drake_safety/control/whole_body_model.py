@@ -91,11 +91,7 @@ class StandingFoot:
 
 
 class WholeBodyModel:
-    """Frames, gains and limits of a robot's whole-body program; no reaching without a hand.
-
-    Raises:
-        ValueError: The hand does not exist.
-    """
+    """Frames, gains and limits of a robot's whole-body program; no reaching without a hand."""
 
     def __init__(self, kinematics: RobotKinematics, hand: str | None = None):
         robot, plant = kinematics.robot, kinematics.plant
@@ -132,18 +128,13 @@ class WholeBodyModel:
         self.H = np.diag(diagonal)
         """Part of the cost's matrix from regularisation and posture, (n_v, n_v)."""
         self.base_turns = np.eye(3, self.num_velocities)
-        self.torque_limits = self._torque_limits()
-        self._stances: dict[bytes, Stance] = {}
-
-    def _torque_limits(self) -> np.ndarray:
+        self.torque_limits = np.zeros(self.num_joints)
         """Largest torque of every joint (n_j,) [N·m]; zero for a joint without an actuator."""
-        plant = self.kinematics.plant
-        limits = np.zeros(self.num_joints)
         for index in plant.GetJointActuatorIndices():
             actuator = plant.get_joint_actuator(index)
-            joint = self.kinematics.joint_names.index(actuator.joint().name())
-            limits[joint] = actuator.effort_limit()
-        return limits
+            joint = kinematics.joint_names.index(actuator.joint().name())
+            self.torque_limits[joint] = actuator.effort_limit()
+        self._stances: dict[bytes, Stance] = {}
 
     def stance(self, is_stance: np.ndarray) -> Stance:
         """Returns the constant part of programs with these stance feet."""
@@ -188,23 +179,19 @@ class WholeBodyModel:
                 raise ValueError(f"{who} must have {name} for {entries}; got {size} entries")
         if self.hand is not None and reference.reaching is None:
             raise ValueError(f"{who} must have reaching for the hand; got none")
-        for point in (reference.center_of_mass, reference.reaching or reference.center_of_mass):
-            values = np.concatenate([point.position, point.rate, point.acceleration])
-            if values.shape != (9,) or not np.isfinite(values).all():
-                raise ValueError(f"{who}'s points must be three finite numbers each; got {point}")
-        if not np.isfinite(reference.posture).all():
-            raise ValueError(f"{who}'s posture must be finite; got {reference.posture}")
+        vectors = [reference.posture]
+        for point in filter(None, (reference.center_of_mass, reference.reaching)):
+            vectors += [point.position, point.rate, point.acceleration]
+        is_sized = all(np.shape(vector) == (3,) for vector in vectors[1:])
+        if not is_sized or not np.isfinite(np.concatenate(vectors)).all():
+            raise ValueError(f"{who} must have finite numbers, three for a point; got {reference}")
 
     def reaching_position(self, q: np.ndarray) -> np.ndarray:
         """Returns the reaching point in the world, (3,) [m]."""
-        kinematics = self.kinematics
         if self.hand is None:
-            raise ValueError(
-                f"robot '{kinematics.robot.name}': the model has no hand, expected one of "
-                f"{list(kinematics.robot.reaching_frames)}"
-            )
-        kinematics.set_positions(q)
-        return self.hand.present_position(kinematics)
+            raise ValueError(f"robot '{self.kinematics.robot.name}': the model has no hand")
+        self.kinematics.set_positions(q)
+        return self.hand.present_position(self.kinematics)
 
 
 class Stance:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import daqp
 import numpy as np
-from pydrake.math import RotationMatrix
 from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
@@ -81,9 +80,8 @@ def build_qp(
     model: WholeBodyModel, q: np.ndarray, v: np.ndarray, reference: WholeBodyReference
 ) -> WholeBodyQP:
     """Builds the quadratic program at one instant, or raises a `NotFiniteError`."""
-    _check_size(model, "the state", q.dot(q) + v.dot(v))
     # Drake's plant aborts the process for a zero quaternion, as for a state that is not finite.
-    _check_size(model, "the inverse of the quaternion", 1.0 / max(q[:4].dot(q[:4]), _TINY))
+    _check_size(q.dot(q) + v.dot(v), 1.0 / max(q[:4].dot(q[:4]), _TINY))
     plant, context = model.kinematics.plant, model.kinematics.context
     plant.SetPositionsAndVelocities(context, np.concatenate([q, v]))
     M = plant.CalcMassMatrix(context)
@@ -110,7 +108,7 @@ def build_qp(
             rate[rows], feedforward[rows] = point.rate, point.acceleration
     wanted = feedforward - Jdot_v
     wanted += model.stiffness * error + model.damping * (rate - J @ v)
-    _check_size(model, "the set points' acceleration", wanted.dot(wanted))
+    _check_size(wanted.dot(wanted))
     weighted = model.task_weights * J
     posture = model.parameters.posture
     g = -(wanted @ weighted)
@@ -138,12 +136,9 @@ def build_qp(
     )
 
 
-def _check_size(model: WholeBodyModel, what: str, squared: float) -> None:
-    if not squared < _BOUNDLESS:
-        raise NotFiniteError(
-            f"robot '{model.kinematics.robot.name}': state and set points must be finite; got "
-            f"{squared} for the square of {what}"
-        )
+def _check_size(*squared_norms: float) -> None:
+    if not all(squared < _BOUNDLESS for squared in squared_norms):
+        raise NotFiniteError("state and set points must be finite, with an orientation")
 
 
 def _add_contacts(
@@ -212,7 +207,9 @@ def _set_body_rows(
         else:
             frame = body.body_frame()
             J[rows] = plant.CalcJacobianAngularVelocity(context, kv, frame, world, world)
-        error[rows] = _turn_to(R_WBd, body.EvalPoseInWorld(context).rotation())
+        R_WB = body.EvalPoseInWorld(context).rotation()
+        # R_WBd R_WBᵀ. Drake's product of rotations is wrapped in Python, and twice as slow.
+        error[rows] = rotation_vector(R_WBd.inverse().InvertAndCompose(R_WB.inverse()))
     if model.hand is not None and reference.reaching is not None:
         frame, p = model.hand.frame, model.hand.point
         J[_LAST] = plant.CalcJacobianTranslationalVelocity(context, kv, frame, p, world, world)
@@ -233,12 +230,6 @@ def _set_body_biases(model: WholeBodyModel, Jdot_v: np.ndarray) -> None:
         frame, p = model.hand.frame, model.hand.point
         acceleration = plant.CalcBiasTranslationalAcceleration(context, kv, frame, p, world, world)
         Jdot_v[_LAST] = acceleration[:, 0]
-
-
-def _turn_to(R_WBd: RotationMatrix, R_WB: RotationMatrix) -> np.ndarray:
-    """Rotation vector from an orientation to the wanted one, in the world (3,) [rad]."""
-    # R_WBd R_WBᵀ. Drake's product of rotations is wrapped in Python, and twice as slow.
-    return rotation_vector(R_WBd.inverse().InvertAndCompose(R_WB.inverse()))
 
 
 @one_blas_thread
