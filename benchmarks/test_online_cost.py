@@ -94,7 +94,7 @@ class Running:
         self._simulator.AdvanceTo((self._num_updates - 0.5) * PERIOD_S)
 
 
-def evaluator(assessment: SafetyAssessment) -> SafetyAssessor:
+def assessor_of(assessment: SafetyAssessment) -> SafetyAssessor:
     return SafetyAssessor(assessment, period_s=PERIOD_S, checks_margins=False, heeds_alarm=False)
 
 
@@ -159,7 +159,7 @@ def test_one_evaluation_inside_a_diagram(
     previous_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        running = Running(evaluator(assessment), inputs)
+        running = Running(assessor_of(assessment), inputs)
         empty = Running(EmptySystem(running.system), inputs)
         eager = EagerNetworks(assessment.embedding_)
         # Γ is really evaluated, and torch does the same.
@@ -199,7 +199,7 @@ def test_novelty_and_monitor_beside_an_evaluation(
     detector = dataclasses.replace(assessment.detector_, step_s=PERIOD_S)
     assessment.detector_ = detector
     inputs = {name: getattr(some[0], name)[0] for name in INPUT_NAMES}
-    gamma = Running(evaluator(assessment), inputs)
+    gamma = Running(assessor_of(assessment), inputs)
     monitor = Running(ChangeMonitor(assessment), inputs)
     # Constant inputs are frozen ones, which the monitor notices: it is really evaluated.
     monitor.update()

@@ -70,7 +70,7 @@ def test_a_guard_that_does_not_act_passes_on_what_it_cannot_judge(state):
 
 
 @pytest.mark.parametrize("what", ["beliefs", "an alarm"])
-def test_a_guard_judges_by_what_the_evaluator_has_adopted_and_during_an_alarm_by_nothing(what):
+def test_a_guard_judges_by_what_the_assessor_has_adopted_and_during_an_alarm_by_nothing(what):
     assessment = load_assessment("go2_walking")
     loop = load_scenario("go2_walking").make_loop(assessment=assessment, guard=True)
     simulator = Simulator(loop)

@@ -27,18 +27,12 @@ def solve_inverse_kinematics(
     *,
     max_iterations: int = 20,
 ) -> np.ndarray:
-    """Solves for joint positions with desired contact points at a given base pose.
+    """Returns joint positions (n_j,) [rad] with desired contact points at a given base pose.
 
-    Damped Gauss-Newton from ``guess``; one step suffices from the previous tick's solution. An
-    unreachable target ends at the nearest reachable point. Joints outside the legs keep the guess,
-    and every joint stays inside its limits.
-
-    Args:
-        p_WC: Desired positions of the contact spheres' centres, (n_c, 3) [m].
-        guess: Initial joint positions, (n_j,) [rad].
-
-    Returns:
-        Joint positions (n_j,) [rad].
+    Damped Gauss-Newton from ``guess`` (n_j,) [rad]; one step suffices from the previous tick's
+    solution. An unreachable goal ends at the nearest reachable point. Joints outside the legs keep
+    the guess, and every joint stays inside its limits. ``p_WC`` has the desired positions of the
+    contact spheres' centres, (n_c, 3) [m].
     """
     q = kinematics.positions_at(X_WB, guess)
     return solve_from(kinematics, q, p_WC, max_iterations=max_iterations)[0]

@@ -16,8 +16,6 @@ EQUALITY = 5
 """daqp's value in ``sense`` for rows with equal bounds."""
 
 _COINCIDENT_M = 1e-6  # Tolerance of collinear and coincident contact points.
-
-
 _REST = np.zeros(3)
 _REST.flags.writeable = False
 

@@ -48,12 +48,10 @@ class RecoveryStepPlanner(LeafSystem):
 
     While idle, the feet keep the positions of the first state that the planner sees when a
     simulation is initialised, put on level ground, or those of :meth:`set_stance`. When
-    ``recovery_active`` rises, the group of feet whose partners' line is nearest to the capture
-    point swings to Raibert footholds, which follow the base at every update. The base set point
-    follows the measured base at the standing height, so that the stance legs carry the weight
-    without pulling the base back. The heading of the initial stance is held: the stance legs twist
-    the base towards it and damp its yaw rate. With a ``max_twist_rad`` of 0 the base follows the
-    yaw of its feet instead.
+    ``recovery_active`` rises, groups of feet swing by turns to Raibert footholds, which follow the
+    base at every update. The base set point follows the measured base at the standing height, so
+    that the stance legs carry the weight without pulling the base back, and they twist the base
+    towards the heading of the initial stance.
 
     Groups alternate until the capture point is well inside the support polygon and the heading
     error is small. The base then comes to rest like an inverted pendulum over its capture point,
@@ -61,12 +59,8 @@ class RecoveryStepPlanner(LeafSystem):
     capture point comes near the polygon's edge meanwhile, the robot steps again. After that
     ``recovery_done`` is 1 until ``recovery_active`` has fallen.
 
-    Preview and outlook are the base set point, held constant, in the stance frame of the present
-    set points. No output has direct feedthrough.
-
-    Args:
-        horizon: H, samples of the preview.
-        num_outlook: M, samples of the outlook.
+    Preview (H, ``horizon`` samples) and outlook (M, ``num_outlook``) are the base set point, held
+    constant, in the stance frame of the present set points. No output has direct feedthrough.
     """
 
     def __init__(

@@ -52,13 +52,10 @@ def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndar
     times_s = step_s * np.arange(len(preview))
     motion = interpolate(np.zeros(1), np.ones(1), duration_s)
     progress = motion.vector_values(times_s.tolist()).ravel()
-    shape, *_ = np.linalg.lstsq(_shares(progress), preview, rcond=None)
+    # Shares of start, goal and detour in each sample; see `interpolate`.
+    shares = np.stack([1 - progress, progress, 4 * progress * (1 - progress)], axis=1)
+    shape, *_ = np.linalg.lstsq(shares, preview, rcond=None)
     return shape
-
-
-def _shares(progress: np.ndarray) -> np.ndarray:
-    """Shares of start, goal and detour in a plan's points, (M, 3); see ``interpolate``."""
-    return np.stack([1 - progress, progress, 4 * progress * (1 - progress)], axis=1)
 
 
 def to_world(stance_pose: np.ndarray, points: np.ndarray) -> np.ndarray:
