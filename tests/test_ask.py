@@ -14,7 +14,7 @@ import command_line
 from drake_safety.cli import join_targets
 from drake_safety.cli.ask import parse_target
 from drake_safety.cli.run import alarm_times, named_push
-from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file, goal_threshold
+from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import SafetyAssessment
@@ -56,8 +56,8 @@ def calibrate(folder, threshold):
     rates = {"miss_rate": 0.01, "false_alarm_rate": 0.05, "confidence": None}
     counts = {"num_unsafe": 99, "num_safe": 99, "num_missed": 0, "num_accepted": 9}
     chosen = {"threshold": threshold, "unsafe_below": threshold}
-    of = {"kind": "plan", "seed": 5, "scenario_hash": ""}
-    assessment.calibrations_["plan"] = Calibration(**of, **chosen, **rates, **counts)
+    kind = {"kind": "plan", "seed": 5, "scenario_hash": ""}
+    assessment.calibrations_["plan"] = Calibration(**kind, **chosen, **rates, **counts)
     file.unlink()
     assessment.save(file)
     return assessment
@@ -74,61 +74,53 @@ def ask(call, folder):
     return lambda *words: call("ask", SCENARIO, "--assessment", folder, *words)
 
 
-def test_an_accepted_target_is_told_with_its_belief_and_ends_with_zero(call, folder):
+def test_an_accepted_target_is_printed_with_its_belief_and_ends_with_zero(ask, folder):
     calibrate(folder, 0.4)
-    code, told = call("ask", SCENARIO, "--assessment", folder, "--target", *NEAR)
-    assert code == 0
-    assert "0.6 0.5 1.05 m of the left hand" in told
-    assert re.search(r"verdict +safe: probability \d\.\d+ ≥ threshold 0\.400", told)
-    assert "belief" in told
-    assert "nearest accepted" not in told
-    assert "at most 1 % of unsafe episodes called safe" in told
+    code, printed = ask("--target", *NEAR)
+    assert code == 0 and "nearest accepted" not in printed
+    assert "0.6 0.5 1.05 m of the left hand" in printed
+    assert re.search(r"verdict +safe: probability \d\.\d+ ≥ threshold 0\.400", printed)
+    assert "belief" in printed
+    assert "at most 1 % of unsafe episodes called safe" in printed
 
 
-def test_a_refused_target_is_told_with_its_cause_and_what_would_be_accepted(call, folder):
-    code, told = call("ask", SCENARIO, "--assessment", folder, "--target", *FAR)
+def test_a_refused_target_is_printed_with_its_cause_and_the_nearest_accepted_one(ask, folder):
+    # A threshold beside the assessment is not believed.
+    forged = Estimate.exact(-5.0, 100)
+    Results({("plans", "sharpened", "threshold"): forged}).write(folder / "evaluation.json")
+    code, printed = ask("--target", *FAR)
     assert code == 1
-    assert re.search(r"verdict +unsafe: probability \d\.\d+ < threshold 0\.500", told)
-    assert re.search(rf"likely cause +{CAUSE}", told)
-    nearest = re.search(r"nearest accepted +(\S+ \S+ \S+) m, \S+ cm away", told)[1]
-    # What is told can be typed, and is accepted then.
-    assert call("ask", SCENARIO, "--assessment", folder, "--target", *nearest.split())[0] == 0
+    assert re.search(r"verdict +unsafe: probability \d\.\d+ < threshold 0\.500", printed)
+    assert re.search(rf"likely cause +{CAUSE}", printed)
+    assert re.search(r"threshold +0\.500, the default, which promises nothing", printed)
+    nearest = re.search(r"nearest accepted +(\S+ \S+ \S+) m, \S+ cm away", printed)[1]
+    # The printed target can be typed, and is accepted then.
+    assert ask("--target", *nearest.split())[0] == 0
     assert float(nearest.split()[0]) < FAR[0]
-    gamma = re.search(r"cm away, probability (\S+)", told)[1]
-    assert float(gamma) >= 0.5 + 0.8 * 0.5
+    assert float(re.search(r"cm away, probability (\S+)", printed)[1]) >= 0.5 + 0.8 * 0.5
 
 
 @pytest.mark.parametrize("target", [NEAR, FAR])
-def test_the_answer_as_json_is_the_library_s_own(call, folder, trained, loop, target, monkeypatch):
+def test_the_answer_as_json_is_the_library_s_own(ask, folder, trained, loop, target, monkeypatch):
     verdict = assess_goal(loop, trained[1], np.array(target), threshold=DEFAULT_THRESHOLD)
     monkeypatch.setattr("drake_safety.cli.ask.nearest_accepted_goal", lambda *_, **options: verdict)
-    options = ("--assessment", folder, "--target", *target, "--json")
-    code, told = call("ask", SCENARIO, *options)
-    answer = json.loads(told)
-    assert answer.pop("hand") == "left"
-    assert answer.pop("assessment") == str(folder)
+    code, printed = ask("--target", *target, "--json")
+    answer = json.loads(printed)
+    assert (answer.pop("hand"), answer.pop("assessment")) == ("left", str(folder))
     assert "promises nothing" in answer.pop("threshold_origin")
     assert answer.pop("nearest_accepted") == (None if verdict.is_accepted else list(target))
     assert answer == json.loads(json.dumps(verdict.to_json()))
     assert code == (0 if verdict.is_accepted else 1)
 
 
-@pytest.mark.parametrize(
-    ("target", "words"),
-    [
-        (("nan", 0.3, 1.0), "don't know: the target is not finite"),
-        ((0.7, -0.9, 1.0), "don't know: the target is outside the region sampled in training"),
-    ],
-)
-def test_outside_the_region_the_answer_is_the_region_and_ends_with_one(call, folder, target, words):
+def test_outside_the_region_the_answer_is_the_region_and_ends_with_one(ask, folder):
     calibrate(folder, 0.0)
-    code, told = call("ask", SCENARIO, "--assessment", folder, "--target", *target)
+    code, printed = ask("--target", 0.7, -0.9, 1.0)
     assert code == 1
-    assert words in told
-    assert "x 0.45…1, y -0.3…1.3, z 0.5…1.6 m" in told
-    # The number that may follow is of another target, which may be suggested.
-    assert "probability" not in told.partition("nearest accepted")[0]
-    assert "belief" not in told
+    assert "don't know: the target is outside the region sampled in training" in printed
+    assert "x 0.45…1, y -0.3…1.3, z 0.5…1.6 m" in printed
+    # The region of the other hand is the mirrored one.
+    assert ask("--target", NEAR[0], -NEAR[1], NEAR[2], "--hand", "right")[0] == 0
 
 
 @pytest.fixture
@@ -145,15 +137,16 @@ def shipped(trained, monkeypatch, tmp_path):
 
 
 def test_without_a_training_the_shipped_assessment_answers_and_is_named(call, ask, shipped, folder):
-    code, told = call("ask", SCENARIO, "--target", *NEAR)
+    code, printed = call("ask", SCENARIO, "--target", *NEAR)
     assert code == 0
-    first, *answer = told.splitlines()
+    first, *answer = printed.splitlines()
     assert first.split() == ["assessment", *"comes with the package,".split(), str(shipped)]
     # It is the same assessment as that of the folder, which is not announced when it is asked for.
     answer = [line.replace(str(shipped), str(folder)) for line in answer]
     assert answer == ask("--target", *NEAR)[1].splitlines()
-    code, told = call("ask", SCENARIO, "--target", *NEAR, "--json")
-    assert json.loads(told)["assessment"] == str(shipped)
+    code, printed = call("ask", "talos_reaching", "--target", *NEAR)
+    assert code == 2
+    assert f"which has those of ['{SCENARIO}']: `drake-safety train` learns one" in printed
 
 
 def test_a_run_with_the_shipped_assessment_writes_to_the_working_folder(
@@ -163,15 +156,8 @@ def test_a_run_with_the_shipped_assessment_writes_to_the_working_folder(
     monkeypatch.setattr("drake_safety.cli.run._go", lambda *_, **options: None)
     monkeypatch.setattr("drake_safety.cli.run._save", lambda folder, *_: folders.append(folder))
     assert call("run", SCENARIO, "--target", "blue_box", "--force")[0] == 0
-    assert folders == [Path("runs") / f"{SCENARIO}-shipped" / "run"]
     assert call("run", SCENARIO, "--target", "blue_box", "--force", "--out", tmp_path)[0] == 0
-    assert folders[1:] == [tmp_path / "run"]
-
-
-def test_what_was_never_shipped_is_answered_with_what_was_and_with_train(call, shipped):
-    code, told = call("ask", "talos_reaching", "--target", *NEAR)
-    assert code == 2
-    assert f"which has those of ['{SCENARIO}']: `drake-safety train` learns one" in told
+    assert folders == [Path("runs") / f"{SCENARIO}-shipped" / "run", tmp_path / "run"]
 
 
 def test_an_answer_takes_none_of_the_packages_that_training_takes(folder):
@@ -193,16 +179,11 @@ def test_an_answer_takes_none_of_the_packages_that_training_takes(folder):
     assert loaded & heavy == set()
 
 
-@pytest.mark.parametrize("target", [(), ("--target", "1", "0", "0"), ("--command", "1", "0", "0")])
-def test_a_task_without_targets_is_told_what_to_do_instead(call, target):
-    code, told = call("ask", "laikago_balancing", *target)
+def test_for_a_task_without_targets_the_answer_is_the_command_to_use_instead(call):
+    code, printed = call("ask", "laikago_balancing", "--target", "1", "0", "0")
     assert code == 2
-    assert "task 'Balancing' has no targets or commands to ask about" in told
-    assert "`drake-safety run laikago_balancing`" in told and "--push ball" in told
-
-
-def test_the_region_of_the_other_hand_is_the_mirrored_one(ask):
-    assert ask("--target", NEAR[0], -NEAR[1], NEAR[2], "--hand", "right")[0] == 0
+    assert "task 'Balancing' has no targets or commands to ask about" in printed
+    assert "`drake-safety run laikago_balancing`" in printed and "--push ball" in printed
 
 
 def test_a_named_target_is_the_point_of_that_name(loop):
@@ -220,9 +201,9 @@ def test_a_named_target_is_the_point_of_that_name(loop):
     ],
 )
 def test_what_does_not_exist_is_answered_with_what_does(call, folder, arguments, message):
-    code, told = call("ask", SCENARIO, "--assessment", folder, *arguments)
+    code, printed = call("ask", SCENARIO, "--assessment", folder, *arguments)
     assert code == 2
-    assert all(part in told for part in message.split(".*"))
+    assert all(part in printed for part in message.split(".*"))
 
 
 @pytest.mark.parametrize(
@@ -236,9 +217,9 @@ def test_what_does_not_exist_is_answered_with_what_does(call, folder, arguments,
     ],
 )
 def test_options_that_a_task_or_a_run_does_not_know_are_refused(call, folder, arguments, message):
-    code, told = call("run", SCENARIO, "--assessment", folder, *arguments)
+    code, printed = call("run", SCENARIO, "--assessment", folder, *arguments)
     assert code == 2
-    assert message in told
+    assert message in printed
     assert not (folder / "run").exists()
 
 
@@ -250,9 +231,9 @@ def nothing_near(monkeypatch):
 
 def test_a_run_obeys_a_refusal(call, folder, nothing_near):
     calibrate(folder, 1.0 + 1e-6)
-    code, told = call("run", SCENARIO, "--assessment", folder, "--target", "red_can")
+    code, printed = call("run", SCENARIO, "--assessment", folder, "--target", "red_can")
     assert code == 1
-    assert "refused: nothing moved; --force goes there" in told
+    assert "refused: nothing moved; --force goes there" in printed
     assert not (folder / "run").exists()
 
 
@@ -272,31 +253,11 @@ def test_a_run_goes_where_it_is_let(call, folder, monkeypatch):
 def test_a_run_that_is_forced_leaves_recording_and_timeline(call, folder, nothing_near):
     calibrate(folder, 1.0 + 1e-6)
     options = ("--assessment", folder, "--target", "blue_box", "--duration", 0.2)
-    code, told = call("run", SCENARIO, *options, "--force")
+    code, printed = call("run", SCENARIO, *options, "--force")
     assert code == 0
     written = {path.name for path in (folder / "run").iterdir()}
     assert written == {"recording.html", "run.json", "timeline.png", "timeline.svg"}
-    assert "standing, inside the safe set throughout" in told
-
-
-def test_without_a_calibrated_threshold_the_default_is_taken_and_said_to_be_one(
-    call, folder, trained
-):
-    gamma = trained[1]
-    assert goal_threshold(folder, gamma).threshold == DEFAULT_THRESHOLD
-    told = call("ask", SCENARIO, "--assessment", folder, "--target", *NEAR)[1]
-    assert re.search(r"threshold +0\.500, the default, which promises nothing", told)
-    threshold, unsafe_below, origin = goal_threshold(folder, calibrate(folder, 0.25))
-    assert (threshold, unsafe_below) == (0.25, 0.25)
-    assert re.match(r"calibrated on \d+ episodes for a promised miss rate: at most 1 % of", origin)
-
-
-def test_a_threshold_beside_the_assessment_is_not_believed(call, folder):
-    forged = Estimate.exact(-5.0, 100)
-    Results({("plans", "sharpened", "threshold"): forged}).write(folder / "evaluation.json")
-    code, told = call("ask", SCENARIO, "--assessment", folder, "--target", *FAR)
-    assert code == 1
-    assert "unsafe" in told
+    assert "standing, inside the safe set throughout" in printed
 
 
 @pytest.mark.parametrize(

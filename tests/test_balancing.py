@@ -1,16 +1,30 @@
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from pydrake.geometry import Role
+from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from balancing_loops import PACKAGED, packaged_loop, scenario_of, standing_loop, started
-from drake_safety import load_scenario, run_episode
+from drake_safety import load_assessment, load_scenario, run_episode
+from drake_safety.control.kinematics import NUM_BASE_VELOCITIES
+from drake_safety.control.safe_sets import BalanceSafeSet
+from drake_safety.diagrams.balancing.sampling import (
+    PushSampling,
+    StartSampling,
+    calm_start,
+    resting_feet,
+    undisturbed_start,
+)
+from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.plants.balls import Throw
-from drake_safety.simulation.motion import Recorder
 from drake_safety.simulation.scenario import parse_scenario
-from legged_robots import ROBOT_NAMES, edited, robot_kinematics, write_hexapod
+from legged_robots import edited, robot_kinematics, write_hexapod
+
+ROBOTS = (PACKAGED, "hexapod")
+MASS_KG = 25.433
 
 
 @functools.cache
@@ -18,69 +32,68 @@ def episode_of(robot=PACKAGED, variation="nominal"):
     return run_episode(standing_loop(robot, variation))
 
 
-@pytest.mark.parametrize("name", ROBOT_NAMES)
+def sampling_for(kinematics, **options):
+    """The default ranges, about the robot's own height."""
+    band = [0.9 * kinematics.standing_height, kinematics.standing_height]
+    return StartSampling(base_height_m=band, target_height_m=band, **options)
+
+
+def contact_velocities(kinematics, start):
+    return kinematics.contact_jacobian(start.q) @ start.v
+
+
+@pytest.mark.parametrize("name", ROBOTS)
 def test_any_robot_with_feet_stands_for_two_seconds_within_five_millimetres(name):
     episode = episode_of(name)
-    assert episode.is_safe
-    assert episode.time_s[-1] == pytest.approx(2.0)
+    assert episode.is_safe and episode.time_s[-1] == pytest.approx(2.0)
     error = np.linalg.norm(episode.output - episode.desired_output, axis=1)
     assert error.max() < 0.005
 
 
 def test_the_packaged_robot_stands_on_the_actual_plant_too():
     scenario = load_scenario("laikago_balancing")
-    standing = scenario_of(PACKAGED)
-    scenario.parameters = standing.parameters
+    scenario.parameters = scenario_of(PACKAGED).parameters
     episode = run_episode(scenario.make_loop("actual"))
-    assert episode.is_safe
-    true_height = episode.true_state[:, 2]
-    assert np.abs(true_height - robot_kinematics(PACKAGED).standing_height).max() < 0.01
+    height = episode.true_state[:, 2] - robot_kinematics(PACKAGED).standing_height
+    assert episode.is_safe and np.abs(height).max() < 0.01
 
 
-def test_without_an_assessment_or_recovery_nothing_is_promised_of_them():
+def test_without_an_assessment_or_recovery_there_are_no_ports_for_them():
     loop = standing_loop()
-    assert not loop.HasOutputPort("recovery_active")
-    assert loop.num_input_ports() == 0
+    assert not loop.HasOutputPort("recovery_active") and loop.num_input_ports() == 0
 
 
 def test_a_robot_without_gains_is_refused(tmp_path):
     edited(write_hexapod(tmp_path), joint_gains={})
-    scenario = parse_scenario(
+    text = (
         "task: drake_safety.diagrams.balancing:Balancing\nrobot: robot.yaml\n"
-        "variations: {nominal: {}}",
-        name="weak",
-        folder=tmp_path,
+        "variations: {nominal: {}}"
     )
     with pytest.raises(ValueError, match="stiffness must be 18 positive numbers"):
-        scenario.make_loop()
+        parse_scenario(text, name="weak", folder=tmp_path).make_loop()
 
 
-@pytest.mark.parametrize(("variation", "scale"), [("nominal", 1.0), ("light", 0.8)])
-def test_the_variations_mass_is_the_plants(variation, scale):
-    loop = standing_loop(variation=variation)
+def test_the_plant_has_the_variations_mass_and_the_controller_the_nominal_one():
+    loop = standing_loop(variation="light")
     _, context = started(loop)
     mass = loop.plant.CalcTotalMass(loop.plant.GetMyContextFromRoot(context), [loop.robot_instance])
-    assert mass == pytest.approx(scale * 25.433, abs=0.001)
+    assert mass == pytest.approx(0.8 * MASS_KG, abs=0.001)
+    assert loop.kinematics.total_mass == pytest.approx(MASS_KG, abs=0.001)
+    actual = load_scenario("laikago_balancing").make_loop("actual", ball=False)
+    assert actual.kinematics.total_mass == pytest.approx(0.8 * MASS_KG, abs=0.001)
 
 
-def test_the_controller_believes_in_the_nominal_mass_whatever_the_plants_is():
-    scenario = load_scenario("laikago_balancing")
-    actual, nominal = scenario.make_loop("actual"), scenario.make_loop("nominal")
-    assert actual.kinematics.total_mass == nominal.kinematics.total_mass
-    assert actual.kinematics.total_mass == pytest.approx(0.8 * 25.433, abs=0.001)
-
-
-def test_feet_and_ground_take_the_variations_friction():
+def test_feet_and_ground_have_the_variations_friction():
     loop = standing_loop(variation="slippery")
     inspector = loop.GetSubsystemByName("scene_graph").model_inspector()
-    found = []
+    slippery = []
     for geometry in inspector.GetAllGeometryIds(Role.kProximity):
         properties = inspector.GetProximityProperties(geometry)
         friction = properties.GetProperty("material", "coulomb_friction").static_friction()
         if friction == 0.123:
-            found.append(inspector.GetName(geometry))
-    assert len(found) == len(loop.robot.feet) + 1
-    assert any("ground" in name for name in found)
+            slippery.append(inspector.GetName(geometry))
+    assert len(slippery) == len(loop.robot.feet) + 1
+    assert any("ground" in name for name in slippery)
 
 
 @functools.cache
@@ -94,9 +107,8 @@ def joint_motion(variation):
     controller = loop.GetSubsystemByName("inverse_kinematics_controller")
     feet = np.column_stack([loop.kinematics.nominal_contacts, loop.kinematics.foot_radii])
     # Half a millimetre at the feet asks the servos for some 1.1 N·m.
-    controller.set_foot_positions(
-        controller.GetMyMutableContextFromRoot(context), feet - [0.0, 0.0, 0.0005]
-    )
+    own_context = controller.GetMyMutableContextFromRoot(context)
+    controller.set_foot_positions(own_context, feet - [0.0, 0.0, 0.0005])
     simulator.AdvanceTo(0.4)
     after = loop.plant.GetPositions(plant_context, loop.robot_instance)[7:]
     return np.abs(after - before).max()
@@ -106,141 +118,219 @@ def test_dry_friction_holds_the_joints_against_small_commands():
     assert joint_motion("rough") < 0.5 * joint_motion("nominal")
 
 
-def test_dry_friction_is_no_part_of_the_nominal_plant():
-    smooth, rough = standing_loop(), standing_loop(variation="rough")
-    count = smooth.plant.num_actuators(smooth.robot_instance)
-    assert rough.plant.num_actuators(rough.robot_instance) == 2 * count
+@pytest.mark.parametrize("variation", ["nominal", "rough"])
+def test_every_servo_follows_its_own_joint(variation):
+    loop = standing_loop("biped", variation)
+    simulator, context = started(loop)
+    simulator.AdvanceTo(0.5)
+    plant_context = loop.plant.GetMyContextFromRoot(context)
+    q = loop.plant.GetPositions(plant_context, loop.robot_instance)[7:]
+    np.testing.assert_allclose(q, loop.kinematics.posture, atol=0.02)
 
 
-def test_every_servo_follows_its_own_joint():
-    for variation in ("nominal", "rough"):
-        loop = standing_loop("biped", variation)
-        simulator, context = started(loop)
-        simulator.AdvanceTo(0.5)
-        plant_context = loop.plant.GetMyContextFromRoot(context)
-        q = loop.plant.GetPositions(plant_context, loop.robot_instance)[7:]
-        np.testing.assert_allclose(q, loop.kinematics.posture, atol=0.02)
-
-
-def test_noise_stands_only_where_it_was_configured():
+def test_noise_is_only_where_it_was_configured():
     quiet, noisy, blurred = (episode_of(variation=v) for v in ("nominal", "noisy", "blurred"))
     np.testing.assert_array_equal(quiet.state, quiet.true_state)
     # Noise on the assessor's input alone: the motion is the quiet one's, to the bit.
     np.testing.assert_array_equal(blurred.true_state, quiet.true_state)
     np.testing.assert_array_equal(blurred.output, quiet.output)
-    assert not np.array_equal(blurred.state, blurred.true_state)
-    # Noise on what is measured: output and state both show it.
+    # Noise on the measured state: output and state both show it.
     assert np.abs(noisy.output[:, 2] - noisy.true_state[:, 2]).max() > 0.004
+    n_j = robot_kinematics(PACKAGED).num_joints
     for episode in (noisy, blurred):
         assert np.abs(episode.features - quiet.features).max() > 1e-4
-
-
-@pytest.mark.parametrize("variation", ["noisy", "blurred"])
-def test_noise_has_its_standard_deviation(variation):
-    episode = episode_of(variation=variation)
-    error = episode.state - episode.true_state
-    n_j = robot_kinematics(PACKAGED).num_joints
-    assert np.std(error[:, 12 : 12 + n_j]) == pytest.approx(0.004, rel=0.15)
-    assert np.std(error[:, 12 + n_j :]) == pytest.approx(0.016, rel=0.15)
-
-
-def test_every_episode_has_noise_of_its_own():
-    errors = []
-    for index in (0, 1):
-        episode = run_episode(standing_loop(variation="blurred"), index)
-        errors.append((episode.state - episode.true_state)[:, 12:].ravel())
+        error = episode.state - episode.true_state
+        assert np.std(error[:, 12 : 12 + n_j]) == pytest.approx(0.004, rel=0.15)
+        assert np.std(error[:, 12 + n_j :]) == pytest.approx(0.016, rel=0.15)
+    other = run_episode(standing_loop(variation="blurred"), 1)
+    errors = [(one.state - one.true_state)[:, 12:].ravel() for one in (blurred, other)]
     assert abs(np.corrcoef(errors)[0, 1]) < 0.1
-
-
-PORTS = ("state", "true_state", "desired_output", "features", "margins")
-
-
-@pytest.mark.parametrize("variation", ["nominal", "actual"])
-def test_a_reset_is_the_same_for_the_same_generator(variation):
-    rows = []
-    for _ in range(2):
-        simulator, context = started(packaged_loop(variation), seed=3)
-        recorder = Recorder(packaged_loop(variation), PORTS)
-        for time in (0.0, 0.05, 0.1):
-            simulator.AdvanceTo(time)
-            recorder.record(context)
-        rows.append(recorder.arrays())
-    for name in PORTS:
-        np.testing.assert_array_equal(rows[0][name], rows[1][name])
-    _, context = started(packaged_loop(variation), seed=4)
-    other = packaged_loop(variation).GetOutputPort("true_state").Eval(context)
-    assert not np.allclose(other, rows[0]["true_state"][0])
 
 
 def test_starts_are_inside_the_ranges_that_the_scenario_gives():
     loop = packaged_loop()
-    sampling = loop.scenario.parameters.start
-    names = loop.state_names
-    first_steps = set()
-    for seed in range(60):
+    sampling, first_steps = loop.scenario.parameters.start, set()
+    low, high = np.add(sampling.base_height_m, [-0.03, 0.03])  # The tracking error's height.
+    lowest, highest = loop.kinematics.position_limits.T
+    for seed in range(30):
         context = loop.CreateDefaultContext()
         first_steps.add(loop.reset(context, np.random.default_rng(seed)))
         state = loop.GetOutputPort("true_state").Eval(context)
-        lowest, highest = loop.kinematics.position_limits.T
         joints = state[12 : 12 + loop.kinematics.num_joints]
         assert np.all((joints >= lowest) & (joints <= highest))
-        height = state[names.index("base_z")]
-        offset_m = sampling.tracking_offset_m[2]
-        assert (
-            sampling.base_height_m[0] - offset_m <= height <= sampling.base_height_m[1] + offset_m
-        )
+        assert low <= state[loop.state_names.index("base_z")] <= high
         assert np.abs(state[3:5]).max() < 2 * sampling.tilt_rad
     assert first_steps == {0, 1}
 
 
-def test_a_loop_without_a_ball_says_how_to_get_one():
+def test_a_loop_without_a_ball_says_how_to_get_one_and_a_parked_one_changes_nothing():
     loop = standing_loop()
     with pytest.raises(ValueError, match="without a ball; pass ball=True"):
         loop.throw_ball(loop.CreateDefaultContext(), Throw(), 0.1)
-
-
-def test_a_ball_that_waits_far_away_changes_nothing():
-    alone = episode_of()
     with_ball = run_episode(standing_loop(variation="nominal", ball=True))
-    np.testing.assert_allclose(with_ball.true_state, alone.true_state, atol=1e-6)
+    np.testing.assert_allclose(with_ball.true_state, episode_of().true_state, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ROBOT_NAMES)
-def test_servo_load_is_what_is_commanded_minus_what_is_measured(name):
+@pytest.mark.parametrize("name", ROBOTS)
+def test_servo_load_is_the_commanded_minus_the_measured_position(name):
     loop = standing_loop(name)
     joints = loop.kinematics.joint_names
     assert loop.feature_names[-len(joints) :] == [f"servo_load_{joint}" for joint in joints]
     simulator, context = started(loop)
-    controller = loop.GetSubsystemByName("inverse_kinematics_controller")
-    # Without noise there is one observer for controller and assessor.
-    observer = loop.GetSubsystemByName("observer")
-
-    def expected():
-        command = controller.GetOutputPort("desired_joint_state").Eval(
-            controller.GetMyContextFromRoot(context)
-        )
-        measured = observer.GetOutputPort("measured_plant_state").Eval(
-            observer.GetMyContextFromRoot(context)
-        )
-        return command[: len(joints)] - measured[7 : 7 + len(joints)]
-
+    ports = {
+        "inverse_kinematics_controller": "desired_joint_state",
+        "observer": "measured_plant_state",
+    }
     for time in (0.0, 0.5):
         simulator.AdvanceTo(time)
+        command, measured = (
+            system.GetOutputPort(port).Eval(system.GetMyContextFromRoot(context))
+            for system, port in ((loop.GetSubsystemByName(n), p) for n, p in ports.items())
+        )
         load = loop.GetOutputPort("features").Eval(context)[-len(joints) :]
-        np.testing.assert_allclose(load, expected(), atol=1e-12)
+        expected = command[: len(joints)] - measured[7 : 7 + len(joints)]
+        np.testing.assert_allclose(load, expected, atol=1e-12)
     # At rest the servos carry the robot: load times stiffness is the static torque.
     assert np.abs(load).max() > 1e-3
 
 
 def test_a_reset_commands_what_the_start_does():
-    loop = load_scenario("laikago_balancing").make_loop(ball=False)
+    loop = packaged_loop(ball=False)
     context = loop.CreateDefaultContext()
     features = loop.GetOutputPort("features")
-
-    def started_features():
-        simulator = Simulator(loop, context.Clone())
-        simulator.Initialize()
-        return features.Eval(simulator.get_context())
-
     loop.reset(context, np.random.default_rng(1))
-    np.testing.assert_array_equal(features.Eval(context), started_features())
+    simulator = Simulator(loop, context.Clone())
+    simulator.Initialize()
+    np.testing.assert_array_equal(features.Eval(context), features.Eval(simulator.get_context()))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_base_moves_along_its_plan_and_the_feet_stand_on_the_ground_at_rest(name):
+    kinematics = robot_kinematics(name)
+    # Joint noise would lift the feet, by design.
+    sampling = sampling_for(kinematics, joint_std_rad=0.0, foot_offset_m=0.0)
+    for seed in range(3):
+        start = sampling.sample(kinematics, np.random.default_rng(seed))
+        feet = start.foot_positions
+        np.testing.assert_allclose(kinematics.contact_positions(start.q), feet, atol=2e-3)
+        np.testing.assert_array_equal(feet[:, 2], kinematics.foot_radii)
+        assert np.abs(start.v[:NUM_BASE_VELOCITIES]).max() > 0.05
+        np.testing.assert_allclose(contact_velocities(kinematics, start), 0.0, atol=1e-6)
+        # With the feet in their nominal places the stance frame is the world's.
+        np.testing.assert_allclose(start.plan.value(0.0).ravel(), start.q[4:7], atol=1e-9)
+        low, high = sampling.plan_duration_s
+        assert low <= start.plan.end_time() <= high
+        goal = start.plan.value(start.plan.end_time()).ravel()
+        offset = np.abs(goal[:2] - kinematics.nominal_base_offset)
+        assert np.all(offset <= sampling.target_offset_m)
+        assert sampling.target_height_m[0] <= goal[2] <= sampling.target_height_m[1]
+
+
+@pytest.mark.parametrize("elapsed_s", [0.0, 0.4, 2.0])
+def test_a_calm_start_is_a_point_of_its_motion_with_the_motions_velocity(elapsed_s):
+    kinematics = robot_kinematics(PACKAGED)
+    options = {"half_widths_m": [0.05, 0.03], "plan_duration_s": [1.0, 1.0]}
+    start = calm_start(kinematics, np.random.default_rng(1), elapsed_s=elapsed_s, **options)
+    assert start.plan.start_time() == -elapsed_s
+    np.testing.assert_allclose(start.q[4:7], start.plan.value(0.0).ravel())
+    np.testing.assert_allclose(contact_velocities(kinematics, start), 0.0, atol=1e-6)
+    is_moving = np.linalg.norm(start.v[3:6]) > 1e-3
+    assert is_moving == (0.0 < elapsed_s < 1.0)
+
+
+def test_undisturbed_motions_follow_each_other_with_rests_in_half_of_the_ranges():
+    kinematics = robot_kinematics(PACKAGED)
+    sampling = sampling_for(kinematics, foot_offset_m=0.01)
+    start = undisturbed_start(kinematics, np.random.default_rng(1), sampling, 30.0)
+    assert not start.v.any() and start.plan.start_time() == 0.0 and start.plan.end_time() >= 30.0
+    values = start.plan.vector_values(np.arange(0.0, 30.0, 0.02)).T
+    half = 0.5 * np.array(sampling.target_offset_m)
+    assert np.all(np.abs(values[:, :2] - kinematics.nominal_base_offset) <= half + 1e-9)
+    rest = np.all(np.diff(values, axis=0) == 0.0, axis=1)
+    # It moves most of the time, without jumps, and rests between two motions.
+    assert 0.1 < rest.mean() < 0.7
+    assert np.count_nonzero(np.diff(rest.astype(int)) == 1) >= 5
+    assert np.abs(np.diff(values, axis=0)).max() < 0.02
+    low, high = np.quantile(sampling.target_height_m, [0.25, 0.75])
+    later = values[300:, 2]  # After the motion from standing.
+    assert low - 1e-9 <= later.min() < later.max() <= high + 1e-9
+
+
+def test_feet_at_rest_need_no_joint_rates_if_the_base_is_at_rest():
+    kinematics = robot_kinematics(PACKAGED)
+    q = kinematics.standing_positions()
+    v = resting_feet(kinematics, RigidTransform(q[4:7]), q[7:], np.zeros(NUM_BASE_VELOCITIES))
+    np.testing.assert_array_equal(v, 0.0)
+
+
+def test_random_throws_lie_in_their_ranges():
+    push = PushSampling(offset_m=0.05)
+    rng = np.random.default_rng(3)
+    throws = [push.sample(rng, 0.7) for _ in range(200)]
+    for name, (low, high) in {
+        "mass_kg": push.mass_kg,
+        "speed_m_s": push.speed_m_s,
+        "offset_m": (-0.05, 0.05),
+        "height_m": (-push.height_m, push.height_m),
+        "direction_rad": (-np.pi, np.pi),
+    }.items():
+        values = np.array([getattr(throw, name) for throw in throws])
+        assert low <= values.min() and values.max() <= high
+        assert values.max() - values.min() > 0.9 * (high - low)
+
+
+def test_a_low_probability_makes_the_robot_step_and_balance_again():
+    loop = standing_loop(PACKAGED, recovery=True)
+    probability = loop.GetInputPort("safety_probability")
+    simulator, context = started(loop)
+    probability.FixValue(context, [1.0])
+    rows = []
+    for step in range(181):
+        time = 0.01 * step
+        simulator.AdvanceTo(time)
+        probability.FixValue(context, [0.0 if abs(time - 0.2) < 0.011 else 1.0])
+        x = loop.GetOutputPort("plant_state").Eval(context)
+        p_WC = loop.kinematics.contact_positions(x[: loop.kinematics.num_positions])
+        active = loop.GetOutputPort("recovery_active").Eval(context)[0]
+        margins = loop.GetOutputPort("margins").Eval(context)
+        rows.append((time, active, p_WC[:, 2] - loop.kinematics.foot_radii, margins))
+    time, active, clearance, margins = (np.array(column) for column in zip(*rows, strict=True))
+    start, end = time[active > 0][[0, -1]]
+    assert 0.2 <= start <= 0.2 + 0.021 and end < time[-1]
+    assert np.all(active[(time >= start) & (time <= end)] > 0)
+    assert clearance[time < 0.2].max() < 0.005
+    assert np.all(clearance[active > 0].max(axis=0) > 0.01)  # Every foot swung.
+    assert margins[-1].min() > 0 and clearance[-1].max() < 0.005
+
+
+def test_in_a_lasting_alarm_the_robot_steps_by_gamma_alone():
+    scenario, gamma = load_scenario("laikago_balancing"), load_assessment("laikago_balancing")
+    gamma.detector_ = replace(gamma.detector_, alarm_level=-1.0)
+    scenario.on_alarm = "unknown"
+    weak, strong = scenario.parameters.demonstration
+    loop = scenario.make_loop("nominal", assessment=gamma, ball=True)
+    throws = [replace(weak, time_s=0.4), replace(strong, time_s=1.2)]
+    log = run_throw(
+        loop, 0, seed=7_000_000, throws=throws, duration_s=1.5, ports=["alarm", "belief"]
+    )
+    assert log["alarm"][5:].all() and (log["belief"][5:] == [0.0, 0.0, 1.0]).all()
+    ((start_s, _),) = log.recovery_intervals_s
+    assert 1.2 < start_s < 1.3
+
+
+def test_during_recovery_features_and_preview_are_of_the_same_plan():
+    loop = packaged_loop(recovery=True)
+    simulator, context = started(loop)
+    loop.GetInputPort("safety_probability").FixValue(context, [0.0])
+    observer = loop._assessor_observer
+    safe_set = BalanceSafeSet(loop.kinematics, loop.scenario.parameters.safe_set)
+    for time in (0.05, 0.3, 0.55):
+        simulator.AdvanceTo(time)
+        assert loop.GetOutputPort("recovery_active").Eval(context)[0] == 1.0
+        own_context = observer.GetMyContextFromRoot(context)
+        x = observer.GetOutputPort("measured_plant_state").Eval(own_context)
+        # The recovery's plan is a set point that is held.
+        preview = loop.GetOutputPort("desired_preview").Eval(context).reshape(-1, 3)
+        expected = safe_set.features(*np.split(x, [loop.kinematics.num_positions]), preview)
+        features = loop.GetOutputPort("features").Eval(context)
+        np.testing.assert_allclose(features[: len(expected)], expected, atol=1e-12)

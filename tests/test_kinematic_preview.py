@@ -1,4 +1,4 @@
-"""KinematicPreview: the hand goes where it is led, the feet stay, and the cost is at its least."""
+"""KinematicPreview: the hand follows its path, the feet stay, and the cost is at its minimum."""
 
 import functools
 
@@ -11,9 +11,7 @@ from drake_safety.control.whole_body_model import PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import task_errors
 from drake_safety.diagrams.reaching.kinematic_preview import KinematicPreview, chain_joints
 from drake_safety.robots.robot_model import load_robot_file
-from legged_robots import edited, robot_kinematics, robot_model, write_porter
-
-HANDS = [("porter", "left"), ("porter", "right"), ("atlas", "left"), ("atlas", "right")]
+from legged_robots import edited, robot_kinematics, write_porter
 
 
 @functools.cache
@@ -43,88 +41,57 @@ def gradient(preview, reference, q):
     return np.linalg.norm(still.T @ slope), np.linalg.norm(still.T @ hand)
 
 
-@pytest.mark.parametrize(("name", "hand"), HANDS)
-def test_the_feet_stay_where_they_are_and_the_hand_arrives_at_easy_goals(name, hand):
+@pytest.mark.parametrize(("name", "hand"), [("porter", "right"), ("atlas", "left")])
+def test_the_hand_arrives_with_fixed_feet_where_the_cost_is_minimal(name, hand):
     preview = preview_of(name, hand)
     kinematics = preview.model.kinematics
     q = kinematics.standing_positions()
-    before = kinematics.contact_positions(q)
-    for path in easy_paths(preview):
+    before, feet = q.copy(), kinematics.contact_positions(q)
+    reference = preview.model.reference(q)
+    for path in easy_paths(preview, num=3):
         positions = preview.follow(q, path)
         for ahead in positions:
-            np.testing.assert_allclose(kinematics.contact_positions(ahead), before, atol=1e-4)
+            np.testing.assert_allclose(kinematics.contact_positions(ahead), feet, atol=1e-4)
+        np.testing.assert_allclose(np.linalg.norm(positions[:, :4], axis=1), 1.0, atol=1e-12)
         reached = preview.model.reaching_position(positions[-1])
         assert np.linalg.norm(reached - path[-1]) < 5e-3
-
-
-@pytest.mark.parametrize(("name", "hand"), HANDS)
-def test_the_last_posture_is_where_the_cost_is_at_its_least(name, hand):
-    # No motion that leaves the feet still makes it less, to first order.
-    preview = preview_of(name, hand)
-    q = preview.model.kinematics.standing_positions()
-    reference = preview.model.reference(q)
-    for path in easy_paths(preview):
+        # No motion that leaves the feet still lowers the cost, to first order.
         reference.reaching = PointReference(position=path[-1])
-        slope, one_centimetre = gradient(preview, reference, preview.follow(q, path)[-1])
-        assert slope < 0.02 * one_centimetre
-        longer = np.vstack([path, np.repeat(path[-1:], 30, axis=0)])
-        positions = preview.follow(q, longer)
         slope, one_centimetre = gradient(preview, reference, positions[-1])
+        assert slope < 0.02 * one_centimetre
+        longer = preview.follow(q, np.vstack([path, np.repeat(path[-1:], 30, axis=0)]))
+        slope, one_centimetre = gradient(preview, reference, longer[-1])
         assert slope < 1e-4 * one_centimetre
-        np.testing.assert_allclose(positions[-1], positions[-2], atol=1e-6)  # Nothing moves.
-
-
-def test_one_sample_is_a_path():
-    preview = preview_of("porter", "left")
-    q = preview.model.kinematics.standing_positions()
-    goal = preview.model.reaching_position(q) + [0.02, 0.0, 0.02]
-    (ahead,) = preview.follow(q, goal[np.newaxis])
-    assert np.linalg.norm(preview.model.reaching_position(ahead) - goal) < 5e-3
-
-
-def test_the_positions_it_starts_from_are_left_alone():
-    preview = preview_of("porter", "left")
-    q = preview.model.kinematics.standing_positions()
-    before = q.copy()
-    positions = preview.follow(q, next(easy_paths(preview)))
     np.testing.assert_array_equal(q, before)
-    assert positions.shape == (6, len(q))
-    np.testing.assert_allclose(np.linalg.norm(positions[:, :4], axis=1), 1.0, atol=1e-12)
 
 
-def test_a_path_does_not_depend_on_the_one_before():
+def test_a_path_does_not_depend_on_the_one_before_and_may_be_one_sample():
     preview = preview_of("porter", "left")
     q = preview.model.kinematics.standing_positions()
-    one, other = easy_paths(preview, num=2)
-    before = preview.follow(q, one)
-    preview.follow(preview.follow(q, other)[-1], other)
-    np.testing.assert_array_equal(preview.follow(q, one), before)
+    first, second = easy_paths(preview, num=2)
+    before = preview.follow(q, first)
+    preview.follow(preview.follow(q, second)[-1], second)
+    np.testing.assert_array_equal(preview.follow(q, first), before)
+    (ahead,) = preview.follow(q, first[:1])
+    assert np.linalg.norm(preview.model.reaching_position(ahead) - first[0]) < 5e-3
 
 
-@pytest.mark.parametrize(("name", "hand"), HANDS)
-def test_the_chain_is_made_of_the_joints_that_move_the_hand(name, hand):
-    model = preview_of(name, hand).model
+def test_the_chain_has_the_joints_that_move_the_hand():
+    model = preview_of("porter", "left").model
     kinematics, body = model.kinematics, model.hand.body
-    rng = np.random.default_rng(0)
+
+    def pose(q):
+        kinematics.set_positions(q)
+        return body.EvalPoseInWorld(kinematics.context).GetAsMatrix4()
+
     q = kinematics.standing_positions()
-    q[7:] += rng.uniform(-0.1, 0.1, kinematics.num_joints)
-    kinematics.set_positions(q)
-    before = body.EvalPoseInWorld(kinematics.context).GetAsMatrix4()
-    moving = []
-    for i in range(kinematics.num_joints):
-        moved = q.copy()
-        moved[7 + i] += 0.1
-        kinematics.set_positions(moved)
-        after = body.EvalPoseInWorld(kinematics.context).GetAsMatrix4()
-        if np.abs(after - before).max() > 1e-9:
-            moving.append(i)
+    q[7:] += np.random.default_rng(0).uniform(-0.1, 0.1, kinematics.num_joints)
+    shifts = 0.1 * np.eye(len(q))[7:]
+    moving = [i for i, dq in enumerate(shifts) if np.abs(pose(q + dq) - pose(q)).max() > 1e-9]
     assert chain_joints(kinematics, model.hand) == moving
-    arm = set(robot_model(name).reaching_frame(hand).joints)
-    assert arm <= {kinematics.joint_names[i] for i in moving}
 
 
-def test_heavier_tasks_win(tmp_path):
-    # What a hand cannot have without its centre of mass it gets as its weight says.
+def test_a_hand_beyond_its_arm_misses_less_with_a_larger_weight(tmp_path):
     misses = []
     for weight in (5.0, 500.0):
         tasks = {"reaching": {"weight": weight}, "orientation": {"pelvis": {"weight": 20.0}}}

@@ -1,19 +1,27 @@
+import math
+
 import numpy as np
 import pytest
 import yaml
+from pydrake.geometry import Meshcat, Role
 from pydrake.systems.analysis import Simulator
 
-from drake_safety import load_scenario
+from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import stance_state
-from drake_safety.learning.segments import RECORDED
+from drake_safety.diagrams.reaching.sampling import Detours, PostureSampling
+from drake_safety.learning.segments import RECORDED, Episode
+from drake_safety.models import load_robot
 from drake_safety.plants.obstacles import Obstacle
-from drake_safety.simulation.rollouts import episode_rng
-from legged_robots import edited, write_biped, write_hexapod, write_porter
+from drake_safety.plants.pushes import Push
+from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
+from drake_safety.simulation.rollouts import episode_rng, run_to_goal
+from legged_robots import edited, write_biped, write_hexapod
 from reaching_loops import (
     EASY,
     LOOPS,
     SCENES,
+    atlas,
     easy_episode,
     evaluated,
     goal_of,
@@ -24,6 +32,10 @@ from reaching_loops import (
     started,
 )
 
+# Feet, and so the frame of a plan, are placed by a search that ends at this error.
+PLACED_M = 1e-4
+HANDS = ("left", "right")
+
 
 @pytest.fixture(params=LOOPS)
 def make_loop(request):
@@ -31,29 +43,38 @@ def make_loop(request):
     return LOOPS[request.param]
 
 
-def test_ports_tell_of_the_plant(make_loop):
+def plant_state(loop, context):
+    return np.split(evaluated(loop, context, "plant_state"), [loop.kinematics.num_positions])
+
+
+def first_row(loop, context):
+    """An episode that ended as it began."""
+    names = ("state", "true_state", "output", "desired_output", "desired_preview", "features")
+    rows = {name: evaluated(loop, context, name)[None].copy() for name in (*names, "margins")}
+    return Episode(index=0, time_s=np.zeros(1), is_safe=True, cause="", **rows)
+
+
+def test_ports_have_values_of_the_plants_state(make_loop):
     loop = make_loop()
     simulator = Simulator(loop, started(loop))
     simulator.AdvanceTo(0.3)
     context = simulator.get_context()
-    q, v = np.split(evaluated(loop, context, "plant_state"), [loop.kinematics.num_positions])
-    hand = loop.robot.reaching_frame(loop.hand)
-    assert np.abs(v).max() > 0.01
+    q, v = plant_state(loop, context)
     for name, expected in {
         "true_state": stance_state(loop.kinematics, q, v),
         "state": stance_state(loop.kinematics, q, v),
-        "output": loop.kinematics.reaching_position(q, hand),
+        "output": loop.kinematics.reaching_position(q, loop.robot.reaching_frame(loop.hand)),
         "safe": [1.0],
         "solver_status": [0.0],
     }.items():
         np.testing.assert_array_equal(evaluated(loop, context, name), expected)
-    # Margins are held from one look at them to the next.
+    # Margins are held for a monitor's period.
     margins = loop.safe_set.margins(q, v)
     np.testing.assert_allclose(evaluated(loop, context, "margins"), margins, atol=0.02)
 
 
 @pytest.mark.parametrize("variation", ["nominal", "noisy"])
-def test_what_is_asked_at_plan_time_is_what_an_episode_begins_with(variation):
+def test_the_inputs_at_plan_time_are_the_first_row_of_an_episode(variation):
     loop = porter(variation)
     context = loop.CreateDefaultContext()
     loop.reset(context, episode_rng(0, 0), EASY)
@@ -62,7 +83,7 @@ def test_what_is_asked_at_plan_time_is_what_an_episode_begins_with(variation):
         np.testing.assert_array_equal(evaluated(loop, context, name), getattr(episode, name)[0])
 
 
-def test_starts_stand_safely_within_the_ranges_of_the_scenario(make_loop):
+def test_starts_stand_safely_and_targets_are_within_the_ranges_of_the_scenario(make_loop):
     loop = make_loop()
     kinematics, sampling = loop.kinematics, loop.scenario.parameters.start
     standing = kinematics.standing_positions()
@@ -70,13 +91,12 @@ def test_starts_stand_safely_within_the_ranges_of_the_scenario(make_loop):
     is_free = np.array([name not in legs for name in kinematics.joint_names])
     standing[6] -= sampling.sink_m
     contacts = kinematics.contact_positions(standing)
-    seen = []
-    for seed in range(25):
+    drawn, goals = [], []
+    for seed in range(15):
         context = started(loop, seed)
-        q, v = np.split(evaluated(loop, context, "plant_state"), [kinematics.num_positions])
-        assert not v.any()
+        q, v = plant_state(loop, context)
         margins = loop.safe_set.margins(q, v)
-        assert margins.min() > 0
+        assert not v.any() and margins.min() > 0
         assert margins[loop.constraint_names.index("collision")] >= sampling.clearance_m
         np.testing.assert_allclose(kinematics.contact_positions(q), contacts, atol=3e-4)
         offset = q[4:7] - standing[4:7]
@@ -84,22 +104,40 @@ def test_starts_stand_safely_within_the_ranges_of_the_scenario(make_loop):
         assert -sampling.base_lowering_m <= offset[2] <= 0
         turn = np.abs(q[7:] - kinematics.posture)[is_free]
         assert turn.max() <= sampling.joint_offset_rad + 1e-12
-        seen.append(np.concatenate([offset, q[7:][is_free]]))
-    assert (np.ptp(seen, axis=0) > 0).all()
+        drawn.append(np.concatenate([offset, q[7:][is_free]]))
+        goals.append(goal_of(loop, context))
+        np.testing.assert_allclose(loop.goal_of(first_row(loop, context)), goals[-1], atol=PLACED_M)
+    assert (np.ptp(drawn, axis=0) > 0).all()
+    lowest, highest = loop.target_box
+    assert ((goals >= lowest) & (goals <= highest)).all()
+    assert (np.ptp(goals, axis=0) > 0.6 * (highest - lowest)).all()
 
 
-def test_targets_are_drawn_from_the_box_of_the_hand(make_loop):
-    left, right = make_loop(), make_loop(hand="right")
-    mirrored = np.sort(left.target_box * [1, -1, 1], axis=0)
-    np.testing.assert_array_equal(right.target_box, mirrored)
-    for loop in (left, right):
-        goals = np.array([goal_of(loop, started(loop, seed)) for seed in range(40)])
-        lowest, highest = loop.target_box
-        assert ((goals >= lowest) & (goals <= highest)).all()
-        assert (np.ptp(goals, axis=0) > 0.8 * (highest - lowest)).all()
+def test_a_posture_has_the_least_clearance_and_distance_to_stops():
+    safe_set = porter().safe_set
+    v = np.zeros(safe_set.kinematics.num_velocities)
+    columns = [safe_set.names.index(name) for name in ("collision", "joint_limits")]
+
+    def least(**options):
+        sampling = PostureSampling(base_lowering_m=0.04, joint_offset_rad=0.3, **options)
+        postures = [sampling.sample(safe_set, np.random.default_rng(seed)) for seed in range(15)]
+        return np.array([safe_set.margins(q, v) for q in postures])[:, columns].min(axis=0)
+
+    assert np.all(least(clearance_m=0.05, joint_margin_rad=0.1) >= [0.05, 0.1])
+    assert np.any(least(clearance_m=0.0) < [0.05, 0.1])
 
 
-def test_a_goal_takes_the_place_of_the_drawn_target_and_of_nothing_else():
+def test_detours_are_made_by_the_share_of_episodes_and_lie_in_their_box():
+    detours = Detours(share=0.25, lowest_m=[-0.3, -0.2, 0.0], highest_m=[0.0, 0.2, 0.3])
+    rng = np.random.default_rng(0)
+    sampled = [detours.sample(rng) for _ in range(400)]
+    made = np.array([detour for detour in sampled if detour is not None])
+    assert len(made) == pytest.approx(100, abs=30)
+    assert np.all((made >= detours.lowest_m) & (made <= detours.highest_m))
+    assert np.all(np.ptp(made, axis=0) > 0.2)
+
+
+def test_a_goal_takes_the_place_of_the_drawn_target_alone():
     loop = porter("noisy")
     drawn, given = started(loop, 2), started(loop, 2, EASY)
     np.testing.assert_allclose(goal_of(loop, given), EASY, atol=1e-12)
@@ -108,41 +146,34 @@ def test_a_goal_takes_the_place_of_the_drawn_target_and_of_nothing_else():
         np.testing.assert_array_equal(evaluated(loop, given, name), evaluated(loop, drawn, name))
 
 
-def test_the_plan_leads_from_the_hand_at_rest_to_the_goal_at_rest(make_loop):
-    loop = make_loop()
-    duration_s = loop.scenario.parameters.plan_duration_s
+def test_the_plan_leads_from_the_hand_at_rest_to_the_goal_at_rest():
+    loop = porter()
     context = started(loop, 1)
     start = loop.safe_set.model.reaching_position(positions(loop, context))
-    np.testing.assert_allclose(evaluated(loop, context, "desired_output"), start, atol=1e-9)
-    rows = []
-    for time in (1e-4, duration_s - 1e-4, duration_s):
-        context.SetTime(time)
-        rows.append(evaluated(loop, context, "desired_output").copy())
-    goal = goal_of(loop, context)
-    np.testing.assert_allclose(rows[0], start, atol=1e-9)
-    np.testing.assert_allclose(rows[1], goal, atol=1e-9)
-    np.testing.assert_allclose(rows[2], goal, atol=1e-9)
+    goal, duration_s = goal_of(loop, context), loop.scenario.parameters.plan_duration_s
+    for time_s, expected in ((0.0, start), (1e-4, start), (duration_s - 1e-4, goal)):
+        context.SetTime(time_s)
+        np.testing.assert_allclose(evaluated(loop, context, "desired_output"), expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("goal", [[0.3, np.nan, 0.6], [np.inf, 0, 0], [0.3, 0.2], 0.3])
+@pytest.mark.parametrize("goal", [[0.3, np.nan, 0.6], [0.3, 0.2]])
 def test_a_goal_that_is_not_three_finite_numbers_is_refused(goal):
     loop = porter()
-    message = "reaching: a target is three finite numbers"
-    with pytest.raises(ValueError, match=message):
-        loop.reset(loop.CreateDefaultContext(), np.random.default_rng(0), goal)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match="reaching: a target is three finite numbers"):
         loop.reset_standing(loop.CreateDefaultContext(), goal)
 
 
-def test_a_standing_start_is_the_posture_of_the_robot_and_always_the_same():
+def test_a_standing_start_is_the_posture_without_noise_and_repeats():
     loop = porter("noisy")
     rows = []
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
     for _ in range(2):
         loop.reset_standing(context, EASY)
-        q = positions(loop, context)
-        np.testing.assert_array_equal(q, loop.kinematics.standing_positions())
+        standing = loop.kinematics.standing_positions()
+        np.testing.assert_array_equal(positions(loop, context), standing)
+        state, true_state = (evaluated(loop, context, name) for name in ("state", "true_state"))
+        np.testing.assert_array_equal(state, true_state)
         simulator.Initialize()
         simulator.AdvanceTo(0.05)
         rows.append(evaluated(loop, context, "state").copy())
@@ -152,7 +183,7 @@ def test_a_standing_start_is_the_posture_of_the_robot_and_always_the_same():
     np.testing.assert_array_equal(rows[0], rows[1])
 
 
-def test_starts_that_cannot_be_safe_are_given_up():
+def test_without_a_safe_posture_the_error_says_to_narrow_the_starts():
     scenario = load_scenario(porter_path())
     scenario.parameters.safe_set.joint_margin_rad = 1.0
     loop = scenario.make_loop()
@@ -160,43 +191,83 @@ def test_starts_that_cannot_be_safe_are_given_up():
         loop.reset(loop.CreateDefaultContext(), np.random.default_rng(0))
 
 
-def test_the_same_generator_draws_the_mirror_image_for_the_other_hand(make_loop):
+def exploring(tmp_path, **options):
+    """The porter, half of whose plans make detours and half of whose episodes are pushed."""
+    changes = {
+        "detours": {"share": 0.5, "lowest_m": [-0.05, -0.1, 0.0], "highest_m": [0.0, 0.1, 0.1]},
+        "random_pushes": {"share": 0.5, "time_s": [0.1, 0.3], "force_n": [1.0, 5.0]},
+    }
+    return load_scenario(porting(tmp_path, parameters=changes)).make_loop(**options)
+
+
+@pytest.mark.parametrize("hand", HANDS)
+def test_the_goal_of_a_plan_with_a_detour_is_where_it_ends(hand, tmp_path):
+    loop = exploring(tmp_path, hand=hand)
+    detours = []
+    for seed in range(8):
+        context = started(loop, seed)
+        episode = first_row(loop, context)
+        np.testing.assert_allclose(loop.goal_of(episode), goal_of(loop, context), atol=PLACED_M)
+        path = episode.desired_preview[0].reshape(-1, 3)
+        along = (path[-1] - path[0]) / np.linalg.norm(path[-1] - path[0])
+        beside = path - path[0] - np.outer((path - path[0]) @ along, along)
+        detours.append(np.linalg.norm(beside, axis=1).max())
+    assert min(detours) < 1e-6 and max(detours) > 0.01
+
+
+def test_evaluation_is_of_straight_plans_without_pushes(tmp_path):
+    training, judging = exploring(tmp_path), exploring(tmp_path, exploring=False)
+    for purpose in ("evaluation", "paper"):
+        assert judging.scenario.options_for(purpose) == {"exploring": False}
+    first_steps = {training: set(), judging: set()}
+    for seed in range(8):
+        for loop, steps in first_steps.items():
+            steps.add(loop.reset(loop.CreateDefaultContext(), np.random.default_rng(seed)))
+        a, b = (first_row(loop, started(loop, seed)) for loop in (training, judging))
+        np.testing.assert_array_equal(a.true_state, b.true_state)
+        np.testing.assert_allclose(training.goal_of(a), judging.goal_of(b), atol=1e-9)
+    assert first_steps[judging] == {0} and len(first_steps[training]) > 1
+    # A given goal is reached straight, too.
+    assert training.reset(training.CreateDefaultContext(), np.random.default_rng(0), EASY) == 0
+
+
+def test_a_push_is_over_when_the_rows_of_training_begin(tmp_path):
+    loop = exploring(tmp_path)
+    episodes = [run_episode(loop, i) for i in range(6)]
+    pushed = [e for e in episodes if e.first_step > 0]
+    assert 0 < len(pushed) < len(episodes)
+    assert all(e.time_s[e.first_step] >= 0.1 + 0.2 for e in pushed if e.is_safe)
+
+
+def test_the_other_hands_loop_is_the_trained_ones_mirror_image(make_loop):
     left, right = make_loop(), make_loop(hand="right")
-    assert left.mirror is None
+    assert left.mirror is None and left.view.mirrored() == right.view
     mirror = Mirror(left.kinematics)
-    for seed in range(5):
-        one, other = started(left, seed), started(right, seed)
-        q, v = np.split(evaluated(left, one, "plant_state"), [left.kinematics.num_positions])
-        expected = np.concatenate(mirror.plant_state(q, v, np.zeros(3)))
-        found = evaluated(right, other, "plant_state")
-        np.testing.assert_allclose(found, expected, atol=1e-12)
-        np.testing.assert_allclose(
-            goal_of(right, other), mirror.points(goal_of(left, one)), atol=1e-9
-        )
-
-
-def test_the_assessor_sees_the_other_hand_as_the_trained_one_in_the_mirror(make_loop):
-    left, right = make_loop(), make_loop(hand="right")
-    # The torso that Atlas was published with is not quite symmetric: its centre of mass lies some
-    # millimetres to one side, and a far reach ends some hundredths of a radian otherwise.
-    atol = 0.03 if left.robot.name == "atlas" else 1e-6
+    image = np.sort(mirror.points(left.target_box), axis=0)
+    np.testing.assert_array_equal(right.target_box, image)
     for name in ("state_names", "output_names", "feature_names", "constraint_names"):
         assert getattr(left, name) == getattr(right, name)
-    compared = 0
-    for seed in range(8):
-        one, other = started(left, seed), started(right, seed)
+    # The torso that Atlas was published with is not quite symmetric: its centre of mass lies some
+    # millimetres to one side, and a far reach ends some hundredths of a radian otherwise.
+    atol, compared = 0.03 if left.robot.name == "atlas" else 1e-6, 0
+    for seed in range(6):
+        contexts = [(left, started(left, seed)), (right, started(right, seed))]
+        (q, v), actual = (plant_state(*one) for one in contexts)
+        expected = mirror.plant_state(q, v, np.zeros(3))
+        np.testing.assert_allclose(np.concatenate(actual), np.concatenate(expected), atol=1e-12)
+        goals = [goal_of(*one) for one in contexts]
+        np.testing.assert_allclose(goals[1], mirror.points(goals[0]), atol=1e-9)
         for name in ("state", "true_state", "desired_preview"):
-            expected = evaluated(left, one, name)
-            np.testing.assert_allclose(evaluated(right, other, name), expected, atol=1e-9)
-        expected = evaluated(left, one, "features")
-        # A hand that never gets there is previewed on its way, wherever it then is.
-        if expected[left.feature_names.index("preview_last_miss")] < 0.015:
-            compared += 1
-            np.testing.assert_allclose(evaluated(right, other, "features"), expected, atol=atol)
+            np.testing.assert_allclose(*(evaluated(*one, name) for one in contexts), atol=1e-9)
         for name in ("output", "desired_output"):
-            expected = evaluated(left, one, name) * [1, -1, 1]
-            np.testing.assert_allclose(evaluated(right, other, name), expected, atol=1e-9)
-    assert compared >= 3
+            values = [evaluated(*one, name) for one in contexts]
+            np.testing.assert_allclose(values[1], mirror.points(values[0]), atol=1e-9)
+        features = [evaluated(*one, "features") for one in contexts]
+        # A hand that never arrives is previewed on its way, wherever it then is.
+        if features[0][left.feature_names.index("preview_last_miss")] < 0.015:
+            compared += 1
+            np.testing.assert_allclose(*features, atol=atol)
+    assert compared >= 2
 
 
 def test_the_mirror_image_moves_as_the_mirrored_robot():
@@ -207,39 +278,38 @@ def test_the_mirror_image_moves_as_the_mirrored_robot():
     np.testing.assert_allclose(right.output, left.output * [1, -1, 1], atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"hand": "tail"}, r"'porter' has no reaching frame 'tail'; it has \['head', 'left', 'r"),
-        ({"hand": "head"}, "are 'left' of robot 'porter' and its mirror image 'right'; got"),
-    ],
-)
-def test_a_hand_that_is_neither_the_trained_one_nor_its_image_is_refused(
-    tmp_path, options, message
-):
-    path = porting(tmp_path, parameters={"hand": "left"})
+@pytest.mark.train
+def test_one_assessment_serves_both_hands():
+    scenario = load_scenario(porter_path())
+    episodes = run_episodes(scenario, 7, num_workers=1)
+    assessment = SafetyAssessment(scenario.assessment).fit(episodes)
+    probabilities = []
+    for hand in HANDS:
+        loop = porter(assessment=assessment, hand=hand)
+        context = started(loop, 3)
+        Simulator(loop, context).Initialize()
+        values = {name: evaluated(loop, context, name) for name in ASSESSMENT_PORTS}
+        assert values["belief"].sum() == pytest.approx(1.0)
+        probabilities.append(values["safety_probability"][0])
+    assert probabilities[0] == pytest.approx(probabilities[1], abs=1e-4)
+
+
+def test_the_scenario_names_the_trained_hand_and_the_other_is_its_image(tmp_path):
+    path = porting(tmp_path, parameters={"hand": "right"})
     frames = yaml.safe_load((tmp_path / "robot.yaml").read_text())["reaching_frames"]
     edited(tmp_path / "robot.yaml", reaching_frames=frames | {"head": {"body": "pelvis"}})
-    with pytest.raises(ValueError, match=message):
-        load_scenario(path).make_loop(**options)
-
-
-def test_the_scenario_says_which_hand_is_trained(tmp_path):
-    scenario = load_scenario(porting(tmp_path, parameters={"hand": "right"}))
+    scenario = load_scenario(path)
     right, left = scenario.make_loop(), scenario.make_loop(hand="left")
     assert (right.hand, left.hand) == ("right", "left")
-    assert right.mirror is None
-    assert left.mirror is not None
+    assert right.mirror is None and left.mirror is not None
     np.testing.assert_array_equal(right.target_box, scenario.parameters.target.box)
-
-
-def test_a_robot_without_a_mirror_has_one_hand_to_reach_with(tmp_path):
-    path = porting(tmp_path)
+    with pytest.raises(ValueError, match=r"has no reaching frame 'tail'; it has \['head', 'left'"):
+        scenario.make_loop(hand="tail")
+    with pytest.raises(ValueError, match="are 'right' of robot 'porter' and its mirror image 'l"):
+        scenario.make_loop(hand="head")
     edited(tmp_path / "robot.yaml", mirror={})
-    scenario = load_scenario(path)
-    assert scenario.make_loop().hand == "left"
     with pytest.raises(ValueError, match=r"mirror pairs joint .* which is not its reflection"):
-        scenario.make_loop(hand="right")
+        load_scenario(path).make_loop(hand="left")
 
 
 @pytest.mark.parametrize(
@@ -247,21 +317,194 @@ def test_a_robot_without_a_mirror_has_one_hand_to_reach_with(tmp_path):
     [
         (write_hexapod, "robot 'hexapod' has no reaching frames, so it cannot reach"),
         (write_biped, "'biped': no body moved by joints of its reaching frames"),
-        (
-            lambda folder: edited(write_porter(folder), feet={}, mirror={}),
-            "robot 'porter' has no feet to stand on",
-        ),
     ],
-    ids=["no hands", "no arm", "no feet"],
 )
 def test_a_robot_that_cannot_reach_is_refused(tmp_path, write, message):
-    path = porting(tmp_path, write)
     with pytest.raises(ValueError, match=message):
-        load_scenario(path).make_loop()
+        load_scenario(porting(tmp_path, write)).make_loop()
 
 
-def test_a_decoration_that_can_be_touched_is_refused():
+def test_a_decoration_with_collision_geometry_is_refused():
     scenario = load_scenario(porter_path())
     scenario.parameters.decorations = [Obstacle(model=f"{SCENES}/bookshelf.urdf")]
-    with pytest.raises(ValueError, match=r"decoration '.*bookshelf.urdf' has collision geometry"):
+    with pytest.raises(ValueError, match=r"decorations .*bookshelf.urdf'\] have collision geo"):
         scenario.make_loop()
+
+
+def test_a_robot_of_ones_own_reaches_from_yaml_alone():
+    episode = easy_episode()
+    assert episode.is_safe and episode.num_controller_failures == 0
+    assert np.linalg.norm(episode.output[-1] - EASY) < 0.02
+    assert np.linalg.norm(episode.output - episode.desired_output, axis=1).max() < 0.05
+
+
+@pytest.mark.parametrize("variation", ["heavy", "rough", "noisy"])
+def test_other_plants_nearly_reach_the_goal(variation):
+    episode = easy_episode(variation)
+    assert episode.cause == ""
+    assert np.linalg.norm(episode.output[-1] - EASY) < 0.04
+    assert np.abs(episode.true_state - easy_episode().true_state).max() > 1e-5
+
+
+def test_a_target_in_a_board_ends_in_a_collision():
+    goal = np.array([0.5, 0.2, 0.475])  # Inside the board below the hand.
+    episode = run_episode(porter(), 0, goal=goal)
+    assert (episode.is_safe, episode.cause) == (False, "collision")
+    assert episode.margins[-1, 1] < 0
+    np.testing.assert_allclose(porter().goal_of(episode), goal, atol=PLACED_M)
+
+
+def test_the_preview_foresees_the_joints_of_a_reach():
+    loop, goal = atlas(), np.array([0.65, 0.3, 1.05])
+    context = loop.CreateDefaultContext()
+    loop.reset_standing(context, goal)
+    x = dict(zip(loop.feature_names, evaluated(loop, context, "features"), strict=True))
+    Simulator(loop, context).AdvanceTo(loop.scenario.episode_duration_s)
+    q = positions(loop, context)
+    assert np.linalg.norm(loop.safe_set.model.reaching_position(q) - goal) < 0.02
+    margins = loop.safe_set.margins(q, np.zeros(loop.kinematics.num_velocities))
+    for name, margin in zip(loop.constraint_names[:3], margins, strict=False):
+        assert x[f"preview_last_{name}"] == pytest.approx(margin, abs=0.03)
+    for goal in ([0.47, -0.27, 1.12], [0.54, -0.26, 1.12]):  # Across the body.
+        loop.reset_standing(context, np.array(goal))
+        x = dict(zip(loop.feature_names, evaluated(loop, context, "features"), strict=True))
+        assert x["preview_last_miss"] < 0.02
+
+
+def test_an_unsolved_program_is_in_the_solver_status():
+    loop = porter()
+    context = started(loop)
+    simulator = Simulator(loop, context)
+    simulator.AdvanceTo(0.02)
+    assert evaluated(loop, context, "solver_status")[0] == 0
+    v = np.zeros(loop.plant.num_velocities())
+    v[6 : 6 + loop.kinematics.num_joints] = 200.0  # No ankle can stop a foot that spins so fast.
+    plant_context = loop.plant.GetMyMutableContextFromRoot(context)
+    loop.plant.SetVelocities(plant_context, loop.robot_instance, v)
+    simulator.AdvanceTo(0.024)
+    assert evaluated(loop, context, "solver_status")[0] != 0
+    assert evaluated(loop, context, "num_controller_failures")[0] > 0
+
+
+def test_an_episode_that_begins_outside_the_safe_set_ends_at_once(monkeypatch):
+    q = porter().kinematics.standing_positions()
+    q[6] += 0.5
+    monkeypatch.setattr(PostureSampling, "sample", lambda *arguments: q)
+    episode = run_episode(porter(), 0)
+    assert episode.cause == "support_polygon" and len(episode.time_s) == 1
+
+
+def test_feet_that_begin_loaded_stay_flat_from_the_first_step():
+    loop = atlas()
+    fastest = []
+    for sink_m in (0.0, loop.scenario.parameters.start.sink_m):
+        context = started(loop, 1)
+        plant_context = loop.plant.GetMyMutableContextFromRoot(context)
+        q = positions(loop, context).copy()
+        q[6] += loop.scenario.parameters.start.sink_m - sink_m
+        loop.plant.SetPositions(plant_context, loop.robot_instance, q)
+        Simulator(loop, context).AdvanceTo(0.002)
+        fastest.append(np.abs(loop.plant.GetVelocities(plant_context, loop.robot_instance)).max())
+    assert fastest[0] > 10.0  # rad/s, of an ankle.
+    assert fastest[1] < 2.0
+
+
+def test_the_hash_depends_on_obstacles_and_their_files_and_on_no_online_parameter(tmp_path):
+    scenario = load_scenario(porter_path())
+    before = scenario.simulation_hash()
+    parameters = scenario.parameters
+    parameters.named_targets, parameters.decorations = {"here": [0.0, 0.0, 1.0]}, []
+    parameters.assessment_period_s, parameters.view.room = 0.5, 3.0
+    assert scenario.simulation_hash() == before
+    hashes, shelf = {before}, tmp_path / "shelf.urdf"
+    parameters.obstacles[0].position[2] += 0.01
+    hashes.add(scenario.simulation_hash())
+    parameters.obstacles[0].model = str(shelf)
+    for size in ("0.1", "0.2"):
+        shelf.write_text(
+            f'<robot name="s"><link name="s"><collision><geometry><box size="{size} 1 1"/>'
+            "</geometry></collision></link></robot>"
+        )
+        hashes.add(scenario.simulation_hash())
+    assert len(hashes) == 4
+
+
+@pytest.mark.parametrize("name", ["blue_box", "red_can"])
+def test_a_named_target_is_where_the_hand_touches_the_thing_on_its_board(name):
+    loop = atlas()
+    plant, context = loop.plant, loop.CreateDefaultContext()
+    query = plant.get_geometry_query_input_port().Eval(plant.GetMyContextFromRoot(context))
+    inspector = query.inspector()
+    (body,) = plant.GetBodyIndices(plant.GetModelInstanceByName(name))
+    corners = []
+    for geometry in inspector.GetGeometries(plant.GetBodyFrameIdOrThrow(body), Role.kIllustration):
+        box = inspector.GetObbInGeometryFrame(geometry)
+        X_WB = query.GetPoseInWorld(geometry) @ box.pose()
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1)
+        corners.append(X_WB.multiply(signs * np.reshape(box.half_width(), (3, 1))))
+    low, high = np.hstack(corners).min(axis=1), np.hstack(corners).max(axis=1)
+    foot = np.append(0.5 * (low + high)[:2], low[2])
+    clearance = loop.safe_set.clearance
+    under, over = clearance.of_points(np.array([foot - [0, 0, 0.025], foot + [0, 0, 0.01]]))
+    # Half a board's height under it is the middle of a board; a centimetre over its foot is air.
+    assert (under, over) == (pytest.approx(-0.025, abs=1e-6), pytest.approx(0.01, abs=1e-6))
+    target = np.array(loop.named_targets[name])
+    radius_m = load_robot("atlas").reaching_frame(loop.hand).radius_m
+    assert abs(np.linalg.norm(target - np.clip(target, low, high)) - radius_m) < 0.01
+    assert clearance.of_points(target[None], radius_m)[0] > 0.01
+    assert np.all((target >= loop.target_box[0]) & (target <= loop.target_box[1]))
+
+
+@pytest.mark.parametrize("is_watched", [False, True])
+def test_visual_shapes_are_simulated_only_with_a_visualiser(is_watched):
+    loop = load_scenario("atlas_reaching").make_loop(meshcat=Meshcat()) if is_watched else atlas()
+    context = loop.CreateDefaultContext()
+    loop.remove_visuals(context)
+    scene_graph = loop.scene_graph
+    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+    model, simulated = scene_graph.model_inspector(), query.inspector()
+    assert simulated.GetCollisionCandidates() == model.GetCollisionCandidates()
+    num_visual = model.NumGeometriesWithRole(Role.kIllustration)
+    assert num_visual > 100
+    assert simulated.NumGeometriesWithRole(Role.kIllustration) == is_watched * num_visual
+
+
+@pytest.fixture(scope="module")
+def actual():
+    return load_scenario("atlas_reaching").make_loop("actual")
+
+
+def test_a_motion_to_a_goal_depends_on_its_seed_and_on_its_push_once_that_begins(actual):
+    goal = np.array(actual.named_targets["blue_box"])
+    alone = run_to_goal(actual, goal, duration_s=0.3, ports=("safe",))
+    np.testing.assert_allclose(alone.time_s, 0.02 * np.arange(16), atol=1e-12)
+    assert np.all(alone["safe"] == 1.0) and not alone.has_left and alone.cause == ""
+    other = run_to_goal(actual, goal, duration_s=0.1, seed=1)
+    assert not np.array_equal(other["plant_state"], alone["plant_state"][: len(other.time_s)])
+    push = Push(body="utorso", force_n=[0.0, 300.0, 0.0], time_s=0.1, duration_s=0.05)
+    pushed = run_to_goal(actual, goal, push=push, duration_s=0.3)
+    is_before = alone.time_s <= push.time_s
+    np.testing.assert_array_equal(pushed["plant_state"][is_before], alone["plant_state"][is_before])
+    y = 5  # The base's, among the positions.
+    assert np.all(pushed["plant_state"][-3:, y] > alone["plant_state"][-3:, y])
+    # The next motion is not pushed, and has the same noise.
+    after = run_to_goal(actual, goal, duration_s=0.3)
+    np.testing.assert_array_equal(after["plant_state"], alone["plant_state"])
+
+
+@pytest.mark.slow
+def test_a_motion_that_leaves_the_safe_set_goes_on_until_the_robot_falls(actual):
+    motion = run_to_goal(actual, np.array(actual.named_targets["red_can"]), duration_s=4.5)
+    assert motion.leave_time_s < motion.fall_time_s == motion.time_s[-1] < 4.5
+    row = int(np.argmin(np.abs(motion.time_s - motion.leave_time_s)))
+    assert motion["margins"][:row].min() >= 0
+    assert actual.constraint_names[int(np.argmin(motion["margins"][row]))] == motion.cause
+    assert motion["margins"][-1, actual.constraint_names.index(actual.fall_name)] < 0
+
+
+@pytest.mark.slow
+def test_the_safe_named_target_is_reached_inside_the_safe_set():
+    goal = np.array(atlas().named_targets["blue_box"])
+    motion = run_to_goal(load_scenario("atlas_reaching").make_loop(), goal, duration_s=3.5)
+    assert not motion.has_left and math.isinf(motion.leave_time_s)
+    assert np.linalg.norm(motion["output"][-1] - goal) < 0.02

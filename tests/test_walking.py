@@ -1,3 +1,4 @@
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -7,18 +8,23 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety import load_scenario, run_episode
+from drake_safety import load_assessment, load_scenario, run_episode
 from drake_safety.control.observation import heading_velocity, walking_state
 from drake_safety.diagrams.walking.parameters import CommandSampling, WalkingRecovery, profile
+from drake_safety.learning.beliefs import empty
 from drake_safety.simulation.contract import check_contract
 from drake_safety.simulation.rollouts import episode_rng
+from system_doubles import HORIZON, LIMITS, OUTLOOK, Bench, SlowIsSafe, guard
 
-NAMES = ["g1_walking", "go2_walking", "t1_walking"]
+
+@pytest.fixture(scope="module")
+def scenario():
+    return load_scenario("go2_walking")
 
 
-@pytest.fixture(scope="module", params=NAMES)
-def loop(request):
-    return load_scenario(request.param).make_loop()
+@pytest.fixture(scope="module")
+def loop(scenario):
+    return scenario.make_loop()
 
 
 def walk(loop, command, duration_s):
@@ -35,20 +41,16 @@ def walk(loop, command, duration_s):
     return np.array(velocities), np.array(margins)
 
 
-def test_the_robot_walks_where_it_is_told_without_leaving_its_safe_set(loop):
-    velocities, margins = walk(loop, [0.5, 0.0, 0.0], 10.0)
+@pytest.mark.parametrize("name", ["g1_walking", "go2_walking", "t1_walking"])
+def test_a_robot_walks_as_commanded_inside_its_safe_set(name):
+    loop = load_scenario(name).make_loop()
+    velocities, margins = walk(loop, [0.5, 0.0, 0.0], 5.0)
     assert margins.min() > 0
-    mean = velocities[15:].mean(axis=0)
-    assert mean[0] == pytest.approx(0.5, abs=0.15)
-    assert abs(mean[1]) < 0.15
+    np.testing.assert_allclose(velocities[15:, :2].mean(axis=0), [0.5, 0.0], atol=0.15)
     velocities, margins = walk(loop, [0.0, 0.0, 0.8], 4.0)
     assert margins.min() > 0
     assert velocities[15:, 2].mean() == pytest.approx(0.8, abs=0.25)
-
-
-def test_the_contract_is_kept(loop):
-    findings = check_contract(loop)
-    assert [finding for finding in findings if not finding.is_ok] == []
+    assert [finding for finding in check_contract(loop) if not finding.is_ok] == []
 
 
 def test_episodes_begin_in_mid_stride_and_depend_on_their_number_alone(loop):
@@ -64,36 +66,31 @@ def test_episodes_begin_in_mid_stride_and_depend_on_their_number_alone(loop):
 
 
 def test_state_and_output_do_not_depend_on_place_and_heading(loop):
-    kinematics = loop.kinematics
     start = loop.rehearse(np.array([0.3, 0.0, 0.0]), 1.0)
     q, v = start.q, start.v
-    turn = RigidTransform(RollPitchYaw(0, 0, 1.3), [4.0, -2.0, 0.0])
-    R = turn.rotation()
+    X = RigidTransform(RollPitchYaw(0, 0, 1.3), [4.0, -2.0, 0.0])
+    R = X.rotation()
     quaternion = R.ToQuaternion().multiply(Quaternion(q[:4] / np.linalg.norm(q[:4])))
-    q_turned = np.concatenate([quaternion.wxyz(), turn @ q[4:7], q[7:]])
-    v_turned = np.concatenate([R @ v[:3], R @ v[3:6], v[6:]])
-    np.testing.assert_allclose(
-        walking_state(kinematics, q, v), walking_state(kinematics, q_turned, v_turned), atol=1e-9
+    moved = (
+        np.concatenate([quaternion.wxyz(), X @ q[4:7], q[7:]]),
+        np.concatenate([R @ v[:3], R @ v[3:6], v[6:]]),
     )
-    np.testing.assert_allclose(
-        heading_velocity(q, v), heading_velocity(q_turned, v_turned), atol=1e-9
-    )
+    states = [walking_state(loop.kinematics, *one) for one in ((q, v), moved)]
+    np.testing.assert_allclose(*states, atol=1e-9)
+    np.testing.assert_allclose(heading_velocity(q, v), heading_velocity(*moved), atol=1e-9)
 
 
-def test_a_hard_push_ends_an_episode_with_its_cause(loop):
-    ends = [run_episode(loop, index, seed=11) for index in range(14)]
-    assert {episode.is_safe for episode in ends} == {True, False}
-    unsafe = [episode for episode in ends if not episode.is_safe]
-    assert all(episode.cause in loop.constraint_names for episode in unsafe)
+def test_some_episodes_are_unsafe_and_say_by_which_constraint(loop):
+    episodes = [run_episode(loop, index, seed=11) for index in range(8)]
+    assert {episode.is_safe for episode in episodes} == {True, False}
+    assert all(episode.cause in loop.constraint_names for episode in episodes if episode.cause)
 
 
-def test_profiles_go_from_one_command_to_the_next_within_their_ranges():
+def test_profiles_go_from_one_command_to_the_next_within_their_ranges(loop):
     plan = profile([np.zeros(3), np.ones(3)], [1.0], 4.0)
-    np.testing.assert_allclose(plan.value(0.9).ravel(), 0.0)
-    np.testing.assert_allclose(plan.value(1.2).ravel(), 1.0)
-    np.testing.assert_allclose(plan.value(4.0).ravel(), 1.0)
-    sampling, limits = CommandSampling(reach=2.0), load_scenario("go2_walking")
-    limits = limits.make_loop().policy.parameters.command
+    for time_s, expected in ((0.9, 0.0), (1.2, 1.0), (4.0, 1.0)):
+        np.testing.assert_allclose(plan.value(time_s).ravel(), expected)
+    sampling, limits = CommandSampling(reach=2.0), loop.policy.parameters.command
     rng = np.random.default_rng(0)
     values = np.concatenate(
         [sampling.sample(limits, rng, 4.0).vector_values([0.0, 2.0, 4.0]).T for _ in range(200)]
@@ -102,14 +99,7 @@ def test_profiles_go_from_one_command_to_the_next_within_their_ranges():
     assert np.any(np.abs(values) > np.array(limits.highest) + 0.2)
 
 
-def test_a_body_that_does_not_exist_is_named():
-    scenario = load_scenario("go2_walking")
-    scenario.parameters.safe_set.clearance_m["wing"] = 0.1
-    with pytest.raises(ValueError, match=r"no bodies \['wing'\] for clearance_m; it has"):
-        scenario.make_loop()
-
-
-def test_a_start_carries_the_controller_so_that_the_motion_goes_on_as_it_was(loop):
+def test_a_start_has_the_controllers_memory_so_that_the_motion_continues(loop):
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
     loop.reset_standing(context, np.array([0.4, 0.0, 0.3]))
@@ -118,47 +108,44 @@ def test_a_start_carries_the_controller_so_that_the_motion_goes_on_as_it_was(loo
     start = loop.start_of(context)
     simulator.AdvanceTo(1.0)
     expected = loop.GetOutputPort("plant_state").Eval(context).copy()
-    again = Simulator(loop)
-    loop.reset_to(again.get_mutable_context(), None, start)
-    again.Initialize()
-    again.AdvanceTo(0.4)
-    found = loop.GetOutputPort("plant_state").Eval(again.get_context())
-    np.testing.assert_allclose(found, expected, atol=1e-3)
-    without = replace(start, controller_state=None)
-    loop.reset_to(again.get_mutable_context(), None, without)
-    again.Initialize()
-    again.AdvanceTo(0.4)
-    forgotten = loop.GetOutputPort("plant_state").Eval(again.get_context())
+
+    def continued(start):
+        again = Simulator(loop)
+        loop.reset_to(again.get_mutable_context(), None, start)
+        again.Initialize()
+        again.AdvanceTo(0.4)
+        return loop.GetOutputPort("plant_state").Eval(again.get_context())
+
+    np.testing.assert_allclose(continued(start), expected, atol=1e-3)
+    forgotten = continued(replace(start, controller_state=None))
     assert np.abs(forgotten - expected).max() > 0.01
 
 
-def test_a_goal_is_a_command_which_may_end_before_the_episode():
-    loop = load_scenario("go2_walking").make_loop(command_s=1.0)
+def test_a_goal_is_a_command_which_may_end_before_the_episode(scenario):
+    loop = scenario.make_loop(command_s=1.0)
     context = loop.CreateDefaultContext()
     loop.reset_standing(context, np.array([0.5, 0.1, -0.2]))
     preview = loop.GetOutputPort("desired_preview").Eval(context).reshape(-1, 3)
     np.testing.assert_allclose(preview[5], [0.5, 0.1, -0.2])
-    outlook = loop.GetOutputPort("features").Eval(context)[
-        [loop.feature_names.index(f"last_command_{axis}") for axis in ("forward", "left", "yaw")]
-    ]
-    np.testing.assert_allclose(outlook, np.zeros(3), atol=1e-12)
+    names = [f"last_command_{axis}" for axis in ("forward", "left", "yaw")]
+    last = loop.GetOutputPort("features").Eval(context)[list(map(loop.feature_names.index, names))]
+    np.testing.assert_allclose(last, np.zeros(3), atol=1e-12)
     assert np.all(loop.target_box[1] > loop.policy.parameters.command.highest)
     with pytest.raises(ValueError, match="a command is three finite numbers"):
         loop.reset_standing(context, np.array([0.5, np.nan, 0.0]))
 
 
-def test_evaluation_starts_without_an_offset():
-    scenario = load_scenario("go2_walking")
-    calm, pushed = scenario.make_loop(disturbed=False), scenario.make_loop()
-    speeds = {True: [], False: []}
-    for loop, is_disturbed in ((calm, False), (pushed, True)):
-        context = loop.CreateDefaultContext()
-        for index in range(12):
-            loop.reset(context, episode_rng(5, index))
-            n_q = loop.kinematics.num_positions
-            state = loop.GetOutputPort("plant_state").Eval(context)
-            speeds[is_disturbed].append(np.linalg.norm(state[n_q + 3 : n_q + 5]))
-    assert max(speeds[False]) < 1.6 < max(speeds[True])
+def test_evaluation_starts_without_an_offset(scenario, loop):
+    assert scenario.options_for("evaluation") == {"disturbed": False}
+    fastest = []
+    for made in (scenario.make_loop(disturbed=False), loop):
+        context, speeds = made.CreateDefaultContext(), []
+        for index in range(8):
+            made.reset(context, episode_rng(5, index))
+            v = made.GetOutputPort("plant_state").Eval(context)[made.kinematics.num_positions :]
+            speeds.append(np.linalg.norm(v[3:5]))
+        fastest.append(max(speeds))
+    assert fastest[0] < 1.6 < fastest[1]
 
 
 @pytest.mark.parametrize(
@@ -171,25 +158,102 @@ def test_recovery_switches_to_the_branch_that_the_scenario_names(branch, slowest
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
     probability = loop.GetInputPort("safety_probability")
-    probability.FixValue(context, [1.0])
     loop.reset_standing(context, np.array([0.8, 0.0, 0.0]))
-    simulator.Initialize()
-    simulator.AdvanceTo(2.0)
-    assert loop.GetOutputPort("recovery_active").Eval(context)[0] == 0.0
-    speed = loop.GetOutputPort("output").Eval(context)[0]
-    assert speed > 0.4
-    probability.FixValue(context, [0.0])
-    simulator.AdvanceTo(3.5)
-    assert loop.GetOutputPort("recovery_active").Eval(context)[0] == 1.0
-    slower = loop.GetOutputPort("output").Eval(context)[0]
+    speeds = []
+    for value, time_s in ((1.0, 2.0), (0.0, 3.5)):
+        probability.FixValue(context, [value])
+        simulator.AdvanceTo(time_s)
+        assert loop.GetOutputPort("recovery_active").Eval(context)[0] == 1.0 - value
+        speeds.append(loop.GetOutputPort("output").Eval(context)[0])
+    assert speeds[0] > 0.4
     assert loop.GetOutputPort("margins").Eval(context)[loop.constraint_names.index("tilt")] > 0.4
-    assert slowest < slower / speed < fastest
+    assert slowest < speeds[1] / speeds[0] < fastest
 
 
-def test_what_a_diagram_lacks_is_named():
+def test_a_missing_part_is_named():
     scenario = load_scenario("go2_walking")
     with pytest.raises(ValueError, match="guard=True needs an assessment"):
         scenario.make_loop(guard=True)
     loop = scenario.make_loop()
     with pytest.raises(ValueError, match="built without a guard"):
         loop.set_guarded(loop.CreateDefaultContext(), True)
+    scenario.parameters.safe_set.clearance_m["wing"] = 0.1
+    with pytest.raises(ValueError, match=r"no bodies \['wing'\] for clearance_m; it has"):
+        scenario.make_loop()
+
+
+def passed_on(assessment, command, state=0.0, is_acting=True):
+    bench = Bench(guard(assessment), command=command, state=state, features=np.zeros(3))
+    bench.system.set_acting(bench.context, is_acting)
+    return bench.begin().outputs()
+
+
+def test_the_guard_passes_an_accepted_command_unchanged():
+    assessment, command = SlowIsSafe(), [1.2, 0.3, 0.0]
+    out = passed_on(assessment, command)
+    np.testing.assert_array_equal(out["desired_output"], command)
+    assert (out["is_changed"][0], out["safety_probability"][0]) == (0.0, 1.0)
+    assert assessment.seen == [1]  # No other command is evaluated.
+    np.testing.assert_array_equal(out["desired_preview"], np.tile(command, HORIZON))
+    np.testing.assert_array_equal(out["desired_outlook"], np.tile(command, OUTLOOK))
+
+
+def test_the_guard_replaces_a_refused_command_by_the_nearest_accepted_one():
+    out = passed_on(SlowIsSafe(fastest=1.5), [2.5, 0.4, 0.0])
+    # Shares of 2.5 are .5 apart, and the other entries stay.
+    np.testing.assert_allclose(out["desired_output"], [1.5, 0.4, 0.0])
+    assert (out["is_changed"][0], out["safety_probability"][0]) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("assessment", "state"), [(SlowIsSafe(novelty=2.0), 0.0), (SlowIsSafe(), np.nan)]
+)
+def test_without_an_accepted_command_the_guard_keeps_to_the_ranges(assessment, state):
+    out = passed_on(assessment, [2.5, 0.4, -3.0], state)
+    np.testing.assert_array_equal(out["desired_output"], [1.0, 0.4, -1.0])
+    assert out["safety_probability"][0] == 0.0
+
+
+@pytest.mark.parametrize("state", [0.0, np.nan])
+def test_a_guard_that_does_not_act_passes_on_everything(state):
+    out = passed_on(SlowIsSafe(fastest=1.5), [2.5, 0.4, 0.0], state, is_acting=False)
+    np.testing.assert_array_equal(out["desired_output"], [2.5, 0.4, 0.0])
+    assert out["safety_probability"][0] == 0.0
+
+
+def test_the_guards_candidates_are_sorted_by_distance_and_contain_standing():
+    asked = np.array([2.0, -1.0, 3.0])
+    candidates = guard(SlowIsSafe()).candidates(asked)
+    scale = np.subtract(LIMITS.highest, LIMITS.lowest)
+    distance = np.linalg.norm((candidates - asked) / scale, axis=1)
+    assert np.all(np.diff(distance) >= -1e-12)
+    np.testing.assert_allclose(candidates[0], asked)
+    assert np.any(np.all(candidates == 0.0, axis=1))
+
+
+@pytest.mark.parametrize("what", ["beliefs", "an alarm"])
+def test_the_guard_judges_by_adopted_beliefs_and_by_none_during_an_alarm(scenario, what):
+    assessment = load_assessment("go2_walking")
+    loop = scenario.make_loop(assessment=assessment, guard=True)
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    loop.reset_standing(context, np.array([0.3, 0.0, 0.0]))
+    guard_system = loop.GetSubsystemByName("command_guard")
+    assessor = loop.GetSubsystemByName("safety_assessor")
+
+    def probability():
+        port = guard_system.GetOutputPort("safety_probability")
+        return port.Eval(guard_system.GetMyContextFromRoot(context))[0]
+
+    simulator.AdvanceTo(0.01)
+    assert probability() > 0.5
+    if what == "beliefs":
+        adapted = copy.copy(assessment)
+        adapted.beliefs_ = empty(assessment.beliefs_.shape[:-1], assessment.beliefs_.shape[-1] - 3)
+        assessor.adopt(assessor.GetMyMutableContextFromRoot(context), adapted)
+    else:
+        port = assessor.evaluator.GetInputPort("alarm")
+        port.FixValue(assessor.evaluator.GetMyMutableContextFromRoot(context), [1.0])
+    simulator.AdvanceTo(0.12)
+    assert loop.GetOutputPort("safety_probability").Eval(context) == 0.0
+    assert probability() == 0.0
