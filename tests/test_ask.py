@@ -149,17 +149,6 @@ def test_without_a_training_the_shipped_assessment_answers_and_is_named(call, as
     assert f"which has those of ['{SCENARIO}']: `drake-safety train` learns one" in printed
 
 
-def test_a_run_with_the_shipped_assessment_writes_to_the_working_folder(
-    call, shipped, nothing_near, tmp_path, monkeypatch
-):
-    folders = []
-    monkeypatch.setattr("drake_safety.cli.run._go", lambda *_, **options: None)
-    monkeypatch.setattr("drake_safety.cli.run._save", lambda folder, *_: folders.append(folder))
-    assert call("run", SCENARIO, "--target", "blue_box", "--force")[0] == 0
-    assert call("run", SCENARIO, "--target", "blue_box", "--force", "--out", tmp_path)[0] == 0
-    assert folders == [Path("runs") / f"{SCENARIO}-shipped" / "run", tmp_path / "run"]
-
-
 def test_an_answer_takes_none_of_the_packages_that_training_takes(folder):
     code = (
         "import sys\n"

@@ -109,18 +109,6 @@ def test_states_are_converted_both_ways(bench):
     np.testing.assert_allclose(bench.system.plant_state(there), plant_state, atol=1e-14)
 
 
-def test_a_turn_of_a_rolled_base_is_in_the_body_in_mujoco_and_in_the_world_in_drake():
-    bench = Bench("hexapod")
-    n_q = bench.model.nq
-    plant_state = np.zeros(n_q + bench.model.nv)
-    plant_state[:7] = [np.sqrt(0.5), np.sqrt(0.5), 0, 0, 1.0, 2.0, 3.0]  # A quarter turn about x.
-    plant_state[n_q : n_q + 6] = [0.0, 0.0, 1.0, 4.0, 5.0, 6.0]  # Turns about the world's z.
-    state = bench.system.state_from(plant_state)
-    np.testing.assert_allclose(state[:7], [1.0, 2.0, 3.0, np.sqrt(0.5), np.sqrt(0.5), 0, 0])
-    # World z is the body's y after a quarter turn about x.
-    np.testing.assert_allclose(state[n_q : n_q + 6], [4.0, 5.0, 6.0, 0.0, 1.0, 0.0], atol=1e-15)
-
-
 def test_mass_matrix_bias_and_feet_are_drakes(bench):
     plant, rng = bench.kinematics.plant, np.random.default_rng(1)
     context = plant.CreateDefaultContext()
@@ -149,23 +137,6 @@ def test_mass_matrix_bias_and_feet_are_drakes(bench):
         np.testing.assert_allclose(
             points, bench.kinematics.contact_positions(plant_state[:n_q]), atol=1e-8
         )
-
-
-def test_a_robot_that_falls_freely_gains_what_gravity_gives():
-    bench = Bench("hexapod")
-    n_q = bench.model.nq
-    plant_state = np.concatenate([bench.kinematics.standing_positions(), np.zeros(bench.model.nv)])
-    plant_state[6] += 2.0
-    plant_state[n_q + 3] = 1.0  # Flies along x.
-    state = bench.system.state_from(plant_state)
-    for _ in range(50):
-        state = bench.system.step(state, np.zeros(bench.system.num_command))
-    fallen, time_s = bench.system.plant_state(state), 50 * STEP_S
-    # Semi-implicit Euler: v is exact, and the fall g t (t + h) / 2.
-    assert fallen[n_q + 5] == pytest.approx(-9.81 * time_s, abs=1e-8)
-    assert fallen[4] - plant_state[4] == pytest.approx(time_s, abs=1e-8)
-    drop = 0.5 * 9.81 * time_s * (time_s + STEP_S)
-    assert plant_state[6] - fallen[6] == pytest.approx(drop, abs=1e-8)
 
 
 def test_friction_stops_and_effort_limits_are_drakes(bench):
@@ -281,18 +252,6 @@ def test_a_model_that_mujoco_cannot_read_is_refused_by_name(tmp_path):
     robot.urdf = "hexapod.sdf"
     with pytest.raises(ValueError, match=r"robot 'hexapod'.*reads models from URDF files"):
         MujocoPlant(robot, plant, scene_graph, PlantVariation(), **options)
-
-
-def test_a_humanoid_under_torques_stands_for_a_second_within_a_centimetre():
-    loop = loop_of("atlas_reaching")
-    context = loop.CreateDefaultContext()
-    loop.reset_standing(context, [0.6, 0.3, 1.0])
-    loop.reset_standing(context, read(loop, context, "output"))
-    before = read(loop, context)
-    after = advanced(loop, context, 1.0)
-    np.testing.assert_allclose(after[4:7], before[4:7], atol=0.01)
-    assert read(loop, context, "safe")[0] == 1
-    assert read(loop, context, "num_controller_failures")[0] == 0
 
 
 def test_both_engines_start_alike_and_export_the_same_ports_and_names():

@@ -8,7 +8,7 @@ import pytest
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.trained_maps import Embedding
 from drake_safety.planning.goal_verdict import SAFE, UNKNOWN, UNSAFE, assess_goal, goal_inputs
-from drake_safety.planning.nearest_goal import nearest_accepted_goal, on_grid
+from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.simulation.closed_loop import ClosedLoop
 from goal_field import BOX, FieldAssessment, GoalTask
 from shuttle_task import shuttling
@@ -125,14 +125,6 @@ def test_a_refusal_names_the_constraint_whose_margin_comes_nearest_to_violation(
     without_margins = replace(verdict, predicted_margins=np.full(2, np.nan))
     assert without_margins.cause == "floor" and math.isnan(without_margins.cause_margin)
     assert replace(without_margins, cause_probability=np.zeros(2)).cause == ""
-
-
-def test_points_on_the_grid_are_the_numbers_that_their_digits_say():
-    points = np.random.default_rng(0).uniform(-2.0, 2.0, (200, 3))
-    placed = on_grid(points, 1e-3)
-    assert np.abs(placed - points).max() <= 0.5e-3 + 1e-9
-    assert placed.tolist() == [[float(f"{value:.3f}") for value in row] for row in placed]
-    np.testing.assert_array_equal(on_grid(placed, 1e-3), placed)
 
 
 @pytest.mark.parametrize(

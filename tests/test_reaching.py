@@ -9,7 +9,7 @@ from pydrake.systems.analysis import Simulator
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import stance_state
-from drake_safety.diagrams.reaching.sampling import Detours, PostureSampling
+from drake_safety.diagrams.reaching.sampling import PostureSampling
 from drake_safety.learning.segments import RECORDED, Episode
 from drake_safety.models import load_robot
 from drake_safety.plants.obstacles import Obstacle
@@ -127,16 +127,6 @@ def test_a_posture_has_the_least_clearance_and_distance_to_stops():
     assert np.any(least(clearance_m=0.0) < [0.05, 0.1])
 
 
-def test_detours_are_made_by_the_share_of_episodes_and_lie_in_their_box():
-    detours = Detours(share=0.25, lowest_m=[-0.3, -0.2, 0.0], highest_m=[0.0, 0.2, 0.3])
-    rng = np.random.default_rng(0)
-    sampled = [detours.sample(rng) for _ in range(400)]
-    made = np.array([detour for detour in sampled if detour is not None])
-    assert len(made) == pytest.approx(100, abs=30)
-    assert np.all((made >= detours.lowest_m) & (made <= detours.highest_m))
-    assert np.all(np.ptp(made, axis=0) > 0.2)
-
-
 def test_a_goal_takes_the_place_of_the_drawn_target_alone():
     loop = porter("noisy")
     drawn, given = started(loop, 2), started(loop, 2, EASY)
@@ -144,16 +134,6 @@ def test_a_goal_takes_the_place_of_the_drawn_target_alone():
     assert not np.allclose(goal_of(loop, drawn), EASY, atol=1e-3)
     for name in ("plant_state", "state", "output"):
         np.testing.assert_array_equal(evaluated(loop, given, name), evaluated(loop, drawn, name))
-
-
-def test_the_plan_leads_from_the_hand_at_rest_to_the_goal_at_rest():
-    loop = porter()
-    context = started(loop, 1)
-    start = loop.safe_set.model.reaching_position(positions(loop, context))
-    goal, duration_s = goal_of(loop, context), loop.scenario.parameters.plan_duration_s
-    for time_s, expected in ((0.0, start), (1e-4, start), (duration_s - 1e-4, goal)):
-        context.SetTime(time_s)
-        np.testing.assert_allclose(evaluated(loop, context, "desired_output"), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("goal", [[0.3, np.nan, 0.6], [0.3, 0.2]])
@@ -181,14 +161,6 @@ def test_a_standing_start_is_the_posture_without_noise_and_repeats():
         simulator.Initialize()
         simulator.AdvanceTo(0.02)
     np.testing.assert_array_equal(rows[0], rows[1])
-
-
-def test_without_a_safe_posture_the_error_says_to_narrow_the_starts():
-    scenario = load_scenario(porter_path())
-    scenario.parameters.safe_set.joint_margin_rad = 1.0
-    loop = scenario.make_loop()
-    with pytest.raises(RuntimeError, match="random postures of robot 'porter' is in the safe set"):
-        loop.reset(loop.CreateDefaultContext(), np.random.default_rng(0))
 
 
 def exploring(tmp_path, **options):

@@ -108,17 +108,6 @@ def test_the_support_margin_is_the_distance_to_the_edge_of_the_feet_on_the_groun
     assert -np.inf < margins(of, standing)["support_polygon"] < 0
 
 
-def test_the_collision_margin_is_the_clearance_of_the_arms():
-    of = safe_set(obstacles=[SHELF])
-    distances = []
-    for x in np.linspace(0.0, 0.6, 5):
-        q = of.kinematics.standing_positions()
-        q[4] += x
-        distances.append(margins(of, q)["collision"])
-        assert distances[-1] == of.clearance.of_arms(q)
-    assert distances[0] == RANGE_M and min(distances) < 0
-
-
 def test_a_robot_has_fallen_below_its_height_and_beyond_its_tilt():
     of = safe_set(fall_height_share=0.6, fall_tilt_rad=0.5)
     kinematics, height = of.kinematics, of.kinematics.standing_height

@@ -32,10 +32,6 @@ class Balancing(LeggedLoop):
         recovery: Whether to add recovery steps; by default if there is an assessment to trigger
             them. Without one the diagram has an input port ``safety_probability``.
         ball: Whether the plant has a ball; by default if pushes are sampled.
-
-    Raises:
-        ValueError: A robot without feet or gains, an assessment of another diagram, or a ball
-            with an engine that does not support it.
     """
 
     Parameters = BalancingParameters
@@ -194,10 +190,7 @@ class Balancing(LeggedLoop):
         return self.scenario.parameters.push.sample(rng, time_s)
 
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> None:
-        """Sets the ball in flight, which hits the base at rest after ``lead_s`` [s].
-
-        The monitor waits from now until the impact has settled.
-        """
+        """Sets the ball in flight, which hits the base after ``lead_s`` [s]; the monitor waits."""
         if self.ball is None:
             raise ValueError("balancing: built without a ball; pass ball=True to make_loop")
         with self._physics.edited(context) as plant_context:

@@ -129,10 +129,6 @@ def run_throw(
             ``recovery_active`` if there is one, and ``violations``, (N, 4), whether the state has
             each of `VIOLATIONS`.
         **options: Those of :func:`~drake_safety.simulation.motion.simulate`.
-
-    Raises:
-        ValueError: The task has no balls, or the plant another engine than Drake.
-        EpisodeError: A ball misses the robot, or the simulation failed.
     """
     thrown = require(loop, HasBall)
     if throws is None:

@@ -57,7 +57,8 @@ class KinematicPreview:
             least, most = _LAST_ITERATIONS if sample == len(path) - 1 else (1, _MAX_ITERATIONS)
             for iteration in range(most):
                 kinematics.set_positions(q)
-                if iteration >= least and self._is_near(point):
+                miss = self.hand.present_position(kinematics) - point
+                if iteration >= least and miss.dot(miss) < _NEAR_M**2:
                     break
                 reached, J_feet = kinematics.present_contacts()
                 J, error = task_errors(model, reference)
@@ -77,10 +78,6 @@ class KinematicPreview:
                 q[:4] /= math.sqrt(q[:4].dot(q[:4]))
             positions[sample] = q
         return positions
-
-    def _is_near(self, point: np.ndarray) -> bool:
-        miss = self.hand.present_position(self.model.kinematics) - point
-        return float(miss.dot(miss)) < _NEAR_M**2
 
 
 def chain_joints(kinematics: RobotKinematics, hand: Hand) -> list[int]:

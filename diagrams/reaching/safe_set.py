@@ -130,15 +130,6 @@ class ReachingSafeSet:
         distance = np.minimum(np.minimum(joints - lowest, highest - joints), math.pi)
         return distance - self.limits.joint_margin_rad
 
-    def _velocities(self, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Velocities of centre of mass and hand at the Context's positions, (3,) each [m/s]."""
-        plant, context = self.kinematics.plant, self.kinematics.context
-        plant.SetVelocities(context, v)
-        V_WB = self._hand.body.EvalSpatialVelocityInWorld(context)
-        R_WB = self._hand.body.EvalPoseInWorld(context).rotation()
-        v_WH = V_WB.Shift(R_WB @ self._hand.point).translational()
-        return plant.CalcCenterOfMassTranslationalVelocityInWorld(context), v_WH
-
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Returns the signed margins (4,) of a state; minus infinity without one."""
         if not is_state(q, v):
@@ -160,16 +151,20 @@ class ReachingSafeSet:
         """
         if not is_state(q, v, preview):
             return np.full(len(self.feature_names), np.nan)
-        kinematics, model = self.kinematics, self.model
+        kinematics, model, body = self.kinematics, self.model, self._hand.body
+        plant, context = kinematics.plant, kinematics.context
         p_WC = kinematics.contact_positions(q)
         X_WS = planar_pose(kinematics.stance_pose(q))
         R_SW = X_WS.rotation().matrix().T
         path = np.asarray(X_WS @ preview.T).T  # In the world.
         center_of_mass = kinematics.center_of_mass(q)  # Sets the positions.
-        v_WC, v_WH = self._velocities(v)
+        plant.SetVelocities(context, v)
+        v_WC = plant.CalcCenterOfMassTranslationalVelocityInWorld(context)
+        p_BH_W = body.EvalPoseInWorld(context).rotation() @ self._hand.point
+        v_WH = body.EvalSpatialVelocityInWorld(context).Shift(p_BH_W).translational()
         rate = math.sqrt(max(center_of_mass[2], 0.1 * kinematics.standing_height) / GRAVITY_M_S2)
         capture_point = center_of_mass[:2] + rate * v_WC[:2]
-        shoulder = self._shoulder.CalcPoseInWorld(kinematics.context).translation()
+        shoulder = self._shoulder.CalcPoseInWorld(context).translation()
         hand = model.reaching_position(q)
         from_shoulder = self._reflect * (R_SW @ (path[-1] - shoulder))
         in_stance = np.asarray(X_WS.inverse() @ p_WC.T).T * self._reflect
@@ -188,9 +183,8 @@ class ReachingSafeSet:
                 self._joint_margins(ahead).min(axis=1),
             ]
         )
-        com_support = min(
-            signed_distance_to_polygon(kinematics.center_of_mass(at)[:2], corners) for at in ahead
-        )
+        com_ahead = [kinematics.center_of_mass(at)[:2] for at in ahead]
+        com_support = min(signed_distance_to_polygon(at, corners) for at in com_ahead)
         soon = q.copy()
         soon[NUM_BASE_POSITIONS:] += _SOON_S * v[NUM_BASE_VELOCITIES:]
         miss = float(np.linalg.norm(path[-1] - model.reaching_position(ahead[-1])))

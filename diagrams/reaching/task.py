@@ -42,11 +42,6 @@ class Reaching(LeggedLoop):
         hand: The hand that reaches; the scenario's by default.
         exploring: Whether episodes with random goals have the scenario's random detours and pushes;
             otherwise every plan is straight and undisturbed.
-
-    Raises:
-        ValueError: A robot without feet or reaching frames, an unknown hand, one that is neither
-            the trained hand nor its mirror image, a decoration with collision geometry, or an
-            assessment of another diagram.
     """
 
     Parameters = ReachingParameters
@@ -175,12 +170,7 @@ class Reaching(LeggedLoop):
     ) -> int:
         """Samples a standing posture and a target, and plans the hand's motion between them.
 
-        Returns:
-            The first step after the initial push; 0 without one.
-
-        Raises:
-            ValueError: The goal is not three finite numbers.
-            RuntimeError: No sampled posture is in the safe set.
+        Returns the first step after the initial push; 0 without one.
         """
         parameters = self.scenario.parameters
         q = parameters.start.sample(self.safe_set, rng, self.mirror)
@@ -231,11 +221,7 @@ class Reaching(LeggedLoop):
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
-        """Starts in the standing posture with a plan to a target; without initial noise.
-
-        Raises:
-            ValueError: The goal is not three finite numbers.
-        """
+        """Starts in the standing posture with a plan to a target; without initial noise."""
         self._set(context, self.kinematics.standing_positions(), goal)
         self._observers.reseed(context, rng)
         self._observers.silence(context)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
@@ -35,12 +33,12 @@ class CommandGuard(LeafSystem):
         - is_changed: 1
         - safety_probability: 1
 
-    Every ``period_s`` the asked command, held from now on, is assessed. If it is accepted,
-    ``desired_output`` is the asked command. Otherwise it is the accepted one nearest to it,
-    measured in the policy's ranges, among commands whose entries are shares of the asked ones; if
-    none is accepted, the one with the largest probability. A command is accepted if its probability
-    reaches the threshold. ``safety_probability`` is that of the asked command. All outputs are
-    discrete states, and preview and outlook hold the command. ``learned``, that of a
+    Every ``period_s`` the asked command, held from now on, is assessed. It is accepted, and passed
+    on, if its probability reaches the threshold. Otherwise ``desired_output`` is the accepted
+    command nearest to it, measured in the policy's ranges, among commands whose entries are shares
+    of the asked ones; if none is accepted, the one with the largest probability.
+    ``safety_probability`` is that of the asked command. All outputs are discrete states, and
+    preview and outlook hold the command. ``learned``, that of a
     :class:`~drake_safety.systems.safety_assessor.SafetyAssessor`, replaces the beliefs of the
     assessment. Whether the guard acts is a parameter of the Context; one that does not passes on
     everything.
@@ -65,8 +63,6 @@ class CommandGuard(LeafSystem):
         num_outlook: int,
     ):
         super().__init__()
-        if not 0 <= threshold <= 1:
-            raise ValueError(f"command guard: threshold must be in [0, 1]; got {threshold}")
         info = assessment.info_
         self._assessment, self._with_commands = assessment, with_commands
         self._threshold, self._horizon = threshold, info.horizon
@@ -96,17 +92,6 @@ class CommandGuard(LeafSystem):
         """Sets whether the guard acts, from its next decision on."""
         context.get_mutable_numeric_parameter(self._is_acting).SetAtIndex(0, float(is_acting))
 
-    def probabilities(
-        self, state: np.ndarray, features: np.ndarray, commands: np.ndarray, **learned: Any
-    ) -> np.ndarray:
-        """Probability of constant commands (C, 3) from now on, (C,); 0 where it is "don't know"."""
-        return self._assessment.predict(
-            np.tile(state, (len(commands), 1)),
-            np.tile(commands, self._horizon),
-            self._with_commands(features, commands),
-            **learned,
-        ).probability
-
     def candidates(self, asked: np.ndarray) -> np.ndarray:
         """Commands that may replace an asked one, nearest first, (C, 3) [m/s, rad/s]."""
         shares = np.stack(np.meshgrid(*[_SHARES] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -115,15 +100,28 @@ class CommandGuard(LeafSystem):
         distance = np.linalg.norm((commands - asked) / (self._highest - self._lowest), axis=1)
         return commands[np.argsort(distance, kind="stable")]
 
-    def decide(
-        self, asked: np.ndarray, probabilities: Callable[[np.ndarray], np.ndarray]
-    ) -> tuple[np.ndarray, float]:
-        """Returns the command to pass on, (3,), and the probability of the asked one."""
-        asked_probability = float(probabilities(asked[None])[0])
+    def _probabilities(self, context: Context, commands: np.ndarray) -> np.ndarray:
+        """Probability of constant commands (C, 3) from now on, (C,); 0 where it is "don't know"."""
+        state, features = self._state_port.Eval(context), self._features_port.Eval(context)
+        if not (np.isfinite(state).all() and np.isfinite(features).all()):
+            return np.zeros(len(commands))
+        learned = self._learned_port.Eval(context) if self._learned_port.HasValue(context) else {}
+        return self._assessment.predict(
+            np.tile(state, (len(commands), 1)),
+            np.tile(commands, self._horizon),
+            self._with_commands(features, commands),
+            **learned,
+        ).probability
+
+    def _decide(self, context: Context, asked: np.ndarray) -> tuple[np.ndarray, float]:
+        """The command to pass on, (3,), and the probability of the asked one."""
+        if not np.isfinite(asked).all():
+            return np.zeros(3), 0.0
+        asked_probability = float(self._probabilities(context, asked[None])[0])
         if asked_probability >= self._threshold:
             return asked, asked_probability
         commands = self.candidates(asked)
-        probability = probabilities(commands)
+        probability = self._probabilities(context, commands)
         is_accepted = probability >= self._threshold
         chosen = int(np.argmax(is_accepted)) if is_accepted.any() else int(np.argmax(probability))
         if not probability[chosen] > 0:  # Nothing is known: as asked, within the ranges.
@@ -132,15 +130,7 @@ class CommandGuard(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         asked = self._command_port.Eval(context)
-        state, features = self._state_port.Eval(context), self._features_port.Eval(context)
-        learned = self._learned_port.Eval(context) if self._learned_port.HasValue(context) else {}
-        if not np.isfinite(asked).all():
-            command, probability = np.zeros(3), 0.0
-        elif np.isfinite(state).all() and np.isfinite(features).all():
-            judge = partial(self.probabilities, state, features, **learned)
-            command, probability = self.decide(asked, judge)
-        else:
-            command, probability = np.clip(asked, self._lowest, self._highest), 0.0
+        command, probability = self._decide(context, asked)
         if np.isfinite(asked).all() and not context.get_numeric_parameter(self._is_acting)[0] > 0:
             command = asked
         discrete_state.set_value(self._command, command)

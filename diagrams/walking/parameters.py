@@ -92,16 +92,11 @@ class WalkingStart:
     def offset_positions(self, q: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Samples an offset of tilt and joints, and returns the sum."""
         q = q.copy()
-        half = 0.5 * rng.uniform(-1, 1, 2) * self.tilt_rad
+        a, b = 0.5 * rng.uniform(-1, 1, 2) * self.tilt_rad
         w, x, y, z = q[:4]
         # A small rotation about the base's x and y axes.
         turned = np.array(
-            [
-                w - x * half[0] - y * half[1],
-                x + w * half[0] - z * half[1],
-                y + w * half[1] + z * half[0],
-                z + x * half[1] - y * half[0],
-            ]
+            [w - x * a - y * b, x + w * a - z * b, y + w * b + z * a, z + x * b - y * a]
         )
         q[:4] = turned / np.linalg.norm(turned)
         q[7:] += rng.normal(size=len(q) - 7) * self.joint_rad
@@ -112,7 +107,7 @@ class WalkingStart:
 class GuardParameters:
     """The command guard."""
 
-    threshold: float = 0.9
+    threshold: Share = 0.9
     """Lowest probability of a command that is passed on; set after a look at figures."""
     period_s: Positive = 0.1
     """Time between two decisions [s]."""

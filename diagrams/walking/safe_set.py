@@ -99,12 +99,6 @@ class WalkingSafeSet:
             *(f"foot_height_{i}" for i in range(kinematics.num_contacts)),
         ]
 
-    def _joint_margin(self, q: np.ndarray) -> float:
-        lowest, highest = self.kinematics.position_limits.T
-        joints = q[NUM_BASE_POSITIONS:]
-        distance = np.minimum(np.minimum(joints - lowest, highest - joints), math.pi)
-        return float(distance.min()) + self.limits.stop_rad
-
     def _clearance(self, q: np.ndarray) -> float:
         if not self._clear:
             return self.kinematics.standing_height
@@ -119,18 +113,18 @@ class WalkingSafeSet:
         """Returns the signed margins (5,) of a state; minus infinity without one."""
         if not is_state(q, v):
             return np.full(len(self.names), -np.inf)
-        tilt, height = _tilt(q), float(q[6])
-        fallen = min(
-            height - self._fallen_m,
-            self.kinematics.standing_height * (self.limits.fall_tilt_rad - tilt),
-        )
+        kinematics, limits = self.kinematics, self.limits
+        tilt, height, joints = _tilt(q), float(q[6]), q[NUM_BASE_POSITIONS:]
+        lowest, highest = kinematics.position_limits.T
+        stops = np.minimum(np.minimum(joints - lowest, highest - joints), math.pi)
+        tilt_before_fall = kinematics.standing_height * (limits.fall_tilt_rad - tilt)
         return np.array(
             [
-                self.limits.tilt_rad - tilt,
+                limits.tilt_rad - tilt,
                 height - self._lowest_m,
                 self._clearance(q),
-                self._joint_margin(q),
-                fallen,
+                float(stops.min()) + limits.stop_rad,
+                min(height - self._fallen_m, tilt_before_fall),
             ]
         )
 

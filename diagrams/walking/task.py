@@ -60,10 +60,6 @@ class Walking(LeggedLoop):
             diagram then has an input port ``safety_probability``.
         starts_of: The scenario whose policy walks before the start, within whose commands plans are
             drawn, and whose standing height the safe set refers to; by default this one.
-
-    Raises:
-        ValueError: The policy does not fit the robot, an assessment is that of another diagram, or
-            there is none for the guard.
     """
 
     Parameters = WalkingParameters
@@ -193,10 +189,9 @@ class Walking(LeggedLoop):
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's files and those of the policy."""
-        of_robot = super().model_files(scenario)
         path, network = policy_files(scenario)
         named = network_file(read_policy_file(path, network), str(path.parent))
-        return [*of_robot, path, *network_files(named)]
+        return [*super().model_files(scenario), path, *network_files(named)]
 
     @classmethod
     def options_for(cls, purpose: Purpose, scenario: Scenario, variation: str) -> dict[str, Any]:
@@ -220,11 +215,7 @@ class Walking(LeggedLoop):
         return episode.desired_output[0]
 
     def command_plan(self, command: np.ndarray) -> PiecewisePolynomial:
-        """The plan of a constant command (3,) [m/s, rad/s].
-
-        Raises:
-            ValueError: The command is not three finite numbers.
-        """
+        """The plan of a constant command (3,) [m/s, rad/s]."""
         command = np.asarray(command, dtype=float)
         if command.shape != (3,) or not np.isfinite(command).all():
             raise ValueError(
@@ -288,11 +279,7 @@ class Walking(LeggedLoop):
         self.set_plan(context, PiecewisePolynomial(np.asarray(command, dtype=float)[:, None]))
 
     def set_guarded(self, context: Context, is_guarded: bool) -> None:
-        """Sets whether the guard acts.
-
-        Raises:
-            ValueError: The diagram was built without a guard.
-        """
+        """Sets whether the guard acts."""
         if self._guard is None:
             raise ValueError("walking: the diagram was built without a guard: pass guard=True")
         self._guard.set_acting(self._guard.GetMyMutableContextFromRoot(context), is_guarded)
@@ -320,13 +307,8 @@ class Walking(LeggedLoop):
     def rehearse(self, command: np.ndarray, duration_s: float) -> EpisodeStart:
         """Walks undisturbed from the standing posture, by the nominal robot.
 
-        Args:
-            command: (v_x, v_y, ω_z) (3,) [m/s, rad/s].
-            duration_s: For how long [s]; rounded to the policy's period, so that the controller's
-                next update is due.
-
-        Raises:
-            ValueError: The policy that walks remembers other things than this one.
+        The command is (v_x, v_y, ω_z) (3,) [m/s, rad/s]. The duration is rounded to the policy's
+        period, so that the controller's next update is due.
         """
         other, period_s = self._rehearsing(), self.policy.parameters.period_s
         if _remembered(other.policy) != _remembered(self.policy):

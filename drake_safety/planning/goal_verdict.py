@@ -107,9 +107,6 @@ def assess_goal(
         threshold: Lowest probability of a safe goal.
         unsafe_below: A probability below this is unsafe, from there to the threshold "don't know";
             the threshold by default.
-
-    Raises:
-        ValueError: The loop's plans have no goal, or the goal is not three numbers.
     """
     goal = checked_goal(goal)
     with_goals = require(loop, HasGoals)

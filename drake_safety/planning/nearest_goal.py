@@ -61,9 +61,6 @@ def nearest_accepted_goal(
     Returns:
         The verdict on the goal found, with the threshold itself; None if the given goal is not
         finite, or no goal was found that is accepted with the reserve.
-
-    Raises:
-        ValueError: The loop's plans have no goal, or an argument is out of range.
     """
     if not 0.0 <= reserve <= 1.0:
         raise ValueError(f"nearest accepted goal: reserve is {reserve}, expected a value in [0, 1]")
