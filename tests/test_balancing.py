@@ -17,8 +17,7 @@ from drake_safety.diagrams.balancing.sampling import (
 )
 from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.plants.balls import Throw
-from drake_safety.simulation.scenario import parse_scenario
-from legged_robots import edited, robot_kinematics, write_hexapod
+from legged_robots import robot_kinematics
 
 ROBOTS = (PACKAGED, "hexapod")
 MASS_KG = 25.433
@@ -45,16 +44,6 @@ def test_any_robot_with_feet_stands_for_two_seconds_within_five_millimetres(name
     assert episode.is_safe and episode.time_s[-1] == pytest.approx(2.0)
     error = np.linalg.norm(episode.output - episode.desired_output, axis=1)
     assert error.max() < 0.005
-
-
-def test_a_robot_without_gains_is_refused(tmp_path):
-    edited(write_hexapod(tmp_path), joint_gains={})
-    text = (
-        "task: drake_safety.diagrams.balancing:Balancing\nrobot: robot.yaml\n"
-        "variations: {nominal: {}}"
-    )
-    with pytest.raises(ValueError, match="stiffness must be 18 positive numbers"):
-        parse_scenario(text, name="weak", folder=tmp_path).make_loop()
 
 
 def test_the_plant_has_the_variations_mass_and_the_controller_the_nominal_one():

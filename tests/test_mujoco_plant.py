@@ -19,7 +19,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 import legged_robots
 import reaching_loops
-from drake_safety import load_scenario, run_episode, run_episodes
+from drake_safety import load_scenario, run_episode
 from drake_safety.diagrams.balancing.throws import Violations
 from drake_safety.plants.mujoco_plant import MujocoPlant
 from drake_safety.plants.physics import add_ground
@@ -282,16 +282,6 @@ def test_two_contexts_of_one_diagram_do_not_disturb_each_other():
     context = simulators[0].get_context()
     clone, original = context.Clone(), context.Clone()
     np.testing.assert_array_equal(advanced(loop, clone, 0.05), advanced(loop, original, 0.05))
-
-
-def test_episodes_depend_on_seed_and_number_alone():
-    scenario = load_scenario("laikago_balancing")
-    scenario.episode_duration_s = 0.4
-    both = run_episodes(scenario, 2, variation="mujoco", seed=5, num_workers=1, ball=False)
-    loop = scenario.make_loop("mujoco", ball=False)
-    again = run_episode(loop, 1, seed=5)
-    np.testing.assert_array_equal(both[1].true_state, again.true_state)
-    assert "mujoco" in both.info.versions
 
 
 def test_a_push_moves_the_robot_as_far_as_in_drake():

@@ -64,12 +64,6 @@ def held_still(of, q):
     return in_stance(of.kinematics, q, straight(hand, hand))
 
 
-@pytest.mark.parametrize("name", ["porter", "atlas"])
-def test_a_standing_robot_is_safe_by_every_margin(name):
-    of = safe_set(name, obstacles=[SHELF])
-    assert min(margins(of, of.kinematics.standing_positions()).values()) > 0
-
-
 def test_the_joint_margin_is_zero_at_its_distance_before_any_stop():
     of = safe_set(joint_margin_rad=0.05)
     limits = of.kinematics.position_limits
@@ -184,19 +178,6 @@ def test_features_of_motion_are_velocities_and_the_margins_that_they_lead_to():
     assert at_rest["soon_joint_limits"] == at_rest["now_joint_limits"]
     changed = {name for name in of.feature_names if values[name] != at_rest[name]}
     assert changed <= set(of.rate_features)
-
-
-def test_the_preview_of_a_plan_that_holds_still_ends_where_the_robot_stands():
-    of = safe_set(obstacles=[SHELF])
-    q = leaning(of.kinematics, [0.0, 0.0, -0.05])
-    values = features(of, q, held_still(of, q))
-    assert values["preview_last_miss"] < 5e-3
-    stops = [values[name] for name in of.feature_names if name.startswith("preview_last_stop")]
-    assert min(stops) >= values["preview_last_joint_limits"]
-    for constraint in of.names[:3]:
-        lowest, last = (values[f"preview_{when}_{constraint}"] for when in ("lowest", "last"))
-        assert lowest <= last
-        assert last == pytest.approx(values[f"now_{constraint}"], abs=0.05)
 
 
 def test_a_goal_in_an_obstacle_has_a_plan_that_is_not_clear():

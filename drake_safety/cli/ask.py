@@ -100,25 +100,27 @@ def print_verdict(
 ) -> None:
     """Prints a verdict, where its threshold is from, and for a refusal what would be accepted."""
     words = goal_words(require(loop, HasGoals))
-    of = f" of {words.subject}" if words.is_point else ""
-    lines = {words.goal: f"{words.value(verdict.goal)}{of}"}
     probability, threshold = verdict.probability, verdict.threshold
+    subject = f" of {words.subject}" if words.is_point else ""
     sign = "<" if probability < threshold else "≥"
     numbers = f"probability {probability:.3f} {sign} threshold {threshold:.3f}"
-    lines["verdict"] = f"{verdict.verdict}: {verdict.reason or numbers}"
+    lines = {
+        words.goal: f"{words.value(verdict.goal)}{subject}",
+        "verdict": f"{verdict.verdict}: {verdict.reason or numbers}",
+    }
     if np.isfinite(probability):
         safe, unsafe, unknown = verdict.belief.tolist()
         lines["belief"] = f"safe {safe:.2f}, unsafe {unsafe:.2f}, don't know {unknown:.2f}"
     if not verdict.is_accepted and verdict.cause:
         masses = verdict.cause_probability
-        label, told = verdict.cause_words(loop.angular_constraints)
+        label, cause = verdict.cause_words(loop.angular_constraints)
         if not np.isfinite(verdict.cause_margin):
-            told += f" ({100 * masses.max() / masses.sum():.0f} %)"
-        lines[label] = told
+            cause += f" ({100 * masses.max() / masses.sum():.0f} %)"
+        lines[label] = cause
     if nearest is not None:
-        distance = words.distance(nearest.goal - verdict.goal)
-        told = f"{distance} away, probability {nearest.probability:.3f}"
-        lines["nearest accepted"] = f"{words.value(nearest.goal)}, {told}"
+        away = f"{words.distance(nearest.goal - verdict.goal)} away"
+        value, probability_there = words.value(nearest.goal), nearest.probability
+        lines["nearest accepted"] = f"{value}, {away}, probability {probability_there:.3f}"
     elif not verdict.is_accepted and np.isfinite(verdict.goal).all():
         lines["nearest accepted"] = "none found that is accepted with reserve"
     if nearest is not None or np.isfinite(probability):
