@@ -431,7 +431,7 @@ def test_a_named_target_is_where_the_hand_touches_the_thing_on_its_board(name):
 def test_visual_shapes_are_simulated_only_with_a_visualiser(is_watched):
     loop = load_scenario("atlas_reaching").make_loop(meshcat=Meshcat()) if is_watched else atlas()
     context = loop.CreateDefaultContext()
-    loop.remove_visuals(context)
+    loop.prepare(context)
     scene_graph = loop.scene_graph
     query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
     model, simulated = scene_graph.model_inspector(), query.inspector()
