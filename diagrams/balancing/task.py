@@ -185,10 +185,6 @@ class Balancing(LeggedLoop):
             own_context = planner.GetMyMutableContextFromRoot(context)
             planner.set_stance(own_context, p_WC, self._stance_of(start))
 
-    def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
-        """Samples a ball with its impact at ``time_s`` [s]."""
-        return self.scenario.parameters.push.sample(rng, time_s)
-
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> None:
         """Sets the ball in flight, which hits the base after ``lead_s`` [s]; the monitor waits."""
         if self.ball is None:

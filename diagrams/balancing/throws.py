@@ -45,9 +45,6 @@ class HasBall(Protocol):
     def reset_calm(self, context: Context, rng: np.random.Generator) -> None:
         """Samples an undisturbed motion, during which a ball is thrown."""
 
-    def sample_throw(self, rng: np.random.Generator, time_s: float) -> Throw:
-        """Samples a ball with a given time of impact [s]."""
-
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> None:
         """Sets a ball in flight that hits a robot at rest after ``lead_s`` [s]."""
 
@@ -134,7 +131,8 @@ def run_throw(
     if throws is None:
         rng = episode_rng(seed, index)
         thrown.reset_calm(loop.CreateDefaultContext(), rng)  # The ball is drawn after the start.
-        throws = [thrown.sample_throw(rng, rng.uniform(_EARLIEST_S, _LATEST_S))]
+        push = loop.scenario.parameters.push
+        throws = [push.sample(rng, rng.uniform(_EARLIEST_S, _LATEST_S))]
     impact_s = min((throw.time_s for throw in throws), default=math.inf)
     if duration_s is None:
         duration_s = _AFTER_S + (impact_s if throws else _LATEST_S)
