@@ -24,11 +24,7 @@ def assessed_scenarios() -> list[str]:
 
 
 def shipped_folder(scenario: str) -> Path:
-    """Returns the folder of a scenario's shipped assessments, by its name.
-
-    Raises:
-        ValueError: The scenario has no assessment; the message lists all that exist.
-    """
+    """Returns the folder of a scenario's shipped assessments, by its name."""
     if scenario not in assessed_scenarios():
         raise ValueError(
             f"no trained assessment of scenario '{scenario}' comes with the package, which has "
@@ -42,9 +38,6 @@ def load_assessment(scenario: str | os.PathLike[str], mode: str = "sharpened") -
 
     Args:
         scenario: Name of a scenario with shipped assessments, or a folder that ``train`` wrote.
-
-    Raises:
-        ValueError: The scenario, folder or mode has no assessment; the message lists all.
     """
     from drake_safety.learning.assessment import SafetyAssessment
 

@@ -63,7 +63,7 @@ def assert_kept(folder, undisturbed):
 
 
 @pytest.mark.train
-@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT])
 def test_a_killed_command_leaves_no_process_and_resumes_exactly(kill, tmp_path, undisturbed):
     process = start(tmp_path)
     workers = workers_of(process)

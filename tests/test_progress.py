@@ -5,8 +5,7 @@ import pytest
 from rich.console import Console
 
 from drake_safety import SafetyAssessment, run_episodes
-from drake_safety.cli.console import open_stages as open_stages_of_commands
-from drake_safety.files.progress import open_stages, shown
+from drake_safety.files.progress import open_stages
 from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import SCENARIO
 
@@ -53,23 +52,6 @@ def test_on_a_terminal_there_are_bars():
     with open_stages(Console(file=file, width=200, force_terminal=True)) as stages:
         stages("throws", 1, 2)
     assert "throws" in file.getvalue() and "━" in file.getvalue()
-
-
-def test_the_commands_print_a_line_every_ten_seconds(capsys):
-    with open_stages_of_commands() as stages:
-        stages("throws", 2, 2)
-    assert capsys.readouterr().out == "throws: 2/2 0:00:00 left 0:00:00\n"
-
-
-def test_a_callback_is_used_as_it_is_and_false_is_none():
-    def report(done, total):
-        pass
-
-    with shown(report, lambda stages: stages) as given:
-        assert given is report
-    for nothing in (None, False):
-        with shown(nothing, lambda stages: stages) as given:
-            assert given is None
 
 
 @pytest.mark.train

@@ -86,7 +86,6 @@ def test_an_episode_counts_by_its_first_row_and_by_all_of_them_together():
 @pytest.mark.parametrize(
     ("change", "hidden"),
     [
-        ((-0.6, 0.3, -0.2), np.zeros((2, 3))),
         ((-0.6, 0.3, -0.2, 0.4), np.zeros((2, 3))),
         (np.zeros(3), [[1.0, -1.0, 0.5], [0.0, 0.8, -0.6]]),
     ],

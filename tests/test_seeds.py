@@ -122,7 +122,7 @@ def test_an_assessment_knows_all_that_it_was_learned_calibrated_and_adapted_with
 ):
     calibrated(assessment, 30)
     adapted = assessment.adapt(paired(40))
-    found = [(one.purpose, one.variation, one.seed, one.num_episodes) for one in adapted.used_]
+    found = [(u.purpose, u.variation, u.seed, u.num_episodes) for u in adapted.used_]
     assert found == [
         ("training", "nominal", 0, 40),
         ("calibration", "nominal", 30, 20),

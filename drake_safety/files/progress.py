@@ -22,9 +22,7 @@ def open_stages(
 ) -> Iterator[StageProgress]:
     """Shows stages while the block runs: bars on a terminal and in a notebook, lines elsewhere.
 
-    Args:
-        console: Where it prints; standard error by default.
-        period_s: Longest time between two lines [s].
+    It prints to standard error by default, a line at least every `period_s`.
     """
     console = console or Console(stderr=True)
     # A log file that is told to have colours is no terminal either.
@@ -86,12 +84,7 @@ def open_stages(
 def shown(
     progress: _Report | bool | None, of_stages: Callable[[StageProgress], _Report]
 ) -> Iterator[_Report | None]:
-    """Yields the callback that an argument ``progress`` stands for.
-
-    Args:
-        progress: A callback, True to show the progress while the block runs, or None or False.
-        of_stages: Makes the callback that shows it.
-    """
+    """Yields the callback that `progress` stands for: itself, one that shows stages, or None."""
     with open_stages() if progress is True else nullcontext() as stages:
         yield of_stages(stages) if stages else None if isinstance(progress, bool) else progress
 

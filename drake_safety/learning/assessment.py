@@ -71,19 +71,15 @@ class SafetyAssessment:
     - `columns_`: the `InputColumns` of x.
     - `embedding_`: the maps Psi, an immutable `Embedding`.
     - `detector_`: the `ChangeDetector`, which sees a changed plant or sensor, for a monitor.
-    - `beliefs_`: the beliefs of every map's cells, (K, R*R, 3 + n_c). They may be replaced, and
-      predictions take other beliefs as an argument.
-    - `training_`: the `TrainingScores`, the embedded training segments, from which adaptation
-      starts; crowded cells keep some of their segments.
+    - `beliefs_`: the beliefs of every map's cells, (K, R*R, 3 + n_c).
+    - `training_`: the `TrainingScores` of training segments, from which adaptation starts.
     - `novelty_`: the `Novelty`, which says which inputs are unlike those of training.
-    - `base_logit_`: the `BaseLogit`, which scales the maps' heads and the trees to one logit; None
-      without heads.
+    - `base_logit_`: the `BaseLogit` of the maps' heads and the trees; None without heads.
     - `trees_`: the `Trees` beside the maps; None where none are learned.
     - `fall_logit_`: the `FallLogit`, of `fit_falls`; initially None.
     - `correction_`: the `Correction` that feedback adds to the base logit; initially zero.
     - `adaptation_`: the `Adaptation` to feedback; initially None.
-    - `used_`: every set of episodes used for training, calibration or adaptation, as
-      `UsedEpisodes`; evaluation needs other seeds.
+    - `used_`: the `UsedEpisodes` of training, calibration and adaptation; evaluation needs others.
     - `calibrations_`: the `Calibration` by kind for these maps and `beliefs_`; initially empty.
 
     Departure ("sharpened" only): x gains the safe set's signed margins along the plan (`features`),
@@ -158,9 +154,8 @@ class SafetyAssessment:
             progress: Called with a stage ("distances", "t-SNE", "training", "beliefs", "monitor"),
                 the percentage done and 100; True shows it.
             detector: A detector that has learned undisturbed motion.
-            motions: Long undisturbed motions of the same diagram, from which the detector is
-                learned in its place. By default it is learned from the episodes, whose motion
-                rarely suffices for its limits.
+            motions: Long undisturbed motions of the same diagram, from which else the detector is
+                learned; by default the episodes, whose motion rarely suffices for its limits.
         """
         require_extra("train", "SafetyAssessment.fit")
         self.parameters.check()
@@ -393,10 +388,7 @@ class SafetyAssessment:
         return self._predict(x, beliefs=beliefs, correction=correction, novelty=novelty)
 
     def predict_rows(self, rows: Episode | Segments, variation: str = "nominal") -> Prediction:
-        """Assesses recorded rows of a plant.
-
-        In the paper's mode, the states of the nominal plant are without noise.
-        """
+        """Assesses recorded rows of a plant; see `InputColumns.of_rows`."""
         self._check_fitted()
         return self._predict(self.columns_.of_rows(rows, variation))
 
@@ -441,10 +433,9 @@ class SafetyAssessment:
     def strangest_input(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> tuple[str, float]:
-        """Returns the entry of x that contradicts the others most, and by how much.
+        """Returns the name of the entry of x that contradicts the others most, and by how much.
 
-        It is one of `columns_.names`; the difference from what the others say is in standard
-        deviations of training. The arguments are those of `predict_one`.
+        The difference from what the others say is in standard deviations of training.
         """
         difference = self.novelty_.contradictions(self.inputs_of(state, desired_preview, features))
         column = int(np.argmax(np.abs(difference)))
@@ -455,9 +446,8 @@ class SafetyAssessment:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns x, the maps' mean logit (N,) of an unsafe end and its gradient, (N, n_x) both.
 
-        The belief is constant where all corners of a cell agree; the safety heads' logit has a
-        slope everywhere, for planners that need a gradient. Trees have none: they are left out. The
-        arguments are those of `predict`.
+        The belief is constant where all corners of a cell agree; this logit, without the trees, has
+        a slope everywhere. The arguments are those of `predict`.
         """
         x = self.inputs_of(state, desired_preview, features)
         return x, *self.embedding_.logit_gradient(x)
@@ -469,11 +459,7 @@ class SafetyAssessment:
         assessment_file.write(Path(path), self.parameters, learned)
 
     def to_onnx(self, path: str | os.PathLike[str]) -> None:
-        """Writes `predict` as one ONNX graph, atomically; see docs/export.md.
-
-        It is that of the present beliefs, correction and novelty, and its metadata say what its
-        inputs are, what its thresholds promise and for which plant.
-        """
+        """Writes `predict` as it is now as one ONNX graph, atomically; see docs/export.md."""
         from drake_safety.learning import onnx_graph
 
         self._check_fitted()

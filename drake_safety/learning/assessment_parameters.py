@@ -59,11 +59,8 @@ class PaperReading:
     docs/paper.md.
 
     Attributes:
-        stride: Samples between the starts of segments; 0 means H, segments that do not overlap: "We
-            split the simulated trajectories into segments spanning a duration of H". Gamma is asked
-            at every k, for which overlapping segments are the training data.
-        standardized: Whether every column of x is scaled to mean 0 and standard deviation 1. The
-            paper does not say; raw columns weigh as their spread in SI units.
+        stride: Samples between the starts of segments; 0 means H, segments that do not overlap.
+        standardized: Whether every column of x is scaled to mean 0 and standard deviation 1.
         hidden_sizes: Widths of the layers of Psi, "a deep neural network".
         dropout: Dropout rate.
         weight_decay: Weight decay of AdamW.
@@ -92,26 +89,22 @@ class AssessmentParameters:
         mode: "sharpened" or "paper".
         discount: gamma of the unsafety score.
         horizon: H, samples of the preview and of a segment.
-        preview_stride: Rows of an episode between two of them. The parameters of the paper's tasks
-            "are identical [...] except for the prediction horizon", so both have about the same
-            step.
+        preview_stride: Rows of an episode between two of them.
         score_weight: delta, the weight of score differences in Omega.
         initial_uncertainty: mu_ini of nominal beliefs.
         min_count: k_min, beliefs below which a cell stays empty.
         resolution: Number of cells per side of the grid.
         cell_length: Side of a cell.
         distance_backend: Implementation of dynamic time warping: "dtaidistance", or "tslearn",
-            which takes about twenty times as long and gives the same values.
+            which gives the same values in about twenty times the time.
         perplexity: Effective number of neighbours in t-SNE.
         candidates_per_neighbour: Segments among which each of t-SNE's neighbours is sought, those
             with the smallest bounds of Omega; 0 for all segments, with the cost N².
-        exaggeration: Factor of t-SNE's attraction after its early phase; 1 is plain t-SNE. A larger
-            one contracts the clusters, whose inner order Psi cannot reproduce for new inputs.
+        exaggeration: Factor of t-SNE's attraction after its early phase; 1 is plain t-SNE.
         novelty_rate: Share of safe episodes, and of first inputs of all, in which an input may
             exceed a limit of novelty, see `novelty.Novelty`.
         novelty_range: Largest distance of a known input's column from the centre of its range in
-            training, in half widths of it. An actual robot differs: where training holds postures
-            more closely than a loaded robot does, it must be larger.
+            training [half widths]; larger for a robot that sags more than training's rows do.
         seed: Seed of t-SNE and of the maps.
         learning_rate: Peak learning rate of the maps.
         batch_size: Segments per training step.
@@ -121,8 +114,7 @@ class AssessmentParameters:
             them; the final maps are trained on all episodes (sharpened).
         hidden_sizes: Widths of a map's layers (sharpened).
         dropout: Dropout rate (sharpened).
-        target_weight: Weight of the distance to t-SNE's points (sharpened). With a small weight,
-            safety separates segments that are neighbours in t-SNE.
+        target_weight: Weight of the distance to t-SNE's points (sharpened).
         safety_weight: Weight of the safety head's loss (sharpened).
         margin_weight: Weight of the margin head's loss (sharpened).
         margin_unit: Margin that counts as one in the Huber loss [m] (sharpened).
@@ -131,10 +123,10 @@ class AssessmentParameters:
             one (sharpened). A small scale prevents overfitting to them if the features suffice.
         feature_unit: Features enter a second time as asinh(f / feature_unit), which resolves
             margins near zero [unit of the features]; 0 disables it (sharpened).
-        shortest_segment: Least number of samples of a safe episode's segment; 0 means the whole
-            horizon (sharpened). For episodes that end at rest.
-        first_row_weight: Weight of an episode's first segment relative to the others (sharpened).
-            First segments are few, but verdicts at planning time depend on them.
+        shortest_segment: Least number of samples of a safe episode's segment, for episodes that end
+            at rest; 0 means the whole horizon (sharpened).
+        first_row_weight: Weight of an episode's first segment relative to the others, for verdicts
+            at planning time (sharpened).
         trees: Whether the base logit has boosted trees as a third input (sharpened).
         paper: Reading of the paper (paper).
         adaptation: Parameters of the adaptation.

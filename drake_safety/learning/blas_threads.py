@@ -1,8 +1,7 @@
 """One thread for BLAS around a tick, whatever the user's settings.
 
-A product or a triangular solve of a few dozen rows takes microseconds. Handed to a pool of threads
-it takes no less, and the idle threads spin for milliseconds after it: a whole-body controller costs
-several times its own CPU time then.
+A small product takes microseconds in one thread. Handed to a pool it takes no less, and the idle
+threads spin for milliseconds after it.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import functools
 import sys
 from collections.abc import Callable
 from threading import Lock
-from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController
@@ -23,9 +21,8 @@ _R = TypeVar("_R")
 class OneBlasThread:
     """A context in which BLAS runs in the calling thread; the settings are restored after it.
 
-    Contexts may be nested, and entered by several threads at once: BLAS has one setting for the
-    whole process, which the first context changes and the last one restores. A setting that
-    somebody else changes meanwhile stays. It costs some microseconds.
+    Contexts may be nested, and entered by several threads at once: the first one changes the
+    process' setting and the last one restores it. What somebody else changes meanwhile stays.
     """
 
     def __init__(self) -> None:
@@ -44,12 +41,7 @@ class OneBlasThread:
                         self._changed.append((set_to, get, number))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         with self._lock:
             self._depth -= 1
             if self._depth == 0:

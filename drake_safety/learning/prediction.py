@@ -28,20 +28,17 @@ class Prediction:
     """What an assessment says of N inputs, or of one, for which the axis N is missing.
 
     Attributes:
-        belief: (b_safe, b_unsafe, mu), (N, 3); empty for novel inputs. Its first entry is the
-            paper's Γ.
-        probability: Probability of staying safe, (N,), from the base logit, of maps and trees, with
-            the correction by feedback; b_safe without heads, as in the paper's mode. 0 where the
-            belief is "don't know", see `is_unknown`.
+        belief: (b_safe, b_unsafe, mu), (N, 3); empty for novel inputs. b_safe is the paper's Γ.
+        probability: Probability of staying safe, (N,), from the corrected base logit; b_safe
+            without heads, as in the paper's mode. 0 where the belief is "don't know".
         cause_probability: b_unsafe split by the violated constraint, (N, n_c).
         embedding: y of the first map, (N, 2); NaN for inputs that are not finite.
         predicted_margins: Smallest margin of each constraint until the episode's end [unit of the
             margins], (N, n_c); NaN for inputs that are not finite or without a margin head.
-        novelty: Distance of x from the training inputs in units of the largest known one, (N,);
-            novel above 1, infinite for inputs that are not finite.
+        novelty: Distance of x from the training inputs, (N,); novel above 1, infinite for inputs
+            that are not finite.
         fall_probability: Probability of a fall until the episode's end or soon after it left the
-            safe set, (N,), extrapolated for novel inputs; 1 for inputs that are not finite, NaN
-            without a `FallLogit`.
+            safe set, (N,); 1 for inputs that are not finite, NaN without a `FallLogit`.
     """
 
     belief: np.ndarray

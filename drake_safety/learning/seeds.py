@@ -1,11 +1,9 @@
 """Default seeds of each purpose, and the seeds that an assessment has used.
 
 Episode i of a set draws from `SeedSequence(seed, spawn_key=(i,))`: sets with one seed start in the
-same states for every plant, with and without balls. Episodes for evaluation must not share a seed
-with those used for training, calibration or adaptation. The default seeds of two purposes differ.
-
-Choices are made on the default seeds, so that these are no test. The figures that a release
-publishes are of other ones, `RELEASE` above them, which nothing looks at before.
+same states for every plant. Episodes for evaluation must not share a seed with those used for
+training, calibration or adaptation. Choices are made on the default seeds; the figures of a release
+are of other ones, `RELEASE` above them, which nothing looks at before.
 """
 
 from __future__ import annotations

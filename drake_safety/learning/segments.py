@@ -55,7 +55,7 @@ class EpisodesInfo:
     Attributes:
         scenario_hash: SHA-256 of everything that determines a rollout, robot files included.
         variation: The simulated plant variation, e.g. "nominal" or "actual".
-        seed: Seed of the set; episode i draws from SeedSequence(seed, spawn_key=(i,)).
+        seed: Seed of the set, see `seeds`.
         step_s: Time between two rows of an episode [s].
         horizon: The safety assessment horizon H [samples of the preview].
         constraint_names: The n_c safety constraints: columns of `margins` and possible causes.

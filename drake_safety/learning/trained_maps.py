@@ -42,18 +42,13 @@ class Embedding:
     The arrays `weights` are "trunk.i.weight" (K, in, out) and "trunk.i.bias" (K, out);
     "output.weight" (K, width, 2 + n_c) whose first two columns give y and the others the margins;
     with a safety head also "safety.0.weight" (K, 2, hidden), "safety.0.bias", "safety.1.weight"
-    (K, hidden, 1) and "safety.1.bias". Standardisation is folded into them. They are copied to
-    single precision.
+    (K, hidden, 1) and "safety.1.bias". Standardisation is folded into them.
 
     Attributes:
+        num_margins: n_c, the number of predicted margins.
+        input_range: Range to which each column of inputs is clipped, (2, n_x); may be infinite.
         centre: What is subtracted from inputs before they are multiplied, (n_x,).
         centred_bias: Bias of the first layer for these inputs, (K, out).
-
-    Args:
-        weights: The arrays.
-        num_margins: n_c, the number of predicted margins.
-        input_range: Least and largest value of each column, to which inputs are clipped, (2, n_x);
-            None for no clipping.
     """
 
     def __init__(

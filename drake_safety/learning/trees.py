@@ -19,15 +19,13 @@ class Trees:
     """An immutable sum of T decision trees: a logit of an unsafe end.
 
     At a node with ``x[feature] > threshold`` an input goes to the right, in single precision. There
-    is no walk from root to leaf: every node with that outcome excludes the leaves on its left, and
-    the first leaf that no node excludes is the one that is reached ("QuickScorer", Lucchese et
-    al., 2015). That costs the same for any depth. Attribute `arrays` has the arguments.
+    is no walk from root to leaf: every such node excludes the leaves on its left, and the first
+    leaf that no node excludes is reached ("QuickScorer", Lucchese et al., 2015).
 
     Args:
         feature: Columns of x that the nodes compare, (M, T), M < 32.
-        threshold: What they are compared with, (M, T); infinite for nodes that a tree has not.
-        left: Leaves to the left of the nodes, as bits, the lowest of which is the first leaf,
-            (M, T).
+        threshold: Thresholds of the nodes, (M, T); infinite for nodes that a tree has not.
+        left: Leaves to the left of the nodes as bits, the lowest for the first leaf, (M, T).
         value: What the leaves add to the logit, (T, M + 1).
     """
 
@@ -60,14 +58,11 @@ class Trees:
         is_held_out: np.ndarray | None = None,
         num_trees: int = MOST_TREES,
     ) -> Trees:
-        """Learns from inputs with both labels, deterministically for a seed.
+        """Learns from finite inputs x (N, n_x) with both labels, deterministically for a seed.
 
         Args:
-            x: Finite inputs, (N, n_x).
-            is_unsafe: Labels, (N,).
             weight: Weights of the inputs in the log loss, (N,).
-            is_held_out: Inputs, (N,), on which the number of trees is chosen. They are not learned
-                from.
+            is_held_out: Inputs, (N,), on which alone the number of trees is chosen.
             num_trees: Number of trees, or the largest with held-out inputs.
         """
         from sklearn.ensemble import HistGradientBoostingClassifier
