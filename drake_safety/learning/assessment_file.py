@@ -256,36 +256,29 @@ def _learned(
         raise ValueError(f"its novelty has the counts {counts} and limits {limits.tolist()}")
     feedback = Moments(count=counts[1], **group("feedback_novelty.")) if counts[1] else None
     training = {k: v.astype(_TRAINING[k][1]) for k, v in group("training_").items()}
+    nominal = Moments(count=counts[0], **group("novelty."))
+    # Maps of the paper's mode extrapolate: they have no range.
+    shape: dict[str, Any] = {"num_margins": numbers["num_margins"]}
+    shape["input_range"] = tensors.get("input_range")
     learned: dict[str, Any] = {
         "info_": info,
         "grid_": Grid.of(parameters),
         "columns_": columns,
-        # Maps of the paper's mode extrapolate: they have no range.
-        "embedding_": Embedding(
-            group("embedding."),
-            num_margins=numbers["num_margins"],
-            input_range=tensors.get("input_range"),
-        ),
+        "embedding_": Embedding(group("embedding."), **shape),
         "trees_": Trees(**trees) if trees else None,
         "beliefs_": tensors["beliefs"],
         "correction_": correction,
         "training_": TrainingScores(**training),
-        "novelty_": Novelty(
-            training=Moments(count=counts[0], **group("novelty.")),
-            feedback=feedback,
-            limits=limits,
-            plan=columns.plan,
-        ),
+        "novelty_": Novelty(training=nominal, feedback=feedback, limits=limits, plan=columns.plan),
         "detector_": ChangeDetector.from_arrays(group("detector.")),
     }
     for name, made in _MADE_OF_JSON.items():
         # Files from before the probability of a fall have none.
-        value = entries["adaptation"] if name == "adaptation" else numbers.get(name)
-        if isinstance(value, list):
-            learned[f"{name}_"] = [_made(made, item) for item in value]
-        else:
-            learned[f"{name}_"] = None if value is None else _made(made, value)
-    learned["calibrations_"] = {one.kind: one for one in learned["calibrations_"]}
+        value = (numbers | entries).get(name)
+        items = value if isinstance(value, list) else [] if value is None else [value]
+        objects: list[Any] = [_made(made, item) for item in items]
+        learned[f"{name}_"] = objects if isinstance(value, list) else next(iter(objects), None)
+    learned["calibrations_"] = {c.kind: c for c in learned["calibrations_"]}
     # Layers that do not fit together raise an error.
     names = "embedding grid beliefs correction base_logit novelty trees fall_logit"
     model = Model(
