@@ -10,26 +10,13 @@ from drake_safety.cli import adapt, calibrate, evaluate, gate, play, prepare, ru
 from drake_safety.evaluation.episode_study import evaluate_episodes
 from drake_safety.evaluation.loop_comparison import compare_loops
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
-from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
-from drake_safety.learning.calibration import calibrate as choose
+from drake_safety.learning import seeds
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import pair_episodes
-from drake_safety.learning.seeds import (
-    ADAPTATION,
-    BLOCKS,
-    CALIBRATION,
-    DEMONSTRATION,
-    FRESH_MOTION,
-    GATE,
-    NOT_DRAWN,
-    RELEASE,
-    SHIFTS,
-    TRAINING,
-    UsedEpisodes,
-    check_unused,
-    use_of,
-)
+from drake_safety.learning.seeds import NOT_DRAWN, RELEASE, UsedEpisodes, check_unused, use_of
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.feedback import run_pairs
+from lip_assessments import calibration, quick_assessment, quick_episodes
 from lip_episodes import make_episodes
 from studies.__main__ import app as studies
 
@@ -39,51 +26,41 @@ def default_seed(function):
 
 
 def used(seed, purpose="training", num_episodes=7):
-    return UsedEpisodes(
-        purpose=purpose,
-        variation="nominal",
-        scenario_hash="0",
-        seed=seed,
-        num_episodes=num_episodes,
-    )
+    info = dataclasses.replace(make_episodes(1).info, seed=seed)
+    return UsedEpisodes.of(purpose, info, num_episodes)
 
 
 def paired(seed, num=12):
-    nominal = make_episodes(num, seed=seed)
+    nominal = make_episodes(num, seed=seed, noise=0.002)
     actual = Episodes(dataclasses.replace(nominal.info, variation="actual"), list(nominal))
     return pair_episodes(actual, nominal)
 
 
 def calibrated(assessment, seed):
-    score = [i / 99 for i in range(100)]
-    found = choose(score, [one > 0.4 for one in score], kind="plan", miss_rate=0.1)
-    assessment.adopt_calibrations([found], make_episodes(20, seed=seed).info, 20)
+    assessment.adopt_calibrations([calibration()], make_episodes(1, seed=seed).info, 20)
 
 
 @pytest.fixture
 def assessment():
-    parameters = AssessmentParameters(
-        epochs=1, perplexity=5.0, ensemble_size=2, hidden_sizes=[16, 16]
-    )
-    return SafetyAssessment(parameters).fit(make_episodes(40))
+    return quick_assessment("sharpened")
 
 
 def test_no_two_purposes_have_a_seed_in_common_whatever_their_sizes():
-    seeds = [seed for block in BLOCKS for seed in block.seeds().values()]
-    assert len(seeds) == len(set(seeds))
-    for one, other in combinations(BLOCKS, 2):
-        least = 100_000 if FRESH_MOTION in (one, other) else 1_000_000
+    drawn = [seed for block in seeds.BLOCKS for seed in block.seeds().values()]
+    assert len(drawn) == len(set(drawn))
+    for one, other in combinations(seeds.BLOCKS, 2):
+        least = 100_000 if seeds.FRESH_MOTION in (one, other) else 1_000_000
         assert abs(one.first - other.first) >= least
 
 
 def test_the_seeds_of_a_release_are_far_from_those_of_development():
-    highest = max(seed for block in BLOCKS for seed in block.seeds().values())
+    highest = max(seed for block in seeds.BLOCKS for seed in block.seeds().values())
     assert highest + 1_000_000 < RELEASE
     assert use_of(highest) == use_of(0) == "development"
-    for block in (SHIFTS, FRESH_MOTION):
+    for block in (seeds.SHIFTS, seeds.FRESH_MOTION):
         assert use_of(block.first + RELEASE) == f"release {__version__.removesuffix('.dev0')}"
-        assert block.first_beside(SHIFTS.first) == block.first
-        assert block.first_beside(SHIFTS.first + RELEASE) == block.first + RELEASE
+        assert block.first_beside(seeds.SHIFTS.first) == block.first
+        assert block.first_beside(seeds.SHIFTS.first + RELEASE) == block.first + RELEASE
 
 
 def test_every_study_with_seeds_has_those_of_the_release():
@@ -97,14 +74,14 @@ def test_every_study_with_seeds_has_those_of_the_release():
 
 def test_every_command_takes_its_default_seed_from_the_table():
     commands = (train.train, calibrate.calibrate, adapt.adapt)
-    blocks = (TRAINING, CALIBRATION, ADAPTATION)
+    blocks = (seeds.TRAINING, seeds.CALIBRATION, seeds.ADAPTATION)
     assert [default_seed(command) for command in commands] == [block.first for block in blocks]
     # The default of `evaluate` is that of what it evaluates.
     assert default_seed(evaluate.evaluate) is None
     shown = [default_seed(command) for command in (run.run, play.play, prepare.check)]
-    assert shown == [DEMONSTRATION.first] * 3
-    assert default_seed(run_pairs) == ADAPTATION.first
-    assert default_seed(gate.gate) == default_seed(compare_loops) == GATE.first
+    assert shown == [seeds.DEMONSTRATION.first] * 3
+    assert default_seed(run_pairs) == seeds.ADAPTATION.first
+    assert default_seed(gate.gate) == default_seed(compare_loops) == seeds.GATE.first
 
 
 def test_a_used_seed_is_refused_with_what_it_was_used_for_and_one_that_is_free():
@@ -124,7 +101,7 @@ def test_an_assessment_knows_all_that_it_was_learned_calibrated_and_adapted_with
     adapted = assessment.adapt(paired(40))
     found = [(u.purpose, u.variation, u.seed, u.num_episodes) for u in adapted.used_]
     assert found == [
-        ("training", "nominal", 0, 40),
+        ("training", "nominal", 0, len(quick_episodes())),
         ("calibration", "nominal", 30, 20),
         ("adaptation", "actual", 40, 12),
         ("adaptation", "nominal", 40, 12),
@@ -149,7 +126,7 @@ def test_what_has_been_used_otherwise_is_neither_calibrated_nor_adapted_with(ass
     with pytest.raises(ValueError, match="episodes of its training"):
         calibrated(assessment, 0)
     calibrated(assessment, 30)
-    with pytest.raises(ValueError, match="the 20 'nominal' episodes of its calibration"):
+    with pytest.raises(ValueError, match="episodes of its calibration"):
         assessment.adapt(paired(30))
     with pytest.raises(ValueError, match="episodes of its adaptation"):
         calibrated(assessment.adapt(paired(40)), 40)
@@ -160,8 +137,8 @@ def test_who_is_judged_has_not_seen_the_episodes(assessment):
     calibrated(assessment, 30)
     gamma = assessment_scorer("gamma", assessment)
     fresh = make_episodes(20, seed=5)
-    for calibration, test in ((fresh, make_episodes(20, seed=30)), (make_episodes(20), fresh)):
+    for other, test in ((fresh, make_episodes(20, seed=30)), (make_episodes(20), fresh)):
         with pytest.raises(ValueError, match=r"'gamma': seed \d+ gives"):
-            evaluate_episodes([gamma], calibration, test)
+            evaluate_episodes([gamma], other, test)
     stranger = Scorer(name="stranger", probability=gamma.probability)
     evaluate_episodes([stranger], make_episodes(20, seed=30), fresh)
