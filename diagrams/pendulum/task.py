@@ -56,7 +56,7 @@ class PendulumParameters:
 class PendulumSafeSet:
     """Bounds of the pendulum's angle to the front and to the back.
 
-    The features use the capture angle φ + φ̇ √(l/g): beyond the angle that the motor can hold, the
+    Features use the capture angle φ + φ̇ √(l/g): beyond the angle that the motor can hold, the
     pendulum cannot return. Following the plan takes the torque (l/g) φ̈ - sin φ, in units of the
     torque that holds the pendulum horizontally.
     """
@@ -77,10 +77,9 @@ class PendulumSafeSet:
         return _reserves(self._parameters.largest_angle_rad, q)
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
-        """The margins now, and the reserves of angle and torque along the plan, (n_f,).
+        """Margins now, and reserves of angle [rad] and torque [1] along the plan, (n_f,).
 
-        Inputs are the angle (1,) [rad], its rate (1,) [rad/s] and the plan's points from now to
-        its end, (M, 3) [m]. Reserves are in [rad], those of the effort in its unit.
+        The plan's points are from now to its end, (M, 3) [m].
         """
         hold, capture = self._parameters.hold_angle_rad, q + self._time_s * v
         planned = np.arctan2(preview[:, 0], preview[:, 2])
@@ -186,10 +185,8 @@ class PendulumController(LeafSystem):
 class Pendulum(PlannedLoop):
     """The diagram of the pendulum: Drake's plant and a controller with limited torque.
 
-    The output is the bob's position relative to the hinge, which follows a plan of points.
-
-    Args:
-        variation: Name of the plant variation; mass and damping can vary.
+    The output is the bob's position relative to the hinge, which follows a plan of points. In a
+    plant variation, mass and damping can vary.
     """
 
     Parameters = PendulumParameters

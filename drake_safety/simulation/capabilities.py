@@ -48,10 +48,7 @@ class HasGoals(Protocol):
     def reset_standing(
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
-        """Starts at rest in the standing posture with a plan to a goal (3,) [m] in the world.
-
-        The initial state is without noise; later noise is that of fixed seeds by default.
-        """
+        """Starts at rest in the standing posture, without noise, with a plan to a goal (3,)."""
 
     def goal_of(self, episode: Episode) -> np.ndarray:
         """Goal of an episode's plan, in the world, (3,) [m]."""
@@ -129,11 +126,7 @@ class FollowsCommands(Protocol):
         """Sets a constant command (3,) from now on."""
 
     def set_guarded(self, context: Context, is_guarded: bool) -> None:
-        """Sets whether a guard replaces commands that are not accepted.
-
-        Raises:
-            ValueError: The loop was built without a guard.
-        """
+        """Sets whether a guard replaces commands that are not accepted."""
 
 
 @runtime_checkable
@@ -145,11 +138,7 @@ class CanStartAnywhere(Protocol):
     def reset_to(
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
     ) -> None:
-        """Sets plant state and plan; without ``rng`` the initial state is without noise.
-
-        Raises:
-            ValueError: The start does not fit the plant.
-        """
+        """Sets plant state and plan; without ``rng`` the initial state is without noise."""
 
     def start_of(self, context: Context) -> EpisodeStart:
         """State and plan of a Context, as a start for :meth:`reset_to`."""

@@ -29,9 +29,9 @@ class ClosedLoop(Diagram):
     """A task's diagram: plant, controller, planner, monitor, and optionally an assessor.
 
     The contract consists of the output ports below, :meth:`reset`, and the names of the ports'
-    entries. Optional features are protocols in :mod:`~drake_safety.simulation.capabilities`, which
-    a task implements by having their members. A subclass sets the names and connects its systems
-    in ``__init__``, calls :meth:`export`, and finally ``builder.BuildInto(self)``.
+    entries. Optional features are the protocols of :mod:`~drake_safety.simulation.capabilities`. A
+    subclass sets the names and connects its systems in ``__init__``, calls :meth:`export`, and
+    finally ``builder.BuildInto(self)``.
 
     ====================== ======= ============================================================
     output port            size    meaning
@@ -86,10 +86,8 @@ class ClosedLoop(Diagram):
     def options_for(cls, purpose: Purpose, scenario: Any, variation: str) -> dict[str, Any]:
         """Options of the diagram that differ from those of training in the sharpened mode.
 
-        Args:
-            purpose: "evaluation"; "paper", for training of the paper's mode, which has no
-                disturbances but the offsets of the initial state; "pairs", with which an actual
-                variation and its nominal twin can start alike.
+        Training of the "paper" mode has no disturbances but the offsets of the initial state; with
+        those for "pairs" an actual variation and its nominal twin can start alike.
         """
         del purpose, scenario, variation
         return {}
@@ -121,11 +119,7 @@ class ClosedLoop(Diagram):
         return {}
 
     def reset(self, context: Context, rng: np.random.Generator) -> int:
-        """Samples an initial state and a plan into the root Context.
-
-        Args:
-            context: The root Context, of this diagram or of one that contains it. Its time is set
-                to zero, and the state of this diagram is overwritten.
+        """Samples an initial state and a plan into the root Context, at time zero.
 
         Returns:
             The first step whose future is undisturbed: 0, or later if the episode begins with a
@@ -144,13 +138,11 @@ class ClosedLoop(Diagram):
     ) -> MonitoredSafetyAssessor | None:
         """Exports output ports by name; adds an assessor and its ports, if there is an assessment.
 
-        The names of the ports' entries must have been set. The scenario says what an alarm of the
-        monitor does.
+        The names of the ports' entries must have been set.
 
         Args:
             period_s: Time between two evaluations of the assessment [s].
-            margins: Those by which the assessor sees that the safe set was left; by default the
-                exported ones.
+            margins: Measured margins of the safe set; by default the exported ones.
             hold: See :func:`~drake_safety.systems.monitored_assessor.AddSafetyAssessor`.
         """
         for name, port in ports.items():

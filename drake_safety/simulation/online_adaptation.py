@@ -26,10 +26,10 @@ class OnlineAdaptation:
     """Advances a simulation and adapts the assessor of its diagram meanwhile.
 
     "For computational efficiency, the online adaptation process is performed once every k_u sets of
-    feedback data" (paper). Whenever the recorder has finished windows, their nominal twins are
-    simulated; after every k_u windows the prior assessment is adapted to the feedback and the
-    motion so far, at most ten minutes, and the assessor adopts the result. The simulation waits
-    meanwhile. The object keeps feedback of one simulation; use another one for another.
+    feedback data" (paper). Nominal twins of the recorder's windows are simulated; after every k_u
+    windows the prior assessment is adapted to the feedback and the motion so far, at most ten
+    minutes, and the assessor adopts the result. The simulation waits meanwhile. An object is for
+    one simulation.
 
     ```python
     online = OnlineAdaptation(scenario, prior, recorder, assessor)

@@ -137,12 +137,10 @@ class Scenario:
         meshcat: "Meshcat | None" = None,
         **options: Any,
     ) -> ClosedLoop:
-        """Builds the task's diagram.
+        """Builds the task's diagram, with options of the task, such as ``recovery=False``.
 
-        Args:
-            assessment: Adds an assessor and, for example, recovery.
-            meshcat: Adds a visualiser; a task whose constructor does not take it draws nothing.
-            **options: Options of the task, such as ``recovery=False``.
+        An assessment adds an assessor and, for example, recovery. A task whose constructor does not
+        take Meshcat draws nothing.
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
         known = inspect.signature(task).parameters
@@ -188,35 +186,29 @@ class Scenario:
     def simulation_hash(self, variation: str = "nominal", *, name: str = "") -> str:
         """SHA-256 of all parameters that determine a rollout, and of the robot's files.
 
-        Defaults are included, so that episodes from before and after a change of one do not mix.
-        The assessment's parameters except those of the preview, the task's online parameters and
-        the other variations are left out: episodes stay valid when only these change. Source code
-        is not covered.
+        Defaults are included, so that episodes from before and after a change of one do not mix,
+        and the nominal plant, because it is the controllers' model. The assessment's parameters
+        except those of the preview, the task's online parameters and the other variations are left
+        out: episodes stay valid when only these change. Source code is not covered.
 
         Args:
-            variation: The simulated plant. The nominal one is always included, because it is the
-                controllers' model.
             name: File name to hash instead of the current one.
         """
         if variation != "nominal":
             self.variation(variation)
         text = self._values()
         del text["on_alarm"]  # No episode depends on it.
-        text["assessment"] = {
-            name: getattr(self.assessment, name) for name in ("horizon", "preview_stride")
-        }
-        text["variations"] = {
-            name: text["variations"][name]
-            for name in ("nominal", variation)
-            if name in self.variations
-        }
+        preview = ("horizon", "preview_stride")
+        text["assessment"] = {key: getattr(self.assessment, key) for key in preview}
+        plants = [key for key in ("nominal", variation) if key in self.variations]
+        text["variations"] = {key: text["variations"][key] for key in plants}
         text["name"] = name or self.identity or self.name
         # Files are hashed; their folders are irrelevant.
         text["robot"] = Path(self.robot).name
         text["parameters"] = _without_folders(text["parameters"])
         task = self.task_class()
-        for name in getattr(task.Parameters, "online", ()):
-            text["parameters"].pop(name, None)
+        for key in getattr(task.Parameters, "online", ()):
+            text["parameters"].pop(key, None)
         digest = hashlib.sha256(yaml.safe_dump(text, sort_keys=True).encode())
         for path in task.model_files(self):
             digest.update(_content(Path(path)))
@@ -329,9 +321,9 @@ def load_scenario(name: str | Path, changes: Mapping[str, Any] | None = None) ->
     """Loads a scenario by name, or by the path of a YAML file, and imports its task.
 
     Importing runs the task's code, wherever the file says that it is; :func:`read_scenario` does
-    not. The task's module may stand in the scenario file's folder, where modules are searched last,
-    while the task is imported. A relative ``robot`` path is relative to the scenario file's folder.
-    ``changes`` replace values of the file by key, such as ``parameters.policy``.
+    not. The task's module may stand in the scenario file's folder, where modules are searched last.
+    A relative ``robot`` path is relative to that folder. ``changes`` replace values of the file by
+    key, such as ``parameters.policy``.
     """
     path = _scenario_file(name)
     with reading(path, errors=ValueError):
