@@ -16,13 +16,9 @@ def outputs(loop, context):
     return {port.get_name(): port.Eval(context).copy() for port in vectors}
 
 
-def assert_equal(found, expected):
-    differing = [
-        name
-        for name, value in expected.items()
-        if not np.array_equal(found[name], value, equal_nan=True)
-    ]
-    assert not differing
+def assert_equal(values, expected):
+    for name, value in expected.items():
+        np.testing.assert_array_equal(values[name], value, err_msg=name)
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ class Watching:
         return np.array([np.nan if 1.08 < time_s < 1.12 else time_s])
 
 
-def run(duration_s, capacity=400, monitor=None, prior=None, watching=None, **settings):
+def run(duration_s, capacity=400, prior=None, watching=None, end_s=np.inf, **settings):
     builder = DiagramBuilder()
     recorder = builder.AddSystem(
         FeedbackRecorder(INFO, num_steps=NUM_STEPS, plant_state_size=2, watch_period_s=STEP_S)
@@ -71,8 +71,13 @@ def run(duration_s, capacity=400, monitor=None, prior=None, watching=None, **set
         None, prior, recorder, assessor, method="paper", capacity=capacity
     )
     simulator = Simulator(diagram)
-    if monitor is not None:
-        simulator.set_monitor(monitor)
+    simulator.set_monitor(
+        lambda context: (
+            EventStatus.ReachedTermination(diagram, "enough")
+            if context.get_time() > end_s
+            else EventStatus.DidNothing()
+        )
+    )
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(
             online_adaptation,
@@ -82,7 +87,7 @@ def run(duration_s, capacity=400, monitor=None, prior=None, watching=None, **set
             ],
         )
         adaptation.advance(simulator, duration_s)
-    assert monitor is not None or simulator.get_context().get_time() == duration_s
+    assert simulator.get_context().get_time() == duration_s or end_s < duration_s
     return adaptation, adopted
 
 
@@ -121,15 +126,7 @@ def test_the_newest_feedback_is_kept_so_that_a_long_simulation_needs_no_more_mem
 
 
 def test_a_monitor_that_ends_the_simulation_ends_it_here_too():
-    system = ConstantVectorSource([0.0])
-
-    def monitor(context):
-        if context.get_time() > 0.85:
-            return EventStatus.ReachedTermination(system, "enough")
-        return EventStatus.DidNothing()
-
-    adaptation, _ = run(2.05, monitor=monitor, update_interval=1)
-    assert adaptation.num_updates == 2
+    assert run(2.05, end_s=0.85, update_interval=1)[0].num_updates == 2
 
 
 def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterwards(monkeypatch):

@@ -181,20 +181,6 @@ def test_state_that_a_system_keeps_in_an_attribute_is_found_and_named(kind, num_
         record(8, **options)
 
 
-def test_state_that_a_reset_keeps_is_an_error():
-    def make():
-        diagram = make_glider()
-        diagram.num_resets = 0
-        return diagram
-
-    def reset(diagram, context, rng):
-        diagram.num_resets += 1
-        context.SetDiscreteState([0.01 * diagram.num_resets, 0.0])
-
-    with pytest.raises(ValueError, match="0 of 'make', simulated a second time, differs, first at"):
-        record(8, make=make, reset=reset)
-
-
 def test_a_diverged_simulation_is_counted_and_a_mistake_is_an_error(caplog):
     with caplog.at_level(logging.WARNING, logger="drake_safety"):
         record()

@@ -12,11 +12,9 @@ from drake_safety import load_scenario, run_episode, run_episodes
 from drake_safety.learning.segments import DIVERGED, EpisodeError
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.motion import advance_to
-from drake_safety.simulation.rollouts import episode_rng, worker_loop
 from drake_safety.simulation.scenario_check import check_scenario
 from drake_safety.simulation.worker_processes import map_items
 from gliding_task import SCENARIO, Mass, gliding
-from legged_robots import write_hexapod
 from shuttle_task import shuttling
 
 
@@ -61,13 +59,6 @@ def test_an_episode_until_a_fall_goes_on_outside_the_safe_set_and_only_a_fall_is
         run_episode(gliding().make_loop(), until_fall=True)
 
 
-def test_a_loop_can_be_used_again_in_any_order():
-    loop = gliding().make_loop()
-    forward = [run_episode(loop, i) for i in range(6)]
-    backward = [run_episode(loop, i) for i in reversed(range(6))]
-    assert_identical(forward, backward[::-1])
-
-
 def test_seeds_and_variations_are_kept_in_the_info():
     sets = [run_episodes(gliding(), 2, variation="actual", seed=s, num_workers=1) for s in (7, 8)]
     info = sets[0].info
@@ -75,6 +66,9 @@ def test_seeds_and_variations_are_kept_in_the_info():
     assert info.scenario_hash == gliding().simulation_hash("actual")
     assert info.constraint_names == ["right", "left"]
     assert len({episode.state[0, 0] for episodes in sets for episode in episodes}) == 4
+    # An episode depends on its seed and number alone, in any order.
+    loop = gliding().make_loop("actual")
+    assert_identical([run_episode(loop, i, seed=7) for i in (1, 0)][::-1], sets[0])
 
 
 @pytest.mark.parametrize("num_workers", [1, 2])
@@ -168,38 +162,10 @@ def test_an_episode_begun_by_a_push_counts_from_after_it():
     assert {e.first_step for e in episodes if len(e.time_s) > 1} == {0, 1}
 
 
-@pytest.mark.parametrize(
-    ("variation", "duration_s", "num"),
-    [("actual", 0.4, 6), pytest.param("nominal", 1.2, 16, marks=pytest.mark.slow)],
-)
-def test_episodes_of_a_robot_are_the_same_to_the_bit_with_one_and_two_workers(
-    variation, duration_s, num
-):
-    scenario = balancing(duration_s)
-    alone = run_episodes(scenario, num, variation=variation, num_workers=1)
-    assert_identical(run_episodes(scenario, num, variation=variation, num_workers=2), alone)
+def test_episodes_of_a_robot_are_the_same_to_the_bit_with_one_and_two_workers():
+    alone = run_episodes(balancing(0.4), 8, variation="actual", num_workers=1)
+    assert_identical(run_episodes(balancing(0.4), 8, variation="actual", num_workers=2), alone)
     assert alone.num_diverged == 0
-    assert num == 6 or 0.2 < alone.num_unsafe / num < 0.8
-
-
-def test_a_robot_whose_file_has_changed_is_simulated_anew(tmp_path):
-    robot = write_hexapod(tmp_path)
-    path = tmp_path / "mine.yaml"
-    path.write_text(
-        "task: drake_safety.diagrams.balancing:Balancing\nrobot: robot.yaml\n"
-        "episode_duration_s: 0.4\nvariations: {nominal: {}}\n"
-    )
-    ends, hashes = [], set()
-    for stiffness in ("200.0", "60.0"):
-        robot.write_text(robot.read_text().replace("stiffness: 200.0", f"stiffness: {stiffness}"))
-        hashes.add(load_scenario(path).simulation_hash())
-        loop = worker_loop(load_scenario(path))()
-        simulator = Simulator(loop)
-        loop.reset(simulator.get_mutable_context(), episode_rng(0, 0))
-        simulator.AdvanceTo(0.05)
-        ends.append(loop.GetOutputPort("plant_state").Eval(simulator.get_context()).copy())
-    assert len(hashes) == 2
-    assert not np.array_equal(*ends)
 
 
 @pytest.mark.parametrize("num_workers", [1, 2])
