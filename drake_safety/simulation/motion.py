@@ -1,4 +1,4 @@
-"""The one loop that simulates a diagram from a start to an end, and its log."""
+"""Simulation of a diagram from a start to an end, and its log."""
 
 from __future__ import annotations
 
