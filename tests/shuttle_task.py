@@ -5,11 +5,10 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario, parse_scenario
@@ -19,7 +18,6 @@ SIDES = {"left": 1.0, "right": -1.0}
 BOX = np.array([[0.6, -0.3, 0.2], [1.4, 1.4, 1.0]])
 FAILING_Z_M = 0.9
 PERIOD_S = 0.01
-NO_PUSH = [0.0, 0.0, 0.0, 0.0, 0.0]
 
 
 @dataclass(kw_only=True)
@@ -34,8 +32,6 @@ class Shuttle(LeafSystem):
         super().__init__()
         self.reflect = np.array([1.0, sign, 1.0])
         self.DeclareDiscreteState(6)
-        # When a push begins, how long it lasts, and the acceleration that it gives.
-        self.push = self.DeclareNumericParameter(BasicVector(NO_PUSH))
         self.DeclarePeriodicDiscreteUpdateEvent(PERIOD_S, 0.0, self._update)
         self.duration_s = scenario.episode_duration_s
         offsets = scenario.step_s * np.arange(scenario.assessment.horizon)
@@ -54,10 +50,7 @@ class Shuttle(LeafSystem):
             "margins": (2, lambda p, v, left_s: self.margins(p)),
             "safe": (1, lambda p, v, left_s: [float(min(self.margins(p)) >= 0)]),
             "plant_state": (6, lambda p, v, left_s: np.append(p, v)),
-            "num_controller_failures": (
-                1,
-                lambda p, v, left_s: [float(v[2] * self.duration_s > FAILING_Z_M)],
-            ),
+            "num_controller_failures": (1, lambda p, v, _: [v[2] * self.duration_s > FAILING_Z_M]),
         }
         declare_outputs(self, ports, self.read)
 
@@ -70,9 +63,6 @@ class Shuttle(LeafSystem):
 
     def _update(self, context, discrete_state):
         p, v, _ = self.read(context)
-        start_s, duration_s, *push = context.get_numeric_parameter(self.push).get_value()
-        if start_s - 1e-9 <= context.get_time() < start_s + duration_s - 1e-9:
-            v = v + PERIOD_S * np.array(push)
         discrete_state.set_value(np.append(p + PERIOD_S * v, v))
 
 
@@ -82,7 +72,6 @@ class Shuttling(ClosedLoop):
     Parameters = ShuttleParameters
     hand = None
     named_targets: ClassVar[dict] = {}
-    pushes: ClassVar[dict] = {}
 
     def __init__(
         self, scenario, variation="nominal", *, assessment=None, meshcat=None, side="left"
@@ -101,12 +90,9 @@ class Shuttling(ClosedLoop):
         self.export(builder, {port.get_name(): port for port in ports}, period_s=0.04)
         builder.BuildInto(self)
 
-    def _of_this_side(self, box):
-        return np.sort(self.shuttle.reflect * box, axis=0)
-
     @property
     def target_box(self):
-        return self._of_this_side(BOX)
+        return np.sort(self.shuttle.reflect * BOX, axis=0)
 
     def reset(self, context, rng, goal=None):
         start = self.shuttle.reflect * rng.uniform(-0.1, 0.1, 3)
@@ -122,19 +108,6 @@ class Shuttling(ClosedLoop):
         velocity = (goal - start) / self.scenario.episode_duration_s
         shuttle_context = self.shuttle.GetMyMutableContextFromRoot(context)
         shuttle_context.SetDiscreteState(np.append(start, velocity))
-        self._push(context, NO_PUSH)
-
-    def _push(self, context, push):
-        shuttle_context = self.shuttle.GetMyMutableContextFromRoot(context)
-        shuttle_context.get_mutable_numeric_parameter(self.shuttle.push).SetFromVector(push)
-
-    def set_push(self, context, push):
-        """The mass weighs a kilogram."""
-        self._push(context, [push.time_s, push.duration_s, *push.force_n])
-
-    def sample_push(self, rng):
-        force = [*rng.uniform(-2, 12, 2), 0.0]
-        return Push(force_n=force, time_s=0.1 * int(rng.integers(1, 4)), duration_s=0.1)
 
     def goal_of(self, episode):
         position, velocity = np.split(episode.state[0], 2)

@@ -47,7 +47,7 @@ def test_a_task_is_asked_for_a_capability_without_evaluating_its_properties():
             raise AssertionError("evaluated")
 
     loop = Unevaluated(shuttling())
-    for capability in (HasGoals, CanBePushed, CanFall):
+    for capability in (HasGoals, CanFall):
         assert require(loop, capability) is loop
     with pytest.raises(ValueError, match=r"^run: task 'Unevaluated' has no ball to throw"):
         require(loop, HasBall, "run")
