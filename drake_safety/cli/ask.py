@@ -40,7 +40,9 @@ def ask(
     Prints belief and verdict; for a refusal also the likely cause and the nearest accepted target.
     Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
     """
-    loaded, folder, gamma = folders.open_assessment(scenario, assessment, mode, is_told=not as_json)
+    loaded, folder, gamma = folders.open_assessment(
+        scenario, assessment, mode, is_printed=not as_json
+    )
     loop = loaded.make_loop(assessment=gamma, **console.given(hand=hand, command_s=duration))
     if not isinstance(loop, HasGoals):
         balls = ", and throws balls with --push ball" if isinstance(loop, HasBall) else ""

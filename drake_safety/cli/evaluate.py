@@ -205,19 +205,19 @@ def add_verdicts(
 def add_reliability(evaluation: Evaluation, test: Episodes) -> None:
     """Evaluates the reliability of either mode, and its stored calibrations."""
     segments = split(test, stride=1, discount=1.0, shortest=1)
-    found, curves = {}, {}
+    estimates, curves = {}, {}
     for scorer in evaluation.scorers:
         mode, score = scorer.name, scorer.unsafe_score(segments)
         of_first, label = episode_scores(segments, score, PLAN)
         first = curves[f"{mode}, first row"] = reliability(of_first, label, np.arange(len(label)))
         rows = reliability(score, segments.is_unsafe, segments.episode)
         curves[f"{mode}, every row"] = rows
-        found["calibration", mode, "expected_calibration_error"] = first.error
-        found["calibration.rows", mode, "expected_calibration_error"] = rows.error
+        estimates["calibration", mode, "expected_calibration_error"] = first.error
+        estimates["calibration.rows", mode, "expected_calibration_error"] = rows.error
         for kind, one in evaluation.assessments[mode].calibrations_.items():
             shares = verdict_shares(one, *episode_scores(segments, score, kind))
-            found |= {(f"calibration.{kind}", mode, what): n for what, n in shares.items()}
-    evaluation.add(found, reliability=reliability_figure(curves))
+            estimates |= {(f"calibration.{kind}", mode, what): n for what, n in shares.items()}
+    evaluation.add(estimates, reliability=reliability_figure(curves))
 
 
 def add_throws(
@@ -227,7 +227,7 @@ def add_throws(
     recovery = evaluation.scenario.parameters.recovery
     thresholds = dict(zip(MODES, (recovery.threshold, PAPER_THRESHOLD), strict=True))
     own = [TriggerRule(scorer=one, threshold=thresholds[one.name]) for one in evaluation.scorers]
-    found, logs = evaluate_throws(
+    estimates, logs = evaluate_throws(
         evaluation.scenario,
         [*own, *rules],
         persistence_s=recovery.persistence_s,
@@ -236,7 +236,7 @@ def add_throws(
         num_workers=evaluation.workers,
         progress=evaluation.stages,
     )
-    evaluation.add(found)
+    evaluation.add(estimates)
     return logs
 
 

@@ -379,7 +379,7 @@ def _save(folder: Path, viewer: Meshcat, loop: Any, shown: _Shown) -> None:
 
 
 def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
-    """The one push that ``--push`` names, if any."""
+    """The push that ``--push`` names, if any."""
     if not names:
         return None
     pushes = require(loop, CanBePushed, "--push").pushes

@@ -88,23 +88,23 @@ def assessment_file(folder: Path, mode: str) -> Path:
 
 
 def open_assessment(
-    scenario: str, given: Path | None, mode: str = MODES[0], *, is_told: bool = True
+    scenario: str, given: Path | None, mode: str = MODES[0], *, is_printed: bool = True
 ) -> tuple[Scenario, AssessmentFolder, SafetyAssessment]:
     """Loads a scenario, and the assessment of a mode from the given or the shipped folder.
 
-    Prints what is used by default, and what its monitor promises, if `is_told`.
+    Prints what is used by default, and what its monitor promises, if `is_printed`.
     """
     loaded = load_scenario(scenario)
-    folder = assessment_folder(loaded, given, is_told=is_told)
+    folder = assessment_folder(loaded, given, is_printed=is_printed)
     assessment = load_assessment(folder.path, mode)
     check_fresh(assessment, loaded)
-    if is_told:
+    if is_printed:
         console.say(assessment.detector_.describe())
     return loaded, folder, assessment
 
 
 def assessment_folder(
-    scenario: Scenario, given: Path | None, *, is_told: bool = True
+    scenario: Scenario, given: Path | None, *, is_printed: bool = True
 ) -> AssessmentFolder:
     """The given folder, or by default that of the shipped assessments of what is simulated."""
     if given is not None:
@@ -121,7 +121,7 @@ def assessment_folder(
             f"which has those of {names}: `drake-safety train` learns one, in a folder to be "
             "passed as --assessment"
         )
-    if is_told:
+    if is_printed:
         console.say("assessment        comes with the package,", shipped)
     # A separate folder, so that no training is overwritten.
     return AssessmentFolder(shipped, Path("runs") / f"{scenario.name}-shipped")

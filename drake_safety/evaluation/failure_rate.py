@@ -120,17 +120,17 @@ def strata_of(score: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     order = mixed[np.argsort(score[mixed], kind="stable")]
     spread = np.sqrt(score * (1.0 - score))[order]
     weight = (1.0 - _EVEN) * spread / max(spread.mean(), 1e-12) + _EVEN
-    found = np.empty(len(score), dtype=int)
-    found[order] = _NUM_STRATA * (np.cumsum(weight) - 0.5 * weight) / weight.sum()
-    return np.unique(found, return_inverse=True)[1]  # None is empty.
+    stratum = np.empty(len(score), dtype=int)
+    stratum[order] = _NUM_STRATA * (np.cumsum(weight) - 0.5 * weight) / weight.sum()
+    return np.unique(stratum, return_inverse=True)[1]  # None is empty.
 
 
 def in_turns(stratum: np.ndarray) -> list[int]:
     """Starts in the order in which they are simulated, one of each stratum (N,) after the other."""
     order = np.argsort(stratum, kind="stable")
     turn = np.arange(len(order)) - np.searchsorted(stratum[order], stratum[order])
-    found: list[int] = order[np.argsort(turn, kind="stable")].tolist()
-    return found
+    starts: list[int] = order[np.argsort(turn, kind="stable")].tolist()
+    return starts
 
 
 def stratified_rate(

@@ -18,10 +18,10 @@ def gate_figure(verdicts: Mapping[str, Verdict]) -> Figure:
     with style.drawing_style():
         fig = style.new_figure(7.5, 0.6 + 2.4 * len(verdicts))
         panels = fig.subplots(len(verdicts), 1, squeeze=False)[:, 0]
-        for axes, (name, one) in zip(panels, verdicts.items(), strict=True):
-            found, colour = one.difference, _COLOURS.get(one.verdict, style.FAINT_INK)
-            pairs, bound = [look.n for look in found], 100.0 * one.worse_by
-            low, mean, high = 100.0 * np.array([[x.low, x.value, x.high] for x in found]).T
+        for axes, (name, verdict) in zip(panels, verdicts.items(), strict=True):
+            looks, colour = verdict.difference, _COLOURS.get(verdict.verdict, style.FAINT_INK)
+            pairs, bound = [look.n for look in looks], 100.0 * verdict.worse_by
+            low, mean, high = 100.0 * np.array([[x.low, x.value, x.high] for x in looks]).T
             axes.fill_between(pairs, low, high, color=colour, alpha=0.2, linewidth=0)
             axes.plot(pairs, mean, color=colour, linewidth=1.8, marker="o", markersize=2.5)
             axes.axhline(0.0, color=style.FAINT_INK, linewidth=0.8)
@@ -30,7 +30,7 @@ def gate_figure(verdicts: Mapping[str, Verdict]) -> Figure:
             ends = [*mean, 0.0, bound, low[-1], high[-1]]
             room = 0.4 * (max(ends) - min(ends))
             axes.set(xlim=(0, None), ylim=(min(ends) - room, max(ends) + room))
-            axes.set(title=f"{name}: {one.verdict} after {one.pairs} pairs")
+            axes.set(title=f"{name}: {verdict.verdict} after {verdict.pairs} pairs")
             axes.set_ylabel("candidate − baseline\n[points]")
         panels[-1].set_xlabel("pairs of episodes")
     return fig
