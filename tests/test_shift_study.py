@@ -53,7 +53,7 @@ class Gamma:
 
     used_ = ()
     parameters = SimpleNamespace(initial_uncertainty=0.3)
-    settings = SimpleNamespace(uses_true_state=False)
+    settings = SimpleNamespace(is_paper=False)
     detector_ = Detector()
     info_ = SimpleNamespace(step_s=1.0, num_steps=5)
 
