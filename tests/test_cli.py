@@ -69,6 +69,26 @@ SCENE = "laikago_balancing"
 MISSING = "error folder 'x' holds no 'sharpened' assessment; it holds []: run `drake-safety train`"
 
 
+@pytest.mark.train
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "nothing", "--out", "x"], "error scenario 'nothing' does not exist"),
+        (["train", SCENE, "--out", "x", "--mode", "both ways"], "error train: mode must be one of"),
+        (["calibrate", SCENE, "--miss-rate", "2"], "error calibration: --miss-rate is 2.0"),
+        (["run", SCENE, "--assessment", "x"], MISSING),
+    ],
+)
+def test_what_a_user_did_wrong_is_one_line_and_no_traceback(
+    monkeypatch, capsys, tmp_path, arguments, message
+):
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, *arguments) == 2
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith(message)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.fixture
 def stopped(monkeypatch):
     """Simulations that are stopped at once, as by Ctrl-C."""
@@ -77,6 +97,22 @@ def stopped(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("drake_safety.simulation.rollouts.collect_episodes", stop)
+
+
+@pytest.mark.train
+def test_a_training_that_is_stopped_says_what_continues_it(monkeypatch, capsys, stopped, tmp_path):
+    out = tmp_path / "my run"
+    assert call(monkeypatch, "train", "pendulum", "--out", out, "--mode", "paper") == 130
+    line = f"continue with: drake-safety train pendulum --out '{out}' --mode paper --resume"
+    assert capsys.readouterr().out.splitlines() == ["stopped; finished episodes are kept", line]
+    # The option is not added twice.
+    assert call(monkeypatch, "train", "pendulum", "--out", out, "--resume") == 130
+    assert capsys.readouterr().out.splitlines()[1].endswith(f"--out '{out}' --resume")
+    # What keeps its episodes anyway is continued by the same command.
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, "calibrate", "laikago_balancing", "--episodes", 7) == 130
+    line = "continue with: drake-safety calibrate laikago_balancing --episodes 7"
+    assert capsys.readouterr().out.splitlines()[-1] == line
 
 
 def test_a_shell_completes_commands_and_scenarios_without_drake():
@@ -133,6 +169,14 @@ def test_motion_for_one_piece_is_refused_before_anything_is_simulated(
         told = f"error train: --motion {minutes} gives one motion, and the monitor needs one for"
         assert told in capsys.readouterr().out
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.train
+def test_training_is_not_mixed_with_episodes_that_are_there_already(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("drake_safety.cli.train.completed", lambda path: {0, 1, 2})
+    (tmp_path / "episodes").mkdir()
+    assert call(monkeypatch, "train", "laikago_balancing", "--out", tmp_path) == 2
+    assert "already holds 3 episodes: pass --resume" in capsys.readouterr().out
 
 
 @pytest.fixture

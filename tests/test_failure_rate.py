@@ -15,6 +15,7 @@ from drake_safety.evaluation.failure_rate import (
     strata_of,
     stratified_rate,
 )
+from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from shuttle_task import train_shuttle
 
@@ -63,6 +64,32 @@ def test_it_is_unbiased_however_wrong_gamma_is_and_its_interval_holds(
     # At least 95 %, but for chance in 200 replays.
     assert sum(one.low <= truth <= one.high for one in found) >= 0.92 * NUM_REPLAYS
     assert truth * (1 - truth) / NUM_ROLLOUTS / values.var() > least_ratio
+
+
+def test_a_start_is_simulated_as_often_as_its_outcome_is_uncertain():
+    score = np.repeat([0.0, 0.5], 5000)
+    stratum = strata_of(score, np.random.default_rng(0))
+    assert np.bincount(stratum).min() > 0
+    index = in_turns(stratum)[:400]
+    # Half of the simulations are spread evenly, the other half are where Γ is not certain.
+    assert np.mean(score[index] == 0.5) == pytest.approx(0.75, abs=0.06)
+    # A single start of which Γ is not certain is simulated, and leaves no stratum empty.
+    score = np.append(np.zeros(999), 0.5)
+    stratum = strata_of(score, np.random.default_rng(0))
+    assert 999 in in_turns(stratum)[:10]
+    assert np.bincount(stratum).min() > 0
+    # Where Γ tells nothing apart all are spread evenly.
+    assert np.bincount(strata_of(np.zeros(1000), np.random.default_rng(0))).tolist() == [100] * 10
+
+
+def test_without_strata_it_is_a_share_with_nearly_the_exact_interval():
+    for count in (0, 3, 40, 197, 200):
+        found, number = stratified_rate(np.array([10**9]), np.array([200]), np.array([count]))
+        assert number == pytest.approx(200, rel=1e-3)
+        exact = proportion(count, 200)
+        assert found.value == exact.value
+        assert found.low == pytest.approx(exact.low, abs=1e-4)
+        assert found.high == pytest.approx(exact.high, abs=1e-4)
 
 
 def test_it_is_the_prediction_powered_estimate_of_ppi_python():

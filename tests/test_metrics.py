@@ -5,8 +5,10 @@ import pytest
 from scipy.stats import poisson
 
 from drake_safety.evaluation.metrics import (
+    Bootstrap,
     area_under_curve,
     auc,
+    median,
     proportion,
     rate_per_hour,
     segment_estimates,
@@ -34,6 +36,18 @@ def test_a_proportion_has_the_clopper_pearson_interval_of_the_tables():
     assert (nothing.low, nothing.high, nothing.n) == (0.0, 1.0, 0)
 
 
+def test_the_interval_of_the_median_covers_the_truth_about_as_often_as_promised():
+    rng = np.random.default_rng(1)
+    estimates = [
+        median(rng.exponential(size=51), bootstrap=Bootstrap(num_resamples=300, seed=trial))
+        for trial in range(200)
+    ]
+    share = np.mean([estimate.low <= np.log(2.0) <= estimate.high for estimate in estimates])
+    assert 0.90 <= share <= 0.99
+    assert median(np.array([1.0, 2.0, math.inf])).value == 2.0
+    assert median(np.array([1.0, math.inf, math.inf])).value == math.inf
+
+
 @pytest.mark.train
 def test_the_area_agrees_with_scikit_learn_with_weights_and_ties():
     from sklearn.metrics import roc_auc_score
@@ -45,6 +59,16 @@ def test_the_area_agrees_with_scikit_learn_with_weights_and_ties():
     assert area_under_curve(score, label, weight) == pytest.approx(expected)
 
 
+def test_a_score_that_is_nan_counts_as_the_most_unsafe():
+    label = np.array([False, True, True, False])
+    known = np.array([0.1, 0.2, 5.0, 0.3])
+    unknown = np.array([0.1, 0.2, np.nan, 0.3])
+    assert area_under_curve(unknown, label) == area_under_curve(known, label)
+    assert threshold_at(unknown, label) <= 0.3
+    assert math.isnan(area_under_curve(known, np.ones(4, dtype=bool)))
+    assert threshold_at(np.array([np.inf, 0.2, np.inf]), label[1:]) < math.inf
+
+
 def test_repeating_the_segments_of_an_episode_adds_no_certainty():
     rng = np.random.default_rng(2)
     label = rng.random(60) < 0.5
@@ -54,6 +78,18 @@ def test_repeating_the_segments_of_an_episode_adds_no_certainty():
     as_if_independent = auc(np.tile(score, 20), np.tile(label, 20), np.arange(1200))
     assert often == once
     assert as_if_independent.high - as_if_independent.low < 0.4 * (once.high - once.low)
+
+
+def test_the_interval_of_the_area_covers_the_truth_about_as_often_as_promised():
+    rng = np.random.default_rng(3)
+    truth = 0.5 * (1.0 + math.erf(0.5))  # Normal scores one standard deviation apart.
+    num_covered = 0
+    for trial in range(200):
+        label = rng.random(120) < 0.5
+        bootstrap = Bootstrap(num_resamples=200, seed=trial)
+        estimate = auc(rng.normal(size=120) + label, label, np.arange(120), bootstrap=bootstrap)
+        num_covered += estimate.low <= truth <= estimate.high
+    assert 0.90 <= num_covered / 200 <= 0.99
 
 
 def test_rates_have_the_exact_interval_of_a_poisson_process():

@@ -69,6 +69,28 @@ def test_against_no_difference_only_the_pairs_count_in_which_one_fails_alone():
             assert math.exp(found) == pytest.approx(float(_WEIGHTS @ ratios))
 
 
+def test_a_confidence_sequence_ends_where_the_capital_is_one_over_alpha():
+    outcomes = np.random.default_rng(2).choice([-0.5, 0.0, 1.0, 2.0], 300)
+    looks = []
+    for n in (1, 60, 300):
+        looks.append(interim_estimate(outcomes[:n], looks, ALPHA, 2.0))
+    assert [one.n for one in looks] == [1, 60, 300]
+    first, *_, last = looks
+    assert last.value == pytest.approx(outcomes.mean())
+    assert -2 <= first.low <= looks[1].low <= last.low < last.value
+    assert last.value < last.high <= looks[1].high <= first.high <= 2
+    values, counts = np.unique(outcomes / 2, return_counts=True)
+    for sign, end in ((1, last.low), (-1, last.high)):
+        log_e = betting_log_e(sign * values, counts, sign * end / 2)
+        assert log_e == pytest.approx(-math.log(ALPHA))
+    # What a look has excluded stays so.
+    first = interim_estimate(np.ones(50), [], ALPHA)
+    assert interim_estimate(np.zeros(1000), [first], ALPHA).low == first.low > 0.8
+    for wrong in (2.5, np.nan):
+        with pytest.raises(ValueError, match=rf"outcomes must be in ±2; got ±{wrong}"):
+            interim_estimate([0.0, wrong], [], ALPHA, 2.0)
+
+
 REFERENCE_BETS = ((1, 0.0), (-1, 0.0), (-1, 0.05))
 
 
@@ -129,3 +151,19 @@ def test_either_end_excludes_the_true_mean_in_at_most_a_share_alpha_of_replays(k
     for sign in (1, -1):
         log_e = betting_log_e(sign * values, counts, sign * mean)
         assert np.isfinite(first_looks(log_e, looks)).mean() <= ALPHA
+
+
+@pytest.mark.parametrize(("baseline", "num_pairs", "shared"), [(0.05, 416, 0.0), (0.05, 416, 0.9)])
+def test_a_verdict_takes_about_as_many_pairs_as_with_a_mixture_of_all_shares(
+    baseline, num_pairs, shared
+):
+    differences = failures(np.random.default_rng(5), baseline, 2 * baseline, 5000, shared)
+    counts = counted(differences, LOOKS)
+    found = first_looks(betting_log_e(OUTCOMES, counts, 0.0), LOOKS)
+    other = first_looks(naive.mixture_log_e(counts[..., 2], counts[..., 0]), LOOKS)
+    assert np.median(found) <= 1.15 * np.median(other)
+    assert np.isfinite(found).mean() >= np.isfinite(other).mean() - 0.01
+    if not shared:
+        # A batch test of the same power needs 2529 episodes of each loop, and 473.
+        assert np.median(found) == pytest.approx(num_pairs, rel=0.15)
+    assert np.median(found) <= num_pairs * (1 - shared / 2)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
 from drake_safety.learning.calibration import PLAN, calibrate
 from lip_assessments import scored_episodes
@@ -19,6 +20,27 @@ def test_every_episode_has_one_verdict():
     assert of_safe == pytest.approx(1.0)
     assert shares["miss_rate"] == np.mean(score[label] <= 1.0 - found.threshold)
     assert shares["unsafe_unknown"] > 0.0
+
+
+def test_probabilities_that_come_true_lie_on_the_diagonal_and_overconfident_ones_do_not():
+    rng = np.random.default_rng(4)
+    p = rng.random(20000)
+    label = rng.random(20000) < p
+    true = once(p, label)
+    assert true.error.value < 0.02
+    for expected, observed in zip(true.expected, true.observed, strict=True):
+        assert observed.low <= expected <= observed.high
+    # As far from one half again as it should be, where that is possible: off by |p - 1/2|.
+    bold = once(np.clip(2.0 * p - 0.5, 0.0, 1.0), label)
+    assert bold.error.value == pytest.approx(0.125, abs=0.02)
+    assert bold.error.low < bold.error.value < bold.error.high
+
+
+def test_equal_probabilities_share_a_bin():
+    one = once(np.array([0.2, 0.2, 0.2, 1.0]), np.array([True, False, False, True]))
+    np.testing.assert_allclose(one.expected, [0.2, 1.0])
+    assert one.observed == [proportion(1, 3), proportion(1, 1)]
+    assert one.error.value == pytest.approx(3 / 4 * (1 / 3 - 0.2))
 
 
 def test_repeating_the_rows_of_an_episode_adds_no_certainty():

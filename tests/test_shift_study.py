@@ -15,7 +15,9 @@ from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.shift_study import (
     CONFIDENT,
+    Minute,
     false_alarms,
+    monitor_estimates,
     monitored,
     run_monitored,
     safety_probability,
@@ -102,6 +104,47 @@ def test_outside_the_safe_set_gamma_is_not_safe():
     one.margins[:] = -1.0
     probability = safety_probability(gamma, one, slice(None))
     assert (probability == 0.0).any() and not np.nan_to_num(probability).any()
+
+
+def test_a_minute_goes_on_with_the_next_motions_and_an_alarm_is_dont_know():
+    # Γ is asked every second row, and speaks of the next five seconds.
+    motions = [
+        motion(0, 20, probability=0.95, is_safe=False),
+        motion(1, 20, probability=0.95, alarm=[4]),
+        motion(2, 20, probability=CONFIDENT - 0.01, is_safe=False),
+        motion(3, 20, probability=0.95, is_safe=False, alarm=range(12, 16)),
+        motion(4, 20, probability=UNKNOWN, is_safe=False),
+    ]
+    found = monitored(motions, Gamma())
+    assert [one.alarm_s for one in found] == [12.0, 2.0, 16.0, 6.0, 22.0]
+    assert [one.leave_s for one in found] == [10.0, 20.0, 10.0, 10.0, 10.0]
+    # The first is wrong for 5 s, the fourth for 5 s with and 3 s without the alarm.
+    assert [one.silent_error_s[0] for one in found] == [5.0, 0.0, 0.0, 5.0, 0.0]
+    assert [one.error_s[0] for one in found] == [5.0, 0.0, 0.0, 3.0, 0.0]
+    assert [one.silent_error_s[1] for one in found] == [10.0] * 5
+    assert [one.error_s[1] for one in found] == [8.0] * 5
+    late = [motion(i, 100, is_safe=i != 1) for i in range(2)] + [motion(2, 100, alarm=[50])]
+    found = monitored(late, Gamma())
+    assert [one.alarm_s for one in found] == [math.inf, math.inf, 25.0]
+    assert [one.leave_s for one in found] == [math.inf, 50.0, math.inf]
+
+
+def test_estimates_are_of_all_minutes():
+    found = monitor_estimates(
+        [
+            Minute(30.0, 40.0, [6.0, 20.0], [6.0, 20.0]),
+            Minute(2.0, math.inf, [0.0, 0.0], [0.0, 4.0]),
+            Minute(1.0, math.inf, [0.0, 0.0], [0.0, 0.0]),
+            Minute(math.inf, math.inf, [0.0, 0.0], [0.0, 0.0]),
+        ]
+    )
+    assert found["alarmed"].value == 0.75
+    assert found["delay_s"].value == 30.0
+    assert found["delay_s"].low <= 2.0 and found["delay_s"].high == math.inf
+    assert found["delay_95_s"].value == math.inf
+    assert found["confident_error_10s"].value == pytest.approx(0.6 / 4)
+    assert found["confident_error_60s"].value == pytest.approx(20 / 60 / 4)
+    assert {one.n for one in found.values()} == {4}
 
 
 def test_a_promise_is_missed_where_neither_threshold_nor_alarm_announces_the_end():

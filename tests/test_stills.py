@@ -67,6 +67,16 @@ def test_a_robot_that_fell_is_in_the_picture(loop, standing):
         assert not is_dark[[0, -1]].any() and not is_dark[:, [0, -1]].any()
 
 
+def test_the_camera_follows_the_base_over_the_ground_but_not_up(loop, camera, standing):
+    reference = camera.render(standing).astype(int)
+    base = loop.robot.base
+    along = camera.render(moved(loop, standing, base, [0.3, -0.2, 0.0])).astype(int)
+    up = camera.render(moved(loop, standing, base, [0.0, 0.0, 0.15])).astype(int)
+    assert np.abs(along - reference).mean() < 6.0
+    lowered = np.nonzero(up.max(axis=-1) < 90)[0].mean()
+    assert lowered < np.nonzero(reference.max(axis=-1) < 90)[0].mean() - 5
+
+
 def test_stills_are_spread_evenly_and_give_way_to_events():
     time_s = 0.02 * np.arange(201)
     np.testing.assert_allclose(still_times(time_s, num_stills=5), [0, 1, 2, 3, 4])
