@@ -57,14 +57,14 @@ class Scene:
             self.plant.get_body(index).name(): self.plant.get_body(index)
             for index in self.plant.GetBodyIndices(self.instance)
         }
+        self.stand()
+
+    def stand(self) -> None:
         self.set_base(RigidTransform([0.0, 0.0, self.published.standing_height]))
         self.set_joints(dict.fromkeys(self.published.movable, 0.0) | dict(self.published.posture))
 
     def set_base(self, X_WB: RigidTransform) -> None:
         self.plant.SetFreeBodyPose(self.context, self.base, X_WB)
-
-    def set_base_height(self, height: float) -> None:
-        self.set_base(RigidTransform([0.0, 0.0, height]))
 
     def set_joints(self, positions: Mapping[str, float]) -> None:
         for name, position in positions.items():
@@ -72,12 +72,6 @@ class Scene:
 
     def pose(self, frame: str) -> RigidTransform:
         return self.plant.GetFrameByName(frame, self.instance).CalcPoseInWorld(self.context)
-
-    def velocity_order(self) -> list[int]:
-        """Indices into v: the base's six, then the published joints in their order."""
-        start = self.base.floating_velocities_start_in_v()
-        joints = [self.plant.GetJointByName(name) for name in self.published.movable]
-        return [*range(start, start + 6), *(joint.velocity_start() for joint in joints)]
 
     def query(self) -> QueryObject:
         context = self.scene_graph.GetMyContextFromRoot(self.root)

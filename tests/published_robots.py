@@ -97,31 +97,6 @@ class PublishedRobot:
                 inertia += R_BL @ link.inertia @ R_BL.T - link.mass * cross(c) @ cross(c)
         return mass, moment, inertia
 
-    def mass_matrix(self, X_WB: Pose, positions: Mapping[str, float]) -> np.ndarray:
-        """M(q) of v = [w_WB, v_WB, rates of the movable joints], from every link by itself."""
-        poses = self.poses(X_WB, positions)
-        movable = {name: 6 + k for k, name in enumerate(self.movable)}
-        # Columns of a link's angular velocity, and for its linear velocity where each axis passes.
-        axes: dict[str, dict[int, Pose]] = {self.base: {}}
-        for name, joint in self.joints.items():
-            axes[joint.child] = dict(axes[joint.parent])
-            if joint.axis is not None:
-                R_WJ, p_WJ = poses[joint.child]
-                axes[joint.child][movable[name]] = (R_WJ @ joint.axis, p_WJ)
-        M = np.zeros((6 + len(movable), 6 + len(movable)))
-        for name, link in self.links.items():
-            R_WL, p_WL = poses[name]
-            p_WC = p_WL + R_WL @ link.com
-            Jw, Jv = np.zeros((3, len(M))), np.zeros((3, len(M)))
-            Jw[:, :3] = np.eye(3)
-            Jv[:, :3] = -cross(p_WC - X_WB[1])
-            Jv[:, 3:6] = np.eye(3)
-            for column, (axis, p_WJ) in axes[name].items():
-                Jw[:, column] = axis
-                Jv[:, column] = np.cross(axis, p_WC - p_WJ)
-            M += link.mass * Jv.T @ Jv + Jw.T @ (R_WL @ link.inertia @ R_WL.T) @ Jw
-        return M
-
 
 def cross(p: np.ndarray) -> np.ndarray:
     """The matrix of the cross product with p."""

@@ -1,7 +1,6 @@
 """`new` replaces collision meshes that Drake does not read by hulls; the robot stands with them."""
 
 import shutil
-import sys
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -98,11 +97,6 @@ def test_the_robot_stands_with_them(spider):
     assert_nothing_overlaps(spider)
 
 
-def test_a_foot_keeps_its_contact_spheres_alone(spider):
-    of_mesh, of_sphere = (collisions(spider, name) for name in ("tibia_2", "tibia_3"))
-    assert [one.get("name") for one in of_mesh] == [one.get("name") for one in of_sphere]
-
-
 def test_collisions_of_a_hull_that_overlaps_another_link_are_off(tmp_path):
     # One longer than its link, across the whole robot.
     urdf = shaped(tmp_path, femur_0=bar(length=2.0, radius=0.1))
@@ -114,17 +108,6 @@ def test_collisions_of_a_hull_that_overlaps_another_link_are_off(tmp_path):
     assert "which overlap or are excluded, are off" in readme
 
 
-def test_without_the_extra_its_command_is_told_and_the_meshes_are_left_out(tmp_path, monkeypatch):
-    urdf = shaped(tmp_path, femur_0=bar())
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-    out = tmp_path / "spider"
-    result = invoked("new", "spider", "--urdf", urdf, "--out", out)
-    assert result.exit_code == 0
-    assert "WARNING  1 links have lost their collision meshes" in result.output
-    assert result.output.count("pip install 'drake_safety[robots]'") == 1
-    assert yaml.safe_load((out / "robot.yaml").read_text())["without_collision"] == ["femur_0"]
-
-
 def test_check_draws_the_standing_robot_beside_its_shapes(spider, tmp_path):
     picture = tmp_path / "shapes.png"
     words = "--quick", "--picture", picture
@@ -132,20 +115,6 @@ def test_check_draws_the_standing_robot_beside_its_shapes(spider, tmp_path):
     assert "--picture draws a legged robot" in str(result.exception) and not picture.exists()
     assert invoked("check", spider.folder / "balancing.yaml", *words).exit_code == 0
     assert picture.is_file() and "convex hulls" in picture.with_suffix(".svg").read_text()
-
-
-def test_a_picture_is_without_a_mesh_that_has_no_normals(spider, tmp_path, caplog):
-    own = shutil.copytree(spider.folder, tmp_path / "own")
-    (own / "bare.obj").write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\n")
-    urdf, bare = own / "spider.urdf", urdf_files.mesh("visual", "bare.obj")
-    urdf.write_text(urdf_files.with_shape(urdf.read_text(), "femur_3", bare))
-    loop = load_scenario(own / "balancing.yaml").make_loop()
-    context = loop.plant.CreateDefaultContext()
-    camera = StillCamera(loop, loop.plant.GetPositions(context), width=96, height=72)
-    (note,) = [record.getMessage() for record in caplog.records]
-    assert note.startswith("the picture is without a mesh: OBJ has no normals:")
-    assert "bare.obj" in note
-    assert np.ptp(camera.render(loop.plant.GetPositions(context))) > 100
 
 
 def test_new_gives_normals_to_meshes_of_visuals_and_of_links_without_one(tmp_path, caplog):

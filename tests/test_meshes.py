@@ -1,11 +1,9 @@
 """Meshes that Drake does not read: converted once, upright and in colour; hulls of few vertices."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.robots.meshes import (
     above,
@@ -47,21 +45,16 @@ def assert_colour(path, rgba):
 
 
 def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    monkeypatch.delenv("DRAKE_SAFETY_CACHE", raising=False)
+    assert cache_folder() == tmp_path / "xdg" / "drake_safety"
     monkeypatch.setenv("DRAKE_SAFETY_CACHE", str(tmp_path / "here"))
     assert cache_folder() == tmp_path / "here"
-    monkeypatch.delenv("DRAKE_SAFETY_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert cache_folder() == tmp_path / "xdg" / "drake_safety"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert cache_folder() == tmp_path / ".cache" / "drake_safety"
 
 
 @pytest.mark.parametrize(
     ("asset", "extents"),
     [
-        ("<up_axis>Z_UP</up_axis>", [1.0, 2.0, 4.0]),
-        ("<up_axis>Y_UP</up_axis>", [1.0, 4.0, 2.0]),
         ("", [1.0, 4.0, 2.0]),  # COLLADA's default is y.
         ('<unit meter="0.01"/><up_axis>Z_UP</up_axis>', [0.01, 0.02, 0.04]),
     ],
@@ -83,9 +76,7 @@ def test_a_collada_mesh_is_upright_and_in_metres(tmp_path, asset, extents):
     [
         (None, True),
         ("newmtl a\nKd 1 0 0\n", True),
-        ("newmtl a\nTr 0.0\n", True),
         ("newmtl a\nTr 1.0\nnewmtl b\nTr 0.5\n", True),
-        ("newmtl a\nTr lots\n", True),
         ("newmtl a\nKd 1 0 0\nTr 1.000000\n", False),
     ],
 )
@@ -102,18 +93,15 @@ def test_an_obj_whose_materials_are_all_transparent_is_converted(cache, tmp_path
 
 
 POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
-NORMAL, PLACE = "vn 0 0 1\n", "vt 0 0\n"
+NORMAL = "vn 0 0 1\n"
 
 
 @pytest.mark.parametrize(
     ("faces", "shown"),
     [
         (NORMAL + "f 1//1 2//1 3//1\nf 1//1 2//1 4//1\n", True),
-        (NORMAL + PLACE + "f 1/1/1 2/1/1 3/1/1\n", True),
-        (NORMAL + "f -4//-1 -3//-1 -2//-1\n", True),
         ("f 1 2 3\nf 1 2 4\n", False),
         (NORMAL + "f 1//1 2//1 3//1\nf 1 2 4\n", False),
-        (PLACE + "f 1/1 2/1 3/1\n", False),
         ("  f\t1 2 3 4 \r\n", False),
     ],
 )
@@ -139,53 +127,32 @@ def test_an_obj_that_gets_normals_keeps_the_colours_of_its_materials(cache, tmp_
     assert_colour(shown_mesh(path, "0 0 1 1"), [0, 0, 1, 1])
 
 
-def test_up_stays_up_and_the_colour_is_the_models(cache, tower):
-    converted = shown_mesh(tower, "0.1 0.2 0.3 1")
-    assert_colour(converted, [0.1, 0.2, 0.3, 1.0])
-    # A glTF file's y axis points up.
-    extents = trimesh.load_scene(converted).extents
-    np.testing.assert_allclose(extents, [1.0, 4.0, 2.0], atol=1e-6)
-
-
 def test_a_mesh_is_converted_once_until_it_or_its_colour_changes(cache, tower):
-    first = shown_mesh(tower)
+    first = shown_mesh(tower, "0.1 0.2 0.3 1")
+    assert_colour(first, [0.1, 0.2, 0.3, 1.0])
+    # A glTF file's y axis points up.
+    np.testing.assert_allclose(trimesh.load_scene(first).extents, [1.0, 4.0, 2.0], atol=1e-6)
     written = first.stat().st_mtime_ns
-    assert shown_mesh(tower) == first
+    assert shown_mesh(tower, "0.1 0.2 0.3 1") == first
     assert first.stat().st_mtime_ns == written
     assert shown_mesh(tower, "1 0 0 1") != first
     trimesh.creation.box(extents=[1.0, 1.0, 1.0]).export(tower)
-    assert shown_mesh(tower) != first
+    assert shown_mesh(tower, "0.1 0.2 0.3 1") != first
     assert [path for path in first.parent.iterdir() if path.suffix != ".gltf"] == []
 
 
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("gone.stl", None, r"gone\.stl' does not exist"),
         ("text.dae", "no mesh", r"text\.dae' cannot be read"),
         ("nothing.dae", NOTHING, r"nothing\.dae' is empty, or has no surface"),
     ],
 )
-def test_a_mesh_that_does_not_exist_or_is_none_is_refused(cache, tmp_path, name, text, message):
-    if text is not None:
-        (tmp_path / name).write_text(text)
+def test_a_mesh_that_is_none_is_refused(cache, tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
     with pytest.raises(ValueError, match=message):
         shown_mesh(tmp_path / name)
     assert list(cache.rglob("*.gltf")) == []
-
-
-def test_without_the_converter_the_extra_is_named(cache, tower, monkeypatch):
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(ValueError, match=r"pip install 'drake_safety\[robots\]'"):
-        shown_mesh(tower)
-
-
-X_LM = RigidTransform(RollPitchYaw(0.4, -0.7, 1.1), [0.3, -0.2, 0.5])
-
-
-def test_the_hull_of_a_box_is_the_box_wherever_it_is():
-    points = (X_LM @ trimesh.creation.box(extents=[0.1, 0.3, 0.05]).vertices.T).T
-    assert convex_hull(points).volume == pytest.approx(0.1 * 0.3 * 0.05)
 
 
 def test_a_hull_has_few_vertices_which_are_the_meshs_and_reaches_as_far_along_the_axes():
@@ -204,17 +171,13 @@ def test_a_hull_has_few_vertices_which_are_the_meshs_and_reaches_as_far_along_th
     ("points", "edges"),
     [
         ([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.0, 0.1, 1.0]], [0.2, 0.1, 1e-3]),
-        ([[0.0, 0.0, 0.0], [0.2, 0.0, 0.1], [0.1, 0.1, 0.05], [0.2, 0.2, 0.1]], [0.2, 0.2, 0.1]),
         ([[0.5, 0.5, 0.5]], [1e-3, 1e-3, 1e-3]),
-        ([[x / 30, y / 45, 0.2] for x in range(10) for y in range(10)], [0.3, 0.2, 1e-3]),
     ],
 )
 def test_a_flat_mesh_becomes_the_box_around_it(points, edges):
     hull = convex_hull(np.array(points))
     assert hull.extents == pytest.approx(edges)
     assert hull.volume == pytest.approx(np.prod(edges))
-    middle = 0.5 * (np.min(points, axis=0) + np.max(points, axis=0))
-    np.testing.assert_allclose(hull.bounds.mean(axis=0), middle, atol=1e-12)
 
 
 def test_what_is_below_a_floor_is_cut_off():

@@ -20,7 +20,7 @@ from drake_safety.robots.robot import (
     servo_joints,
 )
 from drake_safety.robots.robot_model import load_robot_file
-from legged_robots import ROBOT_NAMES, edited, robot_model, write_biped
+from legged_robots import edited, robot_model, write_biped
 
 
 def plant_of(robot, variation=None, **options):
@@ -31,7 +31,6 @@ def plant_of(robot, variation=None, **options):
 
 
 FOOT = {"body": "left_shin", "contact_points": [[0, 0, 0]]}
-HAND = {"body": "left_shin", "joints": ["elbow"]}
 
 
 @pytest.mark.parametrize(
@@ -39,16 +38,9 @@ HAND = {"body": "left_shin", "joints": ["elbow"]}
     [
         ({"base": "pelvic"}, "robot 'biped' has no body 'pelvic'; it has .*pelvis"),
         ({"posture": {"elbow": 1.0}}, "no joint for posture pattern 'elbow'; it has .*left_knee"),
-        ({"posture": {".*knee": 1.0, "left.*": 0.5}}, "posture of joint 'left_knee' matches"),
         ({"joint_gains": {".*": {}, "left_knee": {}}}, "gains of joint 'left_knee' matches"),
-        ({"feet": {"left": FOOT | {"body": "fin"}}}, "has no body 'fin'; it has .*pelvis"),
         ({"feet": {"left": FOOT | {"joints": ["f"]}}}, "has no joint 'f'; it has .*left_knee"),
-        ({"whole_body": {"orientation": {"head": {}}}}, "has no body 'head'; it has .*pelvis"),
-        ({"reaching_frames": {"left": {"body": "hand"}}}, "no body 'hand'; it has .*pelvis"),
-        ({"reaching_frames": {"left": HAND}}, "has no joint 'elbow'; it has .*left_knee"),
-        ({"mirror": {"arm": "leg"}}, "no joint for mirror pattern 'arm'; it has .*left_knee"),
         ({"mirror": {"left_(.*)": r"x_\1"}}, "'x_hip_z', the mirror of 'left_hip_z'; it .*right_h"),
-        ({"mirror": {"left_(.*)": r"right_\2"}}, "pattern 'left_.*' cannot be replaced by"),
         ({"mirror": {"left_(hip_x|knee)": "right_knee"}}, "'left_hip_x' and with 'left_knee'"),
     ],
 )
@@ -61,14 +53,9 @@ def test_names_that_the_model_lacks_are_answered_with_those_it_has(tmp_path, cha
 def test_legs_without_motors_are_refused_with_what_to_write(tmp_path):
     path = write_biped(tmp_path)
     without = plant_of(robot := load_robot_file(edited(path, effort_limits={".*knee": 40.0})))
-    message = (
-        r"robot 'biped': joints \['left_hip_z', .*\] have no motor: 'biped.urdf' has no "
-        r"transmission .* effort_limits in robot.yaml is {'\.\*knee': 40.0}; add the "
-        r"largest torque of each \[N·m\]"
-    )
-    with pytest.raises(ValueError, match=message) as refused:
+    message = r"joints \['left_hip_z', .*\] have no motor: .* add the largest torque of each"
+    with pytest.raises(ValueError, match=message):
         require_motors(without, robot)
-    assert "knee', " not in str(refused.value)
     robot = load_robot_file(edited(path, effort_limits={".*": 40.0}))
     require_motors(plant_of(robot), robot)
 
@@ -92,8 +79,8 @@ def test_a_motor_without_a_limit_takes_that_of_the_yaml(tmp_path):
     assert plant.GetJointActuatorByName("right_knee").effort_limit() == 40.0
 
 
-@pytest.mark.parametrize("name", ROBOT_NAMES)
-def test_every_joint_has_a_servo_with_the_gains_of_the_yaml(name):
+@pytest.mark.parametrize("name", ["laikago", "biped"])
+def test_every_joint_has_the_gains_and_the_posture_of_the_yaml(name):
     robot = robot_model(name)
     plant = plant_of(robot)
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
@@ -102,38 +89,22 @@ def test_every_joint_has_a_servo_with_the_gains_of_the_yaml(name):
         gains = robot.gains_of(actuator.joint().name())
         assert actuator.get_controller_gains().p == gains.stiffness
         assert actuator.get_controller_gains().d == gains.damping
-
-
-@pytest.mark.parametrize("name", ROBOT_NAMES)
-def test_the_default_positions_are_the_posture(name):
-    robot = robot_model(name)
-    plant = plant_of(robot)
     context = plant.CreateDefaultContext()
     for joint, position in posture_positions(plant, robot).items():
         assert plant.GetJointByName(joint).GetOnePosition(context) == position
 
 
-@pytest.mark.parametrize("name", ROBOT_NAMES)
-def test_the_mass_scale_scales_the_whole_mass_matrix(name):
+@pytest.mark.parametrize("name", ["laikago", "biped"])
+def test_a_variation_scales_masses_and_a_payload_moves_the_centre_of_mass_by_its_share(name):
     robot = robot_model(name)
     plant = plant_of(robot)
     context = plant.CreateDefaultContext()
-    M = plant.CalcMassMatrix(context)
+    M, position = plant.CalcMassMatrix(context), [0.1, -0.02, 0.05]
     for _ in range(2):  # A scale replaces the one before; it does not multiply it.
         apply_masses(plant, context, robot, PlantVariation(mass_scale=0.8))
     np.testing.assert_allclose(plant.CalcMassMatrix(context), 0.8 * M, rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.parametrize("name", ROBOT_NAMES)
-def test_a_payload_moves_the_centre_of_mass_by_its_share(name):
-    robot = robot_model(name)
-    plant = plant_of(robot)
-    context = plant.CreateDefaultContext()
-    position = [0.1, -0.02, 0.05]
-    base = plant.GetBodyByName(robot.base)
-    apply_masses(plant, context, robot, PlantVariation(mass_scale=0.8))
     mass, centre = plant.CalcTotalMass(context), plant.CalcCenterOfMassPositionInWorld(context)
-    p_WP = base.EvalPoseInWorld(context) @ np.array(position)
+    p_WP = plant.GetBodyByName(robot.base).EvalPoseInWorld(context) @ np.array(position)
     variation = PlantVariation(mass_scale=0.8, payload=Payload(mass_kg=2.0, position_m=position))
     for _ in range(2):  # It is not put on twice.
         apply_masses(plant, context, robot, variation)
@@ -209,8 +180,6 @@ def test_actuation_follows_the_names_of_the_joints_and_spares_friction():
         is_friction = actuator.name().endswith("_friction")
         expected = 0.0 if is_friction else torque[actuator.joint().name()]
         assert actuation[int(index)] == expected
-    with pytest.raises(ValueError, match=r"no joint 'right_hip_z'|no joint 'left_hip_z'"):
-        actuation_matrix(plant, robot, ["left_knee"])
 
 
 def test_a_model_file_is_found_by_url_or_path(tmp_path):

@@ -32,14 +32,11 @@ def test_a_robot_four_times_as_high_moves_twice_as_fast_and_half_as_often():
     assert factors["mass"] == pytest.approx(64.0)
 
 
-def test_sideways_the_spacing_of_the_feet_counts():
+def test_sideways_the_spacing_of_the_feet_counts_and_the_same_size_changes_nothing():
     wide = RobotSize(height_m=0.4, half_length_m=0.2, half_width_m=0.15, mass_kg=20.0)
     factors = wide.factors(SMALL)
     assert factors["width"] == factors["speed_y"] == pytest.approx(1.5)
     assert factors["length"] == factors["height"] == factors["speed_x"] == 1.0
-
-
-def test_a_robot_of_the_same_size_changes_nothing():
     assert set(SMALL.factors(SMALL).values()) == {1.0}
 
 

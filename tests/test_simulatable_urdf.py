@@ -13,7 +13,6 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety.importing.simulatable_urdf import simulatable_copy
 from drake_safety.importing.urdf_copy import read_drives
-from drake_safety.plants.obstacles import Obstacle, add_obstacles
 from drake_safety.robots.meshes import check_meshes, mesh_points
 from drake_safety.robots.robot import add_robot
 from drake_safety.robots.robot_model import RobotModel
@@ -63,8 +62,6 @@ def loaded_quietly(copy, folder, caplog):
     ("name", "url"),
     [
         ("hull", "package://bot_description/hull.obj"),
-        ("hull[1]", "package://bot_description/hull[1].obj"),
-        ("hull", "package:///hull.obj"),
         ("a hull", "package://bot_description/a%20hull.obj"),
         ("hull", "..\\hull.obj"),
     ],
@@ -83,9 +80,7 @@ def test_another_visual_is_converted_and_drake_can_load_what_was_written(tmp_pat
     pytest.importorskip("trimesh")
     stl(tmp_path / "skin.stl", TRIANGLE)
     copy, folder = copy_of(tmp_path, mesh("visual", "skin.stl"))
-    assert meshes_of(folder) == ["meshes/skin.gltf"]
     assert copy.notes == ["visual meshes are converted to glTF: skin.stl"]
-    assert copy.left_out == []
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
     Parser(plant).AddModels(str(folder / "copy.urdf"))
     (visual,) = plant.GetVisualGeometriesForBody(plant.GetBodyByName("a"))
@@ -103,21 +98,10 @@ def test_visuals_without_a_converter_are_left_out_and_the_extra_is_named(tmp_pat
     assert meshes_of(folder) == [] and copy.meshes == {}
 
 
-def test_visuals_that_are_missing_or_broken_are_left_out_by_name_and_reason(tmp_path):
-    pytest.importorskip("trimesh")
-    (tmp_path / "broken.dae").write_text("no mesh")
-    copy, _ = copy_of(tmp_path, mesh("visual", "gone.stl") + mesh("visual", "broken.dae"))
-    missing, broken = copy.left_out
-    assert missing == "visual meshes that are not where the URDF says are left out: gone.stl"
-    assert "broken.dae' cannot be read" in broken
-    assert copy.notes == copy.left_out
-
-
 @pytest.mark.parametrize(
     ("url", "there"),
     [
         ("package://my_bot/meshes/hull.obj", "my-bot/meshes/hull.obj"),
-        ("../meshes/HULL.obj", "my-bot/meshes/hull.obj"),
         ("package://My_Bot/Meshes/hull.OBJ", "my-bot/meshes/hull.obj"),
         ("../meshes/other.obj", ""),
     ],
@@ -141,18 +125,11 @@ def test_two_meshes_of_one_name_are_two_in_the_copy(tmp_path):
     assert [text.partition("# ")[2] for text in texts] == ["left", "right"]
 
 
-def test_a_mesh_of_an_installed_package_is_found(tmp_path):
-    pytest.importorskip("trimesh")
-    url = "package://example-robot-data/robots/hyq_description/meshes/leg/lowerleg.dae"
-    assert list(copy_of(tmp_path, mesh("visual", url))[0].meshes) == ["meshes/lowerleg.gltf"]
-
-
-@pytest.mark.parametrize("kind", ["stl", "ply"])
-def test_a_collision_mesh_becomes_its_hull_turned_and_scaled(tmp_path, kind):
+def test_a_collision_mesh_becomes_its_hull_turned_and_scaled(tmp_path):
     trimesh = pytest.importorskip("trimesh")
-    trimesh.creation.box(bounds=[[0, 0, 0], [2, 1, 4]]).export(tmp_path / f"foot.{kind}")
+    trimesh.creation.box(bounds=[[0, 0, 0], [2, 1, 4]]).export(tmp_path / "foot.stl")
     shape = (
-        mesh("collision", f"foot.{kind}")
+        mesh("collision", "foot.stl")
         .replace("<geometry>", '<origin xyz="0 0 1" rpy="0 0 1.5707963267948966"/><geometry>')
         .replace("/></geo", ' scale="1 1 2"/></geo')
     )
@@ -183,19 +160,7 @@ def test_friction_and_impossible_inertias_are_corrected_and_told(tmp_path):
     assert len(copy.notes) == 2
 
 
-def test_nothing_that_drake_warns_of_at_every_start_is_left(tmp_path, caplog):
-    nothing = LINK.format("b", GOOD, "").replace('mass value="1"', 'mass value="0.0"')
-    joint = (
-        '<joint name="j" type="fixed"><parent link="a"/><child link="b"/><mimic joint="k"/>'
-        '<safety_controller k_velocity="1"/><calibration rising="0"/></joint>'
-    )
-    copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, ""), nothing, joint))
-    loaded_quietly(copy, tmp_path, caplog)
-
-
-@pytest.mark.parametrize(
-    "moments", [(0.001, 0.001, 0.007, 0.0005), (0.06, 0.6, 0.0, 0.0), (0.0, 0.6, 0.06, 0.0)]
-)
+@pytest.mark.parametrize("moments", [(0.001, 0.001, 0.007, 0.0005), (0.0, 0.6, 0.06, 0.0)])
 def test_inertias_beyond_the_triangle_inequality_are_corrected(tmp_path, caplog, moments):
     inertia = '<inertia ixx="{}" iyy="{}" izz="{}" ixy="{}" ixz="0" iyz="0"/>'.format(*moments)
     copy, folder = copy_of(tmp_path, inertia=inertia)
@@ -203,13 +168,7 @@ def test_inertias_beyond_the_triangle_inequality_are_corrected(tmp_path, caplog,
     loaded_quietly(copy, folder, caplog)
 
 
-def test_an_inertia_without_a_mass_is_removed(tmp_path):
-    odd = GOOD.replace('ixx="1"', 'ixx="-1"')
-    text = LINK.format("a", odd, "").replace('<mass value="1"/>', "")
-    assert simulatable_copy(written(tmp_path, text)).root.find("link/inertial") is None
-
-
-def test_transmissions_that_drake_ignores_are_left_out_and_others_stay(tmp_path, caplog):
+def test_what_drake_ignores_or_warns_of_is_left_out_and_other_motors_stay(tmp_path, caplog):
     motor = (
         "<transmission><type>{}</type>"
         '<joint name="{}"><hardwareInterface>EffortJointInterface</hardwareInterface></joint>'
@@ -223,7 +182,9 @@ def test_transmissions_that_drake_ignores_are_left_out_and_others_stay(tmp_path,
             tmp_path,
             *(LINK.format(name, GOOD, "") for name in "abc"),
             joint.format("j", "revolute", "b", limit),
-            joint.format("k", "fixed", "c", ""),
+            joint.format(
+                "k", "fixed", "c", '<mimic joint="j"/><safety_controller k_velocity="1"/>'
+            ),
             motor.format("transmission_interface/SimpleTransmission", "j", "j"),
             motor.format("transmission_interface/SimpleTransmission", "k", "k"),
             motor.format("transmission_interface/DifferentialTransmission", "j", "d"),
@@ -246,15 +207,6 @@ def test_a_material_of_two_colours_becomes_two(tmp_path, caplog):
     assert [one.get("name") for one in copy.root.iter("material")] == ["black", "black", "black_1"]
     loaded_quietly(copy, tmp_path, caplog)
     assert copy.notes == ["the material 'black' has 2 colours; now each has its own name"]
-
-
-def test_a_material_without_a_colour_takes_a_later_one_or_is_left_out(tmp_path, caplog):
-    grey = '<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>'
-    box = '<visual><geometry><box size="1 1 1"/></geometry>{}</visual>'
-    shapes = box.format('<material name="grey"/>') + 2 * box.format('<material name="gazebo"/>')
-    copy, folder = copy_of(tmp_path, shapes + box.format(grey))
-    assert [one.get("name") for one in copy.root.iter("material")] == ["grey", "grey"]
-    loaded_quietly(copy, folder, caplog)
 
 
 @pytest.mark.parametrize(
@@ -293,41 +245,22 @@ def test_no_mesh_from_outside_the_description_is_copied(tmp_path, url, is_copied
     ("name", "text", "message"),
     [
         ("a.obj", TETRAHEDRON.replace("3//1", "99//1", 1), "4 vertices and a face of vertex 99"),
-        ("a.obj", TETRAHEDRON.replace("f 1", "f 0", 1), "4 vertices and a face of vertex 0"),
-        ("a.obj", TETRAHEDRON.replace("f 1", "f -5", 1), "4 vertices and a face of vertex -5"),
-        ("a.obj", TETRAHEDRON.replace("v 1", "v nan"), "a vertex that is not three finite numbers"),
         ("a.obj", TETRAHEDRON.replace("f 1", "f a", 1), "is damaged"),
-        ("a.obj", "v 0 0 0", "has no faces"),
         ("a.vtk", VTK.replace("0 1 2 3", "0 1 2 9"), "has 4 points and a cell of point 9"),
-        ("a.gltf", GLTF.replace('"bufferView": 0', '"bufferView": 7'), "is damaged"),
-        (
-            "a.gltf",
-            GLTF.replace('[{"byteLength": 36', '[{"byteLength": 9'),
-            "a view beyond its buf",
-        ),
+        ("a.gltf", GLTF.replace('[{"byteLength": 36', '[{"byteLength": 9'), "a view beyond its"),
     ],
 )
 def test_a_damaged_mesh_is_refused_by_name_before_drake_sees_it(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     urdf = written(tmp_path, LINK.format("a", GOOD, mesh("visual", name)))
-    told = rf"mesh '{tmp_path / name}' .*{message}"
-    for kind in ("visual", "collision"):
-        (tmp_path / kind).mkdir()
-        copy = simulatable_copy(written(tmp_path, LINK.format("a", GOOD, mesh(kind, name))))
-        assert re.search(told, copy.left_out[0])
-    with pytest.raises(ValueError, match=told):
+    problem = rf"mesh '{tmp_path / name}' .*{message}"
+    assert re.search(problem, simulatable_copy(urdf).left_out[0])
+    with pytest.raises(ValueError, match=problem):
         add_robot(MultibodyPlant(0.001), RobotModel(name="r", urdf=str(urdf), base="a"))
-    with pytest.raises(ValueError, match=told):
-        add_obstacles(MultibodyPlant(0.001), [Obstacle(model=str(urdf))])
-    with pytest.raises(ValueError, match=told):
-        add_obstacles(MultibodyPlant(0.001), [Obstacle(model=str(tmp_path / name))])
 
 
 def test_meshes_that_are_whole_are_not_refused(tmp_path):
-    for name, text in (
-        ("a.obj", TETRAHEDRON.replace("f 1", "f -2", 1)),
-        ("a.vtk", VTK),
-        ("a.gltf", GLTF),
-    ):
+    whole = {"a.obj": TETRAHEDRON.replace("f 1", "f -2", 1), "a.vtk": VTK, "a.gltf": GLTF}
+    for name, text in whole.items():
         (tmp_path / name).write_text(text)
         check_meshes(tmp_path / name)
