@@ -24,11 +24,11 @@ from drake_safety.importing.urdf_survey import (
     WITHOUT_STOPS_RAD,
     Limb,
     Survey,
+    base_at_hips,
     mirrored,
+    require_feet,
     require_masses,
     require_motors,
-    require_shapes,
-    upright_base,
 )
 from drake_safety.robots.meshes import above
 from drake_safety.robots.plausibility import (
@@ -212,19 +212,16 @@ def _find_limbs(
 ) -> None:
     copy = found.copy
 
-    def set_base(limbs: list[Limb], *, is_up: bool) -> None:
-        old = found.survey.base
-        pose, why = upright_base(found.survey, limbs, is_up=is_up)
-        if pose is not None:
-            base = copy.add_root("hips", old, pose)
-            copy.warn(f"the root link '{old}' {why}; the base is a new link '{base}'")
-            found.renew_survey()
-        elif why:
-            copy.warn(f"the robot {why} of '{old}'")
-
-    set_base(found.survey.limbs(), is_up=False)
-    require_shapes(found.survey, copy, are_feet_named=feet is not None)
-    set_base(found.survey.legs(feet), is_up=True)
+    if feet is None:
+        require_feet(found.survey, copy)
+    root = found.survey.base
+    pose, why = base_at_hips(found.survey, found.survey.legs(feet))
+    if pose is not None:
+        base = copy.add_root("hips", root, pose)
+        copy.warn(f"the root link '{root}' {why}; the base is a new link '{base}'")
+        found.renew_survey()
+    elif why:
+        copy.warn(f"the root link '{root}' {why}")
     found.legs = found.survey.legs(feet)
     require_motors(found.survey, found.legs, moved)
     found.arms = found.survey.arms(found.legs, hands)
@@ -340,7 +337,7 @@ def _stand(found: NewRobot) -> None:
         for limb in found.legs
         if limb.is_guess
     ]
-    if not survey.collides(survey.base):  # Balls are thrown at it.
+    if not any(survey.geometries(survey.welded(survey.base))):  # Balls are thrown at it.
         found.asked.append(
             f"a <collision> shape of the base '{survey.base}', in {found.name}.urdf [m]: without "
             "one no ball can hit it"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import glob
-import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
@@ -53,7 +52,6 @@ _PLACED = "origin", "geometry"  # Parts that a collision shape and a visual shar
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ROWS, _COLUMNS = np.triu_indices(3)
 _ROUNDING = 1e-6  # Of the digits of moments of inertia.
-_MOST_RAD = 7.0  # Of an angle in rpy, beyond a turn.
 _DESCRIPTIONS = ("urdf", "urdfs", "xacro", "robots", "models", "mjcf")  # Folders in a package.
 _NOISE = 1e-12  # Of moments of inertia that should be zero [kg·m²].
 _WATER_KG_M3 = 1000.0  # Density of the ball in place of a body whose inertia is negative.
@@ -74,14 +72,6 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     for link, shape, words in empty_shapes(copy.root):
         link.remove(shape)
         copy.warn(f"{words}: it is left out")
-    turned = [
-        owner.get("name")
-        for owner in (*copy.root.findall("link"), *joint_elements(copy.root))
-        for origin in owner.iter("origin")
-        if max(map(abs, map(float, origin.get("rpy", "0").split())), default=0.0) > _MOST_RAD
-    ]
-    if turned:
-        copy.warn(f"rpy of {turned} is beyond a turn: degrees instead of radians?")
     _simplify_joints(copy)
     _fix_inertias(copy)
     _tell_materials_apart(copy)
@@ -91,10 +81,12 @@ def simulatable_copy(path: Path) -> UrdfCopy:
 
 def _simplify_joints(copy: UrdfCopy) -> None:
     """Removes speed limits of zero, dry friction, and transmissions that Drake ignores."""
-    zeros = []
+    fixed, zeros = set(), []
     for joint in joint_elements(copy.root):
         name, limit, dynamics = joint.get("name", ""), joint.find("limit"), joint.find("dynamics")
-        if limit is not None and joint.get("type") != "fixed" and number(limit, "velocity") == 0:
+        if joint.get("type") == "fixed":
+            fixed.add(name)
+        elif limit is not None and number(limit, "velocity") == 0:
             del limit.attrib["velocity"]  # At which no joint would move.
             zeros.append(name)
         friction = None if dynamics is None else dynamics.attrib.pop("friction", None)
@@ -102,7 +94,6 @@ def _simplify_joints(copy: UrdfCopy) -> None:
             copy.joint_friction[name] = as_number(friction)
     if zeros:
         copy.warn(f'velocity="0" of joints {zeros} is read as no limit')
-    fixed = {joint.get("name") for joint in copy.root.findall("joint[@type='fixed']")}
     for transmission in copy.root.findall("transmission"):
         kind, driven = transmission.findtext("type", "").strip(), transmission.find("joint")
         is_simple = kind.rpartition("/")[2] == "SimpleTransmission"
@@ -122,8 +113,6 @@ def _fix_inertias(copy: UrdfCopy) -> None:
         if inertia is None:
             continue
         if not mass > 0:
-            if math.isnan(mass):
-                copy.warn(f"link '{link.get('name')}' has an inertia but no mass: it has neither")
             remove(link, "inertial")
             continue
         moments = np.zeros((3, 3))
@@ -135,52 +124,53 @@ def _fix_inertias(copy: UrdfCopy) -> None:
         if lowest < -max(_ROUNDING * values[2], _NOISE):
             radius_m = (0.75 * mass / (np.pi * _WATER_KG_M3)) ** (1 / 3)
             changed, tell = 0.4 * mass * radius_m**2 * np.eye(3), copy.warn
-            how = f"{lowest:g} is replaced by {changed[0, 0]:.3g} kg·m² about all axes, as of a "
-            how += "ball of water of its mass"
+            remark = f"{lowest:g} is replaced by {changed[0, 0]:.3g} kg·m² about all axes, as of a "
+            remark += "ball of water of its mass"
         elif values[0] < _ROUNDING * values[2] and np.triu(moments, 1).any():
-            changed, how = np.diag(np.diag(moments)), "its products of inertia are set to zero"
+            changed, remark = np.diag(np.diag(moments)), "its products of inertia are set to zero"
         elif values[1] > 0 and values[2] > (1 + _ROUNDING) * (values[0] + values[1]):
             # The moments of any body satisfy the triangle inequality.
             values[2] = max(0.999 * (values[0] + values[1]), values[1])  # Digits are rounded.
             changed = axes @ np.diag(values) @ axes.T
-            how = "its largest moment is reduced to the sum of the others"
+            remark = "its largest moment is reduced to the sum of the others"
         else:
             continue
         for key, row, column in zip(_MOMENTS, _ROWS, _COLUMNS, strict=True):
             if changed[row, column] != moments[row, column]:
                 inertia.set(key, f"{changed[row, column]:.9g}")
-        tell(f"link '{link.get('name')}' has an impossible inertia; {how}")
+        tell(f"link '{link.get('name')}' has an impossible inertia; {remark}")
 
 
 def _tell_materials_apart(copy: UrdfCopy) -> None:
     """Renames materials that share a name but not a colour, and drops those without any."""
     stated = {one.get("name"): one for one in copy.root.iter("material") if len(one)}
-    before = {one.get("name") for one in copy.root.findall("material") if len(one)}
+    known = {one.get("name") for one in copy.root.findall("material") if len(one)}
     for visual in copy.root.findall("link/visual"):
         for material in visual.findall("material"):
-            if material.get("name") not in before:  # Drake knows those that came before.
-                material.extend([] if len(material) else stated.get(material.get("name"), []))
+            name = material.get("name")
+            if name not in known and not len(material):  # Drake knows those that came before.
+                material.extend(stated.get(name, []))
                 if not len(material):
                     visual.remove(material)
                     continue
-            before.add(material.get("name"))
-    seen: dict[str, list[list[str]]] = {}
+            known.add(name)
+    colours: dict[str, list[list[str]]] = {}
     for material in copy.root.iter("material"):
         values = " ".join(value for part in material for value in part.attrib.values()).split()
         if not values:
             continue  # A reference to a material.
         # 0 and 0.0 are equal.
-        content = [f"{float(v):g}" if is_number(v) else v for v in values]
+        colour = [f"{float(v):g}" if is_number(v) else v for v in values]
         name = material.get("name", "")
-        known = seen.setdefault(name, [])
-        if content not in known:
-            known.append(content)
-        if index := known.index(content):
+        others = colours.setdefault(name, [])
+        if colour not in others:
+            others.append(colour)
+        if index := others.index(colour):
             material.set("name", f"{name}_{index}")
     copy.notes += [
-        f"the material '{name}' has {len(contents)} colours; now each has its own name"
-        for name, contents in seen.items()
-        if len(contents) > 1
+        f"the material '{name}' has {len(several)} colours; now each has its own name"
+        for name, several in colours.items()
+        if len(several) > 1
     ]
 
 
@@ -188,7 +178,6 @@ def _gather_meshes(copy: UrdfCopy) -> None:
     """Adds the meshes to the copy: as they are, as glTF, or as convex hulls."""
     done: dict[str, list[str]] = {}  # Names of meshes by what became of them.
     lost: dict[str, list[str]] = {}
-    hulls: dict[str, list[trimesh.Trimesh]] = {}
 
     def added(file: Path, name: str) -> str:
         """The name of a mesh in the copy; equal names get separate folders."""
@@ -199,67 +188,71 @@ def _gather_meshes(copy: UrdfCopy) -> None:
     def converted(kind: str, url: str, convert: Callable[[Path], str]) -> str:
         """What a mesh becomes; "", with the reason in ``lost``, if it is left out."""
         candidates = _mesh_files(url, copy.source)
-        file = next((one for one in candidates if one.is_file()), None)
-        name, why, until = url if file is None else file.name, "are not where the URDF says", ""
+        file = next((path for path in candidates if path.is_file()), None)
+        name, why = url if file is None else file.name, "are not where the URDF says are left out"
         try:
             if file is not None:
                 if not _is_inside(file, url, copy.source):
                     raise ValueError("it lies outside the folders of the URDF and of its package")
                 check_meshes(file)
                 return convert(file)
-            for other in (other for one in candidates for other in _alike(one)):
+            for other in (other for path in candidates for other in _alike(path)):
                 name = f"{url} (but '{Path(*other.parts[-len(Path(url).parts) :])}' is there)"
         except MissingExtraError as error:
-            why = "Drake does not read"
-            until = f", until you `pip install '{error.needs}'` and write the folder again"
+            why = "Drake does not read are left out, until you "
+            why += f"`pip install '{error.needs}'` and write the folder again"
         except ValueError as error:
-            why, name = "cannot be read", str(error) if name in str(error) else f"{name}: {error}"
-        lost.setdefault(f"{kind} meshes that {why} are left out{until}", []).append(name)
+            why = "cannot be read are left out"
+            name = str(error) if name in str(error) else f"{name}: {error}"
+        lost.setdefault(f"{kind} meshes that {why}", []).append(name)
         return ""
 
-    def shown(rgba: str, file: Path) -> str:
+    def shown(file: Path, rgba: str = "") -> str:
         mesh = shown_mesh(file, rgba)
         if mesh == file:
             return added(file, file.name)
         done.setdefault("visual meshes are converted to glTF", []).append(file.name)
         return added(mesh, f"{file.stem}.gltf")
 
-    def touched(link: str, shape: ET.Element, mesh: ET.Element, file: Path) -> str:
-        if file.suffix.lower() in SHOWN_FORMATS:
-            return added(file, file.name)
-        points = mesh_points(file) * [*map(float, mesh.get("scale", "1 1 1").split())]
-        hulls.setdefault(link, []).append(convex_hull((pose_of(shape) @ points.T).T))
-        what = "collision meshes that Drake does not read are replaced by convex hulls"
-        done.setdefault(what, []).append(file.name)
-        return "hull"
-
     replace_visual_meshes(
-        copy.root, lambda url, rgba: converted("visual", url, partial(shown, rgba))
+        copy.root, lambda url, rgba: converted("visual", url, partial(shown, rgba=rgba))
     )
+    hulls: dict[str, list[trimesh.Trimesh]] = {}
     for link, shape, mesh in shape_meshes(copy.root, "collision"):
         name, url = link.get("name", ""), mesh.get("filename", "")
+
+        def touched(file: Path, link: str = name, shape: ET.Element = shape) -> str:
+            if file.suffix.lower() in SHOWN_FORMATS:
+                return added(file, file.name)
+            scale = shape.find("geometry/mesh").get("scale", "1 1 1")  # type: ignore[union-attr]
+            points = mesh_points(file) * [*map(float, scale.split())]
+            hulls.setdefault(link, []).append(convex_hull((pose_of(shape) @ points.T).T))
+            what = "collision meshes that Drake does not read are replaced by convex hulls"
+            done.setdefault(what, []).append(file.name)
+            return "hull"
+
         copy.mesh_urls.setdefault(name, []).append(url)
-        found = converted("collision", url, partial(touched, name, shape, mesh))
-        mesh.set("filename", found)
-        if found in ("", "hull"):
+        target = converted("collision", url, touched)
+        mesh.set("filename", target)
+        if target in ("", "hull"):
             link.remove(shape)
-        if not found:
+        if not target:
             copy.lost_links.add(name)
-    told, copy.left_out = (
-        [f"{what}: {', '.join(dict.fromkeys(names))}" for what, names in one.items()]
-        for one in (done, lost)
-    )
-    copy.notes += [*told, *copy.left_out]
+    copy.left_out = _counted(lost)
+    copy.notes += [*_counted(done), *copy.left_out]
     for link in copy.root.findall("link"):
-        if link.find("visual") is None:
-            # Links without visuals show their collision shapes.
-            for shape in link.findall("collision"):
-                visual = ET.SubElement(link, "visual")
-                visual.extend(deepcopy([part for part in shape if part.tag in _PLACED]))
-                for mesh in visual.iter("mesh"):
-                    mesh.set("filename", shown("", copy.meshes[mesh.get("filename", "")]))
+        # Links without visuals show their collision shapes.
+        for shape in link.findall("collision") if link.find("visual") is None else ():
+            visual = ET.SubElement(link, "visual")
+            visual.extend(deepcopy([part for part in shape if part.tag in _PLACED]))
+            for mesh in visual.iter("mesh"):
+                mesh.set("filename", shown(copy.meshes[mesh.get("filename", "")]))
     for name, of_link in hulls.items():
         copy.set_hulls(name, of_link)
+
+
+def _counted(names: dict[str, list[str]]) -> list[str]:
+    return [f"{what}: {', '.join(dict.fromkeys(meshes))}" for what, meshes in names.items()]
 
 
 def _alike(path: Path) -> Iterator[Path]:
@@ -274,18 +267,18 @@ def _is_inside(file: Path, url: str, source: Path) -> bool:
     """Whether a mesh lies in the package of a URDF, in its folder, or in a folder beside that."""
     folder, real = source.resolve().parent, file.resolve()
     around = [folder, *folder.parents]
-    homes = [folder, *(one for one in around if (one / "package.xml").is_file())]
+    homes = [folder, *(path for path in around if (path / "package.xml").is_file())]
     homes += [folder.parent] * (folder.name in _DESCRIPTIONS)
     scheme, _, rest = url.rpartition("://")
     name = unquote(rest).lstrip("/").partition("/")[0]
     if name and scheme in ("package", "model"):
-        named = [one / name for one in around]
+        named = [path / name for path in around]
         near = [*around, *named[:4]]
-        homes += [one for one in named if one in near or (one / "package.xml").is_file()]
+        homes += [path for path in named if path in near or (path / "package.xml").is_file()]
         with contextlib.suppress(ValueError, MissingExtraError):
             homes.append(model_file(f"package://{name}"))
     is_beside = folder.parent in real.parent.parents
-    return is_beside or any(one.resolve() in real.parents for one in homes)
+    return is_beside or any(home.resolve() in real.parents for home in homes)
 
 
 def _mesh_files(url: str, source: Path) -> list[Path]:

@@ -25,75 +25,65 @@ _MOVABLE = ("revolute", "continuous", "prismatic", "screw")
 
 @dataclass(frozen=True, kw_only=True)
 class JointDrives:
-    """Drives of the joints of a URDF.
-
-    Attributes:
-        mimics: Coupled joints: the joint that each follows, multiplier and offset [rad, m].
-        listed: Joints with a transmission (ROS 1) or a command interface (``<ros2_control>``).
-        springs: Stiffness of joints with a spring [N·m/rad].
-        efforts: Effort limits [N·m]; NaN without one.
-    """
+    """Drives of the joints of a URDF."""
 
     mimics: dict[str, tuple[str, float, float]] = field(default_factory=dict)
+    """Coupled joints: the joint that each follows, multiplier and offset [rad, m]."""
     listed: set[str] = field(default_factory=set)
+    """Joints with a transmission (ROS 1) or a command interface (``<ros2_control>``)."""
     springs: dict[str, float] = field(default_factory=dict)
+    """Stiffness of joints with a spring [N·m/rad]."""
     efforts: dict[str, float] = field(default_factory=dict)
+    """Effort limits [N·m]; NaN without one."""
 
     def passive(self, names: Collection[str]) -> dict[str, str]:
         """Returns those of some joints that have no motor, and the evidence."""
         listed = self.listed.intersection(names)
         has_efforts = any(self.efforts[name] > 0 for name in names)
-        found = {}
+        passive: dict[str, str] = {}
         for name in names:
             spring = self.springs.get(name, 0.0)
-            evidence = {
-                "no transmission, as others have": listed and name not in listed,
-                'effort="0"': not listed and has_efforts and self.efforts[name] == 0,
-                f"a spring of {spring:g} N·m/rad": (
-                    spring and name not in listed and len(self.springs) < len(names)
-                ),
-            }
-            if any(evidence.values()):
-                found[name] = ", ".join(words for words, holds in evidence.items() if holds)
-        return found
+            if listed and name not in listed:
+                passive[name] = "no transmission, as others have"
+            elif not listed and has_efforts and self.efforts[name] == 0:
+                passive[name] = 'effort="0"'
+            elif spring and name not in listed and len(self.springs) < len(names):
+                passive[name] = f"a spring of {spring:g} N·m/rad"
+        return passive
 
     def coupled(self, positions: Mapping[str, float]) -> dict[str, float]:
         """Returns joint positions in which coupled joints follow the others [rad, m]."""
-        found = dict(positions)
+        coupled = dict(positions)
         for _ in self.mimics:  # They may follow each other.
             for name, (leader, multiplier, offset) in self.mimics.items():
-                if name in found and leader in found:
-                    found[name] = multiplier * found[leader] + offset
-        return found
+                if name in coupled and leader in coupled:
+                    coupled[name] = multiplier * coupled[leader] + offset
+        return coupled
 
 
 @dataclass(kw_only=True)
 class UrdfCopy:
-    """An editable copy of a URDF file.
-
-    Attributes:
-        drives: Those of the file.
-        notes: Descriptions of the changes, one sentence each.
-        warnings: Those of them that the user should see at once.
-        left_out: Notes about meshes that were removed.
-        mesh_urls: Collision meshes of the file by link.
-        lost_links: Links of collision meshes that were removed.
-        joint_friction: Removed dry friction by joint [N·m].
-        meshes: Meshes of the copy: name relative to the copy -> original file.
-        hulls: Convex hulls in place of collision meshes, by link, in its frame [m].
-    """
+    """An editable copy of a URDF file."""
 
     source: Path
     root: ET.Element
     drives: JointDrives = field(init=False)
     notes: list[str] = field(default_factory=list)
+    """Descriptions of the changes, one sentence each."""
     warnings: list[str] = field(default_factory=list)
+    """Notes that the user should see at once."""
     left_out: list[str] = field(default_factory=list)
+    """Notes about meshes that were removed."""
     mesh_urls: dict[str, list[str]] = field(default_factory=dict)
+    """Collision meshes of the file by link."""
     lost_links: set[str] = field(default_factory=set)
+    """Links of collision meshes that were removed."""
     joint_friction: dict[str, float] = field(default_factory=dict)
+    """Removed dry friction by joint [N·m]."""
     meshes: dict[str, Path] = field(default_factory=dict)
+    """Meshes of the copy: name relative to the copy -> original file."""
     hulls: dict[str, list[trimesh.Trimesh]] = field(default_factory=dict)
+    """Convex hulls in place of collision meshes, by link, in its frame [m]."""
 
     def __post_init__(self) -> None:
         self.drives = read_drives(self.root)
@@ -105,7 +95,7 @@ class UrdfCopy:
 
     def link(self, name: str) -> ET.Element:
         """Returns a link's element."""
-        return next(link for link in self.root.iter("link") if link.get("name") == name)
+        return next(link for link in self.root.findall("link") if link.get("name") == name)
 
     @property
     def bare_links(self) -> list[str]:
@@ -115,12 +105,14 @@ class UrdfCopy:
 
     def drop_world(self) -> None:
         """Removes a root link 'world', and root links under which the robot floats."""
-        joints = joint_elements(self.root)
-        carried = {child.get("link") for joint in joints for child in joint.findall("child")}
+        joints = {
+            joint: [part.get("link") for tag in ("parent", "child") for part in joint.findall(tag)]
+            for joint in joint_elements(self.root)
+        }
+        carried = {name for ends in joints.values() for name in ends[1:]}
         for link in self.root.findall("link"):
             name = link.get("name")
-            ends = ((joint, end) for joint in joints for end in joint.findall("parent"))
-            below = [joint for joint, end in ends if end.get("link") == name]
+            below = [joint for joint, ends in joints.items() if name in ends[:1]]
             kinds = {joint.get("type") for joint in below}
             is_world = name == "world" and kinds == {"fixed"}
             if name not in carried and (is_world or kinds & {"floating", "planar"}):
@@ -252,39 +244,39 @@ def read_drives(root: ET.Element) -> JointDrives:
     movable = [joint for joint in joint_elements(root) if joint.get("type") in _MOVABLE]
     joints = {joint.get("name", ""): joint for joint in movable}
     motors = "transmission//joint", "ros2_control/joint[command_interface]"
-    stated: dict[str, Mapping[str, str | None]] = {}  # Couplings; <mimic> comes last.
+    couplings: dict[str, Mapping[str, str | None]] = {}  # <mimic> comes last.
     for plugin in root.findall("gazebo/plugin[mimicJoint]"):
-        one = {part.tag: part.text for part in plugin}
-        stated[(one.get("joint") or "").strip()] = one | {"joint": one["mimicJoint"]}
-    for joint in root.findall("ros2_control/joint"):
-        one = {part.get("name", ""): part.text for part in joint.findall("param")}
-        if "mimic" in one:
-            stated[joint.get("name", "")] = one | {"joint": one["mimic"]}
+        stated = {part.tag: part.text for part in plugin}
+        couplings[(stated.get("joint") or "").strip()] = stated | {"joint": stated["mimicJoint"]}
+    for joint in root.findall("ros2_control/joint[param]"):
+        stated = {part.get("name", ""): part.text for part in joint.findall("param")}
+        if "mimic" in stated:
+            couplings[joint.get("name", "")] = stated | {"joint": stated["mimic"]}
+    springs = {name: _stiffness(joint) for name, joint in joints.items()}
     for name, joint in joints.items():
         if (mimic := joint.find("mimic")) is not None:
-            stated[name] = mimic.attrib
-    springs = {name: _stiffness(joint) for name, joint in joints.items()}
-    for gazebo in root.findall("gazebo"):
-        name = gazebo.get("reference", "")
-        springs[name] = max(springs.get(name, 0.0), _stiffness(gazebo))
+            couplings[name] = mimic.attrib
+        for gazebo in root.findall("gazebo"):
+            if gazebo.get("reference") == name:
+                springs[name] = max(springs[name], _stiffness(gazebo))
     return JointDrives(
         mimics={
             name: (
-                (one.get("joint") or "").strip(),
-                as_number(one.get("multiplier"), 1.0),
-                as_number(one.get("offset"), 0.0),
+                (stated.get("joint") or "").strip(),
+                as_number(stated.get("multiplier"), 1.0),
+                as_number(stated.get("offset"), 0.0),
             )
-            for name, one in stated.items()
+            for name, stated in couplings.items()
             if name in joints
         },
-        listed={one.get("name", "") for place in motors for one in root.findall(place)},
-        springs={name: springs[name] for name in joints if springs[name] > 0},
-        efforts={name: number(one.find("limit"), "effort") for name, one in joints.items()},
+        listed={joint.get("name", "") for place in motors for joint in root.findall(place)},
+        springs={name: spring for name, spring in springs.items() if spring > 0},
+        efforts={name: number(joint.find("limit"), "effort") for name, joint in joints.items()},
     )
 
 
 def _stiffness(element: ET.Element) -> float:
     """The largest, whatever they are called: springStiffness, spring_stiffness, stiffness."""
-    parts = ({**part.attrib, part.tag: part.text} for part in element.iter())
-    stated = (text for one in parts for key, text in one.items() if "stiffness" in key.lower())
-    return max((as_number(text, 0.0) for text in stated), default=0.0)
+    stated = ({**part.attrib, part.tag: part.text} for part in element.iter())
+    texts = (text for one in stated for key, text in one.items() if "stiffness" in key.lower())
+    return max((as_number(text, 0.0) for text in texts), default=0.0)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import Box, Capsule, Cylinder, Shape, Sphere
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import (
     Joint,
@@ -21,7 +21,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety.importing.urdf_copy import JointDrives, UrdfCopy
 from drake_safety.robots.model_files import package_parser
-from drake_safety.robots.plausibility import extent, listed
+from drake_safety.robots.plausibility import listed
 
 WITHOUT_STOPS_RAD = 4 * math.pi
 """Range of a joint from which it may turn a wheel."""
@@ -33,28 +33,23 @@ _FLAT_M = 1e-3  # Height over a sole's lowest part within which other parts touc
 _LEVEL_M = 0.005  # Height over the lowest sphere within which others count as contacts.
 _LEAST_INERTIA = 1e-10  # Of what a joint moves [kg·m², kg].
 _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("L", "R"), ("l", "r"))
-_Y = np.array([0.0, 1.0, 0.0])
-_Z = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(kw_only=True)
 class Limb:
-    """A leg or an arm.
-
-    Attributes:
-        body: The body at its end, which touches the ground or reaches.
-        joints: Its own joints, starting at the base.
-        points: Centres of contact spheres in the body's frame, (n, 3) [m].
-        is_own_shape: Whether the URDF has these spheres.
-        is_guess: Whether the URDF has no collision shape at the end.
-    """
+    """A leg or an arm."""
 
     body: str
+    """The body at its end, which touches the ground or reaches."""
     joints: list[str]
+    """Its own joints, starting at the base."""
     points: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
+    """Centres of contact spheres in the body's frame, (n, 3) [m]."""
     radius_m: float = _GUESSED_RADIUS_M
     is_own_shape: bool = False
+    """Whether the URDF has these spheres."""
     is_guess: bool = True
+    """Whether the URDF has no collision shape at the end."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +89,7 @@ class Survey:
         floating = [body.name() for body in bodies if body.is_floating_base_body()]
         if len(floating) != 1:
             raise ValueError(
-                f"'{self.source}' must have exactly one floating body, its base; got "
-                f"{floating or 'none'}. "
-                + ("Join them" if floating else "Remove a link 'world' and its joint")
+                f"'{self.source}' must have exactly one floating body, its base; got {floating}"
             )
         (self.base,) = floating
         joints = [plant.get_joint(i) for i in plant.GetJointIndices(self.instance)]
@@ -144,13 +137,13 @@ class Survey:
 
     def chain(self, body: str) -> list[str]:
         """Returns the joints that move a body, starting at the base."""
-        found: list[str] = []
+        names: list[str] = []
         while body in self._above:
             joint = self._above[body]
             if joint.num_velocities() == 1:
-                found.append(joint.name())
+                names.insert(0, joint.name())
             body = joint.parent_body().name()
-        return found[::-1]
+        return names
 
     def pose(self, body: str) -> RigidTransform:
         """Returns the pose of a body in the base's frame."""
@@ -163,11 +156,10 @@ class Survey:
 
     def joint_axis(self, joint: str) -> np.ndarray:
         """Returns the direction of a joint's axis in the base's frame, (3,)."""
-        one = self.plant.GetJointByName(joint, self.instance)
+        moved = self.plant.GetJointByName(joint, self.instance)
         kinds = {RevoluteJoint: "revolute_axis", ScrewJoint: "screw_axis"}
-        axis = getattr(one, kinds.get(type(one), "translation_axis"))()
-        R_BJ = one.frame_on_parent().CalcPoseInWorld(self.context).rotation()
-        return R_BJ.matrix() @ axis
+        axis = getattr(moved, kinds.get(type(moved), "translation_axis"))()
+        return moved.frame_on_parent().CalcPoseInWorld(self.context).rotation().matrix() @ axis
 
     def positions(self, limb: Limb) -> np.ndarray:
         """Returns a limb's contact points in the base's frame, (n, 3) [m]."""
@@ -179,37 +171,29 @@ class Survey:
         groups = [self.welded(joint.child_body().name()) for joint in self.joints]
         return [group for group in groups if not carriers & set(group)]
 
+    def _groups(self, named: list[str] | None) -> list[list[str]]:
+        """The ends of the tree, or those with the links that a user named."""
+        groups = self.leaves()
+        ends = [name for group in groups for name in group]
+        if unknown := [name for name in named or () if name not in ends]:
+            raise ValueError(f"no limb ends in links {unknown}; limbs end in {ends}")
+        return groups if named is None else [one for one in groups if set(one) & set(named)]
+
     def welded(self, body: str) -> list[str]:
         """Returns the bodies welded to a body, including itself."""
-        one = self.plant.GetBodyByName(body, self.instance)
-        return [b.name() for b in self.plant.GetBodiesWeldedTo(one)]
-
-    def collides(self, body: str) -> bool:
-        """Whether a body or one welded to it has collision geometry."""
-        return bool([*self._geometries(self.welded(body))])
-
-    def limbs(self) -> list[Limb]:
-        """Returns the limbs of two joints or more."""
-        return [self._leg(group) for group in self.leaves() if len(self.chain(group[0])) >= 2]
+        welded = self.plant.GetBodiesWeldedTo(self.plant.GetBodyByName(body, self.instance))
+        return [other.name() for other in welded]
 
     def legs(self, feet: list[str] | None = None) -> list[Limb]:
         """Returns the limbs that reach lowest, or those that end in the given links."""
-        groups = self.leaves()
-        ends = [name for group in groups for name in group]
-        for name in feet or ():
-            if name not in ends:
-                raise ValueError(f"no limb ends in link '{name}'; limbs end in {ends}")
+        groups = self._groups(feet)
+        ends = [name for group in self.leaves() for name in group]
         if feet is None:
             floor = min(map(self.lowest, groups), default=0.0)
             # Hanging arms end well above the ground.
             highest = floor + max(-0.25 * floor, 0.02)
-            groups = [
-                group
-                for group in groups
-                if self.lowest(group) <= highest and len(self.chain(group[0])) >= 2
-            ]
-        else:
-            groups = [group for group in groups if set(group) & set(feet)]
+            moved = (group for group in groups if len(self.chain(group[0])) >= 2)
+            groups = [group for group in moved if self.lowest(group) <= highest]
         if len(groups) < 2:
             raise ValueError(
                 f"found {len(groups)} feet, expected at least 2: name the links that touch the "
@@ -229,15 +213,11 @@ class Survey:
         A hand's fingers are no limbs.
         """
         feet = {limb.body for limb in legs}
-        ends = [name for group in self.leaves() for name in group if name not in feet]
-        if unknown := [name for name in named or () if name not in ends]:
-            raise ValueError(f"no arm ends in links {unknown}; limbs end in {ends}")
         # Ends of limbs by their first four joints: chains and bodies.
         hands: dict[tuple[str, ...], list[tuple[list[str], str]]] = {}
-        for group in self.leaves():
+        for group in self._groups(named):
             chain = self.chain(group[0])
-            is_arm = len(chain) >= 4 if named is None else bool(set(group) & set(named))
-            if is_arm and not feet & set(group):
+            if (named is not None or len(chain) >= 4) and not feet & set(group):
                 hands.setdefault(tuple(chain[:4]), []).append((chain, group[-1]))
         arms = []
         for fingers in hands.values():
@@ -260,12 +240,12 @@ class Survey:
 
         Such legs touch by a sphere as large as the wheel, unless they have one of their own.
         """
-        found = []
+        wheels = []
         for limb in legs:
             low, high = self.limits[limb.joints[-1]]
             axis, origin = self.joint_axis(limb.joints[-1]), self.joint_origin(limb.joints[-1])
             group = self.welded(limb.body) if high - low > WITHOUT_STOPS_RAD else []
-            for _, shape, _, X_WO, half in self._geometries(group):
+            for _, shape, _, X_WO, half in self.geometries(group):
                 along = np.abs(X_WO.rotation().matrix().T @ axis)
                 across = np.delete(half, np.argmax(along))
                 radius, center = float(across.max()), X_WO.translation()
@@ -274,28 +254,24 @@ class Survey:
                 offset = max(np.ptp(across), np.linalg.norm(np.cross(axis, center - origin)))
                 is_round = not isinstance(shape, Box) and offset < _ROUND * radius
                 if is_low and is_turned and is_round:
-                    found.append(limb.joints[-1])
+                    wheels.append(limb.joints[-1])
                     if not limb.is_own_shape:
                         limb.points = (self.pose(limb.body).inverse() @ center)[None]
                         limb.radius_m = radius
                     break
-        return found
+        return wheels
 
-    def oversized(self, most_m: float) -> dict[str, float]:
-        """Returns links with a collision shape beyond a size, and their sizes [m]."""
-        sizes = {name: 2 * max(half) for name, *_, half in self._geometries(self.bodies)}
-        return {name: size for name, size in sizes.items() if size > most_m}
-
-    def _geometries(
+    def geometries(
         self, bodies: list[str]
     ) -> Iterator[tuple[str, Shape, RigidTransform, RigidTransform, np.ndarray]]:
-        """The collision shapes of bodies: body, shape, its pose, its box's pose and half edges."""
+        """Yields the collision shapes of bodies: body, shape, pose, its box's pose, half edges."""
         inspector = self._scene_graph.model_inspector()
         for name in bodies:
             body = self.plant.GetBodyByName(name, self.instance)
-            for one in self.plant.GetCollisionGeometriesForBody(body):
-                X_WG = self.pose(name) @ inspector.GetPoseInFrame(one)
-                hull, box = inspector.GetConvexHull(one), inspector.GetObbInGeometryFrame(one)
+            for geometry in self.plant.GetCollisionGeometriesForBody(body):
+                X_WG = self.pose(name) @ inspector.GetPoseInFrame(geometry)
+                hull = inspector.GetConvexHull(geometry)
+                box = inspector.GetObbInGeometryFrame(geometry)
                 if hull is not None:
                     middle, edges = hull.CalcBoundingBox()
                     X_GO, half = RigidTransform(middle), np.array(edges) / 2
@@ -303,18 +279,18 @@ class Survey:
                     X_GO, half = box.pose(), np.array(box.half_width())
                 else:  # It is boundless.
                     continue
-                yield name, inspector.GetShape(one), X_WG, X_WG @ X_GO, half
+                yield name, inspector.GetShape(geometry), X_WG, X_WG @ X_GO, half
 
     def overlaps(self) -> set[tuple[str, str]]:
         """Returns pairs of links that overlap in the present posture, in alphabetical order."""
         context = self._scene_graph.GetMyContextFromRoot(self._root)
         query = self._scene_graph.get_query_output_port().Eval(context)
-        frame_of, found = query.inspector().GetFrameId, set()
-        for one in query.ComputePointPairPenetration():
-            frames = frame_of(one.id_A), frame_of(one.id_B)
+        pairs = set()
+        for contact in query.ComputePointPairPenetration():
+            frames = map(query.inspector().GetFrameId, (contact.id_A, contact.id_B))
             low, high = sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
-            found.add((low, high))
-        return found
+            pairs.add((low, high))
+        return pairs
 
     def lowest(self, group: list[str]) -> float:
         """Returns the height of bodies' lowest point over the base [m]."""
@@ -334,11 +310,11 @@ class Survey:
         if foot.is_sphere:
             level_m = min(shape.lowest_m for shape in shapes) + _LEVEL_M
         alike = (
-            one.centers
-            for one in shapes
-            if (one.body, one.is_sphere) == (foot.body, foot.is_sphere)
-            and abs(one.radius_m - foot.radius_m) < 1e-6
-            and one.lowest_m < level_m
+            shape.centers
+            for shape in shapes
+            if (shape.body, shape.is_sphere) == (foot.body, foot.is_sphere)
+            and abs(shape.radius_m - foot.radius_m) < 1e-6
+            and shape.lowest_m < level_m
         )
         centers = np.concatenate([*alike])
         centers = centers[centers[:, 2] < centers[:, 2].min() + _LEVEL_M + foot.radius_m]
@@ -352,8 +328,8 @@ class Survey:
         )
 
     def _shapes(self, group: list[str]) -> list[_Shape]:
-        found = []
-        for name, shape, X_WG, X_WO, half in self._geometries(group):
+        shapes = []
+        for name, shape, X_WG, X_WO, half in self.geometries(group):
             # A flat cylinder that lies on the ground is a sole.
             is_flat = isinstance(shape, Cylinder) and shape.length() < 2 * shape.radius()
             is_plate = is_flat and abs(X_WG.rotation().matrix()[2, 2]) > 0.7
@@ -369,8 +345,8 @@ class Survey:
             else:
                 # The largest square in a round plate.
                 spheres = _corners(X_WO, half * ([*2 * [math.sqrt(0.5)], 1] if is_plate else 1))
-            found.append(_Shape(name, *spheres, isinstance(shape, Sphere)))
-        return found
+            shapes.append(_Shape(name, *spheres, isinstance(shape, Sphere)))
+        return shapes
 
 
 def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]:
@@ -392,28 +368,22 @@ def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]
     return (X_WG @ (signs * inner).T).T, _CORNER_RADIUS_M
 
 
-def require_shapes(survey: Survey, copy: UrdfCopy, *, are_feet_named: bool) -> None:
-    """Refuses shapes of another order of magnitude, and to guess feet of meshes not found."""
-    robot_m = extent(survey.plant, survey.context, survey.instance)
-    for link, size in survey.oversized(10 * robot_m).items():
-        raise ValueError(
-            f"new: '{survey.source}': a collision shape of link '{link}' "
-            f"{copy.mesh_urls.get(link, '')} is {size:.3g} m large, in a robot of "
-            f"{robot_m:.2g} m; in millimetres? State sizes in metres, or "
-            'scale="0.001 0.001 0.001"'
-        )
+def require_feet(survey: Survey, copy: UrdfCopy) -> None:
+    """Refuses to guess feet of limbs whose collision meshes were not found or not read."""
     groups = [group for group in survey.leaves() if len(survey.chain(group[0])) >= 2]
-    floor = min(map(survey.lowest, groups), default=0.0)
+    heights = [*map(survey.lowest, groups)]
+    floor = min(heights, default=0.0)
+    shaped = {name for name, *_ in survey.geometries(survey.bodies)}
     lost = [
         f"'{name}' ({', '.join(copy.mesh_urls[name])})"
-        for group, z in zip(groups, map(survey.lowest, groups), strict=True)
+        for group, z in zip(groups, heights, strict=True)
         for name in group
         if name in copy.bare_links
         and z < 0.4 * floor
         # What is left reaches lower than the link that was lost, such as a foot's cover.
-        and (survey.pose(name).translation()[2] < z - 0.25 * floor or not survey.collides(name))
+        and (survey.pose(name).translation()[2] < z - 0.25 * floor or not shaped & set(group))
     ]
-    if lost and not are_feet_named:
+    if lost:
         raise ValueError(
             f"new: '{survey.source}': collision meshes at the ends of limbs were not found or not "
             f"read, so that the feet cannot be told: {'; '.join(lost)}. Put them where the URDF "
@@ -425,26 +395,22 @@ def require_shapes(survey: Survey, copy: UrdfCopy, *, are_feet_named: bool) -> N
 def require_motors(survey: Survey, legs: list[Limb], moved: Collection[str]) -> None:
     """Refuses legs with joints that no motor moves by itself, unless a policy ``moved`` them."""
     drives = survey.drives
-    chains = [survey.chain(limb.body) for limb in legs]
-    joints = list(dict.fromkeys(joint for one in chains for joint in one))
+    joints = list(dict.fromkeys(joint for limb in legs for joint in survey.chain(limb.body)))
     mimics = {name: drives.mimics[name] for name in joints if name in drives.mimics}
-    coupled = {name: "= {1:g} · '{0}' + {2:g}".format(*one) for name, one in mimics.items()}
+    coupled = {name: "= {1:g} · '{0}' + {2:g}".format(*mimic) for name, mimic in mimics.items()}
     passive = {name: why for name, why in drives.passive(joints).items() if name not in moved}
-    limits = ((name, *survey.limits[name]) for name in survey.limits if name in joints)
+    limits = ((name, *survey.limits[name]) for name in joints)
     stuck = {name: f"{low:g}" for name, low, high in limits if low == high}
-    fix = 'or fix them (type="fixed")'
-    shared = [name for name in passive if all(name in one for one in chains)]
-    if shared:
-        fix += f"; {shared} carry all legs: the base floats without them and the links above"
-    for found, what, remedy in (
+    fix = 'or fix them (type="fixed"); the base floats without joints that carry all legs'
+    for names, what, remedy in (
         (coupled, "follow others by <mimic>", "remove <mimic> if each has a motor of its own"),
         (passive, "have no motor", f"add a <transmission> if they have one, {fix}"),
         (stuck, "have equal limits", f"correct <limit>, {fix}"),
     ):
-        if found:
+        if names:
             raise ValueError(
                 f"new: '{survey.source}': a robot that stands by servos needs a motor on every "
-                f"joint of its legs, but some {what}: {listed(found)}. Remedy: {remedy}"
+                f"joint of its legs, but some {what}: {listed(names)}. Remedy: {remedy}"
             )
 
 
@@ -460,61 +426,20 @@ def require_masses(survey: Survey) -> None:
             )
 
 
-def upright_base(
-    survey: Survey, limbs: list[Limb], *, is_up: bool
-) -> tuple[RigidTransform | None, str]:
-    """A pose between the hips, x forwards and z up, if the root link is far from that; and why.
-
-    Legs point down: unless z ``is_up``, it is against their direction where they agree and the hips
-    lie in a plane. Left is where joints with names of the left are, else along the axes of hips and
-    knees. A robot that faces backwards is only told of.
-    """
-    hips = np.array([survey.joint_origin(limb.joints[0]) for limb in limbs]).reshape(-1, 3)
-    if not len(hips):
-        return None, ""
-    across = np.array([survey.positions(limb).mean(axis=0) for limb in limbs]) - hips
-    lengths = np.maximum(np.linalg.norm(across, axis=1), 1e-9)
-    length, middle = lengths.mean(), 0.5 * (hips.min(axis=0) + hips.max(axis=0))
-    down = (across / lengths[:, None]).mean(axis=0)
-    up, left, why = (_Z if is_up else -_nearest_axis(down)), _Y, ""
-    if not is_up:
-        if up[2] > 0.5 or np.linalg.norm(down) < 0.8 or np.ptp(hips @ up) > 0.2 * length:
-            return None, ""
-        why = f"has its legs along {_in_words(-up)}"
-    if np.linalg.norm(down) > 0.5:  # Not a spider's.
-        left = _left(survey, limbs, up)
-    if abs(left[1]) < 0.5 and not why:
-        why = f"has its left along {_in_words(left)}"
-    height, offset = -middle @ up, float(np.linalg.norm(np.cross(middle, up)))
-    if not why and not (-0.2 * length < height < 1.2 * length and offset < 0.5 * length):
-        why = f"lies {-height:.2f} m below the hips and {offset:.2f} m aside"
-    if not why:
-        return None, "faces backwards, as its left is along -y" if left[1] < 0 else ""
-    R_BH = RotationMatrix(np.column_stack([np.cross(left, up), left, up]))
-    return RigidTransform(R_BH, middle), why
-
-
-def _left(survey: Survey, limbs: list[Limb], up: np.ndarray) -> np.ndarray:
-    level = 1 - np.abs(up)
-    origins = {name: survey.joint_origin(name) for limb in limbs for name in limb.joints}
-    pairs = [origins[one] - origins[other] for one, other in mirrored(list(origins)).items()]
-    if pairs and np.linalg.norm(np.mean(pairs, axis=0) * level) > 0.01:
-        return _nearest_axis(np.mean(pairs, axis=0) * level)
-    axes = ([survey.joint_axis(joint) for joint in limb.joints] for limb in limbs)
-    turns = np.array([(np.abs(one) > 0.9).sum(axis=0) for one in axes]) * level
-    # Legs that do not agree decide nothing.
-    others = np.flatnonzero(np.all(turns > turns[:, [1]], axis=0))
-    left = np.eye(3)[others[0]] if len(others) else _nearest_axis(_Y * level + 0.1 * level)
-    return left if np.cross(left, up).sum() > 0 else -left
-
-
-def _nearest_axis(direction: np.ndarray) -> np.ndarray:
-    k = int(np.argmax(np.abs(direction)))
-    return np.sign(direction[k]) * np.eye(3)[k]
-
-
-def _in_words(axis: np.ndarray) -> str:
-    return f"{'-' if axis.sum() < 0 else '+'}{'xyz'[int(np.argmax(np.abs(axis)))]}"
+def base_at_hips(survey: Survey, legs: list[Limb]) -> tuple[RigidTransform | None, str]:
+    """Returns a pose between the hips if the root link is far from them; and what is odd of it."""
+    hips = np.array([survey.joint_origin(limb.joints[0]) for limb in legs])
+    feet = np.array([survey.positions(limb).mean(axis=0) for limb in legs])
+    length = np.linalg.norm(feet - hips, axis=1).mean()
+    x, y, z = middle = 0.5 * (hips.min(axis=0) + hips.max(axis=0))
+    if not (-0.2 * length < -z < 1.2 * length and math.hypot(x, y) < 0.5 * length):
+        why = f"lies {z:.2f} m below the hips and {math.hypot(x, y):.2f} m aside"
+        return RigidTransform(middle), why
+    origins = {name: survey.joint_origin(name) for limb in legs for name in limb.joints}
+    sides = [origins[left] - origins[right] for left, right in mirrored(list(origins)).items()]
+    across = np.mean(sides, axis=0) if sides else np.array([0.0, 1.0, 0.0])
+    is_turned = across[1] < 0.5 * np.linalg.norm(across)
+    return None, "is turned: its left is not along +y, so that x is not forwards" * is_turned
 
 
 def mirrored(names: list[str]) -> dict[str, str]:

@@ -89,7 +89,6 @@ class PlantVariation:
 
 
 PAYLOAD_RADIUS_M = 0.05
-_LOGGER = logging.getLogger("drake_safety")
 _SHAPE_FRICTION = 0.2  # Of all shapes but the feet.
 _SPRING_LENGTH_M = 1e4  # Of the spring that exerts a steady force.
 _LOCKED_DAMPING = 1e5  # [N·m·s/rad]. Drake 1.51 crashes when a joint with a servo is locked.
@@ -172,14 +171,11 @@ def _add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceI
 
 @contextmanager
 def _quiet_about(robot: RobotModel) -> Iterator[None]:
-    """Logs warnings about files of other packages, which no user can change, at debug level."""
-    drake = logging.getLogger("drake")
+    """Drops warnings about files of packages, which no user can change."""
+    drake, is_own = logging.getLogger("drake"), not robot.urdf.startswith("package://")
 
     def pass_on(record: logging.LogRecord) -> bool:
-        if not robot.urdf.startswith("package://") or record.levelno > logging.WARNING:
-            return True
-        _LOGGER.debug("%s: %s", robot.name, record.getMessage())
-        return False
+        return is_own or record.levelno > logging.WARNING
 
     drake.addFilter(pass_on)
     try:
