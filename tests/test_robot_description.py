@@ -97,7 +97,7 @@ def test_a_stated_speed_limit_holds_and_what_is_welded_to_a_neighbour_does_not_t
 
 
 def test_shapes_of_no_body_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"no body for shapes \['lid'\]"):
+    with pytest.raises(ValueError, match=r"no body for shapes 'lid'"):
         built(write(tmp_path, shapes={"lid": [{"radius_m": 0.1}]}))
 
 

@@ -29,23 +29,20 @@ _STL = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
 
 @dataclass(kw_only=True)
 class ModelFacts:
-    """What a model file says of a robot beyond a URDF, by the names of its joints and bodies.
-
-    Attributes:
-        gains: Stiffness and damping of position servos [N·m/rad, N·m·s/rad].
-        rotor_inertia: Inertia of the rotors as the joints feel it [kg·m²].
-        postures: Joint positions [rad] by keyframe.
-        friction: Centre (3,) [m] and friction coefficient [1] of each collision shape, by body.
-        apart: Pairs of bodies that do not collide, each in alphabetical order.
-        left_out: What is left out, a note each.
-    """
+    """What a model file says of a robot beyond a URDF, by the names of its joints and bodies."""
 
     gains: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Stiffness and damping of position servos [N·m/rad, N·m·s/rad]."""
     rotor_inertia: dict[str, float] = field(default_factory=dict)
+    """Inertia of the rotors as the joints feel it [kg·m²]."""
     postures: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Joint positions [rad] by keyframe."""
     friction: dict[str, list[tuple[np.ndarray, float]]] = field(default_factory=dict)
+    """Centre (3,) [m] and friction coefficient [1] of each collision shape, by body."""
     apart: set[tuple[str, str]] = field(default_factory=set)
+    """Pairs of bodies that do not collide, each in alphabetical order."""
     left_out: list[str] = field(default_factory=list)
+    """What is left out, a note each."""
 
 
 def is_mjcf(path: Path) -> bool:
@@ -87,13 +84,13 @@ def _check_sizes(path: Path) -> None:
     except (OSError, ET.ParseError):
         return  # MuJoCo says why.
     copies = 1.0
-    for one in elements:
-        sizes = [as_number(x, 0.0) for key in _SIZES for x in one.get(key, "").split()]
-        size = math.prod(max(x, 1.0) for x in sizes)
-        copies *= size if one.tag == "replicate" else 1.0
+    for element in elements:
+        stated = {key: element.get(key, "") for key in _SIZES if key in element.attrib}
+        sizes = [as_number(text, 0.0) for text in " ".join(stated.values()).split()]
+        size = math.prod(max(value, 1.0) for value in sizes)
+        copies *= size if element.tag == "replicate" else 1.0
         if not (size <= _MOST_CELLS and copies <= _MOST_COPIES):
-            stated = {key: one.get(key) for key in _SIZES if key in one.attrib}
-            raise ValueError(f"MJCF '{path}': <{one.tag}> with {stated} takes too much memory")
+            raise ValueError(f"MJCF '{path}': <{element.tag}> with {stated} takes too much memory")
 
 
 class _Robot:

@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping
 
 import numpy as np
-from pydrake.math import RotationMatrix
 
 from drake_safety.importing.urdf_survey import Limb, Survey
 
@@ -26,12 +25,11 @@ _FREE_RAD = 2.5  # Range of a joint without stops.
 def standing_posture(
     survey: Survey, legs: list[Limb], keyframes: Mapping[str, Mapping[str, float]]
 ) -> tuple[dict[str, float], str]:
-    """Takes a standing posture [rad] from the model file's keyframes, or solves one; and which.
+    """Returns a standing posture [rad] and its source: a keyframe, home or stand first, or solved.
 
-    Keyframes called home or stand come first. In a keyframe in which the robot stands, all joints
-    are within their stops, not all joints of legs at zero, all contact points at the same height,
-    and the centre of mass is amid them. Without one, joints of no leg are as in the first, or
-    at zero, but off their stops.
+    A keyframe serves if the robot stands in it: joints within their stops and not all at zero,
+    contact points equally low, and the centre of mass amid them. Otherwise joints of no leg are as
+    in the first keyframe, or at zero, but off their stops.
     """
     names = sorted(keyframes, key=lambda name: not re.search("home|stand", name.lower()))
     for name in names:
@@ -62,12 +60,11 @@ def _stands(survey: Survey, legs: list[Limb], posture: dict[str, float]) -> bool
 def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]:
     """Solves for joint positions by name [rad] in which the robot can stand.
 
-    Every foot is under its hip (the joint where the long links begin), with the lateral offset of
-    the straight leg, and level if it has more than one contact point. The height of the hips is
-    four fifths of a leg's length, or the nearest feasible share. Legs that spread at zero, as a
-    spider's, keep half of their spread. Of several solutions for a leg, the one with small angles
-    and a knee that bends backwards (bipeds: forwards, spread legs: upwards) is used. If the
-    centre of mass is then not amid the feet, all feet are moved under it. Joints of no leg rest.
+    Every foot is level and under its hip, the joint where the long links begin; legs that spread
+    at zero, as a spider's, keep half of their spread. The height of the hips is four fifths of a
+    leg's length, or the nearest feasible share. Of several solutions for a leg, the one with small
+    angles and a knee that bends backwards (bipeds: forwards, spread legs: upwards) is taken. If the
+    centre of mass is not amid the feet, all feet are moved under it.
     """
     survey.set_joints({})
     solvers = [_Leg(survey, leg, len(legs)) for leg in legs]
@@ -90,22 +87,22 @@ def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]
 
 def _solved(survey: Survey, solvers: list[_Leg]) -> dict[str, float]:
     is_spread = any(solver.is_spread for solver in solvers)
-    reach: dict[str, float] = {}
+    out_of_reach = set()
     for share in _SPREAD_SHARES if is_spread else _SHARES:
         lowest = min(solver.hip[2] - share * solver.length for solver in solvers)
         solved: dict[str, float] = {}
         for solver in solvers:
             angles = solver.solve(lowest)
             if angles is None:
-                reach[solver.limb.body] = share
+                out_of_reach.add(solver.limb.body)
                 break
             solved |= dict(zip(solver.limb.joints, angles.tolist(), strict=True))
         else:
             survey.set_joints(solved)
             return {name: round(value, 4) for name, value in survey.posture().items()}
     raise ValueError(
-        f"no standing posture found: the feet {list(reach)} cannot reach the ground under their "
-        "hips within their joints' stops. Are these all feet (--feet)?"
+        f"no standing posture found: the feet {sorted(out_of_reach)} cannot reach the ground under "
+        "their hips within their joints' stops. Are these all feet (--feet)?"
     )
 
 
@@ -149,8 +146,8 @@ class _Leg:
             if len(points) > 1:
                 # The orientation at zero keeps the foot level.
                 R_FF = self._R_BF.inverse() @ self._survey.pose(self.limb.body).rotation()
-                yaw = RotationMatrix(R_FF).ToAngleAxis()
-                parts.append(0.1 * yaw.angle() * np.asarray(yaw.axis()))
+                turn = R_FF.ToAngleAxis()
+                parts.append(0.1 * turn.angle() * np.asarray(turn.axis()))
             return np.concatenate(parts)
 
         def residual(angles: np.ndarray) -> np.ndarray:

@@ -399,7 +399,7 @@ def require_motors(survey: Survey, legs: list[Limb], moved: Collection[str]) -> 
     mimics = {name: drives.mimics[name] for name in joints if name in drives.mimics}
     coupled = {name: "= {1:g} · '{0}' + {2:g}".format(*mimic) for name, mimic in mimics.items()}
     passive = {name: why for name, why in drives.passive(joints).items() if name not in moved}
-    limits = ((name, *survey.limits[name]) for name in joints)
+    limits = ((name, *survey.limits[name]) for name in survey.limits if name in joints)
     stuck = {name: f"{low:g}" for name, low, high in limits if low == high}
     fix = 'or fix them (type="fixed"); the base floats without joints that carry all legs'
     for names, what, remedy in (

@@ -68,7 +68,8 @@ def _fault(path: Path, changed_ns: int) -> str:
 def _obj_fault(content: bytes) -> str:
     lines = [line.split() for line in content.replace(b"\\\n", b" ").splitlines()]
     points = [line[1:4] for line in lines if line[:1] == [b"v"]]
-    corners = [one.split(b"/")[0] for line in lines if line[:1] == [b"f"] for one in line[1:]]
+    faces = (line[1:] for line in lines if line[:1] == [b"f"])
+    corners = [corner.split(b"/")[0] for face in faces for corner in face]
     index = np.array(corners or [b"0"], dtype=float)
     if not np.isfinite(np.array(points, dtype=float)).all():
         return "has a vertex that is not three finite numbers"
@@ -79,10 +80,10 @@ def _obj_fault(content: bytes) -> str:
 
 
 def _gltf_fault(content: bytes) -> str:
-    found = json.loads(content)
-    views, buffers = found.get("bufferViews", []), found.get("buffers", [])
-    for one in found.get("accessors", []):
-        view = views[one.get("bufferView", 0)]
+    mesh = json.loads(content)
+    views, buffers = mesh.get("bufferViews", []), mesh.get("buffers", [])
+    for accessor in mesh.get("accessors", []):
+        view = views[accessor.get("bufferView", 0)]
         if view.get("byteOffset", 0) + view["byteLength"] > buffers[view["buffer"]]["byteLength"]:
             return "has a view beyond its buffer"
     return ""
@@ -110,8 +111,8 @@ def is_shown(path: Path) -> bool:
     materials = path.with_suffix(".mtl")
     if path.suffix.lower() != ".obj" or not materials.is_file():
         return path.suffix.lower() in SHOWN_FORMATS
-    found = _TRANSPARENCY.findall(materials.read_text("utf-8", "replace"))
-    return not found or min(map(float, found)) < 1.0
+    transparency = _TRANSPARENCY.findall(materials.read_text("utf-8", "replace"))
+    return not transparency or min(map(float, transparency)) < 1.0
 
 
 def shown_mesh(path: Path, rgba: str = "") -> Path:
@@ -144,7 +145,7 @@ def mesh_points(path: Path) -> np.ndarray:
 
 
 def convex_hull(points: np.ndarray) -> trimesh.Trimesh:
-    """Returns the convex hull of those of the points (n, 3) [m] that are extreme in 42 directions.
+    """Returns the convex hull of the points (n, 3) [m] that are extreme in 42 directions.
 
     Points in a plane get the box around them, at least 1 mm thick.
     """

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import field
 from itertools import chain
-from typing import Any, Generic, Literal, TypeVar
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
 from pydrake.geometry import (
@@ -104,7 +104,7 @@ def _require(
     fits: Callable[[str, str], Any] = operator.eq,
 ) -> None:
     for name in names:
-        if not any(fits(name, one) for one in known):
+        if not any(fits(name, other) for other in known):
             raise ValueError(f"robot '{robot.name}' has no {what} '{name}'; it has {known}")
 
 
@@ -189,8 +189,7 @@ def _add_stated_shapes(
 ) -> None:
     """Adds the collision geometry of robot.yaml: contact points and shapes."""
     names = [plant.get_body(index).name() for index in plant.GetBodyIndices(instance)]
-    if unused := [one for one in robot.shapes if not any(re.fullmatch(one, b) for b in names)]:
-        raise ValueError(f"robot '{robot.name}' has no body for shapes {unused}; it has {names}")
+    _require(robot, "body for shapes", robot.shapes, names, re.fullmatch)
 
     def add(body: str, name: str, X_BG: RigidTransform, shape: Shape, mu: float) -> None:
         plant.RegisterCollisionGeometry(

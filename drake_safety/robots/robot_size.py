@@ -32,12 +32,7 @@ class RobotSize:
         return self.mass_kg * self.height_m
 
     def factors(self, reference: "RobotSize") -> dict[str, float]:
-        """Scale factors by quantity, from the robot that the parameters were chosen for.
-
-        ``height``, ``length``, ``width`` scale lengths along z, x and y; ``speed_x``, ``speed_y``,
-        ``speed_z`` and ``rate`` linear and angular speeds; there are ``duration``, ``mass`` and
-        ``one``.
-        """
+        """Returns scale factors by quantity, from the robot that parameters were chosen for."""
         height = self.height_m / reference.height_m
         length = self.half_length_m / reference.half_length_m
         width = self.half_width_m / reference.half_width_m
