@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from drake_safety.files.reading import did_you_mean
 from drake_safety.robots.model_files import add_to_package_map, model_file
 from drake_safety.robots.robot_model import RobotModel, load_robot_file
 
@@ -17,18 +16,14 @@ def robot_names() -> list[str]:
 
 
 def load_robot(name: str) -> RobotModel:
-    """Loads a robot by name, or by the path of a ``robot.yaml``.
-
-    Raises:
-        ValueError: The robot does not exist, or the file does not fit the schema.
-    """
+    """Loads a robot by name, or by the path of a ``robot.yaml``."""
     if name in robot_names():
         return load_robot_file(_FOLDER / name / "robot.yaml")
     if Path(name).suffix in (".yaml", ".yml"):
         return load_robot_file(name)
     raise ValueError(
-        f"robot '{name}' does not exist{did_you_mean(name, robot_names())}; robots are "
-        f"{robot_names()}, or pass the path of a robot.yaml"
+        f"robot '{name}' does not exist; robots are {robot_names()}, or pass the path of a "
+        "robot.yaml"
     )
 
 

@@ -115,15 +115,11 @@ class CollisionShape:
     """Centre of a capsule's other end, (3,)."""
 
     def __post_init__(self) -> None:
-        if (self.box_m is None) == (self.radius_m == 0):
+        is_box, is_end = self.box_m is not None, self.to_m == self.position_m
+        if is_box != (self.radius_m == 0) or (self.to_m and (is_box or is_end)):
             raise ValueError(
-                f"either box_m or a positive radius_m; got box_m {self.box_m}, radius_m "
-                f"{self.radius_m}"
-            )
-        if self.to_m and (self.box_m or self.to_m == self.position_m):
-            raise ValueError(
-                f"to_m must be a capsule's other end, away from position_m; got to_m {self.to_m} "
-                f"with position_m {self.position_m}, box_m {self.box_m}"
+                "either box_m or a positive radius_m, with to_m away from position_m for a "
+                f"capsule; got {vars(self)}"
             )
 
 
@@ -196,31 +192,32 @@ class RobotModel:
 
         Patterns hold in both directions, so one side's names suffice.
         """
-        who, names, partners = f"robot '{self.name}'", list(joint_names), dict[str, str]()
+        names, partners = list(joint_names), dict[str, str]()
         for pattern, template in self.mirror.items():
             matches = [match for name in names if (match := re.fullmatch(pattern, name))]
             if not matches:
                 raise ValueError(
-                    f"{who} has no joint for mirror pattern '{pattern}'; it has {names}"
+                    f"robot '{self.name}' has no joint for mirror pattern '{pattern}'; it has "
+                    f"{names}"
                 )
             for match in matches:
-                name = match.string
                 try:
-                    partner = match.expand(template)
+                    name, partner = match.string, match.expand(template)
                 except (re.error, IndexError) as error:
                     raise ValueError(
-                        f"{who}: mirror pattern '{pattern}' cannot be replaced by '{template}': "
-                        f"{error}"
+                        f"robot '{self.name}': mirror pattern '{pattern}' cannot be replaced by "
+                        f"'{template}': {error}"
                     ) from error
                 if partner not in names:
                     raise ValueError(
-                        f"{who} has no joint '{partner}', the mirror of '{name}'; it has {names}"
+                        f"robot '{self.name}' has no joint '{partner}', the mirror of '{name}'; it "
+                        f"has {names}"
                     )
-                for one, other in ((name, partner), (partner, name)):
-                    if partners.setdefault(one, other) != other:
+                for joint, other in ((name, partner), (partner, name)):
+                    if partners.setdefault(joint, other) != other:
                         raise ValueError(
-                            f"{who}: mirror pairs joint '{one}' with '{partners[one]}' and with "
-                            f"'{other}'"
+                            f"robot '{self.name}': mirror pairs joint '{joint}' with "
+                            f"'{partners[joint]}' and with '{other}'"
                         )
         return {name: partners.get(name, name) for name in names}
 
@@ -242,7 +239,7 @@ def by_pattern(
     patterns: dict[str, _Value], name: str, what: str, robot_name: str, kind: str = "joint"
 ) -> _Value | None:
     """Returns the value of the only pattern that fully matches ``name``; None without a match."""
-    found = [key for key in patterns if re.fullmatch(key, name)]
-    if len(found) > 1:
-        raise ValueError(f"robot '{robot_name}': {what} of {kind} '{name}' matches {found}")
-    return patterns[found[0]] if found else None
+    keys = [key for key in patterns if re.fullmatch(key, name)]
+    if len(keys) > 1:
+        raise ValueError(f"robot '{robot_name}': {what} of {kind} '{name}' matches {keys}")
+    return patterns[keys[0]] if keys else None
