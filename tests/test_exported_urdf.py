@@ -171,20 +171,6 @@ def test_efforts_that_no_motor_has_are_estimated_asked_for_and_warned_of(text, a
     assert "(1000 N·m, at most" in findings_of(written, is_imported=False)["motor limits"].message
 
 
-def test_a_slider_is_as_stiff_at_the_foot_as_a_hinge(tmp_path):
-    written = robot_of(SLIDING, tmp_path)
-    assert not written.copy.warnings and "largest" not in " ".join(written.asked)
-    gains = load_robot_file(written.folder / "robot.yaml").joint_gains
-    slider, hinge = (gains[f"FL_{part}_joint"].stiffness for part in ("calf", "hip"))
-    assert slider == pytest.approx(hinge / 0.36**2, rel=0.1)
-
-
-def test_a_speed_limit_of_zero_is_none(tmp_path):
-    written = robot_of(quadruped({'velocity="30"': 'velocity="0"'}), tmp_path)
-    kinematics = RobotKinematics(load_robot_file(written.files[1]))
-    assert np.isinf(kinematics.velocity_limits).all()
-
-
 @pytest.mark.parametrize(
     ("limit", "note"),
     [
@@ -217,11 +203,6 @@ def test_a_short_arm_is_one_if_its_hand_is_named_and_fixed_if_not(tmp_path):
     assert written.joints[-2:] == ["arm0_joint", "arm1_joint"]
 
 
-def test_a_policy_moves_joints_that_move_neither_a_foot_nor_a_hand(tmp_path):
-    written = robot_of(quadruped(above=arm(ARM, ARM)), tmp_path, moved=["arm0_joint"])
-    assert written.joints[-1] == "arm0_joint" and "arm1_joint" not in written.joints
-
-
 def test_a_coupled_joint_of_an_arm_follows_in_the_posture_too(tmp_path):
     text = quadruped(above=arm(ARM, ARM, ARM + MIMIC.format("arm1", 2, 0.3), ARM))
     written = robot_of(text, tmp_path)
@@ -249,13 +230,10 @@ def wheeled(form):
     ("form", "radius_m"),
     [
         ('cylinder radius="0.08" length="0.04"', 0.08),
-        ('mesh filename="tyre.obj"', 0.08),
         ('box size="0.08 0.08 0.04"', None),
     ],
 )
 def test_wheels_are_named_in_the_terminal_and_in_the_files(form, radius_m, tmp_path):
-    rim = np.exp(2j * math.pi * np.arange(32) / 32) * 0.08
-    obj(tmp_path / "tyre.obj", [(p.real, p.imag, z) for p in rim for z in (-0.02, 0.02)])
     written = robot_of(wheeled(form), tmp_path)
     if radius_m:
         assert [limb.radius_m for limb in written.legs] == pytest.approx(4 * [radius_m], abs=1e-6)
@@ -275,12 +253,6 @@ def standing(text, folder):
     simulatable_copy(folder / "b.urdf").write(folder / "copy.urdf")
     survey = Survey(folder / "copy.urdf")
     return survey, survey.legs()
-
-
-def test_a_heel_that_is_higher_than_the_toe_does_not_touch(tmp_path):
-    heel, toe = (shaped('box size="0.08 0.1 0.02"', xyz=at) for at in ("-0.06 0 0.003", "0.06 0 0"))
-    _, legs = standing(biped(heel + toe), tmp_path)
-    assert [leg.points[:, 0].min() for leg in legs] == pytest.approx([0.025, 0.025])
 
 
 @pytest.mark.parametrize("thickness_mm", [2, 15])
@@ -334,7 +306,7 @@ def test_the_base_lies_near_the_hips(text, base, note, tmp_path):
         np.testing.assert_allclose(front, [0.19, 0.05, 0.0], atol=1e-6)
 
 
-@pytest.mark.parametrize("pattern", ["{}1", "1e{}", "{}(a|b)*", "a: {}, #", "'{}\"\\d", "on"])
+@pytest.mark.parametrize("pattern", ["1e{}", "[{}: 1](a|b)*", "'{}\"\\d", "on"])
 def test_names_are_data(pattern, tmp_path):
     numbers = {}
 
@@ -351,12 +323,6 @@ def test_names_are_data(pattern, tmp_path):
     for name, position in zip(written.joints, kinematics.posture, strict=True):
         assert position == written.posture[name]
         assert robot.gains_of(name) is not None
-
-
-def test_a_robot_with_odd_names_passes_its_check(tmp_path):
-    written = robot_of(renamed(quadruped(), "[{}: 1]*".format), tmp_path)
-    partner = load_robot_file(written.files[1]).mirror_partners(written.joints)
-    assert partner["[FL_calf_joint: 1]*"] == "[FR_calf_joint: 1]*"
     assert not [finding for finding in findings_of(written).values() if not finding.is_ok]
 
 

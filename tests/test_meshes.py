@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from drake_safety.robots.meshes import (
-    above,
     cache_folder,
     convex_hull,
     is_shown,
@@ -117,16 +116,6 @@ def test_an_obj_without_normals_is_converted_if_it_can_be(
     assert shown_mesh(path) == path
 
 
-def test_an_obj_that_gets_normals_keeps_the_colours_of_its_materials(cache, tmp_path):
-    path = tmp_path / "hull.obj"
-    path.write_text(f"mtllib hull.mtl\n{POINTS}usemtl a\nf 1 2 3\n")
-    path.with_suffix(".mtl").write_text("newmtl a\nKd 1 0 0\n")
-    assert_colour(shown_mesh(path, "0 0 1 1"), [1, 0, 0, 1])
-    path.with_suffix(".mtl").unlink()
-    path.write_text(f"{POINTS}f 1 2 4\n")
-    assert_colour(shown_mesh(path, "0 0 1 1"), [0, 0, 1, 1])
-
-
 def test_a_mesh_is_converted_once_until_it_or_its_colour_changes(cache, tower):
     first = shown_mesh(tower, "0.1 0.2 0.3 1")
     assert_colour(first, [0.1, 0.2, 0.3, 1.0])
@@ -178,11 +167,3 @@ def test_a_flat_mesh_becomes_the_box_around_it(points, edges):
     hull = convex_hull(np.array(points))
     assert hull.extents == pytest.approx(edges)
     assert hull.volume == pytest.approx(np.prod(edges))
-
-
-def test_what_is_below_a_floor_is_cut_off():
-    hull = convex_hull(np.array(trimesh.creation.box(extents=[0.1, 0.1, 0.4]).vertices))
-    up = np.array([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(above(hull, up, -0.1).bounds[:, 2], [-0.1, 0.2])
-    assert above(hull, up, -0.3).volume == pytest.approx(hull.volume)
-    assert above(hull, up, 0.3) is None

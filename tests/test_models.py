@@ -185,35 +185,6 @@ def test_limbs_are_chains_and_a_reaching_point_is_the_centre_of_the_hands_sphere
         np.testing.assert_allclose(centre, frame.point, rtol=0, atol=1e-12)
 
 
-LEGS, LINKS = ("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf")
-
-
-@pytest.mark.parametrize("scene", ["laikago"], indirect=True)
-def test_only_a_laikago_leg_with_itself_and_the_trunk_with_hips_and_thighs_are_filtered(scene):
-    candidates = {
-        frozenset(scene.geometry_name(geometry).split("/")[0] for geometry in pair)
-        for pair in scene.scene_graph.model_inspector().GetCollisionCandidates()
-    }
-    links = [f"{leg}_{link}" for leg in LEGS for link in LINKS]
-    expected = {
-        frozenset(pair) for pair in itertools.combinations(links, 2) if pair[0][:2] != pair[1][:2]
-    }
-    expected |= {frozenset(("trunk", f"{leg}_calf")) for leg in LEGS}
-    expected |= {frozenset(("world", link)) for link in ("trunk", *links)}
-    assert candidates == expected
-
-
-@pytest.mark.parametrize("scene", ["laikago"], indirect=True)
-def test_a_laikago_leg_never_touches_itself_or_the_trunk_where_legs_are_sampled(scene):
-    scene.set_base(RigidTransform([0.0, 0.0, 1.0]))
-    joints = [f"FR_{link}_joint" for link in LINKS]
-    sampled = ((-0.4, 0.4), (0.2, 1.3), (-2.0, -0.7))
-    for angles in itertools.product(*(np.linspace(*limits, 4) for limits in sampled)):
-        scene.set_joints(dict(zip(joints, angles, strict=True)))
-        touching = scene.touching()
-        assert not any(all(n.startswith(("FR", "trunk")) for n in p) for p in touching), angles
-
-
 @pytest.mark.parametrize("scene", ["atlas"], indirect=True)
 def test_atlas_touches_the_world_by_spheres_only_but_for_forearms_and_never_itself(scene):
     inspector = scene.scene_graph.model_inspector()

@@ -115,27 +115,6 @@ def test_a_variation_scales_masses_and_a_payload_moves_the_centre_of_mass_by_its
         apply_masses(plant, context, robot, PlantVariation(payload=Payload(body="rucksack")))
 
 
-def test_the_mass_scale_leaves_other_models_alone():
-    plant = MultibodyPlant(0.001)
-    first, second = robot_model("biped"), robot_model("hexapod")
-    add_robot(plant, first)
-    add_robot(plant, second)
-    plant.Finalize()
-    context = plant.CreateDefaultContext()
-    instance = [plant.GetModelInstanceByName(second.name)]
-    before = plant.CalcTotalMass(context, instance)
-    apply_masses(plant, context, first, PlantVariation(mass_scale=2.0))
-    assert plant.CalcTotalMass(context, instance) == before
-
-
-def test_joint_damping_is_added_to_the_models_own():
-    robot = robot_model("laikago")
-    published, damped = plant_of(robot), plant_of(robot, PlantVariation(joint_damping=0.7))
-    for name in servo_joints(published, robot):
-        before = published.GetJointByName(name).default_damping()
-        assert damped.GetJointByName(name).default_damping() == pytest.approx(before + 0.7)
-
-
 FRICTION_NM = 0.4
 
 
