@@ -52,7 +52,6 @@ def each(text, names):
 MOTOR = """<transmission name="{0}_t"><type>transmission_interface/SimpleTransmission</type>
 <joint name="{0}"/><actuator name="{0}_m"/></transmission>"""
 MIMIC = '<mimic joint="{}_joint" multiplier="{}" offset="{}"/>'
-SPRING = '<gazebo reference="FL_calf_joint"><springStiffness>900</springStiffness></gazebo>'
 KNEE, STOPS = '<joint name="FL_calf_joint" type="revolute">', 'lower="-0.9" upper="0.9"'
 LOST = shaped('mesh filename="shank.obj"')
 ARM = LIMIT.format(-1, 1)
@@ -76,7 +75,6 @@ REFUSED = {
     ),
     "'FR_calf_joint' (no transmission, as others": quadruped(above=each(MOTOR, DRIVEN)),
     "'FL_calf_joint' (effort=\"0\")": quadruped({CALF: CALF.replace("23.7", "0")}),
-    "'FL_calf_joint' (a spring of 900 N·m/rad)": quadruped(above=SPRING),
     "have equal limits: 'FL_hip_joint' (0)": quadruped({STOPS: 'lower="0" upper="0"'}),
     "'FL_foot' (shank.obj); 'FR_foot' (shank.obj)": quadruped({FOOT: LOST}),
     "'FL_hip_joint' has lower=\"0.9\"": quadruped({STOPS: 'lower="0.9" upper="-0.9"'}),

@@ -40,7 +40,7 @@ FOOT = {"body": "left_shin", "contact_points": [[0, 0, 0]]}
         ({"posture": {"elbow": 1.0}}, "no joint for posture pattern 'elbow'; it has .*left_knee"),
         ({"joint_gains": {".*": {}, "left_knee": {}}}, "gains of joint 'left_knee' matches"),
         ({"feet": {"left": FOOT | {"joints": ["f"]}}}, "has no joint 'f'; it has .*left_knee"),
-        ({"mirror": {"left_(.*)": r"x_\1"}}, "'x_hip_z', the mirror of 'left_hip_z'; it .*right_h"),
+        ({"mirror": {"left_(.*)": r"x_\1"}}, "pairs joints .*'left_hip_z': 'x_hip_z'.*; it has"),
         ({"mirror": {"left_(hip_x|knee)": "right_knee"}}, "'left_hip_x' and with 'left_knee'"),
     ],
 )

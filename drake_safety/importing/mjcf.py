@@ -123,6 +123,8 @@ class _Robot:
         self._note("moving bodies beside the robot are left out", "body", [i for i, _ in others])
         self._note("the base is fixed to the world there, and floats here", "body", fixed)
         self._note("tendons are left out", "tendon", range(model.ntendon))
+        springs = [j for j in self.joints if model.joint(j).stiffness[0] > 0]
+        self._note("springs are left out", "joint", springs)
         self.damping = {j: float(model.joint(j).damping[0]) for j in self.joints}
         self.efforts: dict[int, float] = {}
         self.mimics: dict[int, str] = {}
@@ -284,12 +286,10 @@ class _Robot:
                 X_AJ = RigidTransform(AngleAxis(-q, one.axis), np.zeros(3))
             if math.isfinite(self.efforts.get(j, math.inf)):
                 limit["effort"] = self.efforts[j]
-            # Drake ignores the stiffness; `new` does not.
-            resists = {"friction": one.frictionloss, "stiffness": one.stiffness}
             inside = [
                 _tag("axis", xyz=one.axis),
                 _tag("limit", **limit) if limit else "",
-                _tag("dynamics", damping=self.damping[j], **resists),
+                _tag("dynamics", damping=self.damping[j], friction=one.frictionloss),
                 self.mimics.get(j, ""),
             ]
             X_PJ = X_PB @ RigidTransform(one.pos) @ X_AJ

@@ -234,7 +234,7 @@ def _find_limbs(
 
 
 def _fix_joints(found: NewRobot, moved: Collection[str] | None) -> None:
-    """Fixes what moves no foot or hand, and tells of couplings, motors, springs and wheels."""
+    """Fixes what moves no foot or hand, and notes couplings, motors and wheels."""
     survey, copy, stated = found.survey, found.copy, set(moved or ())
     drives = copy.drives
     legged, armed = (
@@ -259,7 +259,6 @@ def _fix_joints(found: NewRobot, moved: Collection[str] | None) -> None:
         (coupled, "follow others by <mimic>, in the posture too"),
         (loose, "follow joints that move, by <mimic>, but move no foot or hand and are fixed"),
         (passive, f"have no motor and are fixed: {listed(passive)}"),
-        (used & set(drives.springs), "have springs beside their motors, which are left out"),
         (
             {*turns} - {*found.wheels},
             "of legs turn more than four times: are their limits in degrees instead of radians?",

@@ -142,31 +142,26 @@ def _fix_inertias(copy: UrdfCopy) -> None:
 
 
 def _tell_materials_apart(copy: UrdfCopy) -> None:
-    """Renames materials that share a name but not a colour, and drops those without any."""
-    stated = {one.get("name"): one for one in copy.root.iter("material") if len(one)}
-    known = {one.get("name") for one in copy.root.findall("material") if len(one)}
-    for visual in copy.root.findall("link/visual"):
-        for material in visual.findall("material"):
-            name = material.get("name")
-            if name not in known and not len(material):  # Drake knows those that came before.
-                material.extend(stated.get(name, []))
-                if not len(material):
-                    visual.remove(material)
-                    continue
-            known.add(name)
+    """Gives visuals the colours of their materials; those of one name and two colours get two."""
+    materials = reversed([*copy.root.iter("material")])
+    parts = {one.get("name", ""): [*one] for one in materials if len(one)}  # The first of a name.
     colours: dict[str, list[list[str]]] = {}
-    for material in copy.root.iter("material"):
-        values = " ".join(value for part in material for value in part.attrib.values()).split()
-        if not values:
-            continue  # A reference to a material.
-        # 0 and 0.0 are equal.
-        colour = [f"{float(v):g}" if is_number(v) else v for v in values]
-        name = material.get("name", "")
-        others = colours.setdefault(name, [])
-        if colour not in others:
-            others.append(colour)
-        if index := others.index(colour):
-            material.set("name", f"{name}_{index}")
+    for parent in (copy.root, *copy.root.findall("link/visual")):
+        for material in parent.findall("material"):
+            name = material.get("name", "")
+            if not len(material):
+                material.extend(parts.get(name, []))
+            values = " ".join(value for part in material for value in part.attrib.values()).split()
+            if not values:
+                parent.remove(material)
+                continue
+            # 0 and 0.0 are equal.
+            colour = [f"{float(value):g}" if is_number(value) else value for value in values]
+            others = colours.setdefault(name, [])
+            if colour not in others:
+                others.append(colour)
+            if index := others.index(colour):
+                material.set("name", f"{name}_{index}")
     copy.notes += [
         f"the material '{name}' has {len(several)} colours; now each has its own name"
         for name, several in colours.items()

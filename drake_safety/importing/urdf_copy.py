@@ -31,25 +31,18 @@ class JointDrives:
     """Coupled joints: the joint that each follows, multiplier and offset [rad, m]."""
     listed: set[str] = field(default_factory=set)
     """Joints with a transmission (ROS 1) or a command interface (``<ros2_control>``)."""
-    springs: dict[str, float] = field(default_factory=dict)
-    """Stiffness of joints with a spring [N·m/rad]."""
     efforts: dict[str, float] = field(default_factory=dict)
     """Effort limits [N·m]; NaN without one."""
 
     def passive(self, names: Collection[str]) -> dict[str, str]:
         """Returns those of some joints that have no motor, and the evidence."""
         listed = self.listed.intersection(names)
+        if listed:
+            lacking = [name for name in names if name not in listed]
+            return dict.fromkeys(lacking, "no transmission, as others have")
         has_efforts = any(self.efforts[name] > 0 for name in names)
-        passive: dict[str, str] = {}
-        for name in names:
-            spring = self.springs.get(name, 0.0)
-            if listed and name not in listed:
-                passive[name] = "no transmission, as others have"
-            elif not listed and has_efforts and self.efforts[name] == 0:
-                passive[name] = 'effort="0"'
-            elif spring and name not in listed and len(self.springs) < len(names):
-                passive[name] = f"a spring of {spring:g} N·m/rad"
-        return passive
+        weak = [name for name in names if has_efforts and self.efforts[name] == 0]
+        return dict.fromkeys(weak, 'effort="0"')
 
     def coupled(self, positions: Mapping[str, float]) -> dict[str, float]:
         """Returns joint positions in which coupled joints follow the others [rad, m]."""
@@ -240,43 +233,21 @@ def _hull_file(link: str, index: int) -> str:
 
 
 def read_drives(root: ET.Element) -> JointDrives:
-    """Reads the drives of a URDF, also those that only Gazebo and ROS know."""
+    """Reads the drives of a URDF's joints."""
     movable = [joint for joint in joint_elements(root) if joint.get("type") in _MOVABLE]
     joints = {joint.get("name", ""): joint for joint in movable}
     motors = "transmission//joint", "ros2_control/joint[command_interface]"
-    couplings: dict[str, Mapping[str, str | None]] = {}  # <mimic> comes last.
-    for plugin in root.findall("gazebo/plugin[mimicJoint]"):
-        stated = {part.tag: part.text for part in plugin}
-        couplings[(stated.get("joint") or "").strip()] = stated | {"joint": stated["mimicJoint"]}
-    for joint in root.findall("ros2_control/joint[param]"):
-        stated = {part.get("name", ""): part.text for part in joint.findall("param")}
-        if "mimic" in stated:
-            couplings[joint.get("name", "")] = stated | {"joint": stated["mimic"]}
-    springs = {name: _stiffness(joint) for name, joint in joints.items()}
-    for name, joint in joints.items():
-        if (mimic := joint.find("mimic")) is not None:
-            couplings[name] = mimic.attrib
-        for gazebo in root.findall("gazebo"):
-            if gazebo.get("reference") == name:
-                springs[name] = max(springs[name], _stiffness(gazebo))
+    mimics = {name: joint.find("mimic") for name, joint in joints.items()}
     return JointDrives(
         mimics={
             name: (
-                (stated.get("joint") or "").strip(),
-                as_number(stated.get("multiplier"), 1.0),
-                as_number(stated.get("offset"), 0.0),
+                mimic.get("joint", ""),
+                as_number(mimic.get("multiplier"), 1.0),
+                as_number(mimic.get("offset"), 0.0),
             )
-            for name, stated in couplings.items()
-            if name in joints
+            for name, mimic in mimics.items()
+            if mimic is not None
         },
         listed={joint.get("name", "") for place in motors for joint in root.findall(place)},
-        springs={name: spring for name, spring in springs.items() if spring > 0},
         efforts={name: number(joint.find("limit"), "effort") for name, joint in joints.items()},
     )
-
-
-def _stiffness(element: ET.Element) -> float:
-    """The largest, whatever they are called: springStiffness, spring_stiffness, stiffness."""
-    stated = ({**part.attrib, part.tag: part.text} for part in element.iter())
-    texts = (text for one in stated for key, text in one.items() if "stiffness" in key.lower())
-    return max((as_number(text, 0.0) for text in texts), default=0.0)

@@ -195,30 +195,24 @@ class RobotModel:
         names, partners = list(joint_names), dict[str, str]()
         for pattern, template in self.mirror.items():
             matches = [match for name in names if (match := re.fullmatch(pattern, name))]
-            if not matches:
+            try:
+                pairs = {match.string: match.expand(template) for match in matches}
+            except (re.error, IndexError) as error:
                 raise ValueError(
-                    f"robot '{self.name}' has no joint for mirror pattern '{pattern}'; it has "
+                    f"robot '{self.name}': mirror pattern '{pattern}' cannot be replaced by "
+                    f"'{template}': {error}"
+                ) from error
+            if not pairs or not {*pairs.values()} <= {*names}:
+                raise ValueError(
+                    f"robot '{self.name}': mirror pattern '{pattern}' pairs joints {pairs}; it has "
                     f"{names}"
                 )
-            for match in matches:
-                try:
-                    name, partner = match.string, match.expand(template)
-                except (re.error, IndexError) as error:
+            for joint, other in (*pairs.items(), *((other, one) for one, other in pairs.items())):
+                if partners.setdefault(joint, other) != other:
                     raise ValueError(
-                        f"robot '{self.name}': mirror pattern '{pattern}' cannot be replaced by "
-                        f"'{template}': {error}"
-                    ) from error
-                if partner not in names:
-                    raise ValueError(
-                        f"robot '{self.name}' has no joint '{partner}', the mirror of '{name}'; it "
-                        f"has {names}"
+                        f"robot '{self.name}': mirror pairs joint '{joint}' with "
+                        f"'{partners[joint]}' and with '{other}'"
                     )
-                for joint, other in ((name, partner), (partner, name)):
-                    if partners.setdefault(joint, other) != other:
-                        raise ValueError(
-                            f"robot '{self.name}': mirror pairs joint '{joint}' with "
-                            f"'{partners[joint]}' and with '{other}'"
-                        )
         return {name: partners.get(name, name) for name in names}
 
 
