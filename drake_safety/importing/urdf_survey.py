@@ -438,8 +438,9 @@ def base_at_hips(survey: Survey, legs: list[Limb]) -> tuple[RigidTransform | Non
     origins = {name: survey.joint_origin(name) for limb in legs for name in limb.joints}
     sides = [origins[left] - origins[right] for left, right in mirrored(list(origins)).items()]
     across = np.mean(sides, axis=0) if sides else np.array([0.0, 1.0, 0.0])
-    is_turned = across[1] < 0.5 * np.linalg.norm(across)
-    return None, "is turned: its left is not along +y, so that x is not forwards" * is_turned
+    if across[1] < 0.5 * np.linalg.norm(across):
+        return None, "is turned: its left is not along +y, so that x is not forwards"
+    return None, ""
 
 
 def mirrored(names: list[str]) -> dict[str, str]:
