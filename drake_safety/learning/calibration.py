@@ -46,10 +46,7 @@ class Calibration:
         kind: "plan" or "motion", the score of an episode.
         miss_rate: Promised share of unsafe episodes with the verdict "safe".
         false_alarm_rate: Promised share of safe episodes with the verdict "unsafe".
-        confidence: Confidence of both rates for this calibration set; None for rates on average
-            over calibration sets.
-        threshold: Lower bound of the probability for "safe".
-        unsafe_below: Upper bound of the probability for "unsafe"; at most `threshold`.
+        confidence: Confidence of both rates for this calibration set; None for rates on average.
         variation: The plant of the episodes, for which alone the rates are promised.
     """
 

@@ -174,10 +174,7 @@ def stack_members(members: list[dict[str, np.ndarray]], *, num_margins: int) -> 
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Training in one thread, fastest for small layers, with the same bits on any machine.
-
-    The state of torch's generator is restored after it.
-    """
+    """Trains in one thread, with the same bits on any machine; restores torch's generator."""
     import torch
 
     number = torch.get_num_threads()

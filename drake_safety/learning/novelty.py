@@ -139,14 +139,12 @@ def _above(variance: np.ndarray, axes: np.ndarray, least: float) -> np.ndarray:
 class Novelty:
     """Says which inputs are beyond those of training, by three Mahalanobis distances and the range.
 
-    One is along all axes of the training inputs, with a tolerance: an input outside their range is
-    novel. The second is along their redundancies alone. Features and preview follow from state and
-    plan, in an actual robot as in the nominal one; an input that contradicts itself, such as the
-    features of another plan, is novel though every entry is within its range, and the maps ignore
-    these axes. The two are known in process monitoring as T^2 and SPE. The third is that of the
-    plan alone: a planner asks for what it always did, or for something new, whatever the state.
-    The range is that of every column, in half widths from its centre: one entry far from all that
-    training had is novel even where the sum over many others hides it. The object is immutable.
+    The first is along all axes of the training inputs, with a tolerance: an input outside their
+    range is novel. The second is along their redundancies alone: an input that contradicts itself,
+    such as the features of another plan, is novel though every entry is within its range. (In
+    process monitoring they are T^2 and SPE.) The third is that of the plan alone. The range is that
+    of every column, in half widths from its centre: one entry far from all that training had is
+    novel even where the sum over many others hides it. The object is immutable.
 
     Attributes:
         centre: Centre of each column's range, (n_x,).
@@ -196,9 +194,8 @@ class Novelty:
 
         Each limit is exceeded by at most a share of `rate` of the first inputs, which are as drawn,
         and somewhere in at most that share of the safe episodes, each judged by the moments of
-        other episodes. Later inputs of unsafe episodes do not count: they lead out of what is
-        known. The range of a column is as much wider than that of the inputs as one fold of the
-        episodes exceeds that of the others: columns with rare large values have wider ones.
+        other episodes. The range of a column is as much wider than that of the inputs as one fold
+        of the episodes exceeds that of the others.
 
         Args:
             is_unsafe: Whether its episode ended unsafely, (N,).

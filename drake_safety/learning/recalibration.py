@@ -78,13 +78,11 @@ def fitted_change(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fits `change` (3,) or (4,), `hidden` (K, n + 1) and `hidden_range` (2,) of a `Correction`.
 
-    With phi = (1, heads, activations) and the base logit ell, w minimises the log
-    loss of sigma(ell + w . phi) on the actual episodes with a normal prior, minus the error of ell
-    at the start of the twins, w . sum phi (sigma(ell) - label). Errors of ell that a pair shares,
-    from an ambiguous start or on the nominal plant, cancel. Later rows of the actual episodes have
-    no counterpart, as the twin is then in another state. Activations are centred and divided by
-    their mean distance from the mean, so that their joint contribution has the standard deviation
-    `hidden_std`. The corrected slopes stay >= 0.
+    With phi = (1, heads, activations) and the base logit ell, w minimises the log loss of
+    sigma(ell + w . phi) on the actual episodes with a normal prior, minus the error of ell at the
+    start of the twins, w . sum phi (sigma(ell) - label), so that errors that a pair shares cancel.
+    Activations are centred and divided by their mean distance from the mean, so that their joint
+    contribution has the standard deviation `hidden_std`. The corrected slopes stay >= 0.
     """
     from scipy.optimize import minimize
 

@@ -352,10 +352,9 @@ def split(
     """Splits episodes into segments of the assessment horizon H.
 
     A segment's H samples are ``preview_stride`` rows apart, and so are the steps of R. Segments
-    start where at least ``shortest`` samples of a complete episode are left; less than the horizon
-    suffices if the robot is at rest after the episode's end. The rule is the same for both
-    labels, so that a segment's start row carries no information about its label. Segments that
-    reach beyond the end are cut short and keep the terminal sample. Diverged episodes are skipped.
+    start where at least ``shortest`` samples of a complete episode are left, for both labels, so
+    that a start row carries no information about the label. Segments that reach beyond the end are
+    cut short and keep the terminal sample. Diverged episodes are skipped.
 
     Args:
         stride: Rows between two starts; `stride=H` is the paper's split.
