@@ -191,7 +191,7 @@ def test_a_goal_replaces_the_random_one_of_tasks_that_have_goals():
     episode = run_episode(loop, 3, goal=goal)
     np.testing.assert_allclose(loop.goal_of(episode), goal)
     np.testing.assert_array_equal(episode.state[0, :3], run_episode(loop, 3).state[0, :3])
-    with pytest.raises(ValueError, match="'Gliding' has no plans with a goal; it has no optional"):
+    with pytest.raises(ValueError, match="'Gliding' has no plans with a goal"):
         run_episode(gliding().make_loop(), goal=goal)
 
 
