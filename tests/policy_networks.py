@@ -20,7 +20,7 @@ def new(folder, policy, *more):
     return out, result
 
 
-def save_script(path, module, seen=None):
+def save_script(path, module, batch=None):
     """Writes a module as TorchScript, after an evaluation of a batch if one is given.
 
     Returns its path.
@@ -31,8 +31,8 @@ def save_script(path, module, seen=None):
         # Torch deprecates the format, in which policies are nevertheless published.
         warnings.simplefilter("ignore")
         script = torch.jit.script(module.eval())
-        if seen is not None:
-            script(seen)
+        if batch is not None:
+            script(batch)
         script.save(str(path))
     return path
 
@@ -47,7 +47,7 @@ def save_network(path, num_inputs, num_outputs, scale=0.01):
     return save_script(path, linear)
 
 
-def recurrent_module(num_inputs, num_outputs, *, size=4, layers=1, is_replaced=False):
+def recurrent_module(num_inputs, num_outputs, *, size=4, is_replaced=False):
     """An LSTM of random weights whose memory is in buffers, as exporters of rsl_rl write it.
 
     Args:
@@ -59,12 +59,12 @@ def recurrent_module(num_inputs, num_outputs, *, size=4, layers=1, is_replaced=F
         def __init__(self):
             super().__init__()
             torch.manual_seed(0)
-            self.rnn = torch.nn.LSTM(num_inputs, size, layers)
+            self.rnn = torch.nn.LSTM(num_inputs, size)
             self.out = torch.nn.Linear(size, num_outputs)
             self.is_replaced = is_replaced
             self.register_buffer("mean", torch.zeros(num_inputs))
-            self.register_buffer("hidden_state", torch.zeros(layers, 1, size))
-            self.register_buffer("cell_state", torch.zeros(layers, 1, size))
+            self.register_buffer("hidden_state", torch.zeros(1, 1, size))
+            self.register_buffer("cell_state", torch.zeros(1, 1, size))
 
         def forward(self, x):
             memory = (self.hidden_state, self.cell_state)
@@ -114,8 +114,8 @@ def save_onnx(
         nodes.append(helper.make_node("Reshape", ["obs", "sequence"], ["x"]))
         given = ["x", "W", "R", "B", "", *(name for name, _ in memory)]
         kind = "LSTM" if len(memory) == 2 else "GRU"
-        found = ["", *(name for _, name in memory)]
-        nodes.append(helper.make_node(kind, given, found, hidden_size=size))
+        new_memory = ["", *(name for _, name in memory)]
+        nodes.append(helper.make_node(kind, given, new_memory, hidden_size=size))
         last = memory[0][1]
     nodes.append(helper.make_node("Reshape", [last, "row"], ["y"]))
     nodes.append(helper.make_node("MatMul", ["y", "out"], ["actions"]))

@@ -153,46 +153,22 @@ def test_commands_change_no_faster_than_the_policy_takes_them(tmp_path):
     np.testing.assert_allclose(next_command, [0.05, -0.04, 0.02])
 
 
-LONG = terms("last_action", history=4)
-
-
 @pytest.mark.train
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
         ({"joints": ["knee", "elbow"]}, r"lacks \['elbow'\]; it has \['hip', 'knee', 'tail'\]"),
         ({"joints": ["knee"]}, r"takes no observation of 11 entries .*joint_pos_rel 1"),
-        ({"default_positions": {}}, r"'default_positions' \[rad\], such as"),
         ({"joints": []}, r"'joints' in the network's order; the robot has \['hip'"),
-        ({"observation": []}, "state in policy.yaml 'observation', the terms"),
+        ({"gains": {}, "observation": []}, r"'gains' \[N·m/rad\] of joints .*; 'observation', the"),
         ({"observation": terms("lidar")}, r"unknown terms \['lidar'\]; registered"),
-        ({"gains": {"knee": JointGains()}}, r"'gains' \[N·m/rad\] of joints \['hip'\]"),
-        ({"action_scale": {"knee": 1.0}}, r"'action_scale' \[rad\] of joints \['hip'\]"),
         ({"observation": terms("last_action", scale=[1.0] * 3)}, "has 2 entries; got 3 scales"),
-        (
-            {"joints": ["knee"], "observation": terms(*TERMS[:3]) + LONG},
-            "returns 2 actions, expected one for each of 1 joints",
-        ),
+        ({"observation": terms("joint_pos_rel", joints=["ear"])}, r"has joints \['ear'\]"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_what_was_expected(tmp_path, changed, message):
+def test_policy_that_does_not_fit_its_robot_is_refused(tmp_path, changed, message):
     with pytest.raises(ValueError, match=message):
         policy(tmp_path, **changed)
-
-
-@pytest.mark.train
-def test_files_that_are_no_networks_are_named(tmp_path):
-    for name, text, message in (
-        ("a.onnx", "no network", "not an ONNX network"),
-        ("a.pt", "no network", "not a TorchScript network"),
-        ("a.txt", "", "is one of"),
-    ):
-        (tmp_path / name).write_text(text)
-        with pytest.raises(ValueError, match=message) as error:
-            load_network(tmp_path / name)
-        assert name in str(error.value)
-    with pytest.raises(ValueError, match="does not exist"):
-        load_network(tmp_path / "none.onnx")
 
 
 def test_a_policy_of_a_missing_package_says_how_to_install_it():
@@ -205,19 +181,24 @@ WEIGHTS = ["policy.onnx.data", "weights/W", "weights/more/R"]
 
 
 @pytest.mark.train
-def test_weights_in_other_files_are_files_of_the_network(tmp_path):
+def test_external_weights_are_files_of_the_network_below_its_folder(tmp_path):
     path = save_onnx(tmp_path / "policy.onnx", 4, 2, memory=[("h_in", "h_out")], files=WEIGHTS)
     assert set(network_files(path)) == {path, *(tmp_path / name for name in WEIGHTS)}
     load_network(path)
-    assert network_files(tmp_path / "other.pt") == [tmp_path / "other.pt"]
     (tmp_path / WEIGHTS[1]).unlink()
     for read in (network_files, load_network):
         with pytest.raises(ValueError, match=r"are in .*'weights/W', .* there is no weights/W$"):
             read(path)
+    (tmp_path / "inner").mkdir()
+    path = save_onnx(tmp_path / "inner" / "p.onnx", 4, 2, files=["data"])
+    path.write_bytes(path.read_bytes().replace(b"\x04data", b"\x04../x"))
+    (tmp_path / "x").write_bytes(b"0" * 100)
+    with pytest.raises(ValueError, match=r"there is no \.\./x"):
+        network_files(path)
 
 
 @pytest.mark.train
-def test_weights_of_a_constant_in_another_file_count_too(tmp_path):
+def test_external_weights_of_a_constant_are_files_of_the_network(tmp_path):
     onnx = pytest.importorskip("onnx")
     tensor = onnx.numpy_helper.from_array(np.ones(2, dtype=np.float32), "c")
     node = onnx.helper.make_node("Constant", [], ["y"], value=tensor)
@@ -227,16 +208,6 @@ def test_weights_of_a_constant_in_another_file_count_too(tmp_path):
     (tmp_path / "c.data").write_bytes(node.attribute[0].t.raw_data)
     (tmp_path / "p.onnx").write_bytes(model.SerializeToString())
     assert network_files(tmp_path / "p.onnx") == [tmp_path / "p.onnx", tmp_path / "c.data"]
-
-
-@pytest.mark.train
-def test_weights_outside_the_folder_of_the_network_are_refused(tmp_path):
-    (tmp_path / "inner").mkdir()
-    path = save_onnx(tmp_path / "inner" / "p.onnx", 4, 2, files=["data"])
-    path.write_bytes(path.read_bytes().replace(b"\x04data", b"\x04../x"))
-    (tmp_path / "x").write_bytes(b"0" * 100)
-    with pytest.raises(ValueError, match=r"there is no \.\./x"):
-        network_files(path)
 
 
 @pytest.mark.train
@@ -258,39 +229,22 @@ TWO = {"joint_names": "a,b"}
     [
         # Isaac Lab and mjlab: words and numbers between commas, Holosoma: JSON; one for all.
         (TWO | {"joint_stiffness": "20.0,30.0"}, {"stiffness": {"a": 20.0, "b": 30.0}}),
-        ({"dof_names": '["a"]', "kp": "[1.5]"}, {"joints": ["a"], "stiffness": {"a": 1.5}}),
+        ({"dof_names": '["a+b"]', "kp": "[1.5]"}, {"joints": ["a+b"], "stiffness": {r"a\+b": 1.5}}),
         (TWO | {"action_scale": "0.25"}, {"action_scale": {".*": 0.25}}),
         (TWO | {"joint_damping": "{'a.*': 0.5}"}, {"damping": {"a.*": 0.5}}),
-        (TWO | {"default_joint_pos": '{".*": 1}'}, {"default_positions": {".*": 1.0}}),
-        (TWO | {"action_scale": "(0.1, 0.2)"}, {"action_scale": {"a": 0.1, "b": 0.2}}),
-        ({"joint_names": "a+b"}, {"joints": ["a+b"]}),
-        ({"joint_names": "21", "kp": "[1]"}, {"joints": ["21"], "stiffness": {"21": 1.0}}),
-        ({"joint_names": "a+b,c", "kp": "1,2"}, {"stiffness": {r"a\+b": 1.0, "c": 2.0}}),
         ({"command_ranges": '{"lin_vel_x": [-1, 1]}'}, {"command": {"lin_vel_x": [-1, 1]}}),
         (
-            {NAMES: "command,joint_pos,actions,height_scan"},
-            {
-                "observation": [
-                    {"name": name}
-                    for name in ("velocity_commands", "joint_pos_rel", "last_action", "height_scan")
-                ]
-            },
-        ),
-        (
-            {NAMES: "x,y"}
+            {NAMES: "command,height_scan"}
             | {"observation_terms_scale": "2.000;0.500,4.000"}
             | {"observation_terms_history_length": "0.000,3.000"}
             | {"observation_terms_clip": "-inf;inf,-5.000;5.000"},
             {
                 "observation": [
-                    {"name": "x", "scale": [2.0, 0.5], "clip": math.inf, "history": 1},
-                    {"name": "y", "scale": [4.0], "clip": 20.0, "history": 3},
+                    {"name": "velocity_commands", "scale": [2.0, 0.5]}
+                    | {"clip": math.inf, "history": 1},
+                    {"name": "height_scan", "scale": [4.0], "clip": 20.0, "history": 3},
                 ]
             },
-        ),
-        (
-            {NAMES: '["x"]', "observation_history_lengths": '{"x": 5}'},
-            {"observation": [{"name": "x", "history": 5}]},
         ),
     ],
 )
@@ -305,18 +259,13 @@ def test_metadata_are_read_as_exporters_write_them(raw, expected):
     [
         ({"dof_names": '["a"]', "kp": "[1, 2]"}, r"'stiffness' .* the joints \['a'\].* got \[1, 2"),
         (TWO | {"action_scale": "nan"}, "'action_scale' must be a number for each of the joints"),
-        (TWO | {"action_scale": "{'(': 1}"}, "one for all or by regular expression"),
-        (TWO | {"default_joint_pos": "tensor([1, 2])"}, "'default_positions'"),
-        ({NAMES: "x", "observation_terms_scale": "1,2"}, r"'scale' .* terms \['x'\]"),
         ({NAMES: "x", "observation_terms_clip": "-1;2"}, r"'clip' .* got \['-1;2'\]"),
-        ({"command_ranges": '{"lin_vel_x": 1}'}, "'command' must be the lowest and highest"),
-        ({"command_ranges": '{"lin_vel_x": [1, -1]}'}, "'command' .* got {'lin_vel_x': .1, -1.}"),
+        ({"command_ranges": '{"lin_vel_x": [1, -1]}'}, "'command' must be the lowest and highest"),
     ],
 )
-def test_metadata_that_do_not_fit_are_told_and_left_out(raw, message):
+def test_metadata_that_do_not_fit_are_named_and_left_out(raw, message):
     metadata = read_metadata(raw)
-    (told,) = metadata.unread
-    assert re.search(message, told)
+    assert re.search(message, *metadata.unread)
     assert not metadata.action_scale and not metadata.stiffness and not metadata.command
     assert all(term.keys() == {"name"} for term in metadata.observation)
 
@@ -340,9 +289,7 @@ def test_what_the_metadata_say_is_used_where_nothing_is_stated(tmp_path):
     np.testing.assert_allclose(made.action_scale, [0.5, 0.5])
 
 
-@pytest.mark.parametrize(
-    "names", [["leg.hip", "legxhip"], ["a[0]", "a0"], ["hip+", "hipp"], ["(l)", "l"], ["a|b", "a"]]
-)
+@pytest.mark.parametrize("names", [["leg.hip", "legxhip"], ["(l)", "l"], ["a|b", "a"]])
 def test_names_of_joints_are_no_patterns(names):
     made = SimpleNamespace(
         default_positions=np.array([0.1, 0.2]),
@@ -354,23 +301,12 @@ def test_names_of_joints_are_no_patterns(names):
     assert [robot.gains_of(name).stiffness for name in names] == [1, 2]
 
 
-def some(value, where):
-    """A network whose actions are not finite for some observations."""
-    return lambda batch, parts: (np.where(where(batch), value, batch[:, :2]), {})
+def test_a_network_whose_actions_are_not_finite_for_some_observations_is_refused():
+    def evaluate(batch, parts):
+        return np.where(np.abs(batch[:, :1]) > 0.5, np.nan, batch[:, :2]), {}
 
-
-@pytest.mark.parametrize(
-    "evaluate",
-    [
-        some(np.nan, lambda batch: True),
-        some(np.inf, lambda batch: [True, False]),
-        some(np.nan, lambda batch: np.abs(batch[:, :1]) > 0.5),
-    ],
-)
-def test_a_network_whose_actions_are_not_finite_is_refused(evaluate):
-    network = PolicyNetwork(None, evaluate, (9, 2))
-    with pytest.raises(ValueError, match=r"p: the network returns [12] of 2 actions that are not"):
-        network.check("p", 9, 2, "terms")
+    with pytest.raises(ValueError, match="p: the network returns 2 of 2 actions that are not"):
+        PolicyNetwork(None, evaluate, (9, 2)).check("p", 9, 2, "terms")
 
 
 def test_ctrl_c_ends_the_wait_for_a_network_that_loops_for_ever():
@@ -393,11 +329,8 @@ def test_ctrl_c_ends_the_wait_for_a_network_that_loops_for_ever():
 def test_a_term_has_the_joints_that_it_names_also_those_that_are_not_moved(tmp_path):
     observed = terms("joint_pos_rel", "joint_vel_rel", joints=["tail", "hip"])
     made = policy(tmp_path, network=str(saved(tmp_path, 4)), observation=observed)
-    found = made.observe(see(made), np.full(4, np.nan))
-    np.testing.assert_allclose(found, [2.0, 0.1, 8.0, 6.0])
-    assert see(made).all_positions[2] == 2.0
-    with pytest.raises(ValueError, match=r"'joint_pos_rel' has joints \['ear'\] .* has \['hip'"):
-        policy(tmp_path, observation=terms("joint_pos_rel", joints=["ear"]))
+    observation = made.observe(see(made), np.full(4, np.nan))
+    np.testing.assert_allclose(observation, [2.0, 0.1, 8.0, 6.0])
 
 
 @pytest.mark.train
@@ -417,10 +350,8 @@ class Last(torch.nn.Module if torch else object):
     ("shape", "width"),
     [
         ([1, 5, 9], 45),
-        (["batch", 5, 9], 45),
         (["batch", "time", 9], None),
         ([5, 1, 9], 45),
-        ([45], 45),
         ("script", None),
     ],
 )
@@ -436,39 +367,35 @@ def test_a_history_may_be_an_axis_of_its_own(tmp_path, shape, width):
     assert action.shape == (2,)
     if shape == "script":
         np.testing.assert_array_equal(action, [36.0, 37.0])
-    with pytest.raises(ValueError, match="44"):
-        load_network(path).check("p", 44, 2, "terms", 5)
 
 
 class Two(torch.nn.Module if torch else object):
-    def __init__(self, is_lost=False):
-        super().__init__()
-        self.net, self.is_lost = torch.nn.Linear(9, 2), is_lost
-
     def forward(self, x):
-        first = self.net(x)
-        if self.is_lost:
-            first = first + torch.zeros([1], device=torch.device("cuda:0"))
-        return first, x[:, :3]
+        return x[:, :2] / 3, x[:, :3]
+
+
+class OnGpu(torch.nn.Module if torch else object):
+    def forward(self, x):
+        return x[:, :2] + torch.zeros([1], device=torch.device("cuda:0"))
 
 
 @pytest.mark.train
-def test_two_outputs_and_double_precision_are_taken_and_the_reason_of_others_is_told(tmp_path):
-    network = load_network(save_script(tmp_path / "p.pt", Two().double()))
+def test_the_first_of_two_outputs_is_the_action_in_double_precision(tmp_path):
+    module = Two().double()
+    module.register_parameter("unused", torch.nn.Parameter(torch.zeros(1, dtype=torch.double)))
+    network = load_network(save_script(tmp_path / "p.pt", module))
     network.check("p", 9, 2, "terms")
     assert network.outputs == ["[1, 2]", "[1, 3]"]
-    action, _ = network(np.full(9, 1 / 3), np.zeros(0))
-    assert np.any(action != action.astype(np.float32))  # In double precision.
-    with pytest.raises(
-        ValueError, match=r"returns 2 actions, .*'\[1, 3\]'\], the first the action"
-    ):
+    action, _ = network(np.ones(9), np.zeros(0))
+    np.testing.assert_array_equal(action, [1 / 3, 1 / 3])
+    with pytest.raises(ValueError, match=r"returns 2 actions, .*'\[1, 3\]'\], the first"):
         network.check("p", 9, 3, "terms")
-    lost = load_network(save_script(tmp_path / "q.pt", Two(is_lost=True)))
+    lost = load_network(save_script(tmp_path / "q.pt", OnGpu()))
     with pytest.raises(ValueError, match=r"\): \w+Error: .*export it on the CPU$"):
         lost.check("p", 9, 2, "terms")
 
 
-def written(*keys):
+def pickled(*keys):
     """A dictionary of ones, as Python would write it."""
     items = (b"X" + len(key).to_bytes(4, "little") + key.encode() + b"K\x01s" for key in keys)
     return b"\x80\x02}" + b"".join(items) + b"."
@@ -481,28 +408,22 @@ CHECKPOINT = ("model_state_dict", "actor.0.weight", "iter")
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.pt", CHECKPOINT, r"checkpoint \(model_state_dict, .* iter"),
-        (
-            "a.pt",
-            CHECKPOINT[1:2],
-            r"checkpoint \(actor\.0\.weight\): export the policy as TorchScript",
-        ),
-        ("a.onnx", CHECKPOINT, "not an ONNX network, but a training checkpoint"),
+        ("a.onnx", b"no network", "a.onnx: not an ONNX network: "),
+        ("a.txt", b"", "a.txt: .* is one of"),
+        ("a.pt", None, "a.pt: .* does not exist"),
+        ("a.pt", CHECKPOINT, r"checkpoint \(model_state_dict, .* iter\): export .* TorchScript"),
         ("a.pth", ("optimizer",), r"got '\.pth', but a training checkpoint"),
-        ("a.pt", written("iter"), r"training checkpoint \(iter\)"),
-        ("a.pkl", written(), "but a Python pickle: export"),
+        ("a.pkl", pickled(), "but a Python pickle: export"),
         ("a.onnx", b"<!DOCTYPE html><html>", "but a web page: download the file itself"),
-        ("a.pt", b"\n <html>", "not a TorchScript network, but a web page"),
         ("a.onnx", b"version https://git-lfs.github.com/spec/v1\noid x", "pointer of git-lfs"),
-        ("a.safetensors", b"\x40" + bytes(7) + b"{}", r"but weights alone \(safetensors\)"),
-        ("a.pt", b"\x08\x08\x12\x07pytorch", r"like an ONNX network: name it \.onnx"),
     ],
 )
-def test_a_file_that_is_something_else_is_called_that(tmp_path, name, content, message):
+def test_a_file_that_is_no_network_is_called_what_it_is(tmp_path, name, content, message):
+    path = tmp_path / name
     if isinstance(content, bytes):
-        (tmp_path / name).write_bytes(content)
-    else:
-        with zipfile.ZipFile(tmp_path / name, "w") as archive:
-            archive.writestr("model/data.pkl", written(*content))
+        path.write_bytes(content)
+    elif content is not None:
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("model/data.pkl", pickled(*content))
     with pytest.raises(ValueError, match=message):
-        load_network(tmp_path / name)
+        load_network(path)

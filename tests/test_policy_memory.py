@@ -14,7 +14,7 @@ from drake_safety import load_scenario, run_episode, run_episodes
 from drake_safety.learning.segments import Episodes
 from drake_safety.policies.policy_network import load_network
 from drake_safety.simulation.feedback import AddFeedbackRecorder, pair_windows, window_start
-from policy_networks import TERMS, new, recurrent_module, save_network, save_onnx, save_script
+from policy_networks import TERMS, new, recurrent_module, save_onnx, save_script
 from system_doubles import Bench, controller
 
 pytestmark = pytest.mark.train
@@ -23,33 +23,15 @@ torch = pytest.importorskip("torch")
 N_IN, N_OUT, SIZE = 5, 2, 4
 LSTM = [("h_in", "h_out"), ("c_in", "c_out")]
 OTHER = [("h0", "hn"), ("c0", "cn")]
-RLLIB = [(f"state_in_{i}", f"state_out_{i}") for i in (0, 1)]
 
 
-def script(seen=None, **options):
+def script(batch=None, **options):
     module = recurrent_module(N_IN, N_OUT, size=SIZE, **options)
-    return lambda path: save_script(path / "p.pt", module, seen)
+    return lambda path: save_script(path / "p.pt", module, batch)
 
 
 def onnx(**options):
     return lambda path: save_onnx(path / "p.onnx", N_IN, N_OUT, size=SIZE, **options)
-
-
-class Gru(torch.nn.Module):
-    def __init__(self):
-        super().__init__()
-        torch.manual_seed(0)
-        self.rnn = torch.nn.GRU(N_IN, SIZE)
-        self.register_buffer("hidden_state", torch.zeros(1, 1, SIZE))
-
-    def forward(self, x):
-        y, h = self.rnn(x.unsqueeze(0), self.hidden_state)
-        self.hidden_state[:] = h.detach()
-        return y.squeeze(0)[:, :2]
-
-    @torch.jit.export
-    def reset(self):
-        self.hidden_state[:] = 0.0
 
 
 def checked(path):
@@ -62,30 +44,52 @@ def checked(path):
     ("save", "num_memories"),
     [
         (script(), 2),
-        (script(layers=2), 4),
-        (script(seen=torch.ones(1, N_IN)), 2),
+        (script(batch=torch.ones(1, N_IN)), 2),
         (script(is_replaced=True), 2),
-        (lambda path: save_script(path / "p.pt", Gru()), 1),
-        (lambda path: save_network(path / "p.pt", N_IN, N_OUT), 0),
         (onnx(), 0),
         (onnx(memory=LSTM), 2),
         (onnx(memory=LSTM[:1]), 1),
         (onnx(memory=OTHER, shape=[1, "time", N_IN]), 2),
-        (onnx(memory=RLLIB), 2),
     ],
 )
 def test_a_network_remembers_only_what_it_is_given(tmp_path, save, num_memories):
     network = checked(save(tmp_path))
     start = network.initial_memory
     np.testing.assert_array_equal(start, np.zeros(num_memories * SIZE))
-    seen = np.linspace(-1, 1, N_IN)
-    first, memory = network(seen, start)
-    second, _ = network(seen, memory)
+    observation = np.linspace(-1, 1, N_IN)
+    first, memory = network(observation, start)
+    second, _ = network(observation, memory)
     assert np.array_equal(first, second) == (num_memories == 0)
     for _ in range(2):  # From any memory, in any order.
-        np.testing.assert_array_equal(network(seen, memory)[0], second)
-        np.testing.assert_array_equal(network(seen, start)[0], first)
-    np.testing.assert_array_equal(checked(network.path)(seen, start)[0], first)
+        np.testing.assert_array_equal(network(observation, memory)[0], second)
+        np.testing.assert_array_equal(network(observation, start)[0], first)
+    np.testing.assert_array_equal(checked(network.path)(observation, start)[0], first)
+
+
+def test_actions_are_those_of_torch_and_onnxruntime(tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    observations = np.random.default_rng(0).normal(size=(3, N_IN)).astype(np.float32)
+
+    def actions(network):
+        memory, rows = network.initial_memory, []
+        for observation in observations:
+            action, memory = network(observation, memory)
+            rows.append(action)
+        return np.array(rows)
+
+    module = recurrent_module(N_IN, N_OUT, size=SIZE).eval()
+    network = checked(script()(tmp_path))
+    with torch.inference_mode():
+        expected = [module(torch.from_numpy(row[None])).numpy()[0] for row in observations]
+    np.testing.assert_allclose(actions(network), expected, rtol=1e-6)
+    network = checked(onnx(memory=LSTM)(tmp_path))
+    session = onnxruntime.InferenceSession(str(network.path))
+    h = c = np.zeros((1, 1, SIZE), dtype=np.float32)
+    expected = []
+    for row in observations:
+        action, h, c = session.run(None, {"obs": row[None], "h_in": h, "c_in": c})
+        expected.append(action[0])
+    np.testing.assert_allclose(actions(network), expected, rtol=1e-6)
 
 
 class Hidden(torch.nn.Module):
@@ -113,18 +117,12 @@ class Draws(torch.nn.Module):
         return torch.randn_like(x[:, :2])
 
 
-class Explicit(torch.nn.Module):
-    def forward(self, x, hidden):
-        return x[:, :2] + hidden
-
-
 @pytest.mark.parametrize(
     ("network", "message"),
     [
         (Hidden, "a memory that is no buffer of a fixed"),
         (Grows, "memory of 0 buffers was set back"),
         (Draws, "it draws random numbers"),
-        (Explicit, r"inputs \['x', 'hidden'\]; support"),
         (onnx(memory=[("state", "next")]), r"inputs .*'state \[1, 1, 4\].* pairs .* as h_in and"),
     ],
 )
@@ -155,15 +153,11 @@ def test_a_cloned_context_continues_alike_and_a_new_one_from_the_start():
     np.testing.assert_allclose(fresh.get("action_state")[:2], [0.2, 0.4])  # Of count 0.
 
 
-@pytest.fixture(scope="module", params=["pt", "onnx"])
-def walking(request, tmp_path_factory):
+@pytest.fixture(scope="module")
+def walking(tmp_path_factory):
     """A hexapod that stands by a policy of random weights with a memory."""
     folder = tmp_path_factory.mktemp("walking")
-    policy = folder / f"policy.{request.param}"
-    if request.param == "onnx":
-        save_onnx(policy, 42, 18, memory=LSTM)
-    else:
-        save_script(policy, recurrent_module(42, 18))
+    policy = save_script(folder / "policy.pt", recurrent_module(42, 18))
     out, result = new(folder, policy)
     assert result.exit_code == 0, result.output
     stated = {
@@ -195,7 +189,7 @@ def test_a_reset_resets_the_memory(walking):
     context = simulator.get_mutable_context()
 
     def memory():
-        return np.concatenate([np.ravel(one) for one in loop.start_of(context).controller_state])
+        return np.concatenate([np.ravel(part) for part in loop.start_of(context).controller_state])
 
     loop.reset_to(context, None, loop.standing_start())
     first = memory()
@@ -223,22 +217,17 @@ def windows(scenario):
 
 
 def test_a_twin_of_a_window_begins_in_mid_stride_with_the_memory_that_the_policy_has(walking):
-    recorder, found = windows(walking)
-    assert len(found) == 2
+    recorder, pieces = windows(walking)
+    assert len(pieces) == 2
     loop = walking.make_loop()
-    for window in found:
+    for window in pieces:
         twin = run_episode(loop, start=window_start(loop, window))
         np.testing.assert_allclose(twin.true_state, window.episode.true_state, atol=1e-3)
-    assert len(pair_windows(walking, recorder, found)) == 2
-
-
-@pytest.mark.parametrize("memory", [None, np.zeros(3)])
-def test_a_window_without_the_memory_is_refused_before_its_twin_is_simulated(walking, memory):
-    recorder, found = windows(walking)
+    assert len(pair_windows(walking, recorder, pieces)) == 2
+    bad = replace(pieces[1], controller_memory=np.zeros(3))
     with mock.patch("drake_safety.simulation.feedback.run_episode", side_effect=AssertionError):
         with pytest.raises(ValueError, match="entries of the controller's memory, expected"):
-            bad = replace(found[1], controller_memory=memory)
-            pair_windows(walking, recorder, [found[0], bad])
+            pair_windows(walking, recorder, [pieces[0], bad])
 
 
 def test_rows_that_are_not_when_the_policy_acts_are_refused(walking):
