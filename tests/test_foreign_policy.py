@@ -117,7 +117,7 @@ def inputs(policy, action=(0.0, 0.0)):
     q = np.array([1.0, 0, 0, 0, 0, 0, 0.5, 9.0, 0.4, 0.3])
     v = np.array([1.0, 2.0, 300.0, *np.zeros(6)])
     seen = policy.see(q, v, np.array([0.5, 0.1, 0.2]), np.array(action), policy.initial_phases)
-    return policy.observe(seen, np.full(sum(policy.sizes), np.nan))
+    return policy.observe(seen, np.full(policy.num_inputs, np.nan))
 
 
 def test_a_deploy_yaml_says_all_but_the_names_of_the_motors(tmp_path):
@@ -221,7 +221,7 @@ def test_terms_that_nobody_has_registered_are_asked_for(tmp_path):
     text, asked = survey_policy(path, MOTORS).yaml(JOINTS, {})
     assert "name: lidar" in text
     assert any("functions of the terms ['lidar']" in what for what in asked)
-    with pytest.raises(ValueError, match=r"unknown terms \['lidar'\]; registered are"):
+    with pytest.raises(ValueError, match=r"unknown term 'lidar'; registered are"):
         loaded(path, MOTORS)
 
 

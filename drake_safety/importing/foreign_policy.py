@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import yaml
 from pydantic import Field, FiniteFloat
 
@@ -39,7 +40,7 @@ observations_history_priority clip_obs clip_actions_lower clip_actions_upper rl_
 action_scale wheel_indices lin_vel_scale ang_vel_scale dof_pos_scale dof_vel_scale commands_scale
 default_dof_pos joint_names joint_mapping dt decimation framework hip_scale_reduction
 hip_scale_reduction_indices
-fixed_kp fixed_kd torque_limits joint_controller_names command_mapping state_mapping rows cols"""
+fixed_kp fixed_kd torque_limits joint_controller_names command_mapping state_mapping"""
 
 
 def converted_policy(path: Path, motors: Sequence[str] = ()) -> dict[str, Any]:
@@ -56,21 +57,17 @@ def converted_policy(path: Path, motors: Sequence[str] = ()) -> dict[str, Any]:
         content = _parsed(path)
         raw = content if isinstance(content, dict) else {}
         if {"joint_ids_map", "observations"} <= raw.keys():
-            found = _from_unitree(_Entries(raw, str(path)), path, motors)
-        elif any(
-            isinstance(section, dict) and {"rl_kp", "num_observations"} & section.keys()
-            for section in raw.values()
-        ):
-            found = _from_rl_sar(raw, path)
+            converted = _from_unitree(_Entries(raw, str(path), _DEPLOY_KEYS), path, motors)
+        elif any(isinstance(section, dict) and "rl_kp" in section for section in raw.values()):
+            converted = _from_rl_sar(raw, path)
         else:
             raise ValueError(
                 f"'{path}' is neither a deploy.yaml of unitree_rl_lab (joint_ids_map, "
-                "observations, ...) nor a config.yaml of rl_sar (rl_kp, num_observations, ...); "
-                f"its keys are {list(raw) or content}"
+                "observations, ...) nor a config.yaml of rl_sar (rl_kp, ...); its keys are "
+                f"{list(raw) or content}"
             )
-        count = len(found["default_positions"])
-        network = Path(found["network"])
-        names = found["joints"]
+        count, network = len(converted["default_positions"]), Path(converted["network"])
+        names = converted["joints"]
         if not names and network.suffix == ".onnx":  # Others have no metadata.
             names = load_network(network).metadata.joints
         if len(names) != count:
@@ -78,15 +75,13 @@ def converted_policy(path: Path, motors: Sequence[str] = ()) -> dict[str, Any]:
                 f"'{path}' has {count} joints; got {len(names)} names: {names}. A deploy.yaml "
                 "numbers the motors: name their joints in that order by --motors"
             )
-        gains = zip(found.pop("kp"), found.pop("kd"), strict=True)
-        found |= {
-            "joints": list(names),
-            "gains": [{"stiffness": p, "damping": d} for p, d in gains],
-        }
+        gains = zip(converted.pop("kp"), converted.pop("kd"), strict=True)
+        converted["joints"] = list(names)
+        converted["gains"] = [{"stiffness": p, "damping": d} for p, d in gains]
         for key in ("default_positions", "action_scale", "gains"):
-            found[key] = dict(zip(map(re.escape, names), found[key], strict=True))
-        load_typed(PolicyParameters, found, str(path))
-    return found
+            converted[key] = dict(zip(map(re.escape, names), converted[key], strict=True))
+        load_typed(PolicyParameters, converted, str(path))
+    return converted
 
 
 class _Loader(YamlLoader):
@@ -116,11 +111,7 @@ class _Entries:
             raise ValueError(f"{who} must be a mapping; got {raw}")
         self.raw, self.who = raw, who
         unknown = [key for key in raw if known and key not in known.split()]
-        self.refuse(
-            bool(unknown),
-            f"it has unknown keys {unknown}; known are {sorted(known.split())}. Delete them if the "
-            "policy does not depend on them",
-        )
+        self.refuse(bool(unknown), f"it has unknown keys {unknown}; known are {known.split()}")
 
     def refuse(self, is_wrong: bool, what: str) -> None:
         if is_wrong:
@@ -184,7 +175,6 @@ def _network(path: Path, *names: str) -> str:
 
 def _from_unitree(file: _Entries, path: Path, motors: Sequence[str]) -> dict[str, Any]:
     """Gains are in the order of the motors, everything else in that of the network."""
-    _Entries(file.raw, file.who, _DEPLOY_KEYS)
     motor_of = file.indices("joint_ids_map")
     count, last = len(motor_of), max(motor_of, default=0)
     names = motors or (file.get("joint_names", list[str]) if "joint_names" in file else [])
@@ -205,7 +195,7 @@ def _from_unitree(file: _Entries, path: Path, motors: Sequence[str]) -> dict[str
     _check_all_joints(action, count)
     offset = action.numbers("offset", count, joints) if "offset" in action else positions
     action.refuse(
-        any(abs(one - other) > 1e-6 for one, other in zip(offset, positions, strict=True)),
+        not np.allclose(offset, positions, rtol=0.0, atol=1e-6),
         "offset must equal default_joint_pos, from which joints are observed; got "
         f"{offset} and {positions}",
     )
@@ -215,7 +205,7 @@ def _from_unitree(file: _Entries, path: Path, motors: Sequence[str]) -> dict[str
         f"clip of joint positions must be null or beyond ±2π for {count} joints, as this limit is "
         f"not supported; got {limits}",
     )
-    found = {
+    converted = {
         "network": _network(path, *_EXPORTED),
         "joints": joints,
         "default_positions": positions,
@@ -230,8 +220,8 @@ def _from_unitree(file: _Entries, path: Path, motors: Sequence[str]) -> dict[str
         bounds = file.inner("commands").inner("base_velocity").inner("ranges")
         pairs = [bounds.numbers(key, 2) for key in ("lin_vel_x", "lin_vel_y", "ang_vel_z")]
         lowest, highest = zip(*pairs, strict=True)
-        found["command"] = {"lowest": list(lowest), "highest": list(highest)}
-    return found
+        converted["command"] = {"lowest": list(lowest), "highest": list(highest)}
+    return converted
 
 
 def _check_all_joints(entries: _Entries, count: int) -> None:
@@ -248,20 +238,21 @@ def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
         key
         for key, value in terms.raw.items()
         if isinstance(value, dict)
-        and not {*_TERM_KEYS.split()} - {"scale_first"} & value.keys()
-        and any(isinstance(one, dict) for one in value.values())
+        and not set(_TERM_KEYS.split()) - {"scale_first"} & value.keys()
+        and any(isinstance(inner, dict) for inner in value.values())
     ]
     terms.refuse(len(groups) > 1, f"a policy has one input; got the groups {groups}")
     if groups:
         terms = terms.inner(groups[0])
     observation: list[dict[str, Any]] = []
-    found: dict[str, Any] = {"observation": observation}
-    for name in (name for name in terms.raw if name not in _GROUP_SWITCHES):
-        spec = terms.inner(name, _TERM_KEYS)
-        entry: dict[str, Any] = {"name": TERM_NAMES.get(name, str(name))}
+    converted: dict[str, Any] = {"observation": observation}
+    for key in (key for key in terms.raw if key not in _GROUP_SWITCHES):
+        spec = terms.inner(key, _TERM_KEYS)
+        name = TERM_NAMES.get(key, str(key))
+        entry: dict[str, Any] = {"name": name}
         if "scale" in spec:
             scale = spec.raw["scale"]
-            size = _width(entry["name"], count) or (len(scale) if isinstance(scale, list) else 1)
+            size = _width(name, count) or (len(scale) if isinstance(scale, list) else 1)
             entry["scale"] = _scale(spec, "scale", size)
         entry["clip"] = math.inf
         if "clip" in spec:
@@ -269,11 +260,10 @@ def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
             factors = [1.0] if is_scaled else entry.get("scale", [1.0])
             lowest, highest = spec.numbers("clip", 2)
             entry["clip"] = limit(lowest, highest, factors, spec.who)
-        length = int(spec.number("history_length")) if "history_length" in spec else 1
-        entry["history"] = max(length, 1)
-        if entry["name"] == "gait_phase":
+        entry["history"] = max(int(spec.raw.get("history_length") or 1), 1)
+        if name == "gait_phase":
             period_s = spec.inner("params").number("period")
-            found["gait"] = {"period_s": period_s, "offsets": [0.0], "standing_below": 0.0}
+            converted["gait"] = {"period_s": period_s, "offsets": [0.0], "standing_below": 0.0}
         elif "asset_cfg" in (spec.raw.get("params") or {}):
             _check_all_joints(spec.inner("params").inner("asset_cfg"), count)
         observation.append(entry)
@@ -282,8 +272,8 @@ def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
         what = f"use_gym_history needs one history_length; got {sorted(lengths)}"
         terms.refuse(len(lengths) != 1, what)
         if (length := lengths.pop()) > 1:
-            found["history"] = {"ages": list(range(length))[::-1], "by": "time"}
-    return found
+            converted["history"] = {"ages": list(range(length))[::-1], "by": "time"}
+    return converted
 
 
 def _from_rl_sar(raw: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -291,18 +281,12 @@ def _from_rl_sar(raw: dict[str, Any], path: Path) -> dict[str, Any]:
     if len(raw) != 1:
         raise ValueError(f"{path}: one policy in a file is expected; got {list(raw)}")
     ((section, own),) = raw.items()
-    folders = [path.parent, *path.resolve().parents[1:3]]
-    base = next((f / "base.yaml" for f in folders if (f / "base.yaml").is_file()), None)
-    of_robot = None
-    if base is not None:
+    bases = [folder / "base.yaml" for folder in (path.parent, *path.resolve().parents[1:3])]
+    of_robot: Any = {}
+    if base := next(filter(Path.is_file, bases), None):
         with reading(base):
             of_robot = _Entries(_parsed(base), str(base)).raw.get(str(section).partition("/")[0])
     file = _Entries({**(of_robot or {}), **own}, str(path), _RL_SAR_KEYS)
-    file.refuse(
-        "rows" in file and file.raw.get("framework") == "isaacsim",
-        "the reordering by rows and cols of old files with framework isaacsim is not supported; "
-        "put the lists in the network's order, and delete rows and cols",
-    )
     wheels = file.raw.get("wheel_indices")
     file.refuse(bool(wheels), f"wheels are not supported; got wheel_indices {wheels}")
     count = int(file.number("num_of_dofs"))
@@ -338,17 +322,18 @@ def _from_rl_sar(raw: dict[str, Any], path: Path) -> dict[str, Any]:
 
 def _rl_sar_observation(file: _Entries, count: int) -> dict[str, Any]:
     clip = file.number("clip_obs") if "clip_obs" in file else math.inf
-    found: dict[str, Any] = {"observation": []}
+    observation: list[dict[str, Any]] = []
+    converted: dict[str, Any] = {"observation": observation}
     widths = []
     for name in file.get("observations", list[str]):
         term, key = _RL_SAR_TERMS.get(name, (name, ""))
         if name not in registered_terms() and re.fullmatch(r"(?!.*mimic)\w+_phase", name):
             # Its period is in the project's code.
             term = "gait_phase"
-            found["gait"] = {"offsets": [0.0], "standing_below": 0.0}
+            converted["gait"] = {"offsets": [0.0], "standing_below": 0.0}
         widths.append(_width(term, count))
         scale = {"scale": _scale(file, key, widths[-1])} if key else {}
-        found["observation"].append({"name": term, "clip": clip, **scale})
+        observation.append({"name": term, "clip": clip, **scale})
     num = file.number("num_observations") if "num_observations" in file else sum(widths)
     file.refuse(
         num != sum(widths) and all(widths),
@@ -356,8 +341,8 @@ def _rl_sar_observation(file: _Entries, count: int) -> dict[str, Any]:
         f"{sum(widths)} entries with {count} joints",
     )
     if file.raw.get("observations_history"):
-        found["history"] = {
+        converted["history"] = {
             "ages": file.indices("observations_history"),
             "by": file.raw.get("observations_history_priority", "time"),
         }
-    return found
+    return converted

@@ -117,7 +117,7 @@ class GaitClock:
     """A clock whose phases are part of the observation."""
 
     period_s: NotNegative = 0.0
-    """Of a cycle [s]; 0 for policies without a clock."""
+    """Period of a cycle [s]; 0 for policies without a clock."""
     offsets: list[float] = field(default_factory=lambda: [0.0, 0.5])
     """Phase of each foot at the start, as a share of the period."""
     standing_below: float = 0.01
@@ -204,8 +204,9 @@ class Policy:
     Attributes:
         parameters: Contents of ``policy.yaml``.
         joints: The policy's joints as indices into the robot's, (n_a,).
-        default_positions: Of all joints of the robot at zero action, (n_j,) [rad].
-        action_scale: (n_a,) [rad].
+        default_positions: Positions of all joints of the robot at zero action, (n_j,) [rad].
+        action_scale: Joint positions per unit of action, (n_a,) [rad].
+        num_inputs: Number of entries of the network's input, n_o.
     """
 
     def __init__(
@@ -219,8 +220,8 @@ class Policy:
         self.parameters = parameters
         who = f"policy '{parameters.network}' for robot '{robot}'"
         self.network: PolicyNetwork = load_network(network_file(parameters, folder))
-        metadata = self.network.metadata
-        names, (width, num_moved) = parameters.joints or metadata.joints, self.network.widths
+        metadata, (width, num_moved) = self.network.metadata, self.network.widths
+        names = parameters.joints or metadata.joints
         if not parameters.joints and num_moved not in (None, len(names)):
             names = []  # Some are observed, and not moved.
         unknown = [name for name in names if name not in joint_names]
@@ -234,13 +235,15 @@ class Policy:
 
         def by_joint(key: str, joints: list[str]) -> dict[str, Any]:
             """Values that are stated, else those of the network's metadata."""
-            found = {}
-            for source, what in ((metadata, f"{key} of its metadata"), (parameters, key)):
-                for name in joints:
-                    value = by_pattern(getattr(source, key, {}), name, what, robot)
-                    if value is not None:
-                        found[name] = value
-            return found
+            values: dict[str, Any] = {}
+            for name in joints:
+                value = by_pattern(getattr(parameters, key, {}), name, key, robot)
+                if value is None:
+                    stated = getattr(metadata, key, {})
+                    value = by_pattern(stated, name, f"{key} of its metadata", robot)
+                if value is not None:
+                    values[name] = value
+            return values
 
         positions = by_joint("default_positions", joint_names)
         scales, damping = by_joint("action_scale", names), by_joint("damping", names)
@@ -256,9 +259,8 @@ class Policy:
             missing.append(f"'joints' in the network's order{count}; the robot has {joint_names}")
         if not positions:
             missing.append("'default_positions' [rad], such as {.*: 0.0}")
-        for key, found in (("'action_scale' [rad]", scales), ("'gains' [N·m/rad]", self.gains)):
-            without = [name for name in names if name not in found]
-            if without:
+        for key, values in (("'action_scale' [rad]", scales), ("'gains' [N·m/rad]", self.gains)):
+            if without := [name for name in names if name not in values]:
                 missing.append(f"{key} of joints {without}")
         if not parameters.observation:
             entries = "" if width is None else f", {width} entries in all"
@@ -275,24 +277,13 @@ class Policy:
         self.initial_phases = (
             _wrapped(2 * math.pi * np.array(gait.offsets)) if gait.period_s else np.zeros(0)
         )
-        unknown = [one.name for one in parameters.observation if one.name not in TERMS]
-        if unknown:
-            raise ValueError(
-                f"{who}: observation has unknown terms {unknown}; registered are "
-                f"{registered_terms()}"
-            )
-        for one in parameters.observation:
-            if unknown := [name for name in one.joints if name not in joint_names]:
-                raise ValueError(
-                    f"{who}: term '{one.name}' has joints {unknown} that the robot lacks; it has "
-                    f"{joint_names}"
-                )
-        self._terms = [(_term(one, joint_names), one) for one in parameters.observation]
+        self._terms = [(_term(spec, joint_names, who), spec) for spec in parameters.observation]
         q = np.concatenate([np.eye(1, NUM_BASE_POSITIONS)[0], self.default_positions])
         v = np.zeros(NUM_BASE_VELOCITIES + len(joint_names))
         still = self.see(q, v, np.zeros(3), np.zeros(len(names)), self.initial_phases)
-        widths = [np.asarray(term(still)).size for term, _ in self._terms]
-        for (_, spec), width in zip(self._terms, widths, strict=True):
+        widths, all_ages, described = [], [], []
+        for term, spec in self._terms:
+            width = np.asarray(term(still)).size
             if not width:
                 raise ValueError(
                     f"{who}: term '{spec.name}' needs a clock: state 'gait: {{period_s: ...}}' [s]"
@@ -301,34 +292,23 @@ class Policy:
                 raise ValueError(
                     f"{who}: term '{spec.name}' has {width} entries; got {len(spec.scale)} scales"
                 )
-        ages = parameters.history.ages
-        samples = [list(range(spec.history))[::-1] for _, spec in self._terms]
-        if ages:
-            samples = [ages] * len(widths)
-        self.sizes = [w * len(one) for w, one in zip(widths, samples, strict=True)]
-        self._lay_out(widths, samples, by_time=bool(ages) and parameters.history.by == "time")
-        described = ", ".join(
-            f"{spec.name} {width}" + f" x {len(ages)}" * (len(ages) > 1)
-            for (_, spec), width, ages in zip(self._terms, widths, samples, strict=True)
-        )
-        sizes = sum(self.sizes), len(names)
-        waited(self.network.check, who, *sizes, described, max(len(ages), 1))
-
-    def _lay_out(self, widths: list[int], samples: list[list[int]], *, by_time: bool) -> None:
-        """Sets, for each entry of the network's input, where it comes from.
-
-        ``_entries`` is the entry of the present observation, ``_earlier`` that of the last input
-        which is one period younger; -1 for the newest samples.
-        """
+            ages = parameters.history.ages or list(range(spec.history))[::-1]
+            widths.append(width)
+            all_ages.append(ages)
+            described.append(f"{spec.name} {width}" + f" x {len(ages)}" * (len(ages) > 1))
+        blocks = [(term, age) for term, ages in enumerate(all_ages) for age in ages]
+        if parameters.history.ages and parameters.history.by == "time":
+            blocks.sort(key=lambda block: parameters.history.ages.index(block[1]))
         ends = np.cumsum(widths)
-        terms = range(len(widths))
-        blocks = [(term, age) for term in terms for age in samples[term]]
-        if by_time:
-            blocks = [(term, age) for age in samples[0] for term in terms]
         order = [(i, age) for k, age in blocks for i in range(ends[k] - widths[k], ends[k])]
-        places = {one: place for place, one in enumerate(order)}
+        places = {entry: place for place, entry in enumerate(order)}
+        self.num_inputs = len(order)
+        # For each entry of the input, that of the present observation, and that of the last input
+        # which is one period younger; -1 for the newest samples.
         self._entries = np.array([entry for entry, _ in order], dtype=int)
         self._earlier = np.array([places.get((i, age - 1), -1) for i, age in order], dtype=int)
+        num_samples = max(len(parameters.history.ages), 1)
+        waited(self.network.check, who, len(order), len(names), ", ".join(described), num_samples)
 
     def see(
         self,
@@ -392,8 +372,15 @@ class Policy:
         return np.clip(wanted, applied - change, applied + change)
 
 
-def _term(spec: ObservationTerm, joint_names: list[str]) -> Term:
+def _term(spec: ObservationTerm, joint_names: list[str], who: str) -> Term:
     """The function of a term, of its own joints if it has some."""
+    if spec.name not in TERMS:
+        raise ValueError(f"{who}: unknown term '{spec.name}'; registered are {registered_terms()}")
+    if unknown := [name for name in spec.joints if name not in joint_names]:
+        raise ValueError(
+            f"{who}: term '{spec.name}' has joints {unknown} that the robot lacks; it has "
+            f"{joint_names}"
+        )
     term = TERMS[spec.name]
     if not spec.joints:
         return term
@@ -421,11 +408,7 @@ def read_policy_file(path: Path, network: str = "") -> PolicyParameters:
 
 
 def load_policy(path: Path, kinematics: RobotKinematics, network: str = "") -> Policy:
-    """Loads a policy for a robot; see :func:`read_policy_file`.
-
-    Raises:
-        ValueError: The file does not fit the schema, the robot or the network.
-    """
+    """Loads a policy for a robot; a network replaces the one that the file names."""
     return Policy(
         read_policy_file(path, network),
         kinematics.joint_names,

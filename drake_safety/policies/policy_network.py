@@ -24,14 +24,12 @@ import numpy as np
 from pydantic import FiniteFloat
 
 from drake_safety.extras import require_extra
-from drake_safety.files.schema import Bounds, load_typed
+from drake_safety.files.schema import Bounds, Pattern, load_typed
 
-_MOST = 1_000_000_000  # Bytes of a file.
 _SUPPORTED = (
     "supported are one observation, an action, and as memory further inputs and outputs of ONNX in "
     "pairs of one shape, such as h_in and h_out, or buffers of TorchScript"
 )
-_EXPORT = "export the policy as TorchScript (torch.jit.save) or ONNX"
 _MOST_PICKLED = 1_000_000  # Bytes of a checkpoint that are searched for its keys.
 _KEYS_OF_CHECKPOINTS = r".*state_dict|.*\.(weight|bias)|iter|epoch|optimizer"
 _Memory = Mapping[str, np.ndarray]
@@ -91,38 +89,33 @@ def read_metadata(raw: Mapping[str, str]) -> PolicyMetadata:
     joints = _words(raw.get("dof_names", raw.get("joint_names", "")))
     names = _words(raw.get("observation_names", ""))
     terms: list[dict[str, Any]] = [{"name": TERM_NAMES.get(name, name)} for name in names]
-    found = PolicyMetadata(joints=joints, observation=terms)
+    metadata = PolicyMetadata(joints=joints, observation=terms)
     for name, keys in _KEYS.items():
         text = next((raw[key] for key in keys if raw.get(key)), "")
+        is_of_terms = name in ("scale", "clip", "history")
+        if not text or (is_of_terms and not names):
+            continue
         value = _parsed(text)
-        expected = f"a value for each of the terms {names}"
         try:
-            if text and name == "command":
+            if name == "command":
                 expected = "the lowest and highest velocity by name"
                 stated = {key: pair for key, pair in dict(value).items() if key in _VELOCITIES}
-                found.command = load_typed(dict[str, Bounds[FiniteFloat]], stated, name)
-            elif text and hasattr(found, name):
+                metadata.command = load_typed(dict[str, Bounds[FiniteFloat]], stated, name)
+            elif is_of_terms:
+                expected = f"a value for each of the terms {names}"
+                values = _by_term(value, names, terms, name)
+                for term, of_term in list(zip(terms, values, strict=True)):
+                    term[name] = of_term
+            else:
                 expected = f"a number for each of the joints {joints}, one for all or by regular "
                 expected += "expression"
-                setattr(found, name, _by_joint(value, joints))
-            elif text and names:
-                values = _by_term(value, names, terms, name)
-                for term, one in list(zip(terms, values, strict=True)):
-                    term[name] = one
-        except (KeyError, TypeError, ValueError, re.error):
-            found.unread.append(f"its metadata '{name}' must be {expected}; got {value}")
-    return found
-
-
-def _by_joint(value: Any, joints: list[str]) -> dict[str, float]:
-    if isinstance(value, list):
-        value = dict(zip(map(re.escape, joints), value, strict=True))
-    elif not isinstance(value, dict):
-        value = {".*": value}
-    numbers = {re.compile(pattern).pattern: float(number) for pattern, number in value.items()}
-    if not all(map(math.isfinite, numbers.values())):
-        raise ValueError(value)
-    return numbers
+                if isinstance(value, list):
+                    value = dict(zip(map(re.escape, joints), value, strict=True))
+                by_joint = value if isinstance(value, dict) else {".*": value}
+                setattr(metadata, name, load_typed(dict[Pattern, FiniteFloat], by_joint, name))
+        except (KeyError, TypeError, ValueError):
+            metadata.unread.append(f"its metadata '{name}' must be {expected}; got {value}")
+    return metadata
 
 
 def _by_term(value: Any, names: list[str], terms: list[dict[str, Any]], key: str) -> list[Any]:
@@ -162,50 +155,43 @@ def _parsed(text: str) -> Any:
     return text.split(",")
 
 
+@dataclass(eq=False)
 class PolicyNetwork:
     """A network that maps an observation (n_o,) and its memory (n_m,) to an action (n_a,).
 
-    Args:
-        evaluate: Maps a batch and parts of the memory by name to the action and the new parts.
-        widths: Of observation and action; None where the file does not say them.
-        start: All that may be memory, at the start.
-        shape: Of a batch of one observation.
-        dtype: Of a batch.
-        outputs: What else than an action it returns, and the action first.
-
     Attributes:
-        initial_memory: (n_m,), known after :meth:`check`; n_m is 0 without a memory.
+        evaluate: Maps a batch and parts of the memory by name to the action and the new parts.
+        widths: Entries of observation and action; None where the file does not say them.
+        start: Parts of the memory at the start by name; all that may be memory until
+            :meth:`check`.
+        shape: Shape of a batch of one observation.
+        dtype: Type of a batch.
+        outputs: Names and shapes of what it returns, the action first.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        evaluate: Callable[[np.ndarray, _Memory], tuple[np.ndarray, _Memory]],
-        widths: tuple[int | None, int | None],
-        metadata: PolicyMetadata | None = None,
-        start: _Memory | None = None,
-        *,
-        shape: tuple[int, ...] = (1, -1),
-        dtype: Any = np.float32,
-        outputs: list[str] | None = None,
-    ):
-        self.path, self.outputs = path, outputs if outputs is not None else []
-        self._shape, self._dtype = shape, dtype
-        self.widths = widths
-        self.metadata = metadata or PolicyMetadata()
-        self._evaluate = evaluate
-        self._start = dict(start or {})
-        self.initial_memory = np.zeros(0)
+    path: Path
+    evaluate: Callable[[np.ndarray, _Memory], tuple[np.ndarray, _Memory]]
+    widths: tuple[int | None, int | None]
+    metadata: PolicyMetadata = field(default_factory=PolicyMetadata)
+    start: _Memory = field(default_factory=dict)
+    shape: tuple[int, ...] = (1, -1)
+    dtype: Any = np.float32
+    outputs: list[str] = field(default_factory=list)
+
+    @property
+    def initial_memory(self) -> np.ndarray:
+        """The memory at the start, (n_m,); n_m is 0 without a memory."""
+        return _flat(self.start.values())
 
     def __call__(
         self, observation: np.ndarray, memory: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns the action (n_a,) for an observation (n_o,), and the new memory (n_m,)."""
-        ends = np.cumsum([part.size for part in self._start.values()])
-        pairs = zip(self._start.items(), np.split(memory, ends), strict=False)
-        given = {name: new.reshape(one.shape).astype(one.dtype) for (name, one), new in pairs}
-        batch = np.asarray(observation, dtype=self._dtype).reshape(self._shape)
-        action, after = self._evaluate(batch, given)
+        ends = np.cumsum([part.size for part in self.start.values()])
+        pairs = zip(self.start.items(), np.split(memory, ends), strict=False)
+        given = {name: new.reshape(old.shape).astype(old.dtype) for (name, old), new in pairs}
+        batch = np.asarray(observation, dtype=self.dtype).reshape(self.shape)
+        action, after = self.evaluate(batch, given)
         return np.asarray(action, dtype=float).reshape(-1), _flat(after[name] for name in given)
 
     def check(
@@ -215,36 +201,34 @@ class PolicyNetwork:
 
         An observation of several samples that is no row for it is one of (1, num_samples, n).
         """
-        seen, acting = self.widths
-        if seen not in (None, num_inputs):
+        width, num_acting = self.widths
+        if width not in (None, num_inputs):
             raise ValueError(
-                f"{who}: the network expects an observation of {seen} entries; the terms have "
+                f"{who}: the network expects an observation of {width} entries; the terms have "
                 f"{num_inputs}: {terms}. If it observes joints that it does not move, name them "
                 "under 'joints' of a term"
             )
         probe = np.linspace(-1.0, 1.0, num_inputs, dtype=np.float32)
         try:
-            batch = probe.astype(self._dtype).reshape(self._shape)
-            _, after = self._evaluate(batch, self._start)
+            _, after = self.evaluate(probe.astype(self.dtype).reshape(self.shape), self.start)
             # What does not change is no memory, and what grows has no place in a Context.
-            self._start = {
+            self.start = {
                 name: part
-                for name, part in self._start.items()
+                for name, part in self.start.items()
                 if part.shape == after[name].shape and part.tobytes() != after[name].tobytes()
             }
-            self.initial_memory = _flat(self._start.values())
             action, later = self(probe, self.initial_memory)
             self(probe, later)
             again, _ = self(probe, self.initial_memory)
         except Exception as error:  # Those of onnxruntime have no common base but this.
-            if self._shape == (1, -1) and num_samples > 1:
-                self._shape = (1, num_samples, -1)
+            if self.shape == (1, -1) and num_samples > 1:
+                self.shape = (1, num_samples, -1)
                 return self.check(who, num_inputs, num_outputs, terms, num_samples)
             raise ValueError(
                 f"{who}: the network takes no observation of {num_inputs} entries ({terms}): "
                 f"{_reason(error)}"
             ) from error
-        if action.shape != (num_outputs,) or acting not in (None, num_outputs):
+        if action.shape != (num_outputs,) or num_acting not in (None, num_outputs):
             raise ValueError(
                 f"{who}: the network returns {action.size} actions, expected one for each of "
                 f"{num_outputs} joints; its outputs are {self.outputs}, the first the action"
@@ -258,20 +242,20 @@ class PolicyNetwork:
         if action.tobytes() != again.tobytes():
             raise ValueError(
                 f"{who}: the network answers the same observation differently after another, "
-                f"though its memory of {len(self._start)} buffers was set back: it draws random "
+                f"though its memory of {len(self.start)} buffers was set back: it draws random "
                 f"numbers, or has a memory that is no buffer of a fixed size; {_SUPPORTED}"
             )
 
 
 def waited(call: Callable[..., Any], *arguments: Any) -> Any:
     """Calls a network in a thread: Ctrl-C ends the wait for a network that loops for ever."""
-    found: Future[Any] = Future()
+    result: Future[Any] = Future()
 
     def run() -> None:
         try:
-            found.set_result(call(*arguments))
+            result.set_result(call(*arguments))
         except BaseException as error:
-            found.set_exception(error)
+            result.set_exception(error)
 
     def leave() -> None:
         if thread.is_alive():  # It would abort the process as this ends.
@@ -281,7 +265,7 @@ def waited(call: Callable[..., Any], *arguments: Any) -> Any:
     thread = Thread(target=run, daemon=True)
     thread.start()
     try:
-        return found.result()
+        return result.result()
     except KeyboardInterrupt:
         atexit.register(leave)
         raise
@@ -301,36 +285,27 @@ def _flat(parts: Iterable[np.ndarray]) -> np.ndarray:
 
 
 def load_network(path: Path) -> PolicyNetwork:
-    """Loads a network from an ONNX (``.onnx``) or TorchScript (``.pt``, ``.jit``) file.
-
-    Raises:
-        MissingExtraError: The package that evaluates it is not installed.
-        ValueError: The file does not exist, is of another kind, or cannot be read.
-    """
+    """Loads a network from an ONNX (``.onnx``) or TorchScript (``.pt``, ``.jit``) file."""
     if path.suffix not in LOADERS:
         raise ValueError(
             f"{path}: a policy's network is one of {list(LOADERS)}; got '{path.suffix}'"
             f"{_described(path)}"
         )
-    if not path.is_file() or path.stat().st_size > _MOST:
+    if not path.is_file():
         raise ValueError(f"{path}: the policy's network does not exist")
     return LOADERS[path.suffix](path)
 
 
 def network_kinds(paths: Iterable[Path]) -> list[str]:
-    """What whoever runs them must know of those files that are networks."""
+    """Texts on which of some files are networks, and which of these are code."""
     script = "TorchScript: code of its author, which runs here"
     kinds = {end: "ONNX, which is no code" if end == ".onnx" else script for end in LOADERS}
-    found = dict.fromkeys(path for path in paths if path.suffix in kinds)
-    return [f"the policy's network {path} is {kinds[path.suffix]}" for path in found]
+    networks = dict.fromkeys(path for path in paths if path.suffix in kinds)
+    return [f"the policy's network {path} is {kinds[path.suffix]}" for path in networks]
 
 
 def network_files(path: Path) -> list[Path]:
-    """Returns a network's file, and those with the weights of an ONNX network (external data).
-
-    Raises:
-        ValueError: A file of weights does not exist, or is not below the folder of the network.
-    """
+    """Returns a network's file, and the files of weights of an ONNX network (external data)."""
     # Without the key of external data in it, nothing needs to be parsed.
     if path.suffix != ".onnx" or not path.is_file() or b"location" not in path.read_bytes():
         return [path]
@@ -363,35 +338,24 @@ def _reading(path: Path, what: str) -> Iterator[None]:
 
 
 def _described(path: Path) -> str:
-    """What else than a network a file is, with the remedy; "" if it cannot be told."""
+    """Text on a file that is a pickle, such as a training checkpoint; nothing of it is run."""
     head = b""
     with suppress(OSError), path.open("rb") as file:
         head = file.read(_MOST_PICKLED)
     with suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
         names = {Path(name).name: name for name in archive.namelist()}
-        if "constants.pkl" in names:
-            return ", but TorchScript: name it .pt" if path.suffix == ".onnx" else ""
-        if "data.pkl" in names:
+        if "data.pkl" in names and "constants.pkl" not in names:  # With both it is TorchScript.
             head = archive.open(names["data.pkl"]).read(_MOST_PICKLED)
-    # The strings of a pickle stand after their length, of one byte or four. Nothing of it is run.
+    if not head.startswith(b"\x80"):
+        return ""
+    # The strings of a pickle stand after their length, of one byte or four.
     texts = (
-        head[found.end() : found.end() + (found[1] or found[2])[0]].decode(errors="replace")
-        for found in re.finditer(rb"X(.)\0{3}|\x8c(.)", head, re.DOTALL)
+        head[match.end() : match.end() + (match[1] or match[2])[0]].decode(errors="replace")
+        for match in re.finditer(rb"X(.)\0{3}|\x8c(.)", head, re.DOTALL)
     )
     keys = [text for text in texts if re.fullmatch(_KEYS_OF_CHECKPOINTS, text)]
-    if head.startswith(b"\x80"):
-        kind = f"a training checkpoint ({', '.join(keys[:4])})" if keys else "a Python pickle"
-        return f", but {kind}: {_EXPORT}"
-    if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < _MOST:
-        return f", but weights alone (safetensors): {_EXPORT}"
-    for start, text in {
-        b"version https://git-lfs": "a pointer of git-lfs: get the file by `git lfs pull`",
-        b"<": "a web page: download the file itself, such as by 'raw'",
-        b"\x08": "like an ONNX network: name it .onnx",
-    }.items():
-        if head.lstrip().startswith(start) and path.suffix != text[-5:]:
-            return f", but {text}"
-    return ""
+    kind = f"a training checkpoint ({', '.join(keys[:4])})" if keys else "a Python pickle"
+    return f", but {kind}: export the policy as TorchScript (torch.jit.save) or ONNX"
 
 
 def _load_onnx(path: Path) -> PolicyNetwork:
@@ -408,51 +372,52 @@ def _load_onnx(path: Path) -> PolicyNetwork:
             str(path), options, providers=["CPUExecutionProvider"]
         )
     inputs, outputs = session.get_inputs(), session.get_outputs()
-    shapes = {one.name: _shape(one) for one in outputs}
+    shapes = {value.name: _shape(value) for value in outputs}
     # Such as h_out after h_in, or hn after h0.
-    pairs = ((one, one.name.replace("_in", "_out")) for one in inputs)
-    names = [(one, name) for one, out in pairs for name in (out, re.sub("0$", "n", out))]
-    after = {one.name: name for one, name in names if shapes.get(name) == _shape(one)}
-    memory = [one for one in inputs if one.name in after]
-    seen = [one for one in inputs if one.name not in after]
-    acting = [one for one in outputs if one.name not in after.values()]
-    if len(seen) != 1 or not acting:
+    pairs = ((value, value.name.replace("_in", "_out")) for value in inputs)
+    names = [(value, name) for value, out in pairs for name in (out, re.sub("0$", "n", out))]
+    after = {value.name: name for value, name in names if shapes.get(name) == _shape(value)}
+    memory = [value for value in inputs if value.name in after]
+    observed = [value for value in inputs if value.name not in after]
+    acting = [value for value in outputs if value.name not in after.values()]
+    if len(observed) != 1 or not acting:
         raise ValueError(
-            f"{path}: got inputs {[f'{one.name} {one.shape} {one.type}' for one in inputs]} and "
-            f"outputs {[f'{one.name} {one.shape}' for one in outputs]}; {_SUPPORTED}"
+            f"{path}: got inputs {[f'{value.name} {value.shape}' for value in inputs]} and "
+            f"outputs {[f'{value.name} {value.shape}' for value in outputs]}; {_SUPPORTED}"
         )
-    (observed,) = seen
     dtypes = {"tensor(double)": np.float64, "tensor(float16)": np.float16}
-    start = {one.name: np.zeros(_shape(one), dtypes.get(one.type, np.float32)) for one in memory}
-    shape, last = _shape(observed), (acting[0].shape or [None])[-1]
-    free = [i for i, size in enumerate(observed.shape) if i and not isinstance(size, int)]
+    start = {v.name: np.zeros(_shape(v), dtypes.get(v.type, np.float32)) for v in memory}
+    name, sizes, shape = observed[0].name, observed[0].shape, _shape(observed[0])
+    free = [i for i, size in enumerate(sizes) if i and not isinstance(size, int)]
     # A size between that varies is a history's; of a network with a memory it is one step of time.
     if free and (not memory or free[-1] == len(shape) - 1):
         shape[free[-1]] = -1
-    num_seen = None if -1 in shape else math.prod(shape)
-    num_acting = last if isinstance(last, int) else None
+    num_acting = (acting[0].shape or [None])[-1]
+    widths = (
+        None if -1 in shape else math.prod(shape),
+        num_acting if isinstance(num_acting, int) else None,
+    )
 
     def evaluate(batch: np.ndarray, parts: _Memory) -> tuple[np.ndarray, _Memory]:
-        given = {**start, **parts, observed.name: batch}
+        given = {**start, **parts, name: batch}
         action, *new = session.run([acting[0].name, *after.values()], given)
         return action, dict(zip(start, new, strict=True))
 
-    metadata = read_metadata(session.get_modelmeta().custom_metadata_map)
     return PolicyNetwork(
         path,
         evaluate,
-        (num_seen, num_acting),
-        metadata,
+        widths,
+        read_metadata(session.get_modelmeta().custom_metadata_map),
         start,
-        shape=tuple(shape),
-        dtype=dtypes.get(observed.type, np.float32),
-        outputs=[f"{one.name} {one.shape}" for one in acting],
+        tuple(shape),
+        dtypes.get(observed[0].type, np.float32),
+        [f"{value.name} {value.shape}" for value in acting],
     )
 
 
-def _shape(one: Any) -> list[int]:
+def _shape(value: Any) -> list[int]:
     """A shape for one robot: a size that varies is that of the batch."""
-    return [size if isinstance(size, int) else 1 for size in one.shape]
+    return [size if isinstance(size, int) else 1 for size in value.shape]
 
 
 def _load_torchscript(path: Path) -> PolicyNetwork:
@@ -463,7 +428,7 @@ def _load_torchscript(path: Path) -> PolicyNetwork:
         # Torch deprecates the format, in which policies are nevertheless published.
         warnings.simplefilter("ignore", DeprecationWarning)
         module = torch.jit.load(str(path), map_location="cpu").eval()
-    arguments = [one.name for one in module.forward.schema.arguments[1:]]
+    arguments = [argument.name for argument in module.forward.schema.arguments[1:]]
     if len(arguments) != 1:
         raise ValueError(f"{path}: got inputs {arguments}; {_SUPPORTED}")
     for reset in ("reset", "reset_memory"):
@@ -479,10 +444,10 @@ def _load_torchscript(path: Path) -> PolicyNetwork:
                 buffers = dict(module.named_buffers())
                 for name, part in parts.items():
                     buffers[name].copy_(torch.from_numpy(part))
-                found = module(torch.from_numpy(batch))
-                found = found if isinstance(found, (tuple, list)) else [found]
-                outputs[:] = [f"{[*one.shape]}" for one in found]
-                action = found[0].numpy()
+                returned = module(torch.from_numpy(batch))
+                tensors = returned if isinstance(returned, (tuple, list)) else [returned]
+                outputs[:] = [f"{[*tensor.shape]}" for tensor in tensors]
+                action = tensors[0].numpy()
                 buffers = dict(module.named_buffers())  # The script may have replaced them.
                 return action, {name: buffers[name].numpy().copy() for name in parts}
         finally:
@@ -490,7 +455,7 @@ def _load_torchscript(path: Path) -> PolicyNetwork:
 
     start = {name: buffer.numpy().copy() for name, buffer in module.named_buffers()}
     outputs: list[str] = []
-    kinds = [str(one.dtype).removeprefix("torch.") for one in module.parameters()]
+    kinds = [str(parameter.dtype).removeprefix("torch.") for parameter in module.parameters()]
     return PolicyNetwork(
         path,
         partial(waited, evaluate),

@@ -52,7 +52,7 @@ class PolicyController(LeafSystem):
         self._action = self.DeclareDiscreteState(np.concatenate(still))
         self._phases = self.DeclareDiscreteState(phases if self._num_phases else np.zeros(1))
         self._applied = self.DeclareDiscreteState(3)
-        self._history = self.DeclareDiscreteState(np.full(sum(policy.sizes), np.nan))
+        self._history = self.DeclareDiscreteState(np.full(policy.num_inputs, np.nan))
         self._memory = self.DeclareDiscreteState(policy.network.initial_memory)
         self._status = self.DeclareDiscreteState([ACTING])  # From here on no memory.
         self._num_failures = self.DeclareDiscreteState(1)
