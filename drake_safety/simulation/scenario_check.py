@@ -40,7 +40,6 @@ _WALKS = "walks for 2 s at half the command"
 _WALKED_S = 2.0
 _SLOW = 0.1  # Error of the velocity that is none [m/s].
 _SINK_SHARE = 0.1  # Share of the standing height by which a robot may sink.
-_AT_STOP_RAD = 0.05
 _LEVEL_M = 2e-3  # Largest difference of the feet's heights.
 _MATCH_M = 1e-3
 _UNSAFE_SHARES = (0.1, 0.9)
@@ -187,14 +186,14 @@ def _kinematics(robot: RobotModel) -> Generator[Finding, None, RobotKinematics]:
 
 def _posture(kinematics: RobotKinematics) -> _Check:
     q = kinematics.standing_positions()
-    beyond = [
+    joints = zip(
+        kinematics.joint_names, kinematics.posture, kinematics.position_limits, strict=True
+    )
+    if beyond := [
         f"{name} at {value:g}, between {low:g} and {high:g}"
-        for name, value, (low, high) in zip(
-            kinematics.joint_names, kinematics.posture, kinematics.position_limits, strict=True
-        )
+        for name, value, (low, high) in joints
         if not low <= value <= high
-    ]
-    if beyond:
+    ]:
         yield failed(
             "joint stops",
             f"the posture is beyond them [rad]: {'; '.join(beyond)}",
@@ -202,11 +201,8 @@ def _posture(kinematics: RobotKinematics) -> _Check:
         )
     p_WC = kinematics.contact_positions(q)
     heights = p_WC[:, 2] - kinematics.foot_radii
-    high_feet = [
-        name
-        for name, points in zip(kinematics.foot_names, kinematics.foot_slices, strict=True)
-        if heights[points].max() > _LEVEL_M
-    ]
+    feet = zip(kinematics.foot_names, kinematics.foot_slices, strict=True)
+    high_feet = [name for name, points in feet if heights[points].max() > _LEVEL_M]
     spread = np.ptp(heights)
     yield _judged(
         "feet level",
@@ -273,18 +269,17 @@ def _motors(kinematics: RobotKinematics) -> _Check:
         remedy = "correct <limit> in the model file, or 'effort_limits' [N·m] and"
         yield passed("motor limits", odd, f"{remedy} 'velocity_limits' [rad/s] in robot.yaml")
     torques = kinematics.gravity_torques(q, np.ones(kinematics.num_contacts, dtype=bool))
-    needs = dict(zip(kinematics.joint_names, np.abs(torques), strict=True))
-    shares = {name: need / limits[name] for name, need in needs.items() if name in limits}
-    weak = [
-        f"{name} needs {needs[name]:.1f} of {limits[name]:.1f} "
-        f"{effort_unit(plant.GetJointByName(name, instance))}"
-        for name, share in shares.items()
-        if share > 1
-    ]
+    weak, most = [], 0.0
+    for name, need in zip(kinematics.joint_names, np.abs(torques), strict=True):
+        share = need / limits.get(name, np.inf)
+        most = max(most, share)
+        if share > 1:
+            unit = effort_unit(plant.GetJointByName(name, instance))
+            weak.append(f"{name} needs {need:.1f} of {limits[name]:.1f} {unit}")
     yield _judged(
         "effort against gravity",
         not weak,
-        f"{100 * max(shares.values(), default=0):.0f} % at most",
+        f"{100 * most:.0f} % at most",
         "; ".join(weak),
         "check the effort limits' unit [N·m], the masses [kg], or straighten the legs",
     )
@@ -325,22 +320,20 @@ def _contacts(loop: LeggedLoop) -> _Check:
     for name, foot in robot.feet.items():
         body = plant.GetBodyByName(foot.body, loop.robot_instance)
         spheres = [
-            (inspector.GetPoseInFrame(g).translation(), inspector.GetShape(g).radius())
+            (*inspector.GetPoseInFrame(g).translation(), inspector.GetShape(g).radius())
             for g in plant.GetCollisionGeometriesForBody(body)
             if isinstance(inspector.GetShape(g), Sphere)
         ]
         for point in foot.contact_points:
-            if not any(
-                np.linalg.norm(centre - point) < _MATCH_M and abs(r - foot.radius_m) < _MATCH_M
-                for centre, r in spheres
-            ):
-                found = [f"{np.round(c, 4).tolist()} r {r:.4f}" for c, r in spheres]
-                missing.append(f"{name} at {point} r {foot.radius_m}; it has {found or 'none'}")
+            stated = (*point, foot.radius_m)
+            if not any(np.allclose(stated, sphere, rtol=0, atol=_MATCH_M) for sphere in spheres):
+                stated_spheres = [np.round(sphere, 4).tolist() for sphere in spheres] or "none"
+                missing.append(f"{name} at {point} r {foot.radius_m}; it has {stated_spheres}")
     yield _judged(
         "contact spheres",
         not missing,
         f"{loop.kinematics.num_contacts} in the model file",
-        "the model file has no such sphere: " + "; ".join(missing),
+        "the model file has no such sphere (x, y, z, r): " + "; ".join(missing),
         "add a collision sphere to the URDF, or correct contact_points and radius_m [m]",
     )
 
@@ -357,16 +350,18 @@ def _off_the_ground(loop: LeggedLoop) -> _Check:
         frames = map(query.inspector().GetFrameId, (pair.id_A, pair.id_B))
         bodies = [plant.GetBodyFromFrameId(frame) for frame in frames]
         is_ground = plant.world_body().index() in [body.index() for body in bodies]
-        if is_ground and pair.depth > _MATCH_M:
-            for body in bodies:
-                if body.model_instance() == loop.robot_instance and body.index() not in allowed:
-                    depths[body.name()] = max(pair.depth, depths.get(body.name(), 0.0))
-    told = ", ".join(f"'{name}' by {100 * depth:.1f} cm" for name, depth in depths.items())
+        if pair.depth < _MATCH_M or not is_ground:
+            continue
+        for body in bodies:
+            if body.model_instance() == loop.robot_instance and body.index() not in allowed:
+                depths[body.name()] = max(pair.depth, depths.get(body.name(), 0.0))
+    texts = [f"'{name}' by {100 * depth:.1f} cm" for name, depth in depths.items()]
     yield _judged(
         "off the ground",
         not depths,
         "in the standing posture the feet alone touch it",
-        f"in the standing posture the robot rests on shapes that reach into the ground: {told}",
+        "in the standing posture the robot rests on shapes that reach into the ground: "
+        f"{', '.join(texts)}",
         "look at them by `check --picture FILE`; make them smaller in the URDF [m]",
     )
 
@@ -387,9 +382,8 @@ def _stands(loop: LeggedLoop) -> _Check:
     standing = kinematics.contact_positions(kinematics.standing_positions())
     is_line = len(convex_hull(standing[:, :2].tolist())) < 3
     if is_line and not (is_still and margins.min() > 0):
-        kind = "biped" if len(loop.robot.feet) == 2 else "robot"
         where = f"{kinematics.num_contacts} points along a line"
-        problem = f"{loop.robot.name}: a {kind} on {where} cannot balance with this controller"
+        problem = f"{loop.robot.name}: a robot on {where} cannot balance with this controller"
         yield failed(_STANDS, problem, _LINE_REMEDY)
         return
     yield from _stands_safely(loop, margins)
@@ -431,19 +425,12 @@ def _walks(loop: Any) -> Generator[Finding, None, str]:
 
 def _stands_safely(loop: LeggedLoop, margins: np.ndarray) -> _Check:
     """Judges the margins of the standing posture."""
-    kinematics, height = loop.kinematics, loop.kinematics.standing_height
+    height = loop.kinematics.standing_height
     is_wrong = is_outside(margins[:, None])
     names = [loop.constraint_names[i] for i in np.flatnonzero(is_wrong)]
     wrong = [
         describe_margin(name, margin, loop.angular_constraints)
         for name, margin in zip(names, margins[is_wrong], strict=True)
-    ]
-    stops = zip(kinematics.joint_names, kinematics.posture, kinematics.position_limits, strict=True)
-    wrong += [
-        f"{joint} is at {value:.3g} rad, its stop at {stop:.3g}"
-        for joint, value, both in stops
-        for stop in both
-        if abs(value - stop) < _AT_STOP_RAD and {*names}.intersection(loop.angular_constraints)
     ]
     remedy = "change 'posture' in robot.yaml [rad]"
     if names == ["height"]:
