@@ -333,13 +333,6 @@ def test_a_term_has_the_joints_that_it_names_also_those_that_are_not_moved(tmp_p
     np.testing.assert_allclose(observation, [2.0, 0.1, 8.0, 6.0])
 
 
-@pytest.mark.train
-def test_joints_that_a_network_names_but_does_not_move_are_asked_for(tmp_path):
-    network = save_onnx(tmp_path / "p.onnx", 8, 2, metadata={"joint_names": "hip,knee,tail"})
-    with pytest.raises(ValueError, match="'joints' in the network's order, 2 that it moves; the"):
-        policy(tmp_path, network=str(network), joints=[], observation=terms("joint_pos_rel"))
-
-
 class Last(torch.nn.Module if torch else object):
     def forward(self, x):
         return x[:, -1, :2]

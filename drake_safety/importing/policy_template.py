@@ -28,17 +28,17 @@ class PolicyTemplate:
     """What the files of a policy tell.
 
     Attributes:
-        found: What a file of another project says, by key of ``policy.yaml``.
+        stated: Values of a file of another project, by key of ``policy.yaml``.
     """
 
     network: PolicyNetwork
-    found: dict[str, Any] = field(default_factory=dict)
+    stated: dict[str, Any] = field(default_factory=dict)
     source: str = ""
 
     @property
     def joints(self) -> list[str]:
         """The joints that the policy moves, in its order; empty if no file names them."""
-        return self.found.get("joints") or self.network.metadata.joints
+        return self.stated.get("joints") or self.network.metadata.joints
 
     def write(
         self, folder: Path, robot_joints: list[str], posture: dict[str, float]
@@ -55,7 +55,7 @@ class PolicyTemplate:
 
     def yaml(self, robot_joints: list[str], posture: dict[str, float]) -> tuple[str, list[str]]:
         """Returns the text of ``policy.yaml``, and what the user must supply."""
-        metadata, found = self.network.metadata, dict(self.found)
+        metadata, known = self.network.metadata, dict(self.stated)
         lines: list[str] = []
         asked: list[str] = []
 
@@ -63,23 +63,26 @@ class PolicyTemplate:
             lines.append(f"# {line}  # ASK {what}")
             asked.append(what)
 
-        names = f"joints: [{', '.join(map(yaml_text, robot_joints))}]"
         missing = [name for name in self.joints if name not in robot_joints]
-        if missing:
-            found.pop("joints", None)
-            ask(names, f"the robot's joints in the network's order; {missing} are none of them")
         _, num_moved = self.network.widths
-        observed = self.joints if num_moved not in (None, len(self.joints)) else []
-        if observed and not missing:
-            found.pop("joints", None)
-            names = f"joints: [{', '.join(map(yaml_text, observed))}]"
-            what = f"the {num_moved} joints that it moves, in its order, of the {len(observed)} "
-            ask(names, f"{what}that it names, which joint_pos_rel and joint_vel_rel observe")
+        observed: list[str] = []
+        if missing:
+            what = f"the robot's joints in the network's order; {missing} are none of them"
         elif not self.joints:
-            ask(names, "the joints that the network moves, in its order")
+            what = "the joints that the network moves, in its order"
+        elif num_moved not in (None, len(self.joints)):
+            observed = self.joints
+            what = f"the {num_moved} joints that it moves, in its order, of the {len(observed)} "
+            what += "that it names, which joint_pos_rel and joint_vel_rel observe"
+        else:
+            what = ""
+        if what:
+            known.pop("joints", None)
+            names = ", ".join(map(yaml_text, observed or robot_joints))
+            ask(f"joints: [{names}]", what)
         keys = {yaml_text(as_pattern(name)): value for name, value in posture.items() if value}
         values = ", ".join(f"{key}: {value:g}" for key, value in keys.items())
-        said = vars(metadata) | {"gains": metadata.stiffness and metadata.damping} | found
+        said = vars(metadata) | {"gains": metadata.stiffness and metadata.damping} | known
         for line, what in (
             (f"default_positions: {{{values}}}", "joint positions at zero action [rad]"),
             ("action_scale: {.*: 0.25}", "joint positions per unit of action [rad]"),
@@ -91,24 +94,24 @@ class PolicyTemplate:
             if not said[line.partition(":")[0]]:
                 ask(line, what)
         lines.append("# rotor_inertia: {.*: 0.01}  # that of training, if it had any [kg·m²]")
-        if "action_clip" not in found:
+        if "action_clip" not in known:
             ask("action_clip: 1.0", "the limit of actions in training, if any")
         if len(self.network.outputs) > 1:
             asked.append(f"its outputs are {self.network.outputs}: the first is the action")
-        if "period_s" not in found:
+        if "period_s" not in known:
             lines.append("period_s: 0.02  # ASK the time between two actions [s]")
             asked.append("the time between two actions [s]; 0.02 is assumed")
-        if metadata.observation and "observation" not in found:
+        if metadata.observation and "observation" not in known:
             without = {"name": "", "clip": math.inf}
-            found["observation"] = [without | term for term in metadata.observation]
-            for term in found["observation"] if observed else []:
+            known["observation"] = [without | term for term in metadata.observation]
+            for term in known["observation"] if observed else []:
                 if term["name"] in ("joint_pos_rel", "joint_vel_rel"):
                     term["joints"] = [*observed]
             unstated = [k for k in ("scale", "history") if k not in metadata.observation[0]]
             if unstated:
                 what = f"{' and '.join(unstated)} of the terms of the observation"
                 asked.append(f"{what}; 1 is assumed, as the network only names them")
-        if "observation" not in found:
+        if "observation" not in known:
             width, _ = self.network.widths
             entries = "" if width is None else f", {width} entries"
             ask("observation:", f"the terms of the network's input in its order{entries}")
@@ -118,13 +121,13 @@ class PolicyTemplate:
                 "#   - {name: velocity_commands}",
                 f"# registered terms: {', '.join(registered_terms())}",
             ]
-        stated = {term["name"] for term in found.get("observation", [])}
-        if unknown := sorted(stated - set(registered_terms())):
+        terms = {term["name"] for term in known.get("observation", [])}
+        if unknown := sorted(terms - set(registered_terms())):
             asked.append(f"functions of the terms {unknown}, by @observation_term")
-        if "gait" in found and "period_s" not in found["gait"]:
-            gait = {"period_s": 0.8, **found.pop("gait")}
+        if "gait" in known and "period_s" not in known["gait"]:
+            gait = {"period_s": 0.8, **known.pop("gait")}
             ask(f"gait: {gait}".replace("'", ""), "the period of the gait's clock [s]")
-        if "command" not in found:
+        if "command" not in known:
             ranges, words = metadata.command, ""
             yaw = "ang_vel_z" if "ang_vel_z" in ranges else "ang_vel_yaw"
             pairs = [ranges.get(key) for key in ("lin_vel_x", "lin_vel_y", yaw)]
@@ -139,8 +142,8 @@ class PolicyTemplate:
             "# correct them, and delete the sign. docs/walking.md has all keys.",
             f"network: {self.network.path.name}",
         ]
-        if found:
-            text = yaml.safe_dump(found, default_flow_style=None, sort_keys=False, width=100)
+        if known:
+            text = yaml.safe_dump(known, default_flow_style=None, sort_keys=False, width=100)
             head.append(text.rstrip())
         asked = [f"policy.yaml: {what}" for what in (*asked, *metadata.unread)]
         return "\n".join([*head, *lines]) + "\n", asked
@@ -158,8 +161,8 @@ def survey_policy(
         announce: Called with what the network is, before it is loaded.
     """
     is_described = path.suffix in (".yaml", ".yml")
-    found = converted_policy(path, motors) if is_described else {}
-    file = Path(found.pop("network", path))
+    converted = converted_policy(path, motors) if is_described else {}
+    file = Path(converted.pop("network", path))
     for text in network_kinds([file]):
         announce(text)
-    return PolicyTemplate(network=load_network(file), found=found, source=path.name)
+    return PolicyTemplate(network=load_network(file), stated=converted, source=path.name)

@@ -55,8 +55,8 @@ class NewRobot:
     """A robot found in a model file, and the folder that `write_robot` has written.
 
     Attributes:
-        posture: Its standing joint positions [rad].
-        posture_source: Where they come from.
+        posture: Joint positions while it stands [rad].
+        posture_source: Where the posture comes from.
         wheels: Joints that turn wheels at the ends of legs.
         fixed: Joints that move neither a foot nor a hand.
         odd: Joints with efforts that no such motor has; robot.yaml estimates them.
@@ -95,16 +95,16 @@ class NewRobot:
     @property
     def decided(self) -> list[str]:
         """What was decided for it, and why; the scenario says so too."""
-        lines = self.files[-1].read_text(encoding="utf-8").splitlines()
-        found = [line.replace("# DECIDED ", "").strip() for line in lines if "# DECIDED" in line]
+        text = self.files[-1].read_text(encoding="utf-8")
+        lines = [line.strip() for line in text.splitlines() if "# DECIDED" in line]
         if self.fixed:
             reason = "they move neither a foot nor a hand, which --hands would name"
-            found.insert(0, f"joints {', '.join(self.fixed)} are fixed: {reason}")
-        return found
+            lines.insert(0, f"joints {', '.join(self.fixed)} are fixed: {reason}")
+        return [line.replace("# DECIDED ", "") for line in lines]
 
     @property
     def joints(self) -> list[str]:
-        """Its joints, in the order of its positions."""
+        """Names of the joints, in the order of the positions."""
         return [joint.name() for joint in self.survey.joints]
 
     @property
@@ -124,7 +124,7 @@ class NewRobot:
 
     @cached_property
     def sizes(self) -> Sizes:
-        """Its sizes as it stands."""
+        """Sizes of the robot as it stands."""
         survey, friction = self.survey, list(self.copy.joint_friction.values())
         points = [survey.positions(limb) for limb in self.legs]
         centroid = np.concatenate(points).mean(axis=0)
@@ -188,67 +188,67 @@ def write_robot(
         copy.source = model
         copy.left_out = facts.left_out + copy.left_out
         copy.notes += [f"it is converted from '{model.name}'", *facts.left_out][urdf == model :]
-        found = NewRobot(name=name, task=task, folder=Path(scratch), copy=copy, facts=facts)
-        _find_limbs(found, feet, hands, moved or ())
-        _fix_joints(found, moved)
-        _stand(found)
+        new = NewRobot(name=name, task=task, folder=Path(scratch), copy=copy, facts=facts)
+        _find_limbs(new, feet, hands, moved or ())
+        _fix_joints(new, moved)
+        _stand(new)
         # Copied to the target only when complete.
-        found.folder = Path(scratch) / "robot"
-        found.folder.mkdir()
-        description, robot, readme, scenario = found.files
+        new.folder = Path(scratch) / "robot"
+        new.folder.mkdir()
+        description, robot, readme, scenario = new.files
         copy.write(description)
-        robot.write_text(_robot_yaml(found), encoding="utf-8")
+        robot.write_text(_robot_yaml(new), encoding="utf-8")
         load_robot_file(robot)
-        scenario.write_text(scenario_yaml(task, found.sizes), encoding="utf-8")
-        readme.write_text(_readme(found), encoding="utf-8")
+        scenario.write_text(scenario_yaml(task, new.sizes), encoding="utf-8")
+        readme.write_text(_readme(new), encoding="utf-8")
         folder.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copytree(found.folder, folder)
-    found.folder = folder
-    return found
+        shutil.copytree(new.folder, folder)
+    new.folder = folder
+    return new
 
 
 def _find_limbs(
-    found: NewRobot, feet: list[str] | None, hands: list[str] | None, moved: Collection[str]
+    new: NewRobot, feet: list[str] | None, hands: list[str] | None, moved: Collection[str]
 ) -> None:
-    copy = found.copy
+    copy = new.copy
 
     if feet is None:
-        require_feet(found.survey, copy)
-    root = found.survey.base
-    pose, why = base_at_hips(found.survey, found.survey.legs(feet))
+        require_feet(new.survey, copy)
+    root = new.survey.base
+    pose, why = base_at_hips(new.survey, new.survey.legs(feet))
     if pose is not None:
         base = copy.add_root("hips", root, pose)
         copy.warn(f"the root link '{root}' {why}; the base is a new link '{base}'")
-        found.renew_survey()
+        new.renew_survey()
     elif why:
         copy.warn(f"the root link '{root}' {why}")
-    found.legs = found.survey.legs(feet)
-    require_motors(found.survey, found.legs, moved)
-    found.arms = found.survey.arms(found.legs, hands)
-    if found.task == "reaching" and not found.arms:
+    new.legs = new.survey.legs(feet)
+    require_motors(new.survey, new.legs, moved)
+    new.arms = new.survey.arms(new.legs, hands)
+    if new.task == "reaching" and not new.arms:
         raise ValueError(
             f"new: '{copy.source}' has no arm (a limb of four joints or more that is not a leg) to "
             "reach with; name its end by --hands, or use --task balancing"
         )
-    found.wheels = found.survey.wheels(found.legs)
+    new.wheels = new.survey.wheels(new.legs)
 
 
-def _fix_joints(found: NewRobot, moved: Collection[str] | None) -> None:
+def _fix_joints(new: NewRobot, moved: Collection[str] | None) -> None:
     """Fixes what moves no foot or hand, and notes couplings, motors and wheels."""
-    survey, copy, stated = found.survey, found.copy, set(moved or ())
+    survey, copy, stated = new.survey, new.copy, set(moved or ())
     drives = copy.drives
     legged, armed = (
         {joint for limb in limbs for joint in survey.chain(limb.body)}
-        for limbs in (found.legs, found.arms)
+        for limbs in (new.legs, new.arms)
     )
     used = legged | armed | (set(survey.limits) if moved is None else stated)
     used -= {name for name, (leader, *_) in drives.mimics.items() if leader in legged}
     coupled = used & set(drives.mimics)
     leaders = {drives.mimics[name][0] for name in coupled}
-    if coupled and found.task != "balancing":
+    if coupled and new.task != "balancing":
         raise ValueError(
             f"new: '{copy.source}': joints {sorted(coupled)} follow others by <mimic>, for which "
-            f"--task {found.task} has no controller; use --task balancing, or remove <mimic>"
+            f"--task {new.task} has no controller; use --task balancing, or remove <mimic>"
         )
     passive = drives.passive(sorted(used - legged - coupled - leaders - stated))
     used = used - set(passive) | leaders
@@ -260,17 +260,17 @@ def _fix_joints(found: NewRobot, moved: Collection[str] | None) -> None:
         (loose, "follow joints that move, by <mimic>, but move no foot or hand and are fixed"),
         (passive, f"have no motor and are fixed: {listed(passive)}"),
         (
-            {*turns} - {*found.wheels},
+            {*turns} - {*new.wheels},
             "of legs turn more than four times: are their limits in degrees instead of radians?",
         ),
         (
-            found.wheels,
+            new.wheels,
             "turn wheels: position servos hold them, so that they neither roll nor drive",
         ),
     ):
         if names:
             copy.warn(f"joints {sorted(names)} {note}")
-    for limb in found.legs:
+    for limb in new.legs:
         if not limb.is_own_shape:
             copy.replace_collisions(limb.body, limb.points, limb.radius_m)
         elif limb.body in copy.hulls:
@@ -282,45 +282,43 @@ def _fix_joints(found: NewRobot, moved: Collection[str] | None) -> None:
         X_BP, X_BC = (survey.pose(body.name()) for body in ends)
         poses[joint.name()] = X_BP.inverse() @ X_BC if joint.name() in drives.mimics else None
     copy.fix_joints(poses)
-    found.fixed = sorted(poses.keys() - loose - set(passive))
-    for limb in (*found.legs, *found.arms):
+    new.fixed = sorted(poses.keys() - loose - set(passive))
+    for limb in (*new.legs, *new.arms):
         limb.joints = [name for name in limb.joints if name not in poses]
-    found.renew_survey()
+    new.renew_survey()
 
 
-def _stand(found: NewRobot) -> None:
+def _stand(new: NewRobot) -> None:
     """Finds the posture, and what touches what in it."""
-    copy, source = found.copy, found.copy.source
-    require_masses(found.survey)
+    copy, source = new.copy, new.copy.source
+    require_masses(new.survey)
     try:
-        found.posture, found.posture_source = standing_posture(
-            found.survey, found.legs, found.facts.postures
-        )
+        new.posture, new.posture_source = standing_posture(new.survey, new.legs, new.facts.postures)
     except ValueError as error:
-        plant, context = found.survey.plant, found.survey.context
-        size = f"The robot is {extent(plant, context, found.survey.instance):.2g} m large"
+        plant, context = new.survey.plant, new.survey.context
+        size = f"The robot is {extent(plant, context, new.survey.instance):.2g} m large"
         raise ValueError(". ".join([f"{error}", size, *copy.warnings, *copy.left_out])) from error
-    for limb in found.legs:
+    for limb in new.legs:
         # Hulls welded to a foot end at the height of its contact points, which alone touch.
-        lowest = float(found.survey.positions(limb)[:, 2].min())
-        for link in set(found.survey.welded(limb.body)) & set(copy.hulls):
-            X_LW = found.survey.pose(link).inverse()
+        lowest = float(new.survey.positions(limb)[:, 2].min())
+        for link in set(new.survey.welded(limb.body)) & set(copy.hulls):
+            X_LW = new.survey.pose(link).inverse()
             up = X_LW.rotation().col(2)
             height = lowest + float(X_LW.translation() @ up)
             parts = [above(hull, up, height) for hull in copy.hulls[link]]
             copy.set_hulls(link, [part for part in parts if part is not None])
-    found.renew_survey()
-    survey = found.survey
-    survey.set_joints(found.posture)
+    new.renew_survey()
+    survey = new.survey
+    survey.set_joints(new.posture)
     model = survey.plant, survey.context, survey.instance
-    found.odd, limits = odd_limits(*model, copy.drives.efforts)
-    for joint in (one for one in joint_elements(copy.root) if one.get("name") in found.odd):
+    new.odd, limits = odd_limits(*model, copy.drives.efforts)
+    for joint in (one for one in joint_elements(copy.root) if one.get("name") in new.odd):
         for limit in joint.findall("limit"):
             limit.attrib.pop("effort", None)  # Of which robot.yaml has an estimate.
     for odd in filter(None, (odd_inertias(*model), limits)):
         copy.warn(odd)
-    copy.ignore_collisions(survey.overlaps() | found.facts.apart)
-    sizes = found.sizes
+    copy.ignore_collisions(survey.overlaps() | new.facts.apart)
+    sizes = new.sizes
     if not _LEAST_HEIGHT_M < sizes.height_m < _GREATEST_HEIGHT_M:
         raise ValueError(
             f"new: '{source}': base '{survey.base}' would stand {sizes.height_m:.3g} m high. "
@@ -331,29 +329,29 @@ def _stand(found: NewRobot) -> None:
             "the contact points of the feet lie on a line: on them, no posture stands by servos; "
             "--task walking takes a policy that balances"
         )
-    found.asked += [
+    new.asked += [
         f"where foot '{limb.body}' touches: the file has no shape there [m]"
-        for limb in found.legs
+        for limb in new.legs
         if limb.is_guess
     ]
     if not any(survey.geometries(survey.welded(survey.base))):  # Balls are thrown at it.
-        found.asked.append(
-            f"a <collision> shape of the base '{survey.base}', in {found.name}.urdf [m]: without "
+        new.asked.append(
+            f"a <collision> shape of the base '{survey.base}', in {new.name}.urdf [m]: without "
             "one no ball can hit it"
         )
 
 
-def _robot_yaml(found: NewRobot) -> str:
-    sizes, facts, names, source = found.sizes, found.facts, found.joints, found.copy.source.name
+def _robot_yaml(new: NewRobot) -> str:
+    sizes, facts, names, source = new.sizes, new.facts, new.joints, new.copy.source.name
     base, keys = yaml_text(sizes.base), {name: yaml_text(as_pattern(name)) for name in names}
-    posture = [f"{key}: {found.posture[j]:g}" for j, key in keys.items() if found.posture.get(j)]
+    posture = [f"{key}: {new.posture[j]:g}" for j, key in keys.items() if new.posture.get(j)]
     lines = [
-        f"# {found.name}: written from {source}. Lines marked ASK have values that",
+        f"# {new.name}: written from {source}. Lines marked ASK have values that",
         "# it lacks: look them up, and state their sources in README.md.",
-        f"name: {found.name}",
-        f"urdf: {found.name}.urdf",
+        f"name: {new.name}",
+        f"urdf: {new.name}.urdf",
         f"base: {base}  # {sizes.mass_kg:.2f} kg in all, {sizes.height_m:.3f} m high [m]",
-        f"posture:  # standing, {found.posture_source} [rad]",
+        f"posture:  # standing, {new.posture_source} [rad]",
         *_indented(posture),
         "feet:  # contact_points are centres of spheres, in the body's frame [m]",
     ]
@@ -361,27 +359,27 @@ def _robot_yaml(found: NewRobot) -> str:
     def ask(title: str, entries: list[str], what: str = "") -> None:
         """Adds a block, unless it is empty."""
         lines.extend([title, *_indented(entries)] if entries else [])
-        found.asked.extend([what] if entries and what else [])
+        new.asked.extend([what] if entries and what else [])
 
-    for limb in found.legs:
+    for limb in new.legs:
         points = [[round(float(value), 5) for value in point] for point in limb.points]
         about = [f"contact_points: {points}", f"radius_m: {float(f'{limb.radius_m:.5g}')}"]
         lines += _limb_lines(limb, about, "  # ASK its contact points [m]" * limb.is_guess)
-        if limb.joints[-1] in found.wheels:
+        if limb.joints[-1] in new.wheels:
             lines[-1] += "  # the last turns a wheel, which its servo holds"
-    lines += ["reaching_frames:"] * bool(found.arms)
-    for limb in found.arms:
+    lines += ["reaching_frames:"] * bool(new.arms)
+    for limb in new.arms:
         about = [
             "point: [0.0, 0.0, 0.0]  # ASK the point that reaches, in the body's frame [m]",
             "radius_m: 0.05  # ASK the radius of the hand's collision sphere [m]",
         ]
         lines += _limb_lines(limb, about)
-        found.asked.append(f"the point of hand '{limb.body}' that reaches, and its size [m]")
+        new.asked.append(f"the point of hand '{limb.body}' that reaches, and its size [m]")
     gains, guessed = [], [name for name in names if name not in facts.gains]
-    legs = {name for limb in found.legs for name in limb.joints}
+    legs = {name for limb in new.legs for name in limb.joints}
     for name, key in keys.items():
         stiffness = _STIFFNESS * sizes.load * (1.0 if name in legs else 0.5)
-        if effort_unit(found.survey.plant.GetJointByName(name, found.survey.instance)) == "N":
+        if effort_unit(new.survey.plant.GetJointByName(name, new.survey.instance)) == "N":
             stiffness /= sizes.height_m**2  # [N/m]
         stiffness, damping = facts.gains.get(name, (stiffness, _DAMPING_S * stiffness))
         origin = f"  # of {source}" if name in facts.gains else ""
@@ -390,41 +388,41 @@ def _robot_yaml(found: NewRobot) -> str:
     lines += [f"joint_gains:  # {note}[N·m/rad, N·m·s/rad]", *_indented(gains)]
     if guessed:
         which = f" of {len(guessed)} joints" if len(guessed) < len(keys) else ""
-        found.asked.append(
+        new.asked.append(
             f"the maker's servo gains{which} [N·m/rad, N·m·s/rad]; estimated from mass and height: "
             f"{_STIFFNESS * sizes.load:.3g} and {_STIFFNESS * _DAMPING_S * sizes.load:.2g} in legs"
         )
     rotors = [f"{keys[j]}: {facts.rotor_inertia[j]:.4g}" for j in names if j in facts.rotor_inertia]
     ask(f"rotor_inertia:  # of {source} [kg·m²]", rotors)
-    plant, efforts = found.survey.plant, []
-    indices = plant.GetJointActuatorIndices(found.survey.instance)
-    motors = [*map(plant.get_joint_actuator, indices)]
-    driven = {one.joint().name() for one in motors if math.isfinite(one.effort_limit())}
-    for name in (name for name in names if name not in driven - found.odd):
-        stated = limit = found.copy.drives.efforts[name]
-        unit, note = effort_unit(plant.GetJointByName(name, found.survey.instance)), ""
-        if name in found.odd or not 0 < limit < math.inf:
+    survey, efforts = new.survey, []
+    indices = survey.plant.GetJointActuatorIndices(survey.instance)
+    motors = [*map(survey.plant.get_joint_actuator, indices)]
+    driven = {motor.joint().name() for motor in motors if math.isfinite(motor.effort_limit())}
+    for name in (name for name in names if name not in driven - new.odd):
+        stated = limit = new.copy.drives.efforts[name]
+        unit, note = effort_unit(survey.plant.GetJointByName(name, survey.instance)), ""
+        if name in new.odd or not 0 < limit < math.inf:
             limit = float(f"{_FORCE * sizes.mass_kg if unit == 'N' else _TORQUE * sizes.load:.3g}")
-            what = "largest force" if unit == "N" else "largest torque"
-            said = f" ({source} says {stated:g})" * (name in found.odd)
+            what = f"largest {'force' if unit == 'N' else 'torque'}"
+            said = f" ({source} says {stated:g})" * (name in new.odd)
             note = f"  # ASK the motor's {what}{said} [{unit}]"
-            found.asked.append(f"the {what} of joint '{name}'{said} [{unit}]")
+            new.asked.append(f"the {what} of joint '{name}'{said} [{unit}]")
         efforts.append(f"{keys[name]}: {limit:g}{note}")
     ask("effort_limits:  # where the file has no motor, or no plausible limit [N·m, N]", efforts)
-    mu = found.foot_friction or 0.6
-    origin = f"that of {source}" if found.foot_friction else "assumed"
+    mu = new.foot_friction or 0.6
+    origin = f"that of {source}" if new.foot_friction else "assumed"
     lines.append(f"foot_friction: {mu:g}  # ASK Coulomb's coefficient of feet on your ground [1]")
-    found.asked.append(f"the friction of feet on your ground [1]; {mu:g} is {origin}")
+    new.asked.append(f"the friction of feet on your ground [1]; {mu:g} is {origin}")
     partners = {keys[one]: other.replace("\\", r"\\") for one, other in mirrored(names).items()}
     ask("mirror:", [f"{key}: {yaml_text(other)}" for key, other in partners.items()])
-    bare = found.copy.bare_links
+    bare = new.copy.bare_links
     ask(
         "without_collision:  # ASK shapes in place of these links' lost meshes [m]",
         [f"- {yaml_text(link)}" for link in bare],
         f"collision shapes of the {len(bare)} links under 'without_collision' in robot.yaml [m]",
     )
     lines += ["whole_body:", f"  orientation: {{{base}: {{weight: 20.0}}}}"]
-    if found.task == "balancing" and len(found.legs) > 2:
+    if new.task == "balancing" and len(new.legs) > 2:
         lines.append("  posture: {weight: 0.001}")
     return "\n".join(lines) + "\n"
 
@@ -436,21 +434,21 @@ def _indented(entries: list[str]) -> list[str]:
 def _limb_lines(limb: Limb, about: list[str], note: str = "") -> list[str]:
     body, joints = yaml_text(limb.body), ", ".join(map(yaml_text, limb.joints))
     entries = [f"body: {body}", *about, f"joints: [{joints}]"]
-    return [f"  {body}:{note}", *_indented(_indented(entries))]
+    return [f"  {body}:{note}", *(f"    {entry}" for entry in entries)]
 
 
-def _readme(found: NewRobot) -> str:
-    sizes = found.sizes
-    notes = "\n".join(f"- {note[0].upper()}{note[1:]}." for note in found.copy.notes)
-    asked = "\n".join(f"- [ ] {what}" for what in found.asked)
-    stated = f"`{found.copy.source.name}`"
-    has_gains = set(found.joints) <= found.facts.gains.keys()
+def _readme(new: NewRobot) -> str:
+    sizes = new.sizes
+    notes = "\n".join(f"- {note[0].upper()}{note[1:]}." for note in new.copy.notes)
+    asked = "\n".join(f"- [ ] {what}" for what in new.asked)
+    stated = f"`{new.copy.source.name}`"
+    has_gains = set(new.joints) <= new.facts.gains.keys()
     gains = stated if has_gains else "estimated from mass and height; replace them by ..."
-    friction = stated if found.foot_friction else "assumed; replace it by ..."
-    return f"""# {found.name}
+    friction = stated if new.foot_friction else "assumed; replace it by ..."
+    return f"""# {new.name}
 
 {sizes.mass_kg:.2f} kg; its base, `{sizes.base}`, stands {sizes.height_m:.3f} m high on
-{len(found.legs)} feet.
+{len(new.legs)} feet.
 
 ## Where the figures come from
 Fill in the sources, so that every figure can be looked up.
@@ -458,7 +456,7 @@ Fill in the sources, so that every figure can be looked up.
 | figure | source |
 |---|---|
 | masses, inertias, joints, limits | {stated}, from ... (address, version) |
-| standing posture | {found.posture_source} |
+| standing posture | {new.posture_source} |
 | servo gains | {gains} |
 | friction of the feet | {friction} |
 

@@ -91,7 +91,6 @@ def check_scenario(
             return
         yield from _guarded("standing posture", _posture, kinematics)
         yield from _guarded("motors", _motors, kinematics)
-        yield from _guarded("inertias", _inertias, kinematics)
         if check_robot is not None:
             yield from _guarded("model file", check_robot, kinematics)
     if not is_imported:
@@ -143,20 +142,17 @@ def _scenario(name: str | Path, is_imported: bool) -> Generator[Finding, None, S
         where = f"{getattr(sys.modules[task.__module__], '__file__', None)}"
     yield passed("scenario", f"'{scenario.name}' fits the schema{what}")
     yield passed("code", f"the scenario runs {scenario.task}, {where}")
-    if "nominal" not in scenario.variations:
-        yield failed(
-            "plants",
-            f"no variation 'nominal'; it has {list(scenario.variations)}",
-            "add `nominal: {}` under 'variations': the plant of the training episodes",
-        )
-        return None
+    missing = [name for name in ("nominal", "actual") if name not in scenario.variations]
     yield _judged(
         "plants",
-        "actual" in scenario.variations,
+        not missing,
         ", ".join(scenario.variations),
-        "no variation 'actual', which `run` and throws simulate",
-        "add `actual: {}` under 'variations', with the differences of the real robot",
+        f"no variations {missing}; it has {list(scenario.variations)}",
+        "add them under 'variations': `nominal` is the plant of the training episodes, `actual` "
+        "the real robot, which `run` simulates",
     )
+    if "nominal" in missing:
+        return None
     return scenario
 
 
@@ -268,6 +264,9 @@ def _motors(kinematics: RobotKinematics) -> _Check:
     if odd := odd_limits(plant, kinematics.context, instance, limits)[1]:
         remedy = "correct <limit> in the model file, or 'effort_limits' [N·m] and"
         yield passed("motor limits", odd, f"{remedy} 'velocity_limits' [rad/s] in robot.yaml")
+    if odd := odd_inertias(plant, kinematics.context, instance):
+        remedy = "correct <inertia>, <mass> and <origin> of these links [kg·m², kg, m] in"
+        yield passed("inertias", odd, f"{remedy} {Path(robot.urdf).name}")
     torques = kinematics.gravity_torques(q, np.ones(kinematics.num_contacts, dtype=bool))
     weak, most = [], 0.0
     for name, need in zip(kinematics.joint_names, np.abs(torques), strict=True):
@@ -283,16 +282,6 @@ def _motors(kinematics: RobotKinematics) -> _Check:
         "; ".join(weak),
         "check the effort limits' unit [N·m], the masses [kg], or straighten the legs",
     )
-
-
-def _inertias(kinematics: RobotKinematics) -> _Check:
-    """Checks masses and inertias; nothing is said of what is in order."""
-    plant, name = kinematics.plant, Path(kinematics.robot.urdf).name
-    kinematics.set_positions(kinematics.standing_positions())
-    instance = plant.GetModelInstanceByName(kinematics.robot.name)
-    if odd := odd_inertias(plant, kinematics.context, instance):
-        remedy = "correct <inertia>, <mass> and <origin> of these links [kg·m², kg, m] in"
-        yield passed("inertias", odd, f"{remedy} {name}")
 
 
 def _target(loop: LeggedLoop) -> _Check:
@@ -374,26 +363,35 @@ def _stands(loop: LeggedLoop) -> _Check:
     simulator.Initialize()
     margins = loop.GetOutputPort("margins").Eval(context).copy()
     simulator.AdvanceTo(1.0)
-    state_now = loop.GetOutputPort("plant_state").Eval(context)
-    q, v = np.split(state_now, [kinematics.num_positions])
+    q, v = np.split(loop.GetOutputPort("plant_state").Eval(context), [kinematics.num_positions])
     sunk = height - q[6]
     speed = float(np.abs(v[NUM_BASE_VELOCITIES:]).max(initial=0.0))
     is_still = abs(sunk) <= _SINK_SHARE * height and speed <= 1.0
-    standing = kinematics.contact_positions(kinematics.standing_positions())
-    is_line = len(convex_hull(standing[:, :2].tolist())) < 3
-    if is_line and not (is_still and margins.min() > 0):
-        where = f"{kinematics.num_contacts} points along a line"
-        problem = f"{loop.robot.name}: a robot on {where} cannot balance with this controller"
-        yield failed(_STANDS, problem, _LINE_REMEDY)
-        return
-    yield from _stands_safely(loop, margins)
+    is_wrong = is_outside(margins[:, None])
+    names = [loop.constraint_names[i] for i in np.flatnonzero(is_wrong)]
+    wrong = [
+        describe_margin(name, margin, loop.angular_constraints)
+        for name, margin in zip(names, margins[is_wrong], strict=True)
+    ]
+    yield _judged(
+        "safe while it stands",
+        not wrong,
+        "the posture is in the safe set",
+        f"the standing posture violates {'; '.join(wrong)}",
+        f"change 'posture' in robot.yaml [rad], or 'safe_set': it stands {height:.3f} m high",
+    )
     clearance = kinematics.contact_positions(q)[:, 2] - kinematics.foot_radii
     touching = int(np.sum(clearance < 5e-3))
     message = (
         f"after 1 s it has sunk {100 * sunk:.1f} cm, {touching} of {kinematics.num_contacts} "
         f"contact points touch, the fastest joint turns at {speed:.2f} rad/s"
     )
-    remedy = _POLICY_REMEDY if isinstance(loop, FollowsCommands) else _GAINS_REMEDY
+    standing = kinematics.contact_positions(kinematics.standing_positions())
+    remedy = _GAINS_REMEDY
+    if isinstance(loop, FollowsCommands):
+        remedy = _POLICY_REMEDY
+    elif len(convex_hull(standing[:, :2].tolist())) < 3:
+        remedy = _LINE_REMEDY
     yield _judged(_STANDS, is_still and touching > 0, message, message, remedy)
 
 
@@ -423,26 +421,6 @@ def _walks(loop: Any) -> Generator[Finding, None, str]:
     return f"correct '{_WALKS}' first: the policy does not walk"
 
 
-def _stands_safely(loop: LeggedLoop, margins: np.ndarray) -> _Check:
-    """Judges the margins of the standing posture."""
-    height = loop.kinematics.standing_height
-    is_wrong = is_outside(margins[:, None])
-    names = [loop.constraint_names[i] for i in np.flatnonzero(is_wrong)]
-    wrong = [
-        describe_margin(name, margin, loop.angular_constraints)
-        for name, margin in zip(names, margins[is_wrong], strict=True)
-    ]
-    remedy = "change 'posture' in robot.yaml [rad]"
-    if names == ["height"]:
-        remedy = (
-            f"widen 'height_m' under 'safe_set', such as [{0.71 * height:.3g}, "
-            f"{1.18 * height:.3g}] [m], which must include the standing height {height:.3f}"
-        )
-    problem = f"the standing posture violates {'; '.join(wrong)}"
-    item, ok = "safe while it stands", "the posture is in the safe set"
-    yield _judged(item, not wrong, ok, problem, remedy)
-
-
 def _episodes(
     loop: ClosedLoop, num_episodes: int, seed: int, report: StageProgress, first: str | None
 ) -> _Check:
@@ -461,7 +439,6 @@ def _episodes(
         "declare it as discrete, continuous or abstract state, or as a parameter",
     )
     causes = Counter(episode.cause for episode in episodes if not episode.is_safe)
-    yield passed("starts can be sampled", f"{num_episodes} episodes simulated")
     lost = sum(episode.num_steps == 0 for episode in episodes)
     if lost > num_episodes / 4:
         yield failed(
@@ -475,9 +452,8 @@ def _episodes(
         )
     share = sum(causes.values()) / num_episodes
     low, high = _UNSAFE_SHARES
-    message = f"{100 * share:.0f} % of {num_episodes} episodes: " + (
-        ", ".join(f"{name} {count}" for name, count in causes.items()) or "none"
-    )
+    counts = ", ".join(f"{name} {count}" for name, count in causes.items()) or "none"
+    message = f"{100 * share:.0f} % of {num_episodes} episodes: {counts}"
     start = getattr(loop.scenario.parameters, "start", None)
     present = "'safe_set'" + (f"; 'start' is {vars(start)}" if is_dataclass(start) else "")
     change, other = ("widen", "narrow") if share < low else ("narrow", "widen")
