@@ -120,6 +120,12 @@ def test_feet_that_do_not_fit_are_a_problem(own):
     assert "outside their polygon, at (" in finding.message
 
 
+def test_a_scenario_that_does_not_scale_is_read_before_its_robot(own):
+    edited(own / "balancing.yaml", parameters={})
+    edited(own / "robot.yaml", base="trunk")
+    assert "has no body 'trunk'" in problems(own / "balancing.yaml")["bodies and joints"].message
+
+
 MOTOR = """<transmission><type>transmission_interface/SimpleTransmission</type><joint name="knee_2">
 <hardwareInterface>EffortJointInterface</hardwareInterface></joint><actuator name="knee_2"/>
 </transmission></robot>"""
@@ -247,34 +253,28 @@ def test_a_robot_that_rests_on_its_trunk_is_not_ready(tmp_path):
     assert "shapes that reach into the ground: 'body' by " in finding.message
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (None, "does not exist"),
-        ("task: os:path\nrobot: x", "has no task 'path'"),
-    ],
-)
-def test_a_scenario_that_is_none_is_a_finding(tmp_path, text, message):
+def test_a_scenario_that_is_none_is_a_problem(tmp_path):
     path = tmp_path / "odd.yaml"
-    if text is not None:
-        path.write_text(text)
-    assert message in problems(path)["scenario"].message
+    assert "does not exist" in problems(path)["scenario"].message
+    path.write_text("task: os:path\nrobot: x")
+    assert "has no task 'path'" in problems(path)["scenario"].message
 
 
 @pytest.mark.parametrize(
-    ("name", "task", "folder", "message"),
+    ("name", "task", "message"),
     [
-        ("my robot", "balancing", "a", "a robot's name is letters"),
-        ("spider", "dancing", "a", r"task must be one of \['balancing', 'reaching', 'walking'\]"),
-        ("spider", "balancing", ".", "exists already"),
-        ("spider", "reaching", "a", "has no arm"),
+        ("my robot", "balancing", "a robot's name is letters"),
+        ("spider", "dancing", r"task must be one of \['balancing', 'reaching', 'walking'\]"),
+        ("spider", "reaching", "has no arm"),
     ],
 )
-def test_new_refuses_what_it_cannot_write(tmp_path, name, task, folder, message):
+def test_new_refuses_what_it_cannot_write(tmp_path, name, task, message):
     write_hexapod(tmp_path)
     with pytest.raises(ValueError, match=message):
-        write_robot(name, tmp_path / "hexapod.urdf", task, tmp_path / folder)
+        write_robot(name, tmp_path / "hexapod.urdf", task, tmp_path / "a")
     assert not (tmp_path / "a").exists()
+    with pytest.raises(ValueError, match="exists already"):
+        write_robot("spider", tmp_path / "hexapod.urdf", "balancing", tmp_path)
 
 
 def test_check_exits_with_1_when_there_is_a_problem_and_says_how_to_fix_it(own):
