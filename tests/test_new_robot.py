@@ -171,15 +171,6 @@ def urdf_of_spider(folder, change):
     return urdf
 
 
-def test_a_urdf_without_effort_limits_gets_estimates_to_be_asked_for(tmp_path):
-    urdf = urdf_of_spider(tmp_path, lambda text: text.replace('effort="40"', ""))
-    written = write_robot("spider", urdf, "balancing", tmp_path / "spider")
-    limits = yaml.safe_load((written.folder / "robot.yaml").read_text())["effort_limits"]
-    assert len(limits) == 18 and min(limits.values()) > 0
-    assert sum("the largest torque of joint" in what for what in written.asked) == 18
-    assert problems(written.folder / "balancing.yaml") == {}
-
-
 def test_a_base_whose_shape_is_a_flat_mesh_collides_as_its_box(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     stl(tmp_path / "trunk.stl", [[-0.2, -0.2, -0.04], [0.2, 0.2, 0.04], [0.2, -0.2, 0.04]])
