@@ -93,7 +93,7 @@ def test_feet_can_be_named_and_a_wrong_name_is_answered_with_those_that_exist(tm
     survey = Survey(tmp_path / "hexapod.urdf")
     legs = survey.legs(["tibia_0", "tibia_2", "tibia_4"])
     assert {leg.body for leg in legs} == {"tibia_0", "tibia_2", "tibia_4"}
-    with pytest.raises(ValueError, match=r"no limb ends in links \['paw'\]; limbs end in \['tibia_0'"):
+    with pytest.raises(ValueError, match=r"in links \['paw'\]; limbs end in \['tibia_0'"):
         survey.legs(["paw"])
     with pytest.raises(ValueError, match="found 1 feet, expected at least 2"):
         survey.legs(["tibia_0"])
