@@ -63,7 +63,6 @@ CASES = {
         "foot_friction: -1.0": "'foot_friction' must be greater than 0; got -1",
         "mirror: {(: x}": r"'mirror\.\(' must be a regular expression: .*; got '\('",
         "shapes: {seat: [{}]}": r"'shapes\.seat\.0': either box_m or a positive rad",
-        "shapes: {seat: [{box_m: [1, 1, 1], to_m: [0, 0, 0]}]}": "a capsule's other end, away",
         "shapes: {a: [{radius_m: 1}]}": r"shapes \['a'\] need collision: stated",
     },
     PolicyParameters: {
