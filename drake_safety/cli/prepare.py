@@ -165,11 +165,10 @@ def check(
             if finding.is_ok:
                 word = ("warning", "bold yellow") if finding.is_warning else ("OK     ", "green")
             # A line of a file cannot look like a finding.
-            message, remedy = (
-                one.replace("\n", "\n    ") for one in (finding.message, finding.remedy)
-            )
-            text = Text.assemble(word, f"  {finding.item}: {message}")
-            if remedy:
+            lines = f"  {finding.item}: {finding.message}".replace("\n", "\n    ")
+            text = Text.assemble(word, lines)
+            if finding.remedy:
+                remedy = finding.remedy.replace("\n", "\n    ")
                 text.append(f"\n         fix: {remedy}")
             console.say(text)
     if picture is not None:
@@ -184,8 +183,8 @@ def check(
         loaded, detector = load_scenario(scenario), load_assessment(assessment, MODES[0]).detector_
         duration_s = num_episodes * loaded.episode_duration_s
         watched = run_motions(loaded, duration_s, seed=seed, are_episodes=True, num_workers=1)
-        told, is_ok = detector.describe_alarms(watched)
-        console.say(told, style=None if is_ok else "yellow")
+        sentence, is_ok = detector.describe_alarms(watched)
+        console.say(sentence, style=None if is_ok else "yellow")
     if num_problems:
         console.say(f"{num_problems} problem{'s' * (num_problems > 1)}", style="red")
         raise Exit(1)

@@ -116,7 +116,7 @@ class NewRobot:
     def foot_friction(self) -> float:
         """Least friction of the shapes nearest to the contact points [1]; 0 if none is stated."""
         stated = [
-            min(shapes, key=lambda one: float(np.linalg.norm(one[0] - limb.points.mean(axis=0))))[1]
+            min(shapes, key=lambda shape: np.linalg.norm(shape[0] - limb.points.mean(axis=0)))[1]
             for limb in self.legs
             if (shapes := self.facts.friction.get(limb.body))
         ]
@@ -129,9 +129,9 @@ class NewRobot:
         points = [survey.positions(limb) for limb in self.legs]
         centroid = np.concatenate(points).mean(axis=0)
         half = np.abs(np.concatenate(points) - centroid).max(axis=0)
-        feet = np.array([one.mean(axis=0) for one in points])
-        legs = zip(points, self.legs, strict=True)
-        lowest = min(float(one[:, 2].min()) - limb.radius_m for one, limb in legs)
+        feet = np.array([of_foot.mean(axis=0) for of_foot in points])
+        radii = [limb.radius_m for limb in self.legs]
+        lowest = min(float(p[:, 2].min()) - r for p, r in zip(points, radii, strict=True))
         reach, shoulder = 0.0, np.zeros(3)
         for arm in self.arms[:1]:
             origins = [survey.joint_origin(joint) for joint in arm.joints]
@@ -277,7 +277,7 @@ def _fix_joints(new: NewRobot, moved: Collection[str] | None) -> None:
             copy.set_hulls(limb.body, [])
             copy.notes.append(f"foot '{limb.body}' has no hull: its spheres alone touch")
     poses: dict[str, RigidTransform | None] = {}
-    for joint in (one for one in survey.joints if one.name() not in used):
+    for joint in (joint for joint in survey.joints if joint.name() not in used):
         ends = joint.parent_body(), joint.child_body()
         X_BP, X_BC = (survey.pose(body.name()) for body in ends)
         poses[joint.name()] = X_BP.inverse() @ X_BC if joint.name() in drives.mimics else None
@@ -312,9 +312,9 @@ def _stand(new: NewRobot) -> None:
     survey.set_joints(new.posture)
     model = survey.plant, survey.context, survey.instance
     new.odd, limits = odd_limits(*model, copy.drives.efforts)
-    for joint in (one for one in joint_elements(copy.root) if one.get("name") in new.odd):
-        for limit in joint.findall("limit"):
-            limit.attrib.pop("effort", None)  # Of which robot.yaml has an estimate.
+    for joint in joint_elements(copy.root):
+        for limit in joint.findall("limit") if joint.get("name") in new.odd else []:
+            limit.attrib.pop("effort", None)  # robot.yaml has an estimate of it.
     for odd in filter(None, (odd_inertias(*model), limits)):
         copy.warn(odd)
     copy.ignore_collisions(survey.overlaps() | new.facts.apart)
@@ -413,7 +413,7 @@ def _robot_yaml(new: NewRobot) -> str:
     origin = f"that of {source}" if new.foot_friction else "assumed"
     lines.append(f"foot_friction: {mu:g}  # ASK Coulomb's coefficient of feet on your ground [1]")
     new.asked.append(f"the friction of feet on your ground [1]; {mu:g} is {origin}")
-    partners = {keys[one]: other.replace("\\", r"\\") for one, other in mirrored(names).items()}
+    partners = {keys[name]: other.replace("\\", r"\\") for name, other in mirrored(names).items()}
     ask("mirror:", [f"{key}: {yaml_text(other)}" for key, other in partners.items()])
     bare = new.copy.bare_links
     ask(

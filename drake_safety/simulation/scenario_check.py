@@ -165,8 +165,8 @@ def _robot(scenario: Scenario) -> Generator[Finding, None, RobotModel | None]:
     yield passed("files", "found")
     text = robot_files(scenario.robot)[0].read_text(encoding="utf-8")
     if asked := [line.strip() for line in text.splitlines() if "# ASK the motor's" in line]:
-        told = f"those of {len(asked)} joints are estimates, such as {asked[0]}"
-        yield passed("effort limits", told, f"{_EFFORT_REMEDY}, and delete the remark")
+        message = f"those of {len(asked)} joints are estimates, such as {asked[0]}"
+        yield passed("effort limits", message, f"{_EFFORT_REMEDY}, and delete the remark")
     return robot
 
 
@@ -332,7 +332,8 @@ def _off_the_ground(loop: LeggedLoop) -> _Check:
     plant, context = loop.plant, loop.CreateDefaultContext()
     loop.reset_to(context, None, loop.standing_start())
     query = plant.get_geometry_query_input_port().Eval(plant.GetMyContextFromRoot(context))
-    feet = [plant.GetBodyByName(one.body, loop.robot_instance) for one in loop.robot.feet.values()]
+    names = [foot.body for foot in loop.robot.feet.values()]
+    feet = [plant.GetBodyByName(name, loop.robot_instance) for name in names]
     allowed = {body.index() for foot in feet for body in plant.GetBodiesWeldedTo(foot)}
     depths: dict[str, float] = {}
     for pair in query.ComputePointPairPenetration():
