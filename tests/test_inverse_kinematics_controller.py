@@ -124,3 +124,9 @@ def test_commands_stay_within_the_joints_limits(name, height):
     lowest, highest = kinematics.position_limits.T
     assert np.all((position >= lowest) & (position <= highest))
     assert np.all(np.abs(rate) <= kinematics.velocity_limits)
+
+
+def test_an_input_that_is_not_finite_is_an_error_not_a_crash():
+    bench = Commanded("laikago", desired=np.array([np.nan, 0.0, 0.4]))
+    with pytest.raises((ValueError, RuntimeError)):
+        bench.simulator.Initialize()

@@ -14,6 +14,8 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
 
 from drake_safety.control import whole_body_qp
 from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.mirror import Mirror
+from drake_safety.control.observation import quaternion_of
 from drake_safety.control.whole_body_model import EQUALITY, PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import ITERATION_LIMIT, SOLVED, build_qp, solve_qp
 from legged_robots import robot_kinematics, robot_model
@@ -325,3 +327,45 @@ def test_a_state_or_set_point_that_is_not_finite_is_refused_not_fatal(value, ent
         (v if entry == "velocity" else q)[3] = value
     with pytest.raises(ValueError, match="state and set points must be finite"):
         build_qp(model, q, v, reference)
+
+
+def test_in_the_air_joints_follow_the_posture():
+    whole = whole_body_model("hexapod")
+    model = only(whole, "posture")
+    q, v = moving_state(model, np.random.default_rng(8), size=0.2)
+    reference = model.reference(q)
+    reference.is_stance = np.zeros(len(model.feet), bool)
+    solution = solved(model, q, v, reference)
+    assert solution.forces.shape == (0, 3)
+    expected = 64.0 * (reference.posture - q[7:]) - 11.0 * v[6:]
+    np.testing.assert_allclose(solution.vdot[6:], expected, atol=0.01)
+
+
+def test_the_torques_do_not_depend_on_place_or_heading(model):
+    # The friction pyramid points along the world's axes, so by quarter turns.
+    kinematics = model.kinematics
+    q, v, reference = random_program(model, np.random.default_rng(10), size=0.3)
+    X = RigidTransform(RotationMatrix.MakeZRotation(np.pi / 2), [3.0, -2.0, 0.0])
+    turn = X.rotation().matrix()
+    X_WB = RigidTransform(RotationMatrix(quaternion_of(q)), q[4:7])
+    moved_q = kinematics.positions_at(X @ X_WB, q[7:])
+    moved_v = np.concatenate([turn @ v[:3], turn @ v[3:6], v[6:]])
+    moved = copy.deepcopy(reference)
+    for point in filter(None, (moved.center_of_mass, moved.reaching)):
+        point.position, point.rate = X @ point.position, turn @ point.rate
+    moved.orientations = [X.rotation() @ R for R in reference.orientations]
+    there, here = solved(model, moved_q, moved_v, moved), solved(model, q, v, reference)
+    np.testing.assert_allclose(there.torques, here.torques, atol=1e-5)
+
+
+def test_a_mirrored_robot_needs_the_mirrored_torques():
+    model = whole_body_model("biped")  # Symmetric in its masses too.
+    mirror = Mirror(model.kinematics)
+    q, v, reference = random_program(model, np.random.default_rng(11), size=0.3)
+    mirrored_q, mirrored_v = mirror.plant_state(q, v, np.zeros(3))
+    mirrored = copy.deepcopy(reference)
+    for point in (mirrored.center_of_mass, mirrored.reaching):
+        point.position, point.rate = mirror.points(point.position), mirror.points(point.rate)
+    expected = mirror.joints(solved(model, q, v, reference).torques)
+    found = solved(model, mirrored_q, mirrored_v, mirrored).torques
+    np.testing.assert_allclose(found, expected, atol=1e-6)
