@@ -1,38 +1,68 @@
 """Live sessions: clicks and sliders, as a browser sends them, and what comes of them."""
 
+import contextlib
+import dataclasses
 import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar
+from unittest import mock
 
 import numpy as np
 import pytest
 from pydrake.geometry import Meshcat
 
+from cart_pole_task import SCENARIO as CART_POLE
+from cart_pole_task import CartPole
 from command_line import call
-from drake_safety import load_scenario
+from drake_safety import AddSafetyAssessor, load_scenario
 from drake_safety.cli.console import LOOPBACK, open_viewer
-from drake_safety.live.session import (
-    AXES,
-    DIRECTION,
-    FORCE,
-    GO,
-    MASS,
-    SPEED,
-    START,
-    STOP,
-    THROW,
-    TICK_S,
-    LiveSession,
-)
+from drake_safety.cli.training_folder import assessment_file
+from drake_safety.live import session as live
+from drake_safety.live.session import GO, PUSH, START, STOP, TICK_S, LiveSession
+from drake_safety.plants.pushes import Push
+from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
+from drake_safety.simulation.scenario import parse_scenario
+from gliding_task import Gliding, gliding
 from live_scenarios import learned, quick
-from reaching_targets import NEAR, SCENARIO, learned_targets
+from reaching_targets import FAR, NEAR, SCENARIO, learned_targets
+from shuttle_task import shuttling
 
-FAR = ("0.95", "0.5", "1.05")
+train = pytest.mark.train
+SHOWN_S = 1.5
 
 
-def move(session, values):
-    for name, value in zip(AXES, values, strict=True):
-        session.panel.set_value(name, float(value))
+class BareCartPole(CartPole):
+    """A task whose constructor takes no Meshcat."""
+
+    def __init__(self, scenario, variation="nominal", *, assessment=None):
+        super().__init__(scenario, variation, assessment=assessment)
+
+
+class Pushed(Gliding):
+    """A mass that can be pushed."""
+
+    pushes: ClassVar[dict] = {}
+
+    def sample_push(self, rng):
+        return Push(force_n=[rng.uniform(2.0, 3.0), 0.0, 0.0])
+
+    def set_push(self, context, push):
+        x, _ = self.GetOutputPort("state").Eval(context)
+        mass_context = self.mass.GetMyMutableContextFromRoot(context)
+        mass_context.SetDiscreteState([x, push.force_n[0]])
+
+
+class FewPorts(Gliding):
+    """A task that exports no more of its assessor than it has to."""
+
+    def export(self, builder, ports, *, period_s):
+        inputs = {name: ports[name] for name in ("state", "desired_preview", "features", "margins")}
+        assessor = AddSafetyAssessor(builder, self.assessment, period_s=period_s, **inputs)
+        ports |= {name: assessor.GetOutputPort(name) for name in ASSESSMENT_PORTS}
+        for name, port in ports.items():
+            builder.ExportOutput(port, name)
 
 
 @pytest.fixture(scope="module")
@@ -43,13 +73,7 @@ def meshcat():
 @pytest.fixture(scope="module")
 def throws_loop(meshcat):
     scenario = quick(load_scenario("laikago_balancing"))
-    options = {"meshcat": meshcat, "ball": True}
-    return scenario.make_loop("nominal", assessment=learned(scenario, 8), **options)
-
-
-@pytest.fixture
-def throws(throws_loop, meshcat):
-    return LiveSession(throws_loop, meshcat, threshold=0.4)
+    return scenario.make_loop(assessment=learned(scenario, 8), meshcat=meshcat, ball=True)
 
 
 @pytest.fixture(scope="module")
@@ -57,58 +81,103 @@ def goals_loop(meshcat):
     return load_scenario(SCENARIO).make_loop(assessment=learned_targets(), meshcat=meshcat)
 
 
+@pytest.fixture(scope="module")
+def commands_loop(meshcat):
+    scenario = quick(load_scenario("go2_walking"))
+    return scenario.make_loop(assessment=learned(scenario, 8), meshcat=meshcat, guard=True)
+
+
+@pytest.fixture(scope="module")
+def cart_loop(meshcat):
+    scenario = parse_scenario(CART_POLE, name="cart_pole", folder=Path())
+    return scenario.make_loop(assessment=learned(scenario, 200), meshcat=meshcat)
+
+
+@pytest.fixture
+def throws(throws_loop, meshcat):
+    return LiveSession(throws_loop, meshcat, threshold=0.4)
+
+
 @pytest.fixture
 def goals(goals_loop, meshcat):
     return LiveSession(goals_loop, meshcat, threshold=0.4)
 
 
-@pytest.mark.train
+@pytest.fixture
+def commands(commands_loop, meshcat):
+    return LiveSession(commands_loop, meshcat, threshold=0.5)
+
+
+@pytest.fixture
+def cart(cart_loop, meshcat):
+    return LiveSession(cart_loop, meshcat, threshold=0.5)
+
+
+def value_of(session, port):
+    return session.loop.GetOutputPort(port).Eval(session.context).copy()
+
+
+def move(session, goal):
+    for name, value in zip(live.AXES, goal, strict=True):
+        session.panel.set_value(name, value)
+
+
+def set_cart(session, *state):
+    cart = session.loop.cart
+    cart.SetPositionsAndVelocities(cart.GetMyMutableContextFromRoot(session.context), state)
+
+
+def ticks(session, *clicks, num=1):
+    for name in clicks:
+        session.panel.click(name)
+    for _ in range(num):
+        assert session.tick()
+
+
+@train
 def test_a_click_throws_the_ball_of_the_sliders_once(throws):
-    ball = throws.loop.GetOutputPort("ball_state")
-    throws.tick()
-    assert np.linalg.norm(ball.Eval(throws.context)[4:6]) > 5  # Far away.
-    for name, value in ((MASS, 2.0), (SPEED, 4.0), (DIRECTION, 90.0)):
+    ticks(throws)
+    assert np.linalg.norm(value_of(throws, "ball_state")[4:6]) > 5  # Far away.
+    for name, value in ((live.MASS, 2.0), (live.SPEED, 4.0), (live.DIRECTION, 90.0)):
         throws.panel.set_value(name, value)
-    throws.panel.click(THROW)
-    throws.tick()
-    state = ball.Eval(throws.context)
-    assert state[-3:-1] == pytest.approx([0.0, 4.0], abs=1e-6)
+    ticks(throws, live.THROW)
+    before = value_of(throws, "ball_state")
+    assert before[-3:-1] == pytest.approx([0.0, 4.0], abs=1e-6)
     assert throws.panel.status.note == "ball of 2 kg at 4 m/s towards 90°"
-    was = state[4:7]
-    throws.tick()
-    assert ball.Eval(throws.context)[5] - was[1] == pytest.approx(4.0 * TICK_S, rel=0.05)
+    ticks(throws)
+    after = value_of(throws, "ball_state")
+    assert after[5] - before[5] == pytest.approx(4.0 * TICK_S, rel=0.05)
 
 
-@pytest.mark.train
+@train
 def test_a_robot_that_has_fallen_is_stood_up_again_after_a_while(throws):
-    context = throws.context
-    plant = throws.loop.plant
-    plant_context = plant.GetMyMutableContextFromRoot(context)
-    state = plant.GetPositionsAndVelocities(plant_context, throws.loop.robot_instance)
+    plant, robot = throws.loop.plant, throws.loop.robot_instance
+    plant_context = plant.GetMyMutableContextFromRoot(throws.context)
+    state = plant.GetPositionsAndVelocities(plant_context, robot)
     state[6] = 0.12  # The base, on the ground.
-    plant.SetPositionsAndVelocities(plant_context, throws.loop.robot_instance, state)
+    plant.SetPositionsAndVelocities(plant_context, robot, state)
     throws.tick()
     assert throws.has_fallen
     assert throws.panel.status.state == "fallen"
-    for _ in range(round(1.5 / TICK_S) + 1):
+    for _ in range(round(SHOWN_S / TICK_S) + 1):
         throws.tick()
     assert not throws.has_fallen
     assert throws.context.get_time() <= 2 * TICK_S
 
 
-@pytest.mark.train
+@train
 def test_stop_ends_a_session_and_its_pace_is_what_was_simulated(throws, monkeypatch):
-    tick, ticks = throws.tick, []
+    tick, results = throws.tick, []
 
-    def stopped_after_ten():
-        ticks.append(tick())
-        if len(ticks) == 10:
+    def tick_and_stop_after_ten():
+        results.append(tick())
+        if len(results) == 10:
             throws.panel.click(STOP)
-        return ticks[-1]
+        return results[-1]
 
-    monkeypatch.setattr(throws, "tick", stopped_after_ten)
+    monkeypatch.setattr(throws, "tick", tick_and_stop_after_ten)
     throws.run()
-    assert len(ticks) == 10
+    assert len(results) == 10
     assert throws.panel.is_stopped
     pace = throws.pace
     assert pace.simulated_s == pytest.approx(throws.context.get_time())
@@ -117,52 +186,239 @@ def test_stop_ends_a_session_and_its_pace_is_what_was_simulated(throws, monkeypa
     assert pace.simulated_s / pace.elapsed_s <= 1.3
 
 
-@pytest.mark.train
-def test_moving_the_target_changes_the_verdict_and_moves_nothing_else(goals):
+@train
+def test_the_robot_stays_in_the_middle_of_the_picture(throws, monkeypatch):
+    moved, camera, context = {}, throws._camera, throws.context
+    spy = SimpleNamespace(
+        SetTransform=lambda path, X, time_s: moved.update({path: X.translation()})
+    )
+    monkeypatch.setattr(camera, "meshcat", spy)
+    camera._target = camera._target + [1.3, -0.7]  # As after a step.
+    base = value_of(throws, "plant_state")[4:6]
+    camera.follow(context)
+    assert np.linalg.norm(base + moved["/drake"][:2]) > 1
+    for _ in range(20):
+        camera._time_s -= TICK_S  # As if the simulation had gone on.
+        camera.follow(context)
+    assert base + moved["/drake"][:2] == pytest.approx([0, 0], abs=0.02)
+    assert np.abs(moved["/drake/grid"][:2] - base).max() <= 0.3
+
+
+@train
+def test_a_goal_is_judged_where_it_is_moved_and_go_names_an_accepted_one_nearby(goals):
     move(goals, NEAR)
     assert not goals.tick()
     assert goals.verdict.is_accepted
     assert goals.panel.status.state == f"accepted: probability {goals.verdict.probability:.2f}"
     move(goals, FAR)
     assert not goals.tick()
-    assert not goals.verdict.is_accepted
     assert goals.panel.status.state.startswith("refused")
-    assert goals.context.get_time() == 0.0
-
-
-@pytest.mark.train
-def test_go_is_refused_where_gamma_refuses_and_an_accepted_target_nearby_is_told(goals):
-    move(goals, FAR)
     goals.panel.click(GO)
     assert not goals.tick()
-    assert goals.context.get_time() == 0.0
-    assert goals.nearest is not None
     distance_cm = 100 * np.linalg.norm(goals.nearest.goal - goals.verdict.goal)
     assert f"accepted {distance_cm:.0f} cm away" in goals.panel.status.note
+    assert goals.context.get_time() == 0.0
 
 
-@pytest.mark.train
-@pytest.mark.parametrize(("target", "button"), [(NEAR, GO), (FAR, FORCE)])
-def test_the_robot_goes_where_it_may_or_is_forced_to(goals, target, button):
-    move(goals, target)
-    goals.panel.click(button)
-    assert goals.tick()
+@train
+@pytest.mark.parametrize(("goal", "button"), [(NEAR, GO), (FAR, live.FORCE)])
+def test_the_robot_goes_to_an_accepted_goal_or_by_force_to_any(goals, goal, button):
+    move(goals, goal)
+    ticks(goals, button)
     assert goals.context.get_time() == pytest.approx(TICK_S)
-    before = goals.loop.GetOutputPort("output").Eval(goals.context).copy()
-    for _ in range(30):
-        assert goals.tick()
-    wanted = np.array(target, dtype=float)
-    after = goals.loop.GetOutputPort("output").Eval(goals.context)
-    assert np.linalg.norm(after - wanted) < np.linalg.norm(before - wanted) - 0.02
+    before = np.linalg.norm(value_of(goals, "output") - goal)
+    ticks(goals, num=30)
+    assert np.linalg.norm(value_of(goals, "output") - goal) < before - 0.02
     goals.panel.click(START)
     assert not goals.tick()
     assert goals.context.get_time() == 0.0
 
 
-def test_a_loop_without_gamma_cannot_be_played_with(meshcat):
-    loop = load_scenario("laikago_balancing").make_loop()
+@train
+def test_goals_need_no_legs(meshcat):
+    scenario = quick(shuttling())
+    session = LiveSession(scenario.make_loop(assessment=learned(scenario)), meshcat, threshold=0.5)
+    assert not session.tick()
+    ticks(session, live.FORCE, num=10)
+    assert not session.has_fallen
+
+
+@train
+def test_keys_change_the_command_within_the_range_of_training(commands):
+    ticks(commands, "Faster", "Turn left")
+    high = commands.loop.target_box[1]
+    np.testing.assert_allclose(commands.command, high * [1 / 8, 0.0, 1 / 8])
+    for _ in range(8):
+        ticks(commands, "Faster")
+    assert commands.command[0] == high[0]
+    ticks(commands, live.HALT, num=4)
+    np.testing.assert_array_equal(commands.command, np.zeros(3))
+    np.testing.assert_allclose(value_of(commands, "desired_preview"), 0.0, atol=1e-9)
+
+
+@train
+def test_without_the_guard_what_is_asked_is_passed_on(commands):
+    ticks(commands, live.GUARD)
+    assert not commands.is_guarded
+    ticks(commands, "Faster", num=4)
+    np.testing.assert_allclose(value_of(commands, "desired_output"), commands.command)
+    assert value_of(commands, "guard_active")[0] == 0.0
+    ticks(commands, live.GUARD)
+    assert commands.is_guarded
+
+
+@train
+def test_a_push_moves_the_robot(commands):
+    ticks(commands, num=3)
+    before = value_of(commands, "output")
+    ticks(commands, PUSH, num=5)
+    assert np.linalg.norm((value_of(commands, "output") - before)[:2]) > 0.5
+    assert "pushed with" in commands.panel.status.note
+
+
+@train
+def test_the_verdict_is_that_of_the_probability(cart):
+    states = set()
+    for tick in range(150):
+        if tick % 50 == 20:
+            set_cart(cart, 0.6, 0.0, 1.5, 0.0)  # On its way to the end of the rail.
+        assert cart.tick()
+        assert cart.panel.probability == value_of(cart, "safety_probability")[0]
+        last = pytest.approx(cart.panel.probability, abs=0.001)
+        assert cart.panel.curve()[-1] == (0.0, last)
+        status = cart.panel.status
+        if not cart.cause:
+            is_known = cart.panel.belief[2] <= 0.65  # Half of it is from empty cells.
+            refused = "unsafe" if is_known else "don't know"
+            assert status.state == ("safe" if cart.panel.probability >= 0.5 else refused)
+            assert status.tone == (status.state if is_known else "plain")
+            states.add(status.state)
+    assert {"safe", "unsafe"} <= states
+
+
+@train
+def test_a_state_unlike_training_is_not_called_unsafe_but_unknown(cart):
+    set_cart(cart, 0.0, 0.0, 15.0, 0.0)
+    ticks(cart)
+    assert cart.panel.belief == (0.0, 0.0, 1.0)
+    assert (cart.panel.status.state, cart.panel.status.cause) == ("don't know", "")
+
+
+@train
+def test_an_alarm_of_the_monitor_is_shown_with_its_cause(cart):
+    ticks(cart, num=10)
+    assert "monitor" not in cart.panel.status.note
+    monitor = cart.loop.GetSubsystemByName("safety_assessor").monitor
+    always = dataclasses.replace(cart.assessment.detector_, alarm_level=-1.0)
+    monitor_context = monitor.GetMyMutableContextFromRoot(cart.context)
+    monitor.adopt(monitor_context, SimpleNamespace(detector_=always))
+    ticks(cart, num=10)
+    cause = cart.loop.GetOutputPort("alarm_cause").Eval(cart.context)
+    assert cause
+    assert cart.panel.status.note == f"R starts anew; monitor: {cause}"
+
+
+@train
+def test_starts_are_those_of_the_seed_and_a_click_begins_the_next(cart_loop, meshcat):
+    starts = []
+    for _ in range(2):
+        session = LiveSession(cart_loop, meshcat, threshold=0.5, seed=3)
+        starts.append(value_of(session, "state"))
+        ticks(session, num=10)
+        ticks(session, START)
+        assert session.context.get_time() == pytest.approx(TICK_S)
+        starts.append(value_of(session, "state"))
+    np.testing.assert_array_equal(starts[:2], starts[2:])
+    assert np.abs(starts[0] - starts[1]).max() > 0.1
+    assert session.panel.buttons == {STOP: "Escape", START: "KeyR"}
+
+
+@train
+@pytest.mark.parametrize(
+    ("state", "shown_after_s", "what"),
+    [
+        ((0.0, 0.0, 0.0, 0.0), 2.0, "the episode's 2 s have passed; the next start follows"),
+        ((0.95, 0.0, 10.0, 0.0), TICK_S, "left the safe set: rail"),
+    ],
+)
+def test_the_end_of_an_episode_is_shown_until_the_next_start(cart, state, shown_after_s, what):
+    set_cart(cart, *state)
+    ticks(cart, num=round(shown_after_s / TICK_S))
+    for _ in range(round(SHOWN_S / TICK_S) - 1):
+        assert what in (cart.panel.status.state, cart.panel.status.note)
+        cart.tick()
+    ticks(cart, num=3)
+    assert cart.context.get_time() < 4 * TICK_S
+    assert not cart.cause
+    assert cart.panel.status.note == "R starts anew"
+
+
+@train
+@pytest.mark.parametrize(("failure", "why"), [("raise", "the solver failed"), ("nan", "finite")])
+def test_a_simulation_that_fails_is_shown_and_the_next_begins(meshcat, failure, why):
+    scenario = quick(gliding(failure=failure, speed_m_s=4.0))
+    loop = scenario.make_loop(assessment=learned(scenario), meshcat=meshcat)
+    session = LiveSession(loop, meshcat, threshold=0.5)
+    while session.tick():
+        pass
+    num_waits = 1
+    while not session.tick():
+        assert session.panel.status.state == "the simulation failed"
+        assert why in session.panel.status.note
+        num_waits += 1
+    assert num_waits * live.BREAK_S == pytest.approx(SHOWN_S, abs=2 * live.BREAK_S)
+    assert session.context.get_time() == pytest.approx(TICK_S)
+    loop.mass.parameters.fails_at_start = True
+    session = LiveSession(loop, meshcat, threshold=0.5)
+    assert session.panel.status.note == "no start"
+    loop.mass.parameters.fails_at_start = False
+    ticks(session, START)
+
+
+@train
+def test_a_task_is_pushed_by_a_button_and_must_export_what_is_shown(meshcat):
+    scenario = quick(gliding())
+    assessment = learned(scenario)
+    session = LiveSession(Pushed(scenario, assessment=assessment), meshcat, threshold=0.5)
+    ticks(session, PUSH)
+    assert value_of(session, "state")[1] >= 2.0
+    with pytest.raises(ValueError, match=r"'FewPorts' exports no port \['cause_probability'"):
+        LiveSession(FewPorts(scenario, assessment=assessment), meshcat, threshold=0.5)
     with pytest.raises(ValueError, match="without an assessment"):
-        LiveSession(loop, meshcat, threshold=0.4)
+        LiveSession(scenario.make_loop(), meshcat, threshold=0.4)
+
+
+@train
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["cart_pole_task:CartPole", "test_live_session:BareCartPole"])
+def test_a_task_is_played_and_run_and_an_empty_scene_is_warned_of(
+    monkeypatch, capsys, tmp_path, task
+):
+    page = pytest.importorskip("drake_safety.live.page")
+    panels = []
+
+    @contextlib.contextmanager
+    def serve_page(panel, **_):
+        timer = threading.Timer(0.5, panel.click, [STOP])
+        timer.start()
+        yield
+        timer.join()
+        panels.append(panel)
+
+    monkeypatch.setattr(page, "serve_page", serve_page)
+    file = tmp_path / "cart_pole.yaml"
+    file.write_text(CART_POLE.replace("cart_pole_task:CartPole", task))
+    learned(quick(load_scenario(file))).save(assessment_file(tmp_path, "sharpened"))
+    for command in ("play", "run"):
+        broken = mock.patch("drake_safety.cli.run.timeline_figure", side_effect=RuntimeError)
+        with broken, contextlib.suppress(RuntimeError):
+            assert call(monkeypatch, command, file, "--assessment", tmp_path) in (0, None)
+        printed = capsys.readouterr().out
+        assert (f"warning: task '{task}' draws nothing in Meshcat" in printed) == ("Bare" in task)
+        assert command == "run" or "real-time factor" in printed
+    assert panels[0].status.state == "stopped"
+    # The pictures of a run come last.
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"recording.html", "run.json"}
 
 
 def test_play_without_an_assessment_or_a_library_for_pages_says_what_to_do_first(
@@ -177,25 +433,7 @@ def test_play_without_an_assessment_or_a_library_for_pages_says_what_to_do_first
     assert "pip install 'drake_safety[live]'" in capsys.readouterr().out
 
 
-@pytest.mark.train
-def test_the_robot_stays_in_the_middle_of_the_picture(throws, monkeypatch):
-    moved, camera, context = {}, throws._camera, throws.context
-    spy = SimpleNamespace(
-        SetTransform=lambda path, X, time_s: moved.update({path: X.translation()})
-    )
-    monkeypatch.setattr(camera, "meshcat", spy)
-    camera._target = camera._target + [1.3, -0.7]  # As after a step.
-    base = throws.loop.GetOutputPort("plant_state").Eval(context)[4:6]
-    camera.follow(context)
-    assert np.linalg.norm(base + moved["/drake"][:2]) > 1
-    for _ in range(20):
-        camera._time_s -= TICK_S  # As if the simulation had gone on.
-        camera.follow(context)
-    assert base + moved["/drake"][:2] == pytest.approx([0, 0], abs=0.02)
-    assert np.abs(moved["/drake/grid"][:2] - base).max() <= 0.3
-
-
-def test_only_this_machine_reaches_a_page_unless_it_is_asked_for(capsys):
+def test_only_this_machine_reaches_a_viewer_unless_it_is_asked_for():
     here, everywhere = open_viewer(LOOPBACK), open_viewer("0.0.0.0")
     lines = Path("/proc/net/tcp").read_text().splitlines()
     listening = {line.split()[1] for line in lines if " 0A " in line}
