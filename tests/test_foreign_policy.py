@@ -211,11 +211,6 @@ def test_slices_that_an_exporter_writes_are_read(tmp_path):
             converted_policy(file, MOTORS)
 
 
-def test_names_of_joints_are_asked_for(tmp_path):
-    with pytest.raises(ValueError, match=r"has 2 joints; got 0 names.*in that order by --motors"):
-        converted_policy(deploy(tmp_path), [])
-
-
 def test_terms_that_nobody_has_registered_are_asked_for(tmp_path):
     path = deploy(tmp_path, lambda c: c["observations"].update(lidar={}))
     text, asked = survey_policy(path, MOTORS).yaml(JOINTS, {})
@@ -260,9 +255,3 @@ def test_a_phase_has_a_clock_whose_period_is_asked_for(tmp_path):
     # It runs while the robot stands, too.
     after = policy.next_phases(policy.initial_phases, np.zeros(3))[0]
     assert after == pytest.approx(2 * math.pi * 0.02 / 0.8)
-
-
-def test_a_file_of_no_known_project_is_refused(tmp_path):
-    path = dump(tmp_path / "odd.yaml", {"a": 1})
-    with pytest.raises(ValueError, match=r"odd.yaml' is neither a deploy.yaml .*keys are \['a'\]"):
-        converted_policy(path)

@@ -155,6 +155,7 @@ def test_new_refuses_a_policy_before_it_writes_anything(tmp_path):
     for policy in ("gone.pt", "odd.yaml"):
         out, result = new(tmp_path, tmp_path / policy)
         assert result.exit_code != 0 and not out.exists()
+    assert "odd.yaml' is neither a deploy.yaml" in str(result.exception)
     result = invoked("new", "walker", "--urdf", tmp_path / "hexapod.urdf", "--task", "walking")
     assert result.exit_code != 0
 
