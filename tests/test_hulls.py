@@ -137,3 +137,17 @@ def test_mujoco_takes_the_hulls_too(spider, tmp_path):
     edited(file, variations={"nominal": {}, "in_mujoco": {"engine": "mujoco"}})
     loop = load_scenario(file).make_loop("in_mujoco", ball=False)
     assert np.isfinite(run_episode(loop, 0, seed=0).margins).all()
+
+
+def test_a_picture_is_without_a_mesh_that_has_no_normals(spider, tmp_path, caplog):
+    own = shutil.copytree(spider.folder, tmp_path / "own")
+    (own / "bare.obj").write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\n")
+    urdf, bare = own / "spider.urdf", urdf_files.mesh("visual", "bare.obj")
+    urdf.write_text(urdf_files.with_shape(urdf.read_text(), "femur_3", bare))
+    loop = load_scenario(own / "balancing.yaml").make_loop()
+    context = loop.plant.CreateDefaultContext()
+    camera = StillCamera(loop, loop.plant.GetPositions(context), width=96, height=72)
+    (note,) = [record.getMessage() for record in caplog.records]
+    assert note.startswith("the picture is without a mesh: OBJ has no normals:")
+    assert "bare.obj" in note
+    assert np.ptp(camera.render(loop.plant.GetPositions(context))) > 100

@@ -169,3 +169,16 @@ def test_a_model_file_is_found_by_url_or_path(tmp_path):
     # A path starts in the folder unless it is absolute.
     assert model_file("meshes/shelf.sdf", str(tmp_path)) == tmp_path / "meshes" / "shelf.sdf"
     assert model_file(str(tmp_path / "shelf.sdf"), "/elsewhere") == tmp_path / "shelf.sdf"
+
+
+def test_the_mass_scale_leaves_other_models_alone():
+    plant = MultibodyPlant(0.001)
+    first, second = robot_model("biped"), robot_model("hexapod")
+    add_robot(plant, first)
+    add_robot(plant, second)
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    instance = [plant.GetModelInstanceByName(second.name)]
+    before = plant.CalcTotalMass(context, instance)
+    apply_masses(plant, context, first, PlantVariation(mass_scale=2.0))
+    assert plant.CalcTotalMass(context, instance) == before

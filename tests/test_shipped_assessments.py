@@ -235,3 +235,15 @@ def test_masked_inputs_are_not_known(entry, form):
     result = assessment.predict(**rows)
     assert np.isinf(result.novelty[1]) and np.isfinite(result.novelty[0])
     np.testing.assert_array_equal(result.belief[1], [0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, int])
+def test_numbers_of_another_type_are_judged_as_floats(dtype):
+    assessment = load_assessment("laikago_balancing")
+    names = ("state", "desired_preview", "features")
+    rows = [np.ones((2, assessment.info_.widths[name])) for name in names]
+    expected, found = (
+        assessment.predict(*(part.astype(kind) for part in rows)) for kind in (float, dtype)
+    )
+    np.testing.assert_array_equal(found.novelty, expected.novelty)
+    np.testing.assert_array_equal(found.belief, expected.belief)
