@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import socket
 import sys
 import threading
 from pathlib import Path
@@ -11,13 +12,14 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from pydrake.geometry import Meshcat
+from pydrake.geometry import Meshcat, Sphere
+from pydrake.math import RigidTransform
 
 from cart_pole_task import SCENARIO as CART_POLE
 from cart_pole_task import CartPole
 from command_line import call
 from drake_safety import AddSafetyAssessor, load_scenario
-from drake_safety.cli.console import LOOPBACK, open_viewer
+from drake_safety.cli.console import LOOPBACK, open_recorder, open_viewer
 from drake_safety.cli.training_folder import assessment_file
 from drake_safety.live import session as live
 from drake_safety.live.session import GO, PUSH, START, STOP, TICK_S, LiveSession
@@ -442,3 +444,18 @@ def test_only_this_machine_reaches_a_viewer_unless_it_is_asked_for():
     assert f"00000000:{here.port():04X}" not in listening
     with pytest.raises(ValueError, match=rf"no page can be served at {LOOPBACK}:{here.port()}"):
         open_viewer(LOOPBACK, here.port())
+
+
+def test_a_recorder_serves_nobody_and_records():
+    before = {*Path("/dev/fd").iterdir()}
+    viewer = open_recorder()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection((LOOPBACK, viewer.port()), timeout=1.0)
+    viewer.SetObject("/drake/ball", Sphere(0.1))
+    viewer.StartRecording()
+    viewer.SetTransform("/drake/ball", RigidTransform([0.0, 0.0, 1.0]), 0.5)
+    viewer.StopRecording()
+    viewer.PublishRecording()
+    assert "animation" in viewer.StaticHtml()
+    del viewer
+    assert {*Path("/dev/fd").iterdir()} == before

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
 import shlex
+import socket
 import sys
 from collections.abc import Iterable
 from functools import partial
@@ -121,6 +124,24 @@ def open_viewer(host: str = LOOPBACK, port: int | None = None, *, has_rate: bool
     except RuntimeError as error:
         place = host if port is None else f"{host}:{port}"
         raise ValueError(f"no page can be served at {place}: {error}") from error
+
+
+def open_recorder() -> Meshcat:
+    """Starts a Meshcat that records and serves nobody."""
+    viewer = open_viewer(port=0)
+    for place in Path("/dev/fd").iterdir():
+        number = int(place.name)
+        with contextlib.suppress(OSError):
+            opened = socket.socket(fileno=number)
+            try:
+                is_server = opened.getsockname()[1:] == (viewer.port(),)
+            finally:
+                opened.detach()
+            # Drake has no Meshcat without a server: an empty file takes the place of its socket.
+            if is_server:
+                with Path(os.devnull).open() as nothing:
+                    os.dup2(nothing.fileno(), number, inheritable=False)
+    return viewer
 
 
 def warn_of_empty_scene(meshcat: Meshcat, task: str) -> None:

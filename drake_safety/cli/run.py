@@ -128,7 +128,7 @@ def run(
         simulated = partial(_throw, throws=parse_pushes(loaded, push or []))
     elif push:
         require(loop, HasBall, "run: --push")
-    viewer = console.open_viewer()
+    viewer = console.open_viewer() if meshcat else console.open_recorder()
     options |= console.given(guard=guard or None)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=viewer, **options)
     if meshcat:
