@@ -7,7 +7,6 @@ import atexit
 import json
 import math
 import os
-import pickletools
 import re
 import sys
 import warnings
@@ -349,11 +348,12 @@ def _described(path: Path) -> str:
             head = archive.open(names["data.pkl"]).read(_MOST_PICKLED)
     if not head.startswith(b"\x80"):
         return ""
-    keys: list[str] = []
-    with suppress(ValueError):  # Only the beginning was read.
-        for _, argument, _ in pickletools.genops(head):
-            if isinstance(argument, str) and re.fullmatch(_KEYS_OF_CHECKPOINTS, argument):
-                keys.append(argument)
+    # The strings of a pickle stand after their length, of one byte or four.
+    texts = (
+        head[match.end() : match.end() + (match[1] or match[2])[0]].decode(errors="replace")
+        for match in re.finditer(rb"X(.)\0{3}|\x8c(.)", head, re.DOTALL)
+    )
+    keys = [text for text in texts if re.fullmatch(_KEYS_OF_CHECKPOINTS, text)]
     kind = f"a training checkpoint ({', '.join(keys[:4])})" if keys else "a Python pickle"
     return f", but {kind}: export the policy as TorchScript (torch.jit.save) or ONNX"
 
