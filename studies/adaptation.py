@@ -11,7 +11,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drake_safety.cli.adapt import ActualPlant
 from drake_safety.cli.console import (
     AssessmentOption,
     ScenarioArgument,
@@ -22,6 +21,7 @@ from drake_safety.cli.training_folder import (
     adapted_folder,
     assessment_folder,
     episodes_folder,
+    feedback_options,
 )
 from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
 from drake_safety.evaluation.results import Key
@@ -34,6 +34,8 @@ from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import ADAPTATION
 from drake_safety.learning.segments import Episode, Episodes, Segments, split
 from drake_safety.simulation.dataset import load_episodes
+from drake_safety.simulation.feedback import run_pairs
+from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.worker_processes import map_items
 from studies.baselines import DirectClassifier
@@ -100,10 +102,18 @@ def adaptation(
         seeds = [ADAPTATION.seeds(study.seed + _POOL_STRIDE * i) for i in range(pools)]
         spent = [one for block in seeds for one in block.values()]
         priors = {mode: study.load(mode, spent) for mode in MODES}
-        plant = ActualPlant(loaded, variation, learned.out, workers, stages)
-        drawn = [plant.pairs(feedback, block["adaptation"]) for block in seeds]
+        drawn, fresh = [], []
+        for block in seeds:
+            drawn_seed = block["adaptation"]
+            kept = feedback_options(loaded, learned.out, variation, drawn_seed, workers)
+            report = partial(stages, "actual episodes and their twins")
+            drawn.append(run_pairs(loaded, feedback, seed=drawn_seed, progress=report, **kept))
+            fresh_seed = block["evaluation of the adaptation"]
+            kept = feedback_options(loaded, learned.out, variation, fresh_seed, workers)
+            kept |= {"path": kept["path"] / variation}
+            report = partial(stages, "fresh actual episodes")
+            fresh.append(run_episodes(loaded, evaluate, seed=fresh_seed, progress=report, **kept))
         sets = [pairs.feedback() for pairs in drawn]
-        fresh = [plant.fresh(evaluate, block["evaluation of the adaptation"]) for block in seeds]
         sizes = [size for size in _SCRATCH_SIZES if scratch and size <= feedback]
         learned_from = {f"scratch {size}": drawn[0].actual[:size] for size in sizes}
         for mode, prior in priors.items():

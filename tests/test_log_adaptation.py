@@ -129,7 +129,7 @@ def test_a_short_log_without_a_difference_is_said_to_change_nothing(
     assert "no correction of Γ (sharpened): the only pair ends as on the nominal plant" in printed
     assert "0 min of an actual robot's correct its prediction" in printed
     assert "about 40 pairs, as of 24 s of logs" in printed
-    assert "sharpened: one pair, so that none is held out" in printed
+    assert "sharpened: only one pair: nothing is held out" in printed
 
 
 def test_a_promise_after_logs_is_for_a_plant_that_is_named(folder, capsys, monkeypatch, tmp_path):

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated
 
 import numpy as np
 from typer import Option
@@ -17,20 +17,17 @@ from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, mean
 from drake_safety.evaluation.results import Results
-from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import LEAST_MOTION_S
 from drake_safety.learning.feedback import EpisodePair
 from drake_safety.learning.seeds import ADAPTATION, MOTION
 from drake_safety.learning.segments import Episodes
-from drake_safety.logs.episodes import cut_log, motions_from_log, require_loggable
-from drake_safety.logs.robot_log import LogPieces, read_pieces
-from drake_safety.simulation.feedback import EpisodePairs, pair_starts, run_pairs
-from drake_safety.simulation.legged_loop import LeggedLoop
-from drake_safety.simulation.rollouts import run_episodes, run_motions
+from drake_safety.logs.episodes import cut_log, motions_from_log
+from drake_safety.logs.robot_log import read_pieces
+from drake_safety.simulation.feedback import pair_starts, run_pairs
+from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
-_MOST_CUTS = 3  # Printed of a log.
 _NUM_FOLDS = 5  # Of the feedback, each of which is judged after adapting to the others.
 _MOTION_S = 1.25 * LEAST_MOTION_S  # Of a simulated actual plant, some of which may leave.
 
@@ -78,20 +75,30 @@ def adapt(
     folder = out or folders.adapted_folder(learned.out, name)
     folders.check_writable(folder)
     with console.open_stages() as stages:
-        plant = ActualPlant(loaded, variation, learned.out, workers, stages)
         if log_map is not None:
             loop = loaded.make_loop("actual")
-            read = [log_pieces(loop, one, log_map, is_strict=strict).pieces for one in logs]
-            pieces = list(chain.from_iterable(read))
-            cut = [cut_log(one, loop) for one in read]
-            found = enumerate(chain.from_iterable(episodes for episodes, _ in cut))
-            actual = Episodes(cut[0][0].info, [replace(one, index=i) for i, one in found])
-            starts = list(chain.from_iterable(starts for _, starts in cut))
-            pairs = pair_starts(loaded, actual, starts, seed=seed)
-            step_s = priors[MODES[0]].detector_.step_s
-            motions = motions_from_log(pieces, loaded, step_s=step_s)
+            pieces, cut = [], []
+            for path in logs:
+                read = read_pieces(path, log_map, loop.robot)
+                if strict and read.lost:
+                    raise ValueError(f"{read.lost[0]}, expected a log of which nothing is lost")
+                if summary := read.summary():
+                    console.say(summary, style="yellow")
+                pieces += read.pieces
+                cut.append(cut_log(read.pieces, loop))
+            episodes = chain.from_iterable(episodes for episodes, _ in cut)
+            numbered = [replace(episode, index=i) for i, episode in enumerate(episodes)]
+            starts = [*chain.from_iterable(starts for _, starts in cut)]
+            pairs = pair_starts(loaded, Episodes(cut[0][0].info, numbered), starts, seed=seed)
+            motions = motions_from_log(pieces, loop, step_s=priors[MODES[0]].detector_.step_s)
         else:
-            pairs, motions = plant.pairs(feedback, seed), plant.motion(seed)
+            kept = folders.feedback_options(loaded, learned.out, variation, seed, workers)
+            report = partial(stages, "actual episodes and their twins")
+            pairs = run_pairs(loaded, feedback, seed=seed, progress=report, **kept)
+            kept |= {"path": kept["path"] / "motion"}
+            report = partial(stages, "undisturbed actual motion")
+            drawn = MOTION.seeds()["motion of the actual robot"]
+            motions = run_motions(loaded, _MOTION_S, seed=drawn, progress=report, **kept)
         sets = pairs.feedback()
         held, unit = "parts of the log" if logs else "episodes", np.arange(len(pairs.actual))
         if len(logs) > 1:
@@ -122,69 +129,10 @@ def adapt(
     Results(figures, console.made_by(loaded.name) | entries).write(folder / "adaptation.json")
     _print_changes(loaded, adapted, gap, name)
     for mode in MODES:
-        console.say(f"{mode}: {_told_of(judged[mode], held)}")
+        console.say(f"{mode}: {_summary(judged[mode], held)}")
     for mode in adapted:
         console.say("assessment", folders.assessment_file(folder, mode))
     console.say("figures   ", folder / "adaptation.json")
-
-
-class ActualPlant(NamedTuple):
-    """Simulations of an actual plant, which the folder of a training keeps."""
-
-    scenario: Scenario
-    variation: str
-    folder: Path
-    workers: int | None
-    stages: StageProgress
-
-    def pairs(self, num_pairs: int, seed: int) -> EpisodePairs:
-        """Actual episodes and their nominal twins."""
-        kept = self._kept("actual episodes and their twins", seed)
-        return run_pairs(self.scenario, num_pairs, seed=seed, **kept)
-
-    def fresh(self, num_episodes: int, seed: int) -> Episodes:
-        """Other episodes of the actual plant."""
-        kept = self._kept("fresh actual episodes", seed, self.variation)
-        return run_episodes(self.scenario, num_episodes, seed=seed, **kept)
-
-    def motion(self, seed: int) -> Episodes:
-        """Undisturbed motion of the actual plant, beside the pairs of a seed."""
-        kept = self._kept("undisturbed actual motion", seed, "motion")
-        drawn = MOTION.seeds()["motion of the actual robot"]
-        return run_motions(self.scenario, _MOTION_S, seed=drawn, **kept)
-
-    def _kept(self, what: str, seed: int, within: str = "") -> dict[str, Any]:
-        hash_ = self.scenario.simulation_hash(self.variation)
-        return self.scenario.options_for("pairs", self.variation) | {
-            "variation": self.variation,
-            "num_workers": self.workers,
-            "path": self.folder / "feedback" / f"{hash_[:12]}-{seed}" / within,
-            "progress": partial(self.stages, what),
-            "extra": {"command": console.command_line()},
-        }
-
-
-def log_pieces(loop: LeggedLoop, log: Path, log_map: Path, *, is_strict: bool = False) -> LogPieces:
-    """The pieces of a log without gaps; where it is cut is printed."""
-    require_loggable(loop)
-    found = read_pieces(log, log_map, loop.robot)
-    if is_strict and found.lost:
-        raise ValueError(f"{found.lost[0]}, expected a log of which nothing is lost")
-    cuts = found.cuts[:_MOST_CUTS]
-    if num_more := len(found.cuts) - len(cuts):
-        cuts.append(f"... and {num_more} more; --strict refuses such a log")
-    if cuts:
-        console.say(
-            f"log '{log}' is cut where values are missing and at gaps, or resampled: "
-            if found.lost
-            else f"log '{log}' is read with notes: ",
-            f"{100 * found.kept_share:.1f} % of {found.duration_s:.1f} s are kept, in "
-            f"{len(found.pieces)} pieces",
-            *(f"\n{cut}" for cut in cuts),
-            sep="",
-            style="yellow",
-        )
-    return found
 
 
 def _held_out(
@@ -192,35 +140,38 @@ def _held_out(
 ) -> dict[str, Estimate]:
     """Brier scores on actual episodes, before and after adapting to those of other units.
 
-    Units (N,) are the pairs' logs, or the pairs; intervals are over them. One alone has no score.
+    Units (N,) are the pairs' logs, or the pairs; intervals are over them. A single one has no
+    score.
     """
-    fold, errors = np.unique(units, return_inverse=True)[1] % _NUM_FOLDS, []
-    for one in range(fold.max() + 1 if fold.any() else 0):
-        adapted = prior.adapt([pairs[i] for i in np.flatnonzero(fold != one)])
-        for i in np.flatnonzero(fold == one):
+    folds, errors = np.unique(units, return_inverse=True)[1] % _NUM_FOLDS, []
+    for fold in range(folds.max() + 1 if folds.any() else 0):
+        adapted = prior.adapt([pairs[i] for i in np.flatnonzero(folds != fold)])
+        for i in np.flatnonzero(folds == fold):
             rows, variation = pairs[i].rows, pairs[i].info.variation
-            safe = [one.predict_rows(rows, variation).probability for one in (prior, adapted)]
-            before, after = (np.array(safe) - ~rows.is_unsafe) ** 2
+            before, after = (
+                (assessment.predict_rows(rows, variation).probability - ~rows.is_unsafe) ** 2
+                for assessment in (prior, adapted)
+            )
             errors.append(np.array([before, after, after - before, np.full(len(rows), units[i])]))
     if not errors:
         return {}
-    *values, unit = np.concatenate(errors, axis=1)
-    found = [mean(one, unit, bootstrap=Bootstrap()) for one in values]
-    return dict(zip(("before", "after", "change"), found, strict=True))
+    *columns, unit = np.concatenate(errors, axis=1)
+    means = [mean(column, unit, bootstrap=Bootstrap()) for column in columns]
+    return dict(zip(("before", "after", "change"), means, strict=True))
 
 
-def _told_of(found: Mapping[str, Estimate], held: str) -> str:
+def _summary(scores: Mapping[str, Estimate], held: str) -> str:
     """Whether Γ gets better on what it was not adapted to."""
-    if not found:
-        return "one pair, so that none is held out to judge the adaptation"
-    before, after, change = found.values()
-    told = "no clear change"
+    if not scores:
+        return "only one pair: nothing is held out to judge the adaptation"
+    before, after, change = scores.values()
+    verdict = "no clear change"
     if change.n < _NUM_FOLDS:
-        told = "too few to tell"
+        verdict = "too few to tell"
     elif change.low > 0 or change.high < 0:
-        told = "worse" if change.low > 0 else "better"
+        verdict = "worse" if change.low > 0 else "better"
     return (
-        f"{told} on {change.n} held-out {held}: Brier score {before.value:.3f} before, "
+        f"{verdict} on {change.n} held-out {held}: Brier score {before.value:.3f} before, "
         f"{after.value:.3f} after, {change.value:+.3f} ({change.low:+.3f} to {change.high:+.3f})"
     )
 

@@ -11,7 +11,6 @@ from typer import Option
 
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
-from drake_safety.cli.adapt import log_pieces
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.timeline_figure import levels_figure
@@ -19,7 +18,7 @@ from drake_safety.files.schema import load_typed_file
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import rows_of
 from drake_safety.logs.episodes import motions_from_log
-from drake_safety.logs.robot_log import FORMATS
+from drake_safety.logs.robot_log import FORMATS, read_pieces
 from drake_safety.logs.sequences import Motion, SequenceMap, read_sequences
 from drake_safety.simulation.rollouts import worker_loop
 from drake_safety.simulation.scenario import Scenario
@@ -92,7 +91,9 @@ def _motions(
         yield from ((what | {"sequence": i}, motions) for i, motions in enumerate(read))
     else:
         loop = worker_loop(scenario, "actual")()
-        pieces = log_pieces(loop, file, log_map)
+        pieces = read_pieces(file, log_map, loop.robot)
+        if summary := pieces.summary():
+            console.say(summary, style="yellow")
         found = motions_from_log(pieces.pieces, loop, step_s=gamma.detector_.step_s)
         what["left_safe_set"] = next((one.cause for one in found if not one.is_safe), "")
         yield (

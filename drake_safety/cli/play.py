@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import secrets
+import signal
 import socket
 import sys
 from typing import Annotated
@@ -78,10 +79,14 @@ def play(
     console.warn_of_empty_scene(meshcat, loaded.task)
     served = {"host": host, "port": page_port, "scene_url": meshcat.web_url()}
     with serve_page(session.panel, **served, names=allow_host or ()):
+        # An exception of a handler could be raised, and lost, inside Drake.
+        numbers = (signal.SIGINT, signal.SIGTERM)
+        handlers = {number: signal.signal(number, session.end) for number in numbers}
         console.say(f"live at http://{host}:{page_port}")
         console.say("Stop, on the page, or Ctrl-C ends")
-        with contextlib.suppress(KeyboardInterrupt):
-            session.run()
+        session.run()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
     pace = session.pace
     if pace.simulated_s == 0.0:
         console.say("nothing was simulated")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from drake_safety.assessments import assessed_scenarios, shipped_folder
 from drake_safety.cli import console
@@ -75,6 +75,19 @@ def run_fresh_episodes(
         progress=progress,
         **options,
     )
+
+
+def feedback_options(
+    scenario: Scenario, folder: Path, variation: str, seed: int, num_workers: int | None
+) -> dict[str, Any]:
+    """Options of simulations of an actual plant that a training's folder keeps."""
+    hash_ = scenario.simulation_hash(variation)
+    return scenario.options_for("pairs", variation) | {
+        "variation": variation,
+        "num_workers": num_workers,
+        "path": folder / "feedback" / f"{hash_[:12]}-{seed}",
+        "extra": {"command": console.command_line()},
+    }
 
 
 def adapted_folder(folder: Path, variation: str) -> Path:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count, repeat
+from types import FrameType
 from typing import Any, Literal
 
 import numpy as np
@@ -49,7 +50,7 @@ HALT, GUARD = "Halt", "Guard on/off"
 MASS, SPEED, DIRECTION = "mass [kg]", "speed [m/s]", "towards [deg]"
 """Sliders of a ball."""
 AXES = ("x [m]", "y [m]", "z [m]")
-"""Sliders of a target."""
+"""Sliders of a goal."""
 STEPS = (
     ("Faster", "ArrowUp", 0, 1),
     ("Slower", "ArrowDown", 0, -1),
@@ -67,7 +68,7 @@ _NUM_CANDIDATES = 24  # Per batch of the search: few, because the user waits for
 _SIZE_M = 1.0  # Of a plant without legs, for markers.
 _NUM_STEPS = 8  # Key presses from zero to the farthest command of training.
 _NUM_CHARACTERS = 160  # Of an error.
-_TARGET, _NEAREST = f"{WORLD}/target", f"{WORLD}/nearest_accepted"
+_GOAL, _NEAREST = f"{WORLD}/target", f"{WORLD}/nearest_accepted"
 
 
 @dataclass
@@ -82,22 +83,18 @@ class Pace:
 class LiveSession:
     """A closed loop with Γ in Meshcat that reacts to the controls of its panel.
 
-    What the controls do follows from what the loop can: commands change while a robot walks, it
-    moves to targets that Γ accepts, or balls are thrown at it. Any other task runs episode after
-    episode from random starts: an episode ends 1.5 s after the state left the safe set, or 1.5 s
-    after its duration. A simulation that fails is shown for 1.5 s; then it starts anew, except that
-    a robot that moves to targets waits for Start again or Go.
-
-    The loop is built with this Meshcat and with an assessment. Every start has a new Context: what
-    was adopted in the last one is forgotten.
+    The loop is built with this Meshcat and with an assessment. Its capabilities decide what the
+    controls do: change commands, choose a goal, or throw balls. Any other task runs episode after
+    episode from random starts. A fall, a failure or the end of an episode is shown for 1.5 s before
+    the next start; with goals, Start again or Go begins it. Every start has a new Context.
 
     Attributes:
-        threshold: Lowest probability that is shown as "safe", and of accepted targets.
-        unsafe_below: Probability below which a target is unsafe; in between is "don't know".
+        threshold: Lowest probability that is shown as "safe", and of accepted goals.
+        unsafe_below: Probability below which a goal is unsafe; in between is "don't know".
         cause: The constraint that was violated first since the start; "" for none.
         command: The present command, (3,), of a loop that follows commands.
         is_guarded: Whether a guard replaces commands that are not accepted.
-        verdict, nearest: On the present target, and the nearest accepted one; None if not asked.
+        verdict, nearest: On the present goal, and the nearest accepted one; None if not asked.
     """
 
     def __init__(
@@ -125,6 +122,7 @@ class LiveSession:
         self._seed, self._rngs = seed, map(episode_rng, repeat(seed), count())
         self._end_s = math.inf  # Of the motion.
         self._num_waits = 0  # Ticks for which a failure is still shown.
+        self._is_ended = False
         self._said, self._said_until_s = "", -math.inf
         self._camera = FollowingCamera(loop, meshcat) if isinstance(loop, LeggedLoop) else None
         self.panel = LivePanel(title=loop.scenario.name, threshold=threshold)
@@ -143,7 +141,13 @@ class LiveSession:
             self._add(ASK, "KeyA", partial(self._assess, is_thorough=True))
             self._add(GO, "Space", partial(self._go, is_forced=False))
             self._add(FORCE, "", partial(self._go, is_forced=True))
-            self._add_target()
+            box = loop.target_box
+            start = next(iter(loop.named_targets.values()), box.mean(axis=0))
+            for name, low, high, value in zip(AXES, *box.tolist(), start, strict=True):
+                self.panel.sliders[name] = Slider(low, high, 0.01, value)
+            marker = Sphere(0.03 * (self._camera.size_m if self._camera else _SIZE_M))
+            meshcat.SetObject(_GOAL, marker, Rgba(*COLOURS["plain"], 0.8))
+            meshcat.SetObject(_NEAREST, marker, Rgba(*COLOURS["safe"], 0.8))
         elif isinstance(loop, HasBall):
             self._use = "balls"
             self._add(THROW, "Space", self._throw)
@@ -163,11 +167,7 @@ class LiveSession:
         return isinstance(self.loop, CanFall) and not margins[names.index(self.loop.fall_name)] >= 0
 
     def tick(self) -> bool:
-        """Reacts to the controls, advances by one tick, and shows belief and verdict.
-
-        Returns:
-            Whether it was simulated.
-        """
+        """Reacts to the controls and simulates one tick; returns whether anything was simulated."""
         is_asked = self.panel.take_click(START)
         if self._num_waits > 0 and not is_asked:
             self._num_waits -= 1
@@ -175,7 +175,11 @@ class LiveSession:
         with self._shows_failure():
             if is_asked or (self._is_over and self._use != "goals"):
                 self._start()
-            self._react()
+            for name, action in self._actions.items():
+                if self.panel.take_click(name):
+                    action()
+            if self._use == "goals" and not np.array_equal(self._slid_goal(), self._goal):
+                self._assess(is_thorough=False)
             if self._is_over:
                 return False
             self._simulator.AdvanceTo(self.context.get_time() + TICK_S)
@@ -185,19 +189,18 @@ class LiveSession:
                 self._camera.follow(self.context)
             status = self._status()
             if self._is_on("alarm"):
-                told = f"monitor: {self._eval('alarm_cause')}"
+                alarm = f"monitor: {self._eval('alarm_cause')}"
                 if self.loop.variation != self.assessment.info_.variation:
-                    told += f" (Γ has not learned plant '{self.loop.variation}')"
-                notes = filter(None, [status.note, told])
-                status = replace(status, note="; ".join(notes))
+                    alarm += f" (Γ has not learned plant '{self.loop.variation}')"
+                status = replace(status, note="; ".join(filter(None, [status.note, alarm])))
             self.panel.status = status
         return self._num_waits == 0
 
     def run(self) -> None:
-        """Ticks in real time until Stop is clicked; the panel says so."""
+        """Ticks in real time until Stop is clicked or :meth:`end` is called."""
         late_s = 0.0
         try:
-            while not self.panel.take_click(STOP):
+            while not (self._is_ended or self.panel.take_click(STOP)):
                 begin = time.perf_counter()
                 if not self.tick():
                     time.sleep(BREAK_S)
@@ -213,6 +216,10 @@ class LiveSession:
                 self.pace.elapsed_s += time.perf_counter() - begin
         finally:
             self.panel.stop()
+
+    def end(self, number: int = 0, frame: FrameType | None = None) -> None:
+        """Ends :meth:`run` after the present tick; a handler of signals."""
+        self._is_ended = True
 
     def _add(self, name: str, key: str, action: Callable[[], object]) -> None:
         self.panel.buttons[name] = key
@@ -251,14 +258,6 @@ class LiveSession:
     @property
     def _is_over(self) -> bool:
         return self.context.get_time() >= self._end_s - 1e-9
-
-    def _react(self) -> None:
-        """Does what was clicked, and assesses a target that was moved."""
-        for name, action in self._actions.items():
-            if self.panel.take_click(name):
-                action()
-        if self._use == "goals" and not np.array_equal(self._slid_goal(), self._goal):
-            self._assess(is_thorough=False)
 
     @contextlib.contextmanager
     def _shows_failure(self) -> Iterator[None]:
@@ -377,30 +376,20 @@ class LiveSession:
         self.is_guarded = not self.is_guarded
         self.loop.set_guarded(self.context, self.is_guarded)
 
-    def _add_target(self) -> None:
-        """Adds sliders and markers of a target."""
-        box = self.loop.target_box
-        start = next(iter(self.loop.named_targets.values()), box.mean(axis=0))
-        for name, low, high, value in zip(AXES, *box.tolist(), start, strict=True):
-            self.panel.sliders[name] = Slider(low, high, 0.01, value)
-        radius_m = 0.03 * (self._camera.size_m if self._camera else _SIZE_M)
-        self.meshcat.SetObject(_TARGET, Sphere(radius_m), Rgba(*COLOURS["plain"], 0.8))
-        self.meshcat.SetObject(_NEAREST, Sphere(radius_m), Rgba(*COLOURS["safe"], 0.8))
-
     def _slid_goal(self) -> np.ndarray:
         return np.array([self.panel.sliders[name].value for name in AXES])
 
     def _go(self, *, is_forced: bool) -> None:
-        """Starts the motion to a target that is accepted, or forced."""
+        """Starts the motion to a goal that is accepted, or forced."""
         verdict = self._assess(is_thorough=not is_forced)
         if verdict.is_accepted or is_forced:
             self.loop.reset_standing(self.context, verdict.goal, next(self._rngs))
             self._begin(self.loop.scenario.episode_duration_s + 1.0)
 
     def _assess(self, *, is_thorough: bool) -> GoalVerdict:
-        """Assesses and shows the target; thoroughly also the nearest one that is accepted."""
+        """Assesses and shows the goal; thoroughly also the nearest one that is accepted."""
         self._goal = goal = self._slid_goal()
-        self.meshcat.SetTransform(_TARGET, RigidTransform(goal))
+        self.meshcat.SetTransform(_GOAL, RigidTransform(goal))
         self.meshcat.SetProperty(_NEAREST, "visible", False)
         asked = (self.loop, self.assessment, goal)
         self.verdict = verdict = assess_goal(
@@ -415,16 +404,11 @@ class LiveSession:
                 num_candidates=_NUM_CANDIDATES,
             )
         self.panel.show_belief(verdict.probability, verdict.belief)
-        self._show_verdict(verdict, is_thorough=is_thorough)
-        return verdict
-
-    def _show_verdict(self, verdict: GoalVerdict, *, is_thorough: bool) -> None:
-        told = f"probability {verdict.probability:.2f}"
+        probability = f"probability {verdict.probability:.2f}"
         if verdict.is_accepted:
-            self.panel.status = Status(f"accepted: {told}", note="Space goes there", tone="safe")
-            return
-        if verdict.reason:
-            told = "don't know"
+            state = f"accepted: {probability}"
+            self.panel.status = Status(state, note="Space goes there", tone="safe")
+            return verdict
         cause = ": ".join(filter(None, verdict.cause_words(self.loop.angular_constraints)))
         notes = [] if cause else [verdict.reason]
         if self.nearest is not None:
@@ -434,5 +418,7 @@ class LiveSession:
             self.meshcat.SetProperty(_NEAREST, "visible", True)
         elif is_thorough:
             notes.append("nothing near is accepted")
+        state = "refused: don't know" if verdict.reason else f"refused: {probability}"
         note = "; ".join(filter(None, notes))
-        self.panel.status = Status(f"refused: {told}", cause, note, "unsafe")
+        self.panel.status = Status(state, cause, note, "unsafe")
+        return verdict

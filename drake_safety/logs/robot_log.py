@@ -107,6 +107,20 @@ class LogPieces:
         """Share of the log's rows that was kept, if they are evenly spaced."""
         return self.row_share * sum(one.duration_s for one in self.pieces) / self.duration_s
 
+    def summary(self) -> str:
+        """How much of the log is kept, and the first cuts; "" if it is read as it is."""
+        if not self.cuts:
+            return ""
+        lines, num_more = self.cuts[:_MOST_CUTS], len(self.cuts) - _MOST_CUTS
+        if num_more > 0:
+            lines.append(f"... and {num_more} more; --strict refuses such a log")
+        what = "read with notes"
+        if self.lost:
+            what = "cut where values are missing and at gaps, or resampled"
+        kept = f"{100 * self.kept_share:.1f} % of {self.duration_s:.1f} s are kept"
+        head = f"log '{self.pieces[0].path}' is {what}: {kept}, in {len(self.pieces)} pieces"
+        return "\n".join([head, *lines])
+
 
 def read_pieces(
     path: str | PathLike[str],
