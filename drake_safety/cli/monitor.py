@@ -46,60 +46,59 @@ def monitor(
     loaded, learned, gamma = folders.open_assessment(scenario, assessment)
     folder = out or learned.out / "monitor"
     folders.check_writable(folder)
-    files = [file for given in log for file in _files(given)]
-    found: list[dict[str, Any]] = []
+    files = [file for path in log for file in _files(path)]
+    logs: list[dict[str, Any]] = []
     with console.open_stages() as stages:
         for i, file in enumerate(files):
-            for what, motions in _motions(file, log_map, loaded, gamma):
-                picture = folder / f"{file.stem}-{len(found) + 1}"
-                found.append(_judged(motions, gamma, picture) | what)
+            for entry, motions in _motions(file, log_map, loaded, gamma):
+                picture = folder / f"{file.stem}-{len(logs) + 1}"
+                logs.append(_judged(motions, gamma, picture) | entry)
             stages("logs", i + 1, len(files))
-    entries = {"monitor": gamma.detector_.describe(), "logs": found}
+    entries = {"monitor": gamma.detector_.describe(), "logs": logs}
     folder.mkdir(parents=True, exist_ok=True)
     Results({}, console.made_by(loaded.name) | entries).write(folder / "monitor.json")
-    _show(found)
+    columns = ("log", "until [s]", "judged", "alarm [s]", "ends [s]", "largest level", "cause")
+    console.show(console.new_table(*columns, rows=[row for entry in logs for row in _rows(entry)]))
     console.say("figures ", folder / "monitor.json")
     console.say("pictures", folder)
-    if told := [one["log"] for one in found if not one["alarms"] and one["judged_s"] < _LEAST_S]:
+    if short := [entry["log"] for entry in logs if _is_too_short(entry)]:
         raise ValueError(
-            f"{len(told)} of {len(found)} logs have less than {_LEAST_S:g} s of motion without a "
-            f"missing value, which is too short to judge: {', '.join(told[:3])}"
+            f"{len(short)} of {len(logs)} logs have less than {_LEAST_S:g} s of motion without a "
+            f"missing value, which is too short to judge: {', '.join(short[:3])}"
         )
 
 
-def _files(given: Path) -> list[Path]:
-    """A log, or those in a folder that is not itself a ROS 2 bag."""
+def _files(path: Path) -> list[Path]:
+    """A log, or the logs in a folder that is not itself a ROS 2 bag."""
     bag, known = "metadata.yaml", [*FORMATS, _SEQUENCES]
-    if not given.exists():
-        raise ValueError(f"log '{given}' does not exist")
-    if not given.is_dir() or (given / bag).is_file():
-        return [given]
-    found = [p for p in given.iterdir() if p.suffix.lower() in known or (p / bag).is_file()]
-    if not found:
-        raise ValueError(f"folder '{given}' has no log; known are {known} and ROS 2 bags")
-    return sorted(found)
+    if not path.exists():
+        raise ValueError(f"log '{path}' does not exist")
+    if not path.is_dir() or (path / bag).is_file():
+        return [path]
+    files = [p for p in path.iterdir() if p.suffix.lower() in known or (p / bag).is_file()]
+    if not files:
+        raise ValueError(f"folder '{path}' has no log; known are {known} and ROS 2 bags")
+    return sorted(files)
 
 
 def _motions(
     file: Path, log_map: Path, scenario: Scenario, gamma: SafetyAssessment
 ) -> Iterator[tuple[dict[str, Any], list[Motion]]]:
-    """A log, or each sequence of a file, by what identifies it; and its motions."""
-    what = {"log": str(file), "sequence": None, "left_safe_set": ""}
+    """What identifies a log, or each sequence of a file, and its motions."""
+    entry = {"log": str(file), "sequence": None, "left_safe_set": ""}
     if file.suffix.lower() == _SEQUENCES:
-        read_by = load_typed_file(SequenceMap, log_map, f"map '{log_map}'")
-        read = read_sequences(file, read_by, gamma.detector_, gamma.info_)
-        yield from ((what | {"sequence": i}, motions) for i, motions in enumerate(read))
-    else:
-        loop = worker_loop(scenario, "actual")()
-        pieces = read_pieces(file, log_map, loop.robot)
-        if summary := pieces.summary():
-            console.say(summary, style="yellow")
-        found = motions_from_log(pieces.pieces, loop, step_s=gamma.detector_.step_s)
-        what["left_safe_set"] = next((one.cause for one in found if not one.is_safe), "")
-        yield (
-            what | {"duration_s": pieces.duration_s},
-            [(one.time_s, rows_of(one)) for one in found],
-        )
+        sequence_map = load_typed_file(SequenceMap, log_map, f"map '{log_map}'")
+        sequences = read_sequences(file, sequence_map, gamma.detector_, gamma.info_)
+        yield from ((entry | {"sequence": i}, motions) for i, motions in enumerate(sequences))
+        return
+    loop = worker_loop(scenario, "actual")()
+    read = read_pieces(file, log_map, loop.robot)
+    if summary := read.summary():
+        console.say(summary, style="yellow")
+    episodes = motions_from_log(read.pieces, loop, step_s=gamma.detector_.step_s)
+    entry["left_safe_set"] = next((e.cause for e in episodes if not e.is_safe), "")
+    motions = [(episode.time_s, rows_of(episode)) for episode in episodes]
+    yield entry | {"duration_s": read.duration_s}, motions
 
 
 def _judged(motions: Sequence[Motion], gamma: SafetyAssessment, picture: Path) -> dict[str, Any]:
@@ -119,35 +118,35 @@ def _judged(motions: Sequence[Motion], gamma: SafetyAssessment, picture: Path) -
         "state": names[int(levels.max(axis=0).argmax())],
         "alarms": [
             {
-                "begin_s": float(time_s[one.begin]),
-                "end_s": float(time_s[one.end]) if one.end < len(time_s) else None,
-                "level": float(levels[one.begin : one.end].max()),
-                "cause": one.cause,
+                "begin_s": float(time_s[alarm.begin]),
+                "end_s": float(time_s[alarm.end]) if alarm.end < len(time_s) else None,
+                "level": float(levels[alarm.begin : alarm.end].max()),
+                "cause": alarm.cause,
             }
-            for one in alarms
+            for alarm in alarms
         ],
     }
 
 
-def _show(found: Sequence[Mapping[str, Any]]) -> None:
-    """Prints a row an alarm, and one for a log without any."""
+def _is_too_short(entry: Mapping[str, Any]) -> bool:
+    return not entry["alarms"] and entry["judged_s"] < _LEAST_S
+
+
+def _rows(entry: Mapping[str, Any]) -> list[list[str]]:
+    """A row of the table for each alarm of a log, or one that says that there is none."""
+    number = "" if entry["sequence"] is None else f" [{entry['sequence']}]"
+    left = entry["left_safe_set"] and f", left the safe set: {entry['left_safe_set']}"
+    share = entry["judged_s"] / max(entry["duration_s"], 1e-9)
+    name = f"{Path(*Path(entry['log']).parts[-2:])}{number}"
+    head = [name, f"{entry['end_s']:.2f}{left}", f"{share:.0%}"]
+    if _is_too_short(entry):
+        why = f"not judged: {entry['judged_s']:.2f} s, expected at least {_LEAST_S:g} s"
+        return [[*head, "-", "-", "-", why]]
+    if not entry["alarms"]:
+        return [[*head, "-", "-", f"{entry['level']:.2f}", f"no alarm; largest: {entry['state']}"]]
     rows = []
-    for one in found:
-        number = "" if one["sequence"] is None else f" [{one['sequence']}]"
-        left = one["left_safe_set"] and f", left the safe set: {one['left_safe_set']}"
-        share = one["judged_s"] / max(one["duration_s"], 1e-9)
-        head = [f"{Path(*Path(one['log']).parts[-2:])}{number}", f"{one['end_s']:.2f}{left}"]
-        head.append(f"{share:.0%}")
-        if not one["alarms"] and one["judged_s"] < _LEAST_S:
-            told = f"not judged: {one['judged_s']:.2f} s, expected at least {_LEAST_S:g} s"
-            rows.append([*head, "-", "-", "-", told])
-        elif not one["alarms"]:
-            told = f"no alarm; largest: {one['state']}"
-            rows.append([*head, "-", "-", f"{one['level']:.2f}", told])
-        for alarm in one["alarms"]:
-            numbers = (alarm[key] for key in ("begin_s", "end_s", "level"))
-            cells = ["goes on" if value is None else f"{value:.2f}" for value in numbers]
-            rows.append([*head, *cells, alarm["cause"]])
-            head = ["", "", ""]
-    columns = ("log", "until [s]", "judged", "alarm [s]", "ends [s]", "largest level", "cause")
-    console.show(console.new_table(*columns, rows=rows))
+    for alarm in entry["alarms"]:
+        numbers = (alarm[key] for key in ("begin_s", "end_s", "level"))
+        cells = ["goes on" if value is None else f"{value:.2f}" for value in numbers]
+        rows.append([*(["", "", ""] if rows else head), *cells, alarm["cause"]])
+    return rows

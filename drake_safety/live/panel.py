@@ -47,8 +47,7 @@ class Slider:
 class LivePanel:
     """What every viewer of a session sees and controls; the session and a page share it.
 
-    The session runs in one thread and the page in another. Each of them replaces whole values,
-    which needs no lock; only a click is taken by the one and made by the other.
+    They run in two threads. Each replaces whole values, which needs no lock; a click needs one.
 
     Attributes:
         probability: The probability; NaN before the first.
@@ -70,7 +69,7 @@ class LivePanel:
         self._history: deque[tuple[float, float]] = deque()
 
     def click(self, name: str) -> None:
-        """Clicks a button; clicks before the next :meth:`take_click` count as one."""
+        """Clicks a button; until it is taken, further clicks count as the same."""
         with self._clicking:
             self._clicks.add(name)
 
@@ -90,9 +89,9 @@ class LivePanel:
     def show_belief(
         self, probability: float, belief: np.ndarray, time_s: float | None = None
     ) -> None:
-        """Shows the probability, or NaN, and the belief (safe, unsafe, don't know), of sum one.
+        """Shows a probability, or NaN, and a belief, on the curve if there is a time [s].
 
-        A belief that is not finite is "don't know". With a time [s] the curve gets a point.
+        A belief (3,) that is not finite is "don't know".
         """
         self.probability = float(probability)
         self.belief = tuple(belief.tolist()) if np.isfinite(belief).all() else _UNKNOWN
