@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Awaitable, Callable, Collection, Iterator, MutableMapping
+from functools import partial
 from importlib.resources import files
 from ipaddress import ip_address
 from typing import Any
@@ -37,28 +38,26 @@ def serve_page(
 ) -> Iterator[None]:
     """Serves the page, with the scene, in a thread; one page in a process.
 
-    It answers requests for ``host``, this machine and further ``names`` of hosts only, and of other
-    pages none, so that no page elsewhere can read it or use its controls.
-
-    Args:
-        scene_url: Address at which this process reaches Meshcat.
+    It answers requests for ``host``, this machine and further ``names`` of hosts only, and none of
+    other pages, which could read it or use its controls. Meshcat is reached at ``scene_url``.
     """
     app.add_middleware(_only_own, host=host, names=names)
     app.mount(_SCENE, _forward(scene_url))
-    options: dict[str, Any] = {
-        "root": lambda: build_page(panel),
-        "title": panel.title,
-        "host": host,
-        "port": port,
-        "show": False,
-        "reload": False,
-        "tailwind": False,
-        "binding_refresh_interval": None,
-        "reconnect_timeout": 10.0,
-        "show_welcome_message": False,
-        "timeout_graceful_shutdown": 1,
-    }
-    thread = threading.Thread(target=ui.run, kwargs=options, name="page", daemon=True)
+    serve = partial(
+        ui.run,
+        lambda: build_page(panel),
+        title=panel.title,
+        host=host,
+        port=port,
+        show=False,
+        reload=False,
+        tailwind=False,
+        binding_refresh_interval=None,
+        reconnect_timeout=10.0,
+        show_welcome_message=False,
+        timeout_graceful_shutdown=1,
+    )
+    thread = threading.Thread(target=serve, name="page", daemon=True)
     thread.start()
     end = time.monotonic() + _WITHIN_S
     while not (app.is_started and Server.instance.started):
@@ -86,11 +85,11 @@ def _only_own(application: _Application, host: str, names: Collection[str]) -> _
         known.add(socket.gethostname().lower())
 
     def is_own(headers: dict[bytes, bytes]) -> bool:
-        asked, origin = (headers.get(one, b"").decode("latin-1").lower() for one in _NAMED)
+        server, page = (headers.get(key, b"").decode("latin-1").lower() for key in _NAMED)
         with contextlib.suppress(ValueError):
-            name = urlsplit(f"//{asked}").hostname or ""
+            name = urlsplit(f"//{server}").hostname or ""
             if name in known or (is_for_all and ip_address(name)):
-                return urlsplit(origin or f"//{asked}").netloc == asked
+                return urlsplit(page or f"//{server}").netloc == server
         return False
 
     async def answer(scope: _Message, receive: Any, send: Any) -> None:
@@ -114,9 +113,9 @@ def _forward(url: str) -> _Application:
         async with ClientSession() as session:
             if scope["type"] == "http":
                 path = scope["path"].removeprefix(_SCENE)
-                async with session.get(url + path) as found:
-                    kind = found.headers.get("content-type", "")
-                    await _answer(send, found.status, await found.read(), kind)
+                async with session.get(url + path) as reply:
+                    kind = reply.headers.get("content-type", "")
+                    await _answer(send, reply.status, await reply.read(), kind)
                 return
             async with session.ws_connect(f"{url}/", max_msg_size=0) as scene:
 
@@ -151,22 +150,24 @@ def build_page(panel: LivePanel) -> None:
     with ui.element().classes("scene"):
         ui.element("iframe").props(f'src="{_SCENE}/?reconnect_ms=-1" title="scene"')
         with ui.element().classes("veil"):
-            ui.label("stopped").classes("told")
+            ui.label("stopped").classes("live")
             ui.label("disconnected").classes("lost")
     with ui.element().classes("panel"):
-        ui.timer(_PERIOD_S, _build_readings(panel))
-        ui.timer(_PERIOD_S, _build_controls(panel))
+        for build in (_build_readings, _build_controls):
+            update = build(panel)
+            update()
+            ui.timer(_PERIOD_S, update)
 
 
 def _build_readings(panel: LivePanel) -> Callable[[], None]:
-    """Builds what is shown: text, probability, belief and curve; returns its update."""
+    """Builds text, probability, belief and curve; returns what updates them."""
     with ui.element().classes("status") as box:
         with ui.element().classes("line"):
-            state = ui.label().classes("state told")
+            state = ui.label().classes("state live")
             ui.label("disconnected").classes("state lost")
-            probability = ui.label().classes("probability told")
-        cause = ui.label().classes("told")
-        note = ui.label().classes("told")
+            probability = ui.label().classes("probability live")
+        cause = ui.label().classes("live")
+        note = ui.label().classes("live")
         ui.label("The server of this page does not answer.").classes("lost")
     with ui.element().classes("bar"):
         parts = [ui.element().style(f"background: var(--{key})") for key in _BELIEF]
@@ -196,12 +197,11 @@ def _build_readings(panel: LivePanel) -> Callable[[], None]:
         if panel.is_stopped:
             body.classes("stopped")
 
-    update()
     return update
 
 
 def _build_controls(panel: LivePanel) -> Callable[[], None]:
-    """Builds sliders and buttons, and returns what shows where other viewers moved the sliders."""
+    """Builds sliders and buttons; returns what moves the sliders as other viewers did."""
     numbers = {}
     with ui.element().classes("sliders"):
         for name, slider in panel.sliders.items():
@@ -223,36 +223,34 @@ def _build_controls(panel: LivePanel) -> Callable[[], None]:
             slider.set_value(panel.sliders[name].value)
             number.set_text(f"{panel.sliders[name].value:g}")
 
-    update()
     return update
 
 
 def _chart_options(threshold: float) -> dict[str, Any]:
-    line = {"yAxis": threshold, "name": f"threshold {threshold:.2f}"}
+    position = f"insideStart{'Top' if threshold < 0.5 else 'Bottom'}"
+    limit = {
+        "silent": True,
+        "symbol": "none",
+        "data": [{"yAxis": threshold, "name": f"threshold {threshold:.2f}"}],
+        "lineStyle": {"color": _css("unsafe"), "type": "solid", "width": 1.5},
+        "label": {"formatter": "{b}", "position": position, "color": _css("unsafe")},
+    }
+    curve = {
+        "type": "line",
+        "showSymbol": False,
+        "silent": True,
+        "lineStyle": {"color": _css("safe"), "width": 2.5},
+        "data": [],
+        "markLine": limit,
+    }
     font = {"fontSize": 13, "fontWeight": "normal"}
-    where = f"insideStart{'Top' if threshold < 0.5 else 'Bottom'}"
     return {
         "animation": False,
         "grid": {"left": 30, "right": 10, "top": 30, "bottom": 22},
         "title": {"text": "probability over time [s]", "textStyle": font, "left": 0, "padding": 0},
         "xAxis": {"type": "value", "min": -HISTORY_S, "max": 0, "splitLine": {"show": False}},
         "yAxis": {"type": "value", "min": 0, "max": 1, "interval": 0.5},
-        "series": [
-            {
-                "type": "line",
-                "showSymbol": False,
-                "silent": True,
-                "lineStyle": {"color": _css("safe"), "width": 2.5},
-                "data": [],
-                "markLine": {
-                    "silent": True,
-                    "symbol": "none",
-                    "data": [line],
-                    "lineStyle": {"color": _css("unsafe"), "type": "solid", "width": 1.5},
-                    "label": {"formatter": "{b}", "position": where, "color": _css("unsafe")},
-                },
-            }
-        ],
+        "series": [curve],
     }
 
 
