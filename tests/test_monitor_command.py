@@ -46,19 +46,19 @@ def write(path, data, **arrays):
 
 def test_sequences_are_rows_of_the_detector(detector, tmp_path):
     rows = [motion(4.0, seed) for seed in (60, 61)]
-    data = np.stack([observed(one) for one in rows])
+    data = np.stack([observed(motion_) for motion_ in rows])
     file = write(tmp_path / "many.npz", data)
     names = np.array(OBSERVED, dtype="S")
     one_file = write(tmp_path / "one.npz", data[1], observation_names=names)
-    found = read_sequences(file, MAP, detector, INFO)
-    for sequence, expected in zip(found, rows, strict=True):
+    sequences = read_sequences(file, MAP, detector, INFO)
+    for sequence, expected in zip(sequences, rows, strict=True):
         ((time_s, read),) = sequence
         np.testing.assert_allclose(time_s, STEP_S * np.arange(len(expected)))
         used = detector.columns
         np.testing.assert_allclose(read[:, used], expected[:, used], atol=1e-12)
         assert not read[:, np.setdiff1d(np.arange(read.shape[1]), used)].any()
     (alone,) = read_sequences(one_file, MAP, detector, INFO)
-    np.testing.assert_array_equal(alone[0][1], found[1][0][1])
+    np.testing.assert_array_equal(alone[0][1], sequences[1][0][1])
 
 
 def test_a_sequence_is_cut_at_missing_values_and_thinned_to_the_step_of_the_detector(
@@ -78,11 +78,8 @@ def test_a_sequence_is_cut_at_missing_values_and_thinned_to_the_step_of_the_dete
     ("change", "message"),
     [
         ({"columns": {}}, r"no observations \['knee', 'knee_rate', .*they have \['load'"),
-        ({"columns": {"kne": "q"}}, r"'kne' \(did you mean 'knee'\?\) is none of .*'load'\]"),
         ({"scale": {"light": 2.0}}, "'light' is none of the monitor's inputs"),
-        ({"step_s": 0.0}, r"'step_s' is 0.0, expected 0.05"),
         ({"step_s": 0.04}, r"'step_s' is 0.04, expected 0.05"),
-        ({"data": "obs"}, r"has no array 'obs'; it has \['observations', 'observation_names'\]"),
         ({"data": "observation_names"}, r"of shape \(6,\), expected numbers .*, 6\)"),
     ],
 )
@@ -92,7 +89,7 @@ def test_a_map_that_does_not_fit_is_refused(detector, tmp_path, change, message)
         read_sequences(file, dataclasses.replace(MAP, **change), detector, INFO)
 
 
-def test_what_is_no_file_of_arrays_is_refused(detector, tmp_path):
+def test_a_file_of_objects_or_text_is_refused(detector, tmp_path):
     text, objects = tmp_path / "text.npz", tmp_path / "objects.npz"
     text.write_text("time,q\n")
     for file in (text, write(objects, np.array([{}], dtype=object))):
@@ -106,8 +103,6 @@ def folder(detector, tmp_path, monkeypatch):
     folder = tmp_path / "spring"
     folder.mkdir()
     assessment = copy.copy(load_assessment("laikago_balancing"))
-    scenario = load_scenario("laikago_balancing")
-    assert assessment.info_.scenario_hash == scenario.simulation_hash()
     names = ("state_names", "output_names", "feature_names", "horizon")
     changed = {name: getattr(INFO, name) for name in names}
     assessment.info_ = dataclasses.replace(assessment.info_, **changed)
@@ -117,7 +112,7 @@ def folder(detector, tmp_path, monkeypatch):
     usual, pushed = motion(30.0, 60), motion(30.0, 50, slice(100, 140))
     write(runs / "a.npz", np.stack([observed(usual), observed(pushed)]))
     write(runs / "b.npz", observed(usual))
-    (runs / "notes.txt").write_text("")
+    (runs / "notes.txt").write_text("")  # No log.
     text = f"step_s: {STEP_S}\nscale: {{knee_rate: 20.0}}\noffset: {{knee: 0.5}}\ncolumns:\n"
     text += "".join(f"  {name}: {column}\n" for name, column in COLUMNS.items())
     (folder / "map.yaml").write_text(text)
@@ -125,34 +120,36 @@ def folder(detector, tmp_path, monkeypatch):
     return folder
 
 
-def test_one_command_judges_a_folder(folder, monkeypatch, capsys, detector):
-    options = ("--map", folder / "map.yaml", "--assessment", folder, "--out", folder / "out")
-    assert not call(monkeypatch, "monitor", "laikago_balancing", "--log", folder / "runs", *options)
+def judge(monkeypatch, folder, *logs):
+    """Calls the command for logs; returns its code, and entries of the logs in its file."""
+    options = ("--map", folder / "map.yaml", "--assessment", folder, "--out", folder / "new/out")
+    given = [word for log in logs for word in ("--log", log)]
+    code = call(monkeypatch, "monitor", "laikago_balancing", *given, *options)
+    file = folder / "new/out/monitor.json"
+    return code, json.loads(file.read_text())["entries"]["logs"] if file.exists() else []
+
+
+def test_the_command_judges_every_sequence_of_a_folder(folder, monkeypatch, capsys, detector):
+    code, logs = judge(monkeypatch, folder, folder / "runs")
+    assert not code
     printed = " ".join(capsys.readouterr().out.split())
-    assert detector.describe() in printed
-    for told in ("runs/a.npz [0]", "runs/a.npz [1]", "runs/b.npz [0]", "no alarm; largest: knee"):
-        assert told in printed
-    logs = json.loads((folder / "out" / "monitor.json").read_text())["entries"]["logs"]
-    assert [(one["sequence"], len(one["alarms"])) for one in logs] == [(0, 0), (1, 1), (0, 0)]
-    ((begin, end, cause),) = detector.watch([motion(30.0, 50, slice(100, 140))], INFO.state_names)[
-        1
-    ]
+    for text in ("runs/a.npz [0]", "runs/a.npz [1]", "runs/b.npz [0]", "no alarm; largest: knee"):
+        assert text in printed
+    assert [(log["sequence"], len(log["alarms"])) for log in logs] == [(0, 0), (1, 1), (0, 0)]
+    _, alarms = detector.watch([motion(30.0, 50, slice(100, 140))], INFO.state_names)
+    ((begin, end, cause),) = alarms
     (alarm,) = logs[1]["alarms"]
     assert (alarm["begin_s"], alarm["end_s"]) == pytest.approx((begin * STEP_S, end * STEP_S))
     assert alarm["cause"] == cause
     assert alarm["level"] == logs[1]["level"] > 1.0 > logs[0]["level"] > 0.0
-    assert f"{begin * STEP_S:.2f}" in printed
-    pictures = {path.name for path in (folder / "out").iterdir()} - {"monitor.json"}
+    pictures = {path.name for path in (folder / "new/out").iterdir()} - {"monitor.json"}
     assert pictures == {f"{n}.{kind}" for n in ("a-1", "a-2", "b-3") for kind in ("png", "svg")}
 
 
-def test_a_folder_without_logs_is_refused(folder, monkeypatch, capsys, tmp_path):
-    options = ("--map", folder / "map.yaml", "--assessment", folder)
-    none = tmp_path / "none"
-    none.mkdir()
-    for log, told in ((none, "has no log; known are ['.csv'"), ("x.npz", "does not exist")):
-        assert call(monkeypatch, "monitor", "laikago_balancing", "--log", log, *options) == 2
-        assert told in capsys.readouterr().out
+def test_a_folder_without_logs_is_refused(folder, monkeypatch, capsys):
+    (folder / "none").mkdir()
+    assert judge(monkeypatch, folder, folder / "none") == (2, [])
+    assert "has no log; known are ['.csv'" in capsys.readouterr().out
 
 
 def test_a_log_is_judged_as_its_motions_are_with_its_own_times(monkeypatch, capsys, tmp_path):
@@ -167,7 +164,7 @@ def test_a_log_is_judged_as_its_motions_are_with_its_own_times(monkeypatch, caps
         monkeypatch, "monitor", "laikago_balancing", *options, "--out", tmp_path / "out"
     )
     assert "run.csv' is cut where values are missing" in capsys.readouterr().out
-    (one,) = json.loads((tmp_path / "out" / "monitor.json").read_text())["entries"]["logs"]
+    (judged,) = json.loads((tmp_path / "out" / "monitor.json").read_text())["entries"]["logs"]
     assessment = load_assessment("laikago_balancing")
     pieces = read_pieces(log, tmp_path / "columns.yaml", loop.robot).pieces
     motions = motions_from_log(pieces, loop)
@@ -176,9 +173,9 @@ def test_a_log_is_judged_as_its_motions_are_with_its_own_times(monkeypatch, caps
         expected = begin_s + scenario.monitor_step_s * np.arange(len(motion_.time_s))
         np.testing.assert_allclose(motion_.time_s, expected, atol=1e-6)
     levels = assessment.detector_.watch([rows_of(motion_) for motion_ in motions])[0]
-    assert one["level"] == pytest.approx(levels.max())
-    assert one["end_s"] == pytest.approx(motions[1].time_s[-1])
-    assert one["left_safe_set"] == ""
+    assert judged["level"] == pytest.approx(levels.max())
+    assert judged["end_s"] == pytest.approx(motions[1].time_s[-1])
+    assert judged["left_safe_set"] == ""
     every_second = motions_from_log(pieces, loop, step_s=0.04)
     np.testing.assert_allclose(every_second[0].state, motions[0].state[::2], atol=1e-9)
 
@@ -190,21 +187,16 @@ def test_a_log_without_the_policy_s_memory_is_refused():
             read([], loop)
 
 
-@pytest.mark.parametrize("kept", [[], range(3), range(0, 50, 2), [*range(4), *range(10, 25)]])
-def test_what_is_too_short_or_missing_is_not_judged(folder, kept, monkeypatch, capsys):
+@pytest.mark.parametrize("kept", [[], range(0, 50, 2), [*range(4), *range(10, 25)]])
+def test_a_log_with_too_few_values_is_not_judged(folder, kept, monkeypatch, capsys):
     rows = observed(motion(30.0, 60))
     rows[np.setdiff1d(np.arange(50), kept)] = rows[50:] = np.nan
-    log, out = write(folder / "bad.npz", rows), folder / "new" / "out"
-    options = ("--map", folder / "map.yaml", "--assessment", folder, "--out", out)
-    good = folder / "runs" / "b.npz"
-    assert (
-        call(monkeypatch, "monitor", "--log", log, "--log", good, "laikago_balancing", *options)
-        == 2
-    )
+    bad = write(folder / "bad.npz", rows)
+    code, logs = judge(monkeypatch, folder, bad, folder / "runs" / "b.npz")
+    assert code == 2
     printed = " ".join(capsys.readouterr().out.split())
     assert printed.count("no alarm") == 1
     assert "not judged: 0." in printed
     assert "error 1 of 2 logs have less than 1 s" in printed
-    logs = json.loads((out / "monitor.json").read_text())["entries"]["logs"]
     assert logs[0]["judged_s"] < 1.0 < logs[1]["judged_s"]
     assert logs[1]["judged_s"] == pytest.approx(logs[1]["duration_s"])
