@@ -13,6 +13,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from unittest.mock import AsyncMock
 
 import numpy as np
 import pytest
@@ -126,29 +127,19 @@ def test_only_requests_of_its_own_page_are_answered(host, name, origin, is_answe
     pytest.importorskip("nicegui")
     from drake_safety.live.page import _only_own
 
-    reached, answers = [], []
-
-    async def application(scope, receive, send):
-        reached.append(scope["type"])
-
-    async def send(message):
-        answers.append(message)
+    application, send = AsyncMock(), AsyncMock()
 
     own = _only_own(application, host, ["Robot.example"])
     headers = {"host": name} | ({} if origin is None else {"origin": origin})
     raw = [(name.encode(), value.encode()) for name, value in headers.items()]
     for kind in ("http", "websocket", "lifespan"):
         asyncio.run(own({"type": kind, "headers": raw, "extensions": {}}, None, send))
-    assert reached == ["http", "websocket", "lifespan"] if is_answered else ["lifespan"]
+    reached = [call.args[0]["type"] for call in application.call_args_list]
+    assert reached == (["http", "websocket", "lifespan"] if is_answered else ["lifespan"])
+    answers = [call.args[0] for call in send.call_args_list]
     refused = ["http.response.start", "http.response.body", "websocket.close"]
     assert [answer["type"] for answer in answers] == ([] if is_answered else refused)
     assert is_answered or answers[0]["status"] == 403
-
-
-def free_port():
-    """A port that is free."""
-    with socket.create_server((HERE, 0)) as server:
-        return server.getsockname()[1]
 
 
 def answer_to(address, **headers):
@@ -165,12 +156,11 @@ def answer_to(address, **headers):
 def playing():
     """A command that plays, and the address of its page."""
     pytest.importorskip("nicegui")
-    port = free_port()
     code = "from drake_safety.cli import main; main()"
-    line = [sys.executable, "-u", "-c", code, "play", "laikago_balancing", "--port", str(port)]
+    command = [sys.executable, "-u", "-c", code, "play", "laikago_balancing"]
     # NiceGUI serves otherwise in a test.
     environment = {key: text for key, text in os.environ.items() if "PYTEST" not in key}
-    process = subprocess.Popen(line, stdout=subprocess.PIPE, text=True, env=environment)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     printed = ""
     while "live at" not in printed:
         line = process.stdout.readline()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -69,7 +69,7 @@ def adapt(
     logs = log or []
     if bool(logs) != (log_map is not None):
         raise ValueError("adapt: --log needs --map, and --map needs --log")
-    if len({one.resolve() for one in logs}) < len(logs):
+    if len({path.resolve() for path in logs}) < len(logs):
         raise ValueError(f"adapt: logs must differ; got {', '.join(map(str, logs))}")
     name = logs[0].stem if logs else variation
     folder = out or folders.adapted_folder(learned.out, name)
@@ -102,34 +102,42 @@ def adapt(
         sets = pairs.feedback()
         held, unit = "parts of the log" if logs else "episodes", np.arange(len(pairs.actual))
         if len(logs) > 1:
-            held, unit = "logs", np.repeat(range(len(logs)), [len(one) for one, _ in cut])
+            held, unit = "logs", np.repeat(range(len(logs)), [len(episodes) for episodes, _ in cut])
         units = unit[[pair.actual.index for pair in sets]]
         adapted = {mode: prior.adapt(sets, motions=motions) for mode, prior in priors.items()}
         folder.mkdir(parents=True, exist_ok=True)
-        for mode, one in adapted.items():
-            one.save(folders.assessment_file(folder, mode))
-        judged = {mode: _held_out(prior, sets, units) for mode, prior in priors.items()}
-    gap = sum(pair.differs for pair in sets), len(sets)
+        for mode, gamma in adapted.items():
+            gamma.save(folders.assessment_file(folder, mode))
+        scores = {mode: _held_out(prior, sets, units) for mode, prior in priors.items()}
+    num_differing = sum(pair.differs for pair in sets)
     entries = {
         "scenario_hash": pairs.actual.info.scenario_hash,
         "nominal_hash": pairs.nominal.info.scenario_hash,
         "variation": name,
-        "logs": [str(one) for one in logs],
+        "logs": [str(path) for path in logs],
         "seed": seed,
-        "feedback_sets": gap[1],
-        "differing_pairs": gap[0],
-        "change": {mode: one.correction_.change.tolist() for mode, one in adapted.items()},
+        "feedback_sets": len(sets),
+        "differing_pairs": num_differing,
+        "change": {mode: gamma.correction_.change.tolist() for mode, gamma in adapted.items()},
         "monitor": adapted[MODES[0]].detector_.describe(),
     }
     figures = {
-        ("held_out", mode, metric): one
-        for mode, found in judged.items()
-        for metric, one in found.items()
+        ("held_out", mode, metric): estimate
+        for mode, estimates in scores.items()
+        for metric, estimate in estimates.items()
     }
     Results(figures, console.made_by(loaded.name) | entries).write(folder / "adaptation.json")
-    _print_changes(loaded, adapted, gap, name)
+    console.say(f"adapted to '{name}': {num_differing} of {len(sets)} pairs end differently")
+    console.say(adapted[MODES[0]].detector_.describe())
+    unchanged = [
+        mode
+        for mode, gamma in adapted.items()
+        if gamma.base_logit_ is not None and not gamma.correction_.is_any
+    ]
+    if unchanged and not num_differing:
+        console.say(_why_unchanged(loaded, unchanged, len(sets)), style="yellow")
     for mode in MODES:
-        console.say(f"{mode}: {_summary(judged[mode], held)}")
+        console.say(f"{mode}: {_summary(scores[mode], held)}")
     for mode in adapted:
         console.say("assessment", folders.assessment_file(folder, mode))
     console.say("figures   ", folder / "adaptation.json")
@@ -176,26 +184,12 @@ def _summary(scores: Mapping[str, Estimate], held: str) -> str:
     )
 
 
-def _print_changes(
-    scenario: Scenario, adapted: Mapping[str, SafetyAssessment], gap: tuple[int, int], name: str
-) -> None:
-    """Prints how many pairs differ, what the monitor takes over, and what an update needs."""
-    differing, num_pairs = gap
-    unchanged = [
-        mode
-        for mode, one in adapted.items()
-        if one.base_logit_ is not None and not one.correction_.is_any
-    ]
-    console.say(f"adapted to '{name}': {differing} of {num_pairs} pairs end differently")
-    console.say(adapted[MODES[0]].detector_.describe())
-    if differing or not unchanged:
-        return
+def _why_unchanged(scenario: Scenario, modes: Sequence[str], num_pairs: int) -> str:
     num_needed = scenario.assessment.adaptation.update_interval
     duration_s = num_needed * scenario.episode_duration_s
     pairs = "the only pair ends" if num_pairs == 1 else f"all {num_pairs} pairs end"
-    console.say(
-        f"no correction of Γ ({', '.join(unchanged)}): {pairs} as on the nominal plant, and it "
-        f"learns from those that do not. A first update takes about {num_needed} pairs, as of "
-        f"{duration_s:g} s of logs, some of which end otherwise. Its inputs are known from now on",
-        style="yellow",
+    return (
+        f"no correction of Γ ({', '.join(modes)}): {pairs} as on the nominal plant, and it learns "
+        f"from those that do not. A first update takes about {num_needed} pairs, as of "
+        f"{duration_s:g} s of logs, some of which end otherwise. Its inputs are known from now on"
     )

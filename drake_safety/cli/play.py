@@ -60,15 +60,15 @@ def play(
     loaded, folder, gamma = folders.open_assessment(scenario, assessment, mode)
     options = console.given(hand=hand, recovery=recovery)
     # Check the capabilities of the task before a browser is opened.
-    asked = loaded.make_loop(variation, assessment=gamma, **options)
+    task = loaded.make_loop(variation, assessment=gamma, **options)
     rule = folders.goal_threshold(folder.path, gamma)
-    threshold, told = rule.threshold, f"threshold {rule.threshold:.3g}, {rule.origin}"
-    if isinstance(asked, FollowsCommands):
-        options["guard"], threshold, told = True, loaded.parameters.guard.threshold, ""
-    elif isinstance(asked, HasBall) and not isinstance(asked, HasGoals):
-        options["ball"], threshold, told = True, loaded.parameters.recovery.threshold, ""
-    if told:
-        console.say(told)
+    threshold = rule.threshold
+    if isinstance(task, FollowsCommands):
+        options["guard"], threshold = True, loaded.parameters.guard.threshold
+    elif isinstance(task, HasBall) and not isinstance(task, HasGoals):
+        options["ball"], threshold = True, loaded.parameters.recovery.threshold
+    else:
+        console.say(f"threshold {threshold:.3g}, {rule.origin}")
     page_port = _page_port(host, port)
     # The page forwards the scene, from an address that other pages cannot guess.
     meshcat = console.open_viewer(_hidden_host(), 0, has_rate=False)
@@ -99,12 +99,12 @@ def play(
 
 def _page_port(host: str, port: int | None) -> int:
     """The port of the page, which is free."""
-    asked = range(_FIRST_PORT, _FIRST_PORT + 200) if port is None else [port]
-    for candidate in asked:
+    candidates = range(_FIRST_PORT, _FIRST_PORT + 200) if port is None else [port]
+    for candidate in candidates:
         with contextlib.suppress(OSError, OverflowError):
             socket.create_server((host, candidate)).close()
             return candidate
-    raise ValueError(f"no page can be served at {host}:{asked[0]}: this port is not free")
+    raise ValueError(f"no page can be served at {host}:{candidates[0]}: this port is not free")
 
 
 def _hidden_host() -> str:

@@ -31,7 +31,7 @@ class FollowingCamera:
     def __init__(self, loop: LeggedLoop, meshcat: Meshcat):
         self.meshcat = meshcat
         self._state_port = loop.GetOutputPort("plant_state")
-        self._target, self._time_s = np.zeros(2), 0.0
+        self._target, self._time_s = np.zeros(2), np.inf
         q = loop.kinematics.standing_positions()
         contacts = loop.kinematics.contact_positions(q)
         self.size_m = float(max(2 * q[6], *np.ptp(contacts, axis=0)))
@@ -41,25 +41,18 @@ class FollowingCamera:
         self._draw_grid()
         meshcat.SetCameraPose(_DISTANCE * self.size_m * loop.view.direction(), np.zeros(3))
 
-    def begin(self, context: Context) -> None:
-        """Aims at the robot in a Context of the loop."""
-        self._target, self._time_s = self._base(context), context.get_time()
-        self.follow(context)
-
     def follow(self, context: Context) -> None:
-        """Moves the world so that the robot stays in the picture, from wherever a viewer looks."""
+        """Moves the world so that the robot stays in the picture, at once if time went back."""
         elapsed_s, self._time_s = context.get_time() - self._time_s, context.get_time()
-        share = 1.0 - (1.0 - _FOLLOWED) ** (elapsed_s / _TICK_S)
-        self._target = self._target + share * (self._base(context) - self._target)
+        share = 1.0 - (1.0 - _FOLLOWED) ** (elapsed_s / _TICK_S) if elapsed_s >= 0 else 1.0
+        base = self._state_port.Eval(context)[4:6]
+        self._target = self._target + share * (base - self._target)
         # The ground has no end: its disc and whole cells of its grid stay below the robot.
         cells = _CELL_M * np.round(self._target / _CELL_M)
         poses = {WORLD: [*-self._target, -self._height_m]}
         poses |= {_GROUND: [*self._target, 0.0], _GRID: [*cells, 0.0]}
         for path, place in poses.items():
             self.meshcat.SetTransform(path, RigidTransform(place), self._time_s)
-
-    def _base(self, context: Context) -> np.ndarray:
-        return self._state_port.Eval(context)[4:6]
 
     def _draw_grid(self) -> None:
         """Draws a round grid a little above the ground, by which one sees the robot move."""
@@ -80,5 +73,5 @@ def follow(loop: object, meshcat: Meshcat) -> Callable[[Context], None] | None:
     if not isinstance(loop, LeggedLoop):
         return None
     camera = FollowingCamera(loop, meshcat)
-    camera.begin(loop.CreateDefaultContext())
+    camera.follow(loop.CreateDefaultContext())
     return camera.follow

@@ -1,4 +1,4 @@
-"""A session with a simulation in Meshcat, in real time."""
+"""LiveSession: a simulation in Meshcat, in real time, with controls."""
 
 from __future__ import annotations
 
@@ -112,10 +112,8 @@ class LiveSession:
         self.loop: Any = loop  # What it can do is asked below.
         self.assessment, self.meshcat = loop.assessment, meshcat
         self.threshold, self.unsafe_below = threshold, unsafe_below
-        self.pace = Pace()
-        self.cause = ""
-        self.command = np.zeros(3)
-        self.is_guarded = True
+        self.pace, self.cause = Pace(), ""
+        self.command, self.is_guarded = np.zeros(3), True
         self.verdict: GoalVerdict | None = None
         self.nearest: GoalVerdict | None = None
         self._goal = np.full(3, np.nan)
@@ -253,7 +251,7 @@ class LiveSession:
         self._simulator.Initialize()
         self.panel.clear_history()
         if self._camera is not None:
-            self._camera.begin(self.context)
+            self._camera.follow(self.context)
 
     @property
     def _is_over(self) -> bool:
@@ -310,19 +308,16 @@ class LiveSession:
     def _note(self) -> str:
         """What was said last, or what a key does."""
         now_s, duration_s = self.context.get_time(), self.loop.scenario.episode_duration_s
+        notes = {"balls": "Space throws a ball", "goals": "R stands it up again"}
+        note = notes.get(self._use, "R starts anew")
         if now_s < self._said_until_s:
             note = self._said
         elif self._use == "commands":
             note = goal_words(self.loop).value(self.command)
-        elif self._use != "episodes":
-            is_ball = self._use == "balls"
-            note = "Space throws a ball" if is_ball else "R stands it up again"
-        elif self.cause:
+        elif self._use == "episodes" and self.cause:
             note = "the next start follows"
-        elif now_s >= duration_s:
+        elif self._use == "episodes" and now_s >= duration_s:
             note = f"the episode's {duration_s:g} s have passed; the next start follows"
-        else:
-            note = "R starts anew"
         return note if self.is_guarded else f"{note}; guard off"
 
     def _say(self, note: str, seconds: float) -> None:
