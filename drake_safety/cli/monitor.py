@@ -144,7 +144,7 @@ def _rows(entry: Mapping[str, Any]) -> list[list[str]]:
         return [[*head, "-", "-", "-", why]]
     if not entry["alarms"]:
         return [[*head, "-", "-", f"{entry['level']:.2f}", f"no alarm; largest: {entry['state']}"]]
-    rows = []
+    rows: list[list[str]] = []
     for alarm in entry["alarms"]:
         numbers = (alarm[key] for key in ("begin_s", "end_s", "level"))
         cells = ["goes on" if value is None else f"{value:.2f}" for value in numbers]
