@@ -272,7 +272,7 @@ def test_during_recovery_features_and_preview_are_of_the_same_plan():
     loop = packaged_loop(recovery=True)
     simulator, context = started(loop)
     loop.GetInputPort("safety_probability").FixValue(context, [0.0])
-    observer = loop._assessor_observer
+    observer = loop.GetSubsystemByName("assessor_observer")
     safe_set = BalanceSafeSet(loop.kinematics, loop.scenario.parameters.safe_set)
     for time in (0.05, 0.3, 0.55):
         simulator.AdvanceTo(time)

@@ -189,9 +189,10 @@ class Walking(LeggedLoop):
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
         """The robot's files and those of the policy."""
+        of_robot = super().model_files(scenario)  # First, so that its package is asked for first.
         path, network = policy_files(scenario)
         named = network_file(read_policy_file(path, network), str(path.parent))
-        return [*super().model_files(scenario), path, *network_files(named)]
+        return [*of_robot, path, *network_files(named)]
 
     @classmethod
     def options_for(cls, purpose: Purpose, scenario: Scenario, variation: str) -> dict[str, Any]:
