@@ -184,15 +184,17 @@ def check_pair(
         loop = make_paired(pair, side)
         OutcomeReader(loop, metric)
         try:
-            starts.append(_run_with_start(loop, 0, seed=seed, monitor=_after_one_step)[1])
+            starts.append(
+                _run_with_start(loop, 0, seed=seed, monitor=partial(_after_one_step, loop))[1]
+            )
         except EpisodeError as error:
             raise ValueError(f"the {who}: {error}") from error
     _check_alike(0, loop, *starts)
 
 
-def _after_one_step(context: Context) -> EventStatus:
+def _after_one_step(loop: ClosedLoop, context: Context) -> EventStatus:
     is_over = context.get_time() > 0.0
-    return EventStatus.ReachedTermination(None, "") if is_over else EventStatus.DidNothing()
+    return EventStatus.ReachedTermination(loop, "") if is_over else EventStatus.DidNothing()
 
 
 def _verdict(

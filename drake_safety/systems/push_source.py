@@ -53,7 +53,9 @@ class PushSource(LeafSystem):
                 f"{list(self._bodies)}"
             )
         values = [self._bodies[push.body].index(), *push.force_n, push.time_s, push.duration_s]
-        context.get_mutable_numeric_parameter(self._parameter).SetFromVector(values)
+        context.get_mutable_numeric_parameter(self._parameter).SetFromVector(
+            np.array(values, dtype=float)
+        )
 
     def push(self, context: Context) -> np.ndarray:
         """Index of the body, force [N], start and duration [s] of the push, (6,)."""
