@@ -163,7 +163,7 @@ def _rest(point: np.ndarray, start_s: float, duration_s: float) -> PiecewisePoly
 
 
 def _contacts(kinematics: RobotKinematics, rng: np.random.Generator, offset_m: float) -> np.ndarray:
-    """Contact points on the ground near those of the standing posture, (n_p, 3) [m]."""
+    """Contact points on the ground near the standing posture's, (n_p, 3) [m]."""
     xy = rng.uniform(-1, 1, (kinematics.num_contacts, 2)) * offset_m
     return np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])
 

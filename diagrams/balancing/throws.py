@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-# Those of Python 3.11 evaluate properties when a loop is asked for a protocol.
+# Protocols of Python 3.11 evaluate properties when `isinstance` asks a loop for a protocol.
 from typing_extensions import Protocol, runtime_checkable
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES

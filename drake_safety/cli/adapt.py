@@ -190,6 +190,6 @@ def _why_unchanged(scenario: Scenario, modes: Sequence[str], num_pairs: int) -> 
     pairs = "the only pair ends" if num_pairs == 1 else f"all {num_pairs} pairs end"
     return (
         f"no correction of Γ ({', '.join(modes)}): {pairs} as on the nominal plant, and it learns "
-        f"from those that do not. A first update takes about {num_needed} pairs, as of "
+        f"from pairs that end differently. A first update takes about {num_needed} pairs, as of "
         f"{duration_s:g} s of logs, some of which end otherwise. Its inputs are known from now on"
     )

@@ -152,10 +152,11 @@ def score_threshold(
     confidence: float | None = None,
     whose: str = "unsafe",
 ) -> float:
-    """Returns the highest score with the verdict "safe"; arguments are those of `calibrate`.
+    """Returns the highest score with the verdict "safe"; `calibrate` explains the arguments.
 
     It is the midpoint between the k-th lowest unsafe score and the next lower score of either
-    label; just below the former if there is none. `whose` names the labelled class in an error.
+    label; without a lower score, just below the k-th lowest. `whose` names the labelled class in
+    an error.
     """
     score, label = _checked(unsafe_score, is_unsafe)
     if not np.isfinite(score).any():

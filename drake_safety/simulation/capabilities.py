@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from pydrake.systems.framework import Context
 
-# Those of Python 3.11 evaluate properties when a loop is asked for a protocol.
+# Protocols of Python 3.11 evaluate properties when `isinstance` asks a loop for a protocol.
 from typing_extensions import Protocol, runtime_checkable
 
 if TYPE_CHECKING:
