@@ -182,29 +182,25 @@ def test_in_python_a_shipped_assessment_is_loaded_by_the_scenario_s_name(package
         load_assessment("pendulum")
 
 
-PLANS = ("--episodes", 4, "--candidates", 2, "--workers", 1)
-
-
 @pytest.mark.slow
 def test_a_command_takes_the_shipped_assessment_and_says_so(package, monkeypatch, capsys, tmp_path):
     before = {path: path.read_bytes() for path in package.rglob("*") if path.is_file()}
-    assert study(monkeypatch, "plan-study", NAME, *PLANS) == 0
-    told = capsys.readouterr().out
-    assert f"comes with the package, {package / NAME}" in told
-    assert "at most 10 % of unsafe episodes called safe" in told
     calibrated = ("--episodes", 60, "--miss-rate", 0.2, "--workers", 1)
     assert call(monkeypatch, "calibrate", NAME, *calibrated) == 0
+    printed = capsys.readouterr().out
+    assert f"comes with the package, {package / NAME}" in printed
+    assert "at most 20 % of unsafe episodes called safe" in printed
     # What is written goes to the working folder, never into the package.
     assert {path: path.read_bytes() for path in package.rglob("*") if path.is_file()} == before
     own = tmp_path / "work" / "runs" / f"{NAME}-shipped"
     names = {path.name for path in own.iterdir()}
-    assert names >= {"planning.json", "sharpened.safetensors", "paper.safetensors"}
-    capsys.readouterr()
-    # One's own, given, wins.
-    assert study(monkeypatch, "plan-study", NAME, "--assessment", own, *PLANS) == 0
-    told = capsys.readouterr().out
-    assert "comes with the package" not in told
-    assert "at most 20 % of unsafe episodes called safe" in told
+    assert names >= {"sharpened.safetensors", "paper.safetensors"}
+    # A given folder is used in place of the shipped one.
+    calibrated = ("--episodes", 60, "--miss-rate", 0.3, "--workers", 1)
+    assert call(monkeypatch, "calibrate", NAME, "--assessment", own, *calibrated) == 0
+    printed = capsys.readouterr().out
+    assert "comes with the package" not in printed
+    assert "at most 30 % of unsafe episodes called safe" in printed
 
 
 @pytest.mark.slow
@@ -214,9 +210,8 @@ def test_where_none_is_shipped_or_the_scenario_is_another_one_train_is_named(
     for name in (tmp_path / "carrying.yaml", tmp_path / f"{NAME}.yaml"):
         message = f"no assessment of what scenario '{name.stem}' simulates comes with the package"
         name.write_text(SCENARIO.replace("duration_s: 0.8", "duration_s: 1.2"))
-        for command in ("run", "play", "plan-study", "adapt", "calibrate"):
-            asked = study if command == "plan-study" else call
-            assert asked(monkeypatch, command, name) == 2
+        for command in ("run", "play", "adapt", "calibrate"):
+            assert call(monkeypatch, command, name) == 2
             (line,) = capsys.readouterr().out.splitlines()
             assert message in line
             assert "`drake-safety train` learns one, in a folder to be passed as --asse" in line
