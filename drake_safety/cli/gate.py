@@ -12,7 +12,6 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated
-from xml.etree import ElementTree
 
 import numpy as np
 from typer import Argument, Exit, Option
@@ -44,8 +43,7 @@ from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import load_scenario
 
 _MOST_SHOWN = 10  # Of a table of episodes.
-_NOT_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-_POINTS, _SECONDS = Column("", "", "points", digits=1), Column("", "")
+_POINTS = Column("", "", "points", digits=1)
 _PANELS = """<!doctype html><meta charset="utf-8">
 <style>body { display: flex; height: 95vh } iframe { flex: 1 }</style>"""
 
@@ -74,7 +72,6 @@ def gate(
     alpha: Annotated[float, Option(help="Probability that any verdict is wrong.")] = 0.05,
     episodes: Annotated[int, Option(help="Most pairs of episodes a candidate.", min=1)] = 2000,
     out: OutOption = None,
-    junit: Annotated[Path | None, Option(help="JUnit XML file to write.")] = None,
     replay: Annotated[int | None, Option(help="Only record this episode.", min=0)] = None,
     seed: Annotated[int, Option(help="Seed of the episodes.")] = GATE.first,
     workers: console.WorkersOption = None,
@@ -92,29 +89,26 @@ def gate(
         given[text if short in given else short] = (scenario, f"{baseline} {text}")
     if len(given) < max(replay is None, len(candidates or []) + len(candidate or [])):
         raise ValueError("gate: name different candidates: YAML files, or --candidate KEY=VALUE")
+    first = changed_plant(scenario, baseline)
+    folder = out or Path("runs") / f"{first.scenario.name}-gate"
+    folders.check_writable(folder)
+    others: dict[str, ComparedPlant] = {}
+    for name, changed in given.items():
+        try:
+            others[name] = changed_plant(*changed)
+            check_pair((first, others[name]), metric=metric, seed=seed)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+    if replay is not None:
+        return _record(first, others, replay, seed, folder / f"episode-{replay}.html")
+    gamma = None
+    with contextlib.suppress(ValueError):  # That of this very scenario, if one is shipped.
+        shipped = folders.assessment_folder(first.scenario, None)
+        gamma = folders.load_assessment(shipped.path, MODES[0])
     verdicts: dict[str, Verdict] = {}
-    wrong: dict[str, str] = {}
-    under_way, gamma, first_error = "", None, None
     try:
-        first = changed_plant(scenario, baseline)
-        folder = out or Path("runs") / f"{first.scenario.name}-gate"
-        folders.check_writable(folder, *([] if junit is None else [junit.parent]))
-        others: dict[str, ComparedPlant] = {}
-        for name, changed in given.items():
-            try:
-                others[name] = changed_plant(*changed)
-                check_pair((first, others[name]), metric=metric, seed=seed)
-            except (Exception, SystemExit) as error:  # Drake's failed assertions are SystemExit.
-                wrong[name], first_error = _message(error), first_error or error
-        if wrong:
-            raise ValueError("; ".join(map(": ".join, wrong.items()))) from first_error
-        if replay is not None:
-            return _record(first, others, replay, seed, folder / f"episode-{replay}.html")
-        with contextlib.suppress(ValueError):  # That of this very scenario, if one is shipped.
-            shipped = folders.assessment_folder(first.scenario, None)
-            gamma = folders.load_assessment(shipped.path, MODES[0])
         with console.open_stages() as stages:
-            for under_way, other in others.items():
+            for name, other in others.items():
                 compare_loops(
                     first,
                     other,
@@ -125,18 +119,12 @@ def gate(
                     seed=seed,
                     num_workers=workers,
                     path=folder / "episodes",
-                    progress=partial(stages, f"pairs, {under_way}"),
+                    progress=partial(stages, f"pairs, {name}"),
                     assessment=gamma,
-                    each_look=partial(verdicts.__setitem__, under_way),
+                    each_look=partial(verdicts.__setitem__, name),
                 )
-                pairs = verdicts[under_way].pairs
-                stages(f"pairs, {under_way}", pairs, pairs)
-    except (Exception, SystemExit) as error:
-        wrong = wrong or dict.fromkeys([under_way] if under_way else given, _message(error))
-        raise
+                stages(f"pairs, {name}", verdicts[name].pairs, verdicts[name].pairs)
     finally:  # After Ctrl-C too.
-        if junit is not None and replay is None:
-            _write_junit(junit, Path(scenario).stem, given, verdicts, wrong)
         if verdicts:
             _report(first, verdicts, metric, alpha / len(others), worse_by)
             candidates_ = {name: asdict(one) for name, one in verdicts.items()}
@@ -182,12 +170,12 @@ def rate(
             path=folder / "episodes",
             progress=stages,
         )
-    failures, loop = estimated.failures, loaded.make_loop(variation)
+    failures = estimated.failures
     text = Column("", "", "%", digits=2).text(estimated.rate)
     row = (text, estimated.rate.n, len(failures), round(estimated.plain_rollouts))
     columns = ("failure rate", "episodes", "failures", "random episodes of the same variance")
     _show(f"{loaded.name}, {variation}: {metric}", columns, [row])
-    _show_episodes("Failures", failures, metric, loop.output_names)
+    _show_episodes("Failures", failures, metric)
     figures = {("", "", "failure_rate"): estimated.rate}
     entries = {"seed": seed, "metric": metric} | asdict(estimated)
     _write(folder / "rate.json", ComparedPlant(loaded, variation), Results(figures, entries))
@@ -210,10 +198,6 @@ def changed_plant(scenario: str, changes: str) -> ComparedPlant:
     for text in network_kinds(loaded.task_class().model_files(loaded)):
         console.say(text)
     return ComparedPlant(loaded, variation)
-
-
-def _message(error: BaseException) -> str:
-    return f"{error}" if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
 
 
 def _record(
@@ -243,19 +227,30 @@ def _report(
     alpha: float,
     worse_by: float,
 ) -> None:
-    """Prints what is known."""
+    """Prints what is known, and the episodes that end differently."""
     rows = []
     for name, one in verdicts.items():
         counts = f"{one.both}, {len(one.no_longer_failing)}, {len(one.newly_failing)}"
-        ends = (_POINTS.text(one.difference[-1]), _SECONDS.text(one.survival_s[-1]))
-        rows.append((name, one.verdict, one.pairs, counts, *ends))
+        rows.append((name, one.verdict, one.pairs, counts, _POINTS.text(one.difference[-1])))
     failing = "fail: both, only baseline, only candidate"
-    columns = ("candidate", "verdict", "pairs", failing, "difference [points]", "survival [s]")
+    columns = ("candidate", "verdict", "pairs", failing, "difference [points]")
     _show(f"{first.scenario.name}, {first.variation}: {metric}", columns, rows)
     for name, one in verdicts.items():
-        _show_changes(name, metric, one)
-        if one.pairs_needed:
-            console.say(f"{name}: a verdict would take about {one.pairs_needed} pairs like these")
+        new, old = one.newly_failing, one.no_longer_failing
+        _show_episodes(f"{name}: episodes that newly fail", new, metric)
+        _show_episodes(f"{name}: episodes that fail no longer", old, metric)
+        sides = BELIEFS if any(each.belief for each in new) else ()
+        causes = []
+        for cause in dict.fromkeys(each.cause for each in (*new, *old)):
+            here = [each for each in new if each.cause == cause]
+            believed = [BELIEFS[int(np.argmax(each.belief))] for each in here if each.belief]
+            lost = sum(each.cause == cause for each in old)
+            causes.append((spoken(cause or metric), len(here), *map(believed.count, sides), lost))
+        headings = ("cause", "newly fail", *(f"Γ: {what}" for what in sides), "fail no longer")
+        _show(f"{name}: by cause", headings, causes)
+        for each in [*new, *old][:1]:
+            option = f"--replay={each.episode}"
+            console.say("to see one:", console.command_line(option=option))
     console.say(
         "a verdict, or an end of an interval, is wrong with a probability of at most "
         f"{100 * alpha:.3g} % a candidate, whenever one looks; 'not worse': by "
@@ -263,38 +258,7 @@ def _report(
     )
 
 
-def _show_changes(name: str, metric: str, one: Verdict) -> None:
-    """Prints the episodes that end differently, by cause and command, and how to see one."""
-    new, old = one.newly_failing, one.no_longer_failing
-    if not (new or old):
-        return console.say(f"{name}: no episode ends differently")
-    names = list(dict.fromkeys(row[0] for row in one.by_command))
-    _show_episodes(f"{name}: episodes that newly fail", new, metric, names)
-    _show_episodes(f"{name}: episodes that fail no longer", old, metric, names)
-    rows, sides = [], BELIEFS if any(each.belief for each in new) else ()
-    for cause in dict.fromkeys(each.cause for each in (*new, *old)):
-        here = [each for each in new if each.cause == cause]
-        believed = [BELIEFS[int(np.argmax(each.belief))] for each in here if each.belief]
-        lost = sum(each.cause == cause for each in old)
-        rows.append((spoken(cause or metric), len(here), *map(believed.count, sides), lost))
-    columns = ("cause", "newly fail", *(f"Γ: {what}" for what in sides), "fail no longer")
-    _show(f"{name}: by cause", columns, rows)
-    by_command = [(_with_unit(entry), *row) for entry, *row in one.by_command]
-    columns = ("commanded", "from", "to", "pairs", "newly fail", "fail no longer")
-    _show(f"{name}: by what was commanded", columns, by_command)
-    index = [*new, *old][0].episode
-    return console.say("to see one:", console.command_line(option=f"--replay={index}"))
-
-
-def _with_unit(entry: str) -> str:
-    """The name of an entry of the desired output, with its unit."""
-    units = {"velocity": "m/s", "rate": "rad/s"}
-    return f"{spoken(entry)} [{units.get(entry.rpartition('_')[2], 'm')}]"
-
-
-def _show_episodes(
-    title: str, episodes: Sequence[Outcome], metric: str, names: Iterable[str]
-) -> None:
+def _show_episodes(title: str, episodes: Sequence[Outcome], metric: str) -> None:
     """Prints episodes that failed, the first ones in full."""
     if len(episodes) > _MOST_SHOWN:
         title += f": the first {_MOST_SHOWN} of {len(episodes)}"
@@ -302,16 +266,15 @@ def _show_episodes(
     for one in episodes[:_MOST_SHOWN]:
         commanded = ", ".join(f"{value:.3g}" for value in one.commanded)
         belief = ", ".join(f"{mass:.2f}" for mass in one.belief or ()) or "–"
-        cause = spoken(one.cause or metric)
-        rows.append((one.episode, cause, f"{one.time_s:.2f}", commanded, belief))
-    outputs = "commanded: " + ", ".join(map(_with_unit, names))
-    belief_title = "Γ at its start: safe, unsafe, unknown"
-    _show(title, ("episode", "cause", "at [s]", outputs, belief_title), rows)
+        rows.append(
+            (one.episode, spoken(one.cause or metric), f"{one.time_s:.2f}", commanded, belief)
+        )
+    _show(title, ("episode", "cause", "at [s]", "commanded", "Γ: safe, unsafe, unknown"), rows)
 
 
 def _show(title: str, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
     """Prints a table, unless it is empty."""
-    cells = [[f"{one:.4g}" if isinstance(one, float) else f"{one}" for one in row] for row in rows]
+    cells = [[*map(str, row)] for row in rows]
     if cells:
         console.show(console.new_table(*columns, rows=cells, title=title))
 
@@ -322,29 +285,3 @@ def _write(file: Path, plant: ComparedPlant, results: Results) -> None:
     results.entries = made | results.entries
     results.write(file)
     console.say("figures", file)
-
-
-def _write_junit(
-    file: Path,
-    suite: str,
-    names: Iterable[str],
-    verdicts: Mapping[str, Verdict],
-    wrong: Mapping[str, str],
-) -> None:
-    """Writes JUnit XML, a test case a candidate: worse is a failure, what is not known an error."""
-    root = ElementTree.Element("testsuite", name=f"gate {suite}")
-    for name in names:
-        case, kind = ElementTree.SubElement(root, "testcase", classname=suite, name=name), "error"
-        what = message = "not reached"
-        if name in wrong:
-            what, message = "error", wrong[name]
-        elif one := verdicts.get(name):
-            what, kind = one.verdict, {WORSE: "failure", UNDECIDED: "error"}.get(one.verdict, "")
-            message = f"{what} after {one.pairs} pairs: {_POINTS.text(one.difference[-1])} points"
-        if kind:
-            ElementTree.SubElement(case, kind, type=what, message=message)
-    counts = {"tests": "testcase", "failures": "failure", "errors": "error"}
-    root.attrib |= {key: f"{len([*root.iter(kind)])}" for key, kind in counts.items()}
-    text = ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
-    write_file(file, _NOT_XML.sub("?", text))
-    console.say("JUnit  ", file)

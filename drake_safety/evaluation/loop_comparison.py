@@ -18,7 +18,7 @@ from pydrake.systems.framework import Context, EventStatus
 
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.outcomes import UNSAFE, Metric, Outcome, OutcomeReader
-from drake_safety.evaluation.paired_test import interim_estimate, pairs_needed
+from drake_safety.evaluation.paired_test import interim_estimate
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import GATE
 from drake_safety.learning.segments import Episode, EpisodeError
@@ -47,31 +47,21 @@ class Verdict:
     """What is known of a candidate after a number of pairs.
 
     Attributes:
-        verdict: "worse", "better", "not worse" (by `worse_by`), or "undecided". Each is wrong with
-            a probability of at most alpha, whenever one looks.
-        pairs: Number of pairs.
+        verdict: "worse", "better", "not worse" (by `worse_by`), or "undecided".
         both: Number of pairs in which both fail alike.
         difference: Mean outcome of the candidate minus that of the baseline at each look.
-        survival_s: The same of the time until the failure, or the end [s].
         newly_failing: The candidate's episodes that fail, or do worse than the baseline's, by time,
             with Γ's belief at the baseline's start.
         no_longer_failing: The baseline's that do worse.
-        by_command: Rows of an entry of the desired output, a range, a third of all pairs, their
-            number, and how many of them newly fail and fail no longer.
-        pairs_needed: That a verdict takes, if all are like those so far; None if there is one, or
-            too many.
     """
 
     verdict: str
     pairs: int
     both: int
     difference: list[Estimate]
-    survival_s: list[Estimate]
     newly_failing: list[Outcome]
     no_longer_failing: list[Outcome]
-    by_command: list[tuple[str, float, float, int, int, int]]
     worse_by: float
-    pairs_needed: int | None = None
 
 
 def compare_loops(
@@ -91,15 +81,12 @@ def compare_loops(
 ) -> Verdict:
     """Simulates two closed loops in the same episodes until it is known which one fails more.
 
-    The loops of a pair have the same start, plan, disturbances and random generator. Every 16
-    pairs it looks at a confidence sequence of the difference of their failure rates: *worse* means
-    that it is above 0, *better* below 0, *not worse* below `worse_by`.
+    Every 16 pairs it looks at a confidence sequence of the difference of their failure rates:
+    *worse* means that it is above 0, *better* below 0, *not worse* below `worse_by`.
 
     Args:
         metric: What counts as a failure. A diverged simulation does, but for a function.
-        worse_by: The difference that would matter, in (0, 1).
         alpha: Probability of a wrong verdict, of each kind. With k candidates pass alpha / k.
-        max_pairs: Number of pairs after which it is undecided.
         path: Folder in which episodes are kept; those that it holds are not simulated again.
         assessment: Γ of the baseline's scenario, which says whether a change was foreseen.
         each_look: Called with what is known at each look.
@@ -145,7 +132,7 @@ def compare_loops(
             stage="pairs",
         )
         stack.enter_context(closing(results))
-        looks: tuple[list[Estimate], list[Estimate]] = ([], [])
+        looks: list[Estimate] = []
         for number in sorted({*range(_LOOK, max_pairs, _LOOK), max_pairs}):
             while not all(index in known for known in runs for index in range(number)):
                 for side, episode in enumerate(next(results)):
@@ -155,13 +142,8 @@ def compare_loops(
                             writers[side].append(episode)
             pairs = [(runs[0][index], runs[1][index]) for index in range(number)]
             apart = [after.value - before.value for before, after in pairs]
-            later_s = [after.time_s - before.time_s for before, after in pairs]
-            duration_s = first.scenario.episode_duration_s
-            looks[0].append(interim_estimate(apart, looks[0], alpha))
-            looks[1].append(interim_estimate(later_s, looks[1], alpha, duration_s))
-            verdict = _verdict(pairs, looks, worse_by, loops[0].output_names)
-            if verdict.verdict == UNDECIDED:
-                verdict = replace(verdict, pairs_needed=pairs_needed(apart, worse_by, alpha))
+            looks.append(interim_estimate(apart, looks, alpha))
+            verdict = _verdict(pairs, looks, worse_by)
             each_look(verdict)
             if verdict.verdict != UNDECIDED:
                 break
@@ -198,14 +180,10 @@ def _after_one_step(loop: ClosedLoop, context: Context) -> EventStatus:
 
 
 def _verdict(
-    pairs: Sequence[tuple[Outcome, Outcome]],
-    looks: Sequence[list[Estimate]],
-    worse_by: float,
-    output_names: Sequence[str],
+    pairs: Sequence[tuple[Outcome, Outcome]], looks: Sequence[Estimate], worse_by: float
 ) -> Verdict:
     """What is known of all pairs so far."""
-    difference, survival_s = map(list, looks)  # Later looks do not change it.
-    low, high = difference[-1].low, difference[-1].high
+    low, high = looks[-1].low, looks[-1].high
     known = WORSE if low > 0.0 else BETTER if high < 0.0 else NOT_WORSE
     newly = [replace(two, belief=one.belief) for one, two in pairs if two.value > one.value]
     no_longer = [one for one, two in pairs if two.value < one.value]
@@ -213,28 +191,11 @@ def _verdict(
         verdict=known if high < worse_by or known == WORSE else UNDECIDED,
         pairs=len(pairs),
         both=sum(one.value == two.value > 0.0 for one, two in pairs),
-        difference=difference,
-        survival_s=survival_s,
+        difference=[*looks],  # Later looks do not change it.
         newly_failing=sorted(newly, key=lambda one: one.time_s),
         no_longer_failing=sorted(no_longer, key=lambda one: one.time_s),
-        by_command=_by_command(output_names, pairs),
         worse_by=worse_by,
     )
-
-
-def _by_command(
-    names: Sequence[str], pairs: Sequence[tuple[Outcome, Outcome]]
-) -> list[tuple[str, float, float, int, int, int]]:
-    """Changes in each third of what was commanded, by entry of the desired output."""
-    apart = np.array([two.value - one.value for one, two in pairs])
-    rows = []
-    for name, values in zip(names, np.array([one.commanded for one, _ in pairs]).T, strict=True):
-        ends = np.quantile(values, [0.0, 1 / 3, 2 / 3, 1.0])
-        parts = (values, values[apart > 0], values[apart < 0])
-        counts = [np.histogram(part, ends)[0].tolist() for part in parts]
-        columns = ([name] * 3, ends[:-1].tolist(), ends[1:].tolist(), *counts)
-        rows += [row for row in zip(*columns, strict=True) if row[3]]
-    return rows
 
 
 def make_paired(pair: tuple[ComparedPlant, ComparedPlant], side: int, **options: Any) -> ClosedLoop:

@@ -17,7 +17,6 @@ from drake_safety.evaluation.metrics import Estimate
 _SHARES = 0.95 * 0.5 ** np.arange(8)
 """Shares u of the capital that are bet. Large ones have larger weights: failures are rare."""
 _WEIGHTS = np.sqrt(_SHARES) / np.sqrt(_SHARES).sum()
-_MOST_TIMES = 1000.0  # As many pairs as so far.
 _EDGE = 1e-9  # Of the range of means, where a bet would be infinite.
 
 
@@ -43,34 +42,18 @@ def betting_log_e(values: np.ndarray, counts: np.ndarray, mean: float) -> np.nda
 
 
 def interim_estimate(
-    outcomes: Sequence[float], before: Sequence[Estimate], alpha: float, bound: float = 1.0
+    outcomes: Sequence[float], before: Sequence[Estimate], alpha: float
 ) -> Estimate:
-    """A look at a confidence sequence: the mean of all outcomes so far, (N,), and its ends.
+    """A look at a confidence sequence: the mean of all outcomes so far, (N,) in ±1, and its ends.
 
     Each end holds at all looks at once with a probability of at least 1 - alpha, and both with
-    1 - 2 alpha.
-
-    Args:
-        before: Earlier looks. What they have excluded stays so.
+    1 - 2 alpha. What earlier looks have excluded stays so.
     """
-    scaled = np.array(outcomes) / bound
-    if not (worst := np.abs(scaled).max()) <= 1.0 + _EDGE:
-        raise ValueError(f"outcomes must be in ±{bound:g}; got ±{bound * worst}")
-    values, counts = np.unique(np.clip(scaled, -1.0, 1.0), return_counts=True)
-    low, high = (sign * bound * _low(sign * values, counts, alpha) for sign in (1.0, -1.0))
+    values, counts = np.unique(outcomes, return_counts=True)
+    low, high = (sign * _low(sign * values, counts, alpha) for sign in (1.0, -1.0))
     low = max([low, *(one.low for one in before[-1:])])
     high = min([high, *(one.high for one in before[-1:])])
     return Estimate(float(np.mean(outcomes)), low, high, len(outcomes))
-
-
-def pairs_needed(outcomes: Sequence[float], bound: float, alpha: float) -> int | None:
-    """Pairs that exclude 0, or more than a bound, if all are like the outcomes so far, (N,)."""
-    values, counts = np.unique(outcomes, return_counts=True)
-    times = np.geomspace(1.0, _MOST_TIMES, 400)[:, None]
-    bets = ((values, 0.0), (-values, 0.0), (-values, -bound))
-    log_e = [betting_log_e(signed, times * counts, mean) for signed, mean in bets]
-    is_known = np.max(log_e, axis=0) >= -math.log(alpha)
-    return math.ceil(len(outcomes) * times[np.argmax(is_known), 0]) if is_known.any() else None
 
 
 def _low(values: np.ndarray, counts: np.ndarray, alpha: float) -> float:
