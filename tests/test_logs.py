@@ -49,16 +49,6 @@ def test_every_format_gives_the_same_episode(kind, tmp_path):
     assert_same(episode, direct)
 
 
-@pytest.mark.train
-def test_a_log_can_be_resampled(tmp_path):
-    rows = few_rows()
-    log = read(write(rows, tmp_path, "parquet"), reader=read_log, step_s=0.00375)
-    np.testing.assert_allclose(log.time_s, 0.00375 * np.arange(27), atol=1e-12)
-    np.testing.assert_allclose(log.q[2], rows.q[3], atol=1e-11)
-    middle = 0.5 * (rows.v[1] + rows.v[2])
-    np.testing.assert_allclose(log.v[1], middle, atol=1e-11)
-
-
 def test_derivatives_are_exact_for_constant_acceleration_at_uneven_times():
     times = np.array([0.0, 0.1, 0.25, 0.3, 0.5])
     np.testing.assert_allclose(rates(times, times[:, None] ** 2)[:, 0], 2 * times, atol=1e-12)

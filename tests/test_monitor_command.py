@@ -163,7 +163,7 @@ def test_a_log_is_judged_as_its_motions_are_with_its_own_times(monkeypatch, caps
     assert not call(
         monkeypatch, "monitor", "laikago_balancing", *options, "--out", tmp_path / "out"
     )
-    assert "run.csv' is cut where values are missing" in capsys.readouterr().out
+    assert "are kept, in" in capsys.readouterr().out
     (judged,) = json.loads((tmp_path / "out" / "monitor.json").read_text())["entries"]["logs"]
     assessment = load_assessment("laikago_balancing")
     pieces = read_pieces(log, tmp_path / "columns.yaml", loop.robot).pieces

@@ -24,10 +24,8 @@ class Channel:
     """Columns of one table or topic, unconverted.
 
     Attributes:
-        topic: Topic of the messages; empty for a table.
-        time: Time in the log's unit, integers or floats, (N,); dates and durations in ns
-            become integers.
-        frame: The requested columns, N rows of floats; the index is their number in the file.
+        time: Time in the log's unit, integers or floats, (N,); dates and durations become ns.
+        frame: N rows of floats; the index is their number in the file.
         row_name: Name of a row: "line", "row" or "message".
         origin: Instant from which ``time_s`` counts, in the log's unit.
     """
@@ -65,6 +63,4 @@ class Channel:
 def listed(names: Iterable[str], many: int = 40) -> str:
     """Formats names for a message, at most as many as given."""
     names = list(names)
-    if len(names) <= many:
-        return str(names)
-    return f"{names[:many]} and {len(names) - many} more"
+    return f"{names[:many]}" + f" and {len(names) - many} more" * (len(names) > many)

@@ -33,23 +33,14 @@ _LEAST = {"base_linear_velocity": 0.01, "base_angular_velocity": 0.05, "joint_ve
 _DISAGREES, _AGREES = 0.4, 0.25  # Of the motion, if another reading agrees.
 _WRONG, _FAR = 0.9, 3.0  # Of the motion, and of the least change, if none does.
 _FACTOR, _TURN_RAD = 1.6, math.radians(30.0)  # Least factor of a unit or rate, and turn of axes.
-_FASTEST_M_S = 15.0
-_FASTEST = {
-    "base_position": _FASTEST_M_S,
-    "base_linear_velocity": _FASTEST_M_S,
-    "base_orientation": 40.0,
-    "base_angular_velocity": 40.0,  # More than gyroscopes measure.
-    "joint_positions": (20.0, 100.0),
-    "joint_velocities": (20.0, 100.0),
-}
-"""Speeds that no robot exceeds; of joints, the range of the limit [m/s, rad/s]."""
+_FASTEST_M_S, _FASTEST_RAD_S = 15.0, 40.0  # Of the base; gyroscopes measure less.
+_FASTEST_JOINT = (20.0, 100.0)  # Range of the limit [rad/s].
 _JUMP_S = 0.005
 _STEP_S, _NUM_STEPS = 0.05, 80  # In which a foot on the ground does not move.
-_UNEVEN, _MANY_CHANGES = 3.0, 20  # Times of even times' variation, of at least so many.
 _SHORTEST_S = 0.5  # Of a log that says how feet move.
 _SLIP_M, _SLIP_FACTOR, _HIGH_M = 0.004, 3.0, 0.01
 _LONGEST_LEG = 7
-_HOW = ("from their means", "while the lowest one stands", "or rest at several heights")
+_MEASURES = ("from their means", "while the lowest one stands", "or rest at several heights")
 _MIRRORS = {"left and right": (1, -1), "front and rear": (-1, 1), "diagonal": (-1, -1)}
 _INVERSE = "'base_orientation' is the inverse, of the world in the base"
 
@@ -74,21 +65,16 @@ def check(sources: list[Source], kinematics: RobotKinematics) -> list[str]:
     """Checks the first piece's start and the longest one's motion, and the values of all.
 
     Returns notes on the height of the feet.
-
-    Raises:
-        ValueError: A quaternion's norm is not 1; something moves faster than robots do; a joint is
-            far beyond its stops; the robot does not stand on the ground z = 0 at first; or
-            velocities or feet contradict the positions.
     """
-    longest, notes = max(sources, key=lambda one: float(np.ptp(one.at_s))), list[str]()
+    longest, notes = max(sources, key=lambda source: float(np.ptp(source.at_s))), list[str]()
     for source in sources:
-        names = source.log_map.base_orientation.columns
         norms = np.linalg.norm(source.table("base_orientation"), axis=1)
         if (is_bad := np.abs(norms - 1.0) > _NORM_TOLERANCE).any():
             row = int(np.argmax(is_bad))
             raise ValueError(
-                f"{source.channels['base_orientation'].where(row)}, columns {names}: the "
-                f"quaternion has a norm of {norms[row]:g}, expected 1"
+                f"{source.channels['base_orientation'].where(row)}, columns "
+                f"{source.log_map.base_orientation.columns}: the quaternion has a norm of "
+                f"{norms[row]:g}, expected 1"
             )
         if source is sources[0]:
             _check_start(source, kinematics)
@@ -110,15 +96,17 @@ def check(sources: list[Source], kinematics: RobotKinematics) -> list[str]:
 def _check_speed(source: Source, name: str, kinematics: RobotKinematics) -> None:
     """Checks that a quantity nowhere moves, or jumps between two rows, as no robot does.
 
-    Rare jumps take 5 ms at least, so that noise does not reach the limits. Joints have twice their
-    own speed, from 20 to 100 rad/s.
+    Rare jumps take 5 ms at least, so that noise does not reach the limits.
     """
-    channel, values, limit = source.channels[name], source.table(name), np.array(_FASTEST[name])
+    channel, values = source.channels[name], source.table(name)
+    is_angle = "angular" in name or "orientation" in name
+    limit = np.array(_FASTEST_RAD_S if is_angle else _FASTEST_M_S)
     if "joint" in name:
         own = kinematics.velocity_limits
-        limit = np.clip(np.where(own > 1.0, 2 * own, math.inf), *limit)
-    speeds = np.abs(values)
+        limit = np.clip(np.where(own > 1.0, 2 * own, math.inf), *_FASTEST_JOINT)
+    speeds, jump = np.abs(values), ""
     if name not in VELOCITIES:
+        jump = " since the row before"
         speeds = np.abs(np.diff(values, axis=0, prepend=values[:1]))
         if name == "base_orientation":
             cosines = np.sum(values[1:] * values[:-1], axis=1)
@@ -131,10 +119,9 @@ def _check_speed(source: Source, name: str, kinematics: RobotKinematics) -> None
     row = int(np.argmax(is_beyond.any(axis=1)))
     column = int(np.argmax(speeds[row] / limit))
     where = channel.where(row, getattr(source.log_map, name).names(source.joints)[column])
-    jump = "" if name in VELOCITIES else " since the row before"
     raise ValueError(
         f"{where}: the value is {channel.frame.iloc[row].iloc[column]:g}, which means "
-        f"{speeds[row, column]:.3g} {'m/s' if limit.min() == _FASTEST_M_S else 'rad/s'}{jump}; "
+        f"{speeds[row, column]:.3g} {'rad/s' if is_angle or 'joint' in name else 'm/s'}{jump}; "
         f"robots stay below {np.broadcast_to(limit, speeds.shape)[row, column]:g}: check units, "
         f"and that all rows of '{name}' are of one source"
     )
@@ -174,11 +161,7 @@ def _beyond_stops(kinematics: RobotKinematics, joints: np.ndarray) -> tuple[int,
 
 
 def _check_start(source: Source, kinematics: RobotKinematics) -> None:
-    """Checks that the robot stands on the ground in the first row.
-
-    A wrong order or turn of the quaternion tilts it; wrong units lift its feet off the ground or
-    move joints beyond their stops. The error suggests readings that pass the check.
-    """
+    """Checks that the robot stands on the ground in the first row; else says how it would."""
 
     def wrong(read: Source) -> str:
         return _implausible(kinematics, read.positions(source.at_s[:1])[0])
@@ -193,17 +176,15 @@ def _check_start(source: Source, kinematics: RobotKinematics) -> None:
             if unit != part.unit and not wrong(replace(source, log_map=log_map)):
                 likely.append(f"'{name}.unit' is {unit}")
     poses = list(_poses(source, kinematics))
-    if best := _stillest([one for one in poses if "joint" not in one.what], 1):
+    if best := _stillest([pose for pose in poses if "joint" not in pose.what], 1):
         likely.append(best.what)
     if not likely:
-        likely = [one.what for one in (_stillest(poses, 1),) if one]
+        likely = [pose.what for pose in (_stillest(poses, 1),) if pose]
         q = source.positions(source.at_s[:1])[0]
         height = _lowest_foot(kinematics, q)
         q[6] -= height
-        if (
-            not _implausible(kinematics, q)
-            and abs(height) < _REACH_SHARE * kinematics.standing_height
-        ):
+        is_near = abs(height) < _REACH_SHARE * kinematics.standing_height
+        if is_near and not _implausible(kinematics, q):
             side = "lower" if height > 0 else "higher"
             likely.append(f"it were {abs(height):.3g} m {side}: {_offset_text(source, height)}")
     hint = f"; it would stand if {' or '.join(likely)}" if likely else ""
@@ -222,28 +203,27 @@ def _check_desired_output(source: Source, kinematics: RobotKinematics) -> None:
     if distance > _REACH_SHARE * kinematics.standing_height:
         raise ValueError(
             f"{source.where}: the desired output is {distance:.3g} m from the base of robot "
-            f"'{kinematics.robot.name}': check its frame and its unit, "
-            f"{source.log_map.desired_output.unit}; it is a position, no velocity command"
+            f"'{kinematics.robot.name}': check its frame and its unit; it is a position, no "
+            "velocity command"
         )
 
 
 def _check_stance(source: Source, kinematics: RobotKinematics) -> list[str]:
     """Checks that feet do not rest better by another reading of the base's pose or the joints.
 
-    How far they move from their means (rms) and the lowest one in 0.05 s (median) count, and how
-    each rests at the height of all. Returns a note if they rest above or below the ground.
+    Returns a note if they rest above or below the ground.
     """
     if np.ptp(source.at_s) < _SHORTEST_S:
         return []
     poses = _poses(source, kinematics)
     given = next(poses)
     others = list(poses) if max(given.slips) > _SLIP_M else []
-    for i, how in enumerate(_HOW):
+    for i, measure in enumerate(_MEASURES):
         best, slip = _stillest(others, i) or given, given.slips[i]
         if slip > max(_SLIP_M, _SLIP_FACTOR * best.slips[i]):
             raise ValueError(
                 f"{source.where} and after it: the feet of robot '{kinematics.robot.name}' slide "
-                f"by {slip:.3g} m with the base ({how}), but only by {best.slips[i]:.3g} m if "
+                f"by {slip:.3g} m with the base ({measure}), but only by {best.slips[i]:.3g} m if "
                 f"{best.what}"
             )
     if abs(height := given.height) < _HIGH_M:
@@ -266,11 +246,11 @@ def _offset_text(source: Source, height: float) -> str:
     return f"{text} (and of 'desired_output')" if "desired_output" in source.channels else text
 
 
-def _stillest(poses: Iterator[_Pose] | list[_Pose], i: int) -> _Pose | None:
+def _stillest(poses: list[_Pose], i: int) -> _Pose | None:
     """The first of the poses in which a robot stands whose feet slide least, to a millimetre."""
-    standing = [one for one in poses if one.stands]
-    least = min((one.slips[i] for one in standing), default=0.0)
-    return next((one for one in standing if one.slips[i] <= least + 0.001), None)
+    standing = [pose for pose in poses if pose.stands]
+    least = min((pose.slips[i] for pose in standing), default=0.0)
+    return next((pose for pose in standing if pose.slips[i] <= least + 0.001), None)
 
 
 def _poses(source: Source, kinematics: RobotKinematics) -> Iterator[_Pose]:
@@ -354,28 +334,10 @@ def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rot
         yield what, Rotation.from_euler("z", angle, degrees=True) * R, p
 
 
-def _check_stamps(source: Source, name: str, positions: str) -> None:
-    """Checks that a derivative would not be smoother with even times: then the stamps jitter."""
-    channel, moved = source.channels[positions], np.diff(source.table(positions), axis=0)
-    steps_s = np.diff(channel.time_s)
-    given, even = (
-        np.median(np.abs(np.diff(moved / step_s, axis=0)).max(axis=1))
-        for step_s in (steps_s[:, None], np.median(steps_s))
-    )
-    share = given / max(even, 1e-9)
-    if share > _UNEVEN and given > _LEAST[name] / _WINDOW_S and len(moved) > _MANY_CHANGES:
-        raise ValueError(
-            f"{channel.where(0, channel.time_name)}: the times of the rows jitter: the derivative "
-            f"of '{positions}' varies by {share:.1f} times as much as with even times: log when "
-            f"it is measured, or '{name}'"
-        )
-
-
 def _check_velocities(source: Source) -> None:
     """Checks that logged velocities are the derivatives of positions, in frame, sign and unit."""
     for name, positions in VELOCITIES.items():
         if name not in source.channels:
-            _check_stamps(source, name, positions)
             continue
         names = {positions, name} if "joint" in name else {positions, name, "base_orientation"}
         channels = [source.channels[one] for one in names]
@@ -452,17 +414,16 @@ def _require(
 ) -> None:
     """Raises if the given reading differs and one of a tier does not, or if it differs by far."""
 
-    def differs(reading: _Reading) -> tuple[float, float, str]:
-        """Median difference in the windows with motion, relative to it and absolute."""
-        what, derived, logged = reading
-        size = np.median(np.linalg.norm(derived - logged, axis=1)[moves])
-        return float(size / np.median(sizes(derived, logged)[moves])), float(size), what
-
     def sizes(derived: np.ndarray, logged: np.ndarray) -> np.ndarray:
         return np.linalg.norm([derived, logged], axis=2).max(axis=0)
 
+    def differs(derived: np.ndarray, logged: np.ndarray) -> tuple[float, float]:
+        """Median difference in the windows with motion, relative to it and absolute."""
+        size = float(np.median(np.linalg.norm(derived - logged, axis=1)[moves]))
+        return size / float(np.median(sizes(derived, logged)[moves])), size
+
     moves, least = sizes(*given[1:]) > _LEAST[name], _LEAST[name]
-    share, size, _ = differs(given) if moves.any() else (0.0, 0.0, "")
+    share, size = differs(*given[1:]) if moves.any() else (0.0, 0.0)
     if share <= _DISAGREES or size < least:
         return
     unit = "m/s" if "linear" in name else "rad/s"
@@ -471,20 +432,20 @@ def _require(
         f"derivative of '{VELOCITIES[name]}' by {size / width_s:.2f} {unit}, median where it moves"
     )
     for tier in tiers:
-        found = [differs(one) for one in tier]
-        best = min((one[0] for one in found), default=math.inf)
+        shares = [(*differs(*changes), what) for what, *changes in tier]
+        best = min((other[0] for other in shares), default=math.inf)
         if best < min(_AGREES, share / 2):
-            close = [one for one in found if one[0] < best + 0.05][:2]
+            close = [other for other in shares if other[0] < best + 0.05][:2]
             likely = " or ".join(what for _, _, what in close)
             raise ValueError(f"{text}, but by {close[0][1] / width_s:.2f} {unit} if {likely}")
     num_rows = 8 if "angular" in name else 4  # A gyroscope's vibrations need more to be averaged.
-    is_still = [not np.median(np.linalg.norm(one, axis=1)[moves]) for one in given[1:]]
-    is_far = share > _WRONG and (size > _FAR * least or any(is_still))
+    is_still = any(not np.median(np.linalg.norm(part, axis=1)[moves]) for part in given[1:])
+    is_far = share > _WRONG and (size > _FAR * least or is_still)
     if is_far and width_s > num_rows * np.median(np.diff(source.channels[name].time_s)):
-        remedy = f"leave '{name}' out of the map, then the derivative is used"
-        if is_still[0]:
-            remedy = f"'{VELOCITIES[name]}' stands still most of that time"
-        raise ValueError(f"{text}; no other frame, sign or unit agrees: {remedy}")
+        raise ValueError(
+            f"{text}; no other frame, sign or unit agrees: leave '{name}' out of the map, then the "
+            f"derivative is used, unless '{VELOCITIES[name]}' stands still"
+        )
 
 
 def _turn_text(turn: Rotation) -> str:

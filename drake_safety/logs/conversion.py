@@ -20,20 +20,16 @@ class Source:
     Attributes:
         joints: Names of the joints in the robot's order.
         channels: Columns of every quantity that is in the map, by its field of the map.
-        step_s: Time between two converted rows [s]; by default those of the base's position.
     """
 
     log_map: LogMap
     joints: list[str]
     channels: Mapping[str, Channel]
-    step_s: float | None = None
 
     @cached_property
     def at_s(self) -> np.ndarray:
-        """Times of the converted rows [s], which all quantities cover."""
+        """Times of the base's positions [s] that all quantities cover."""
         begin, end = common_span(self.channels.values())
-        if self.step_s is not None:
-            return begin + self.step_s * np.arange(int((end - begin) / self.step_s + 1e-9) + 1)
         base_s = self.channels["base_position"].time_s
         return base_s[(base_s >= begin) & (base_s <= end)]
 

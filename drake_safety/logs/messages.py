@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -21,77 +19,22 @@ _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]|\.")
 _REMEDIES = {
     ".mcap": " ('mcap recover' may repair it)",
     ".bag": ", cut off ('rosbag reindex' repairs it)",
+    "": ", cut off ('ros2 bag reindex' may repair it)",
 }
 
 
-def read_messages(
-    path: Path, wanted: Wanted, time: LogTime
-) -> tuple[dict[str, Channel], list[str]]:
-    """Reads the wanted fields, by topic, of an MCAP file, a ROS 1 bag or the folder of a ROS 2 bag.
-
-    Of an MCAP file that was cut off the whole chunks are read; the text says how much that is.
-    """
+def read_messages(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel]:
+    """Reads fields of an MCAP file, a ROS 1 bag or a ROS 2 bag's folder, by topic."""
     require_extra("logs", f"log '{path}'", "mcap", "rosbags")
-    files, has_index = [path], (path / "metadata.yaml").is_file()
-    if path.is_dir():
-        files = sorted(one for one in path.iterdir() if one.suffix in (".mcap", ".db3"))
-    if not (files or has_index):
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
         raise ValueError(f"log '{path}' is a folder without the metadata.yaml of a ROS 2 bag")
     # A damaged file makes the readers raise errors of any kind.
-    what = f"damaged{_REMEDIES.get(path.suffix, '')}, or without ROS messages: log"
-    with reading(path, what, Exception), TemporaryDirectory() as folder:
-        try:
-            return _channels(path, [path] if has_index else files, wanted, time), []
-        except Exception as error:
-            if str(error).startswith(f"log '{path}'"):  # Of what the map says, not of damage.
-                raise
-            copies = {one: Path(folder) / one.name for one in files if one.suffix == ".mcap"}
-            shares = [_recover(one, copy, wanted) for one, copy in copies.items()]
-            if not any(shares):
-                raise
-        channels = _channels(path, [*copies.values()], wanted, time)
-        share = np.average(shares, weights=[one.stat().st_size for one in copies])
-        cut = f"log '{path}' is cut off: what is whole is read, {share:.0%} of its bytes"
-        return channels, [cut] if share < 1 else []
+    what = f"damaged{_REMEDIES.get(path.suffix, '')}, or with messages other than ROS's: log"
+    with reading(path, what, Exception):
+        return _channels(path, wanted, time)
 
 
-def _recover(source: Path, target: Path, wanted: Wanted) -> float:
-    """Copies the whole chunks of an MCAP file; returns the share of its bytes.
-
-    Topics that are not ROS messages are left out: one of them makes rosbags refuse the file.
-    """
-    from mcap.reader import NonSeekingReader
-    from mcap.writer import Writer
-
-    end, ids, others = 0, dict[int, int](), dict[str, str]()
-    with source.open("rb") as old, target.open("wb") as new:
-        writer = Writer(new)
-        writer.start("ros2")
-        with suppress(Exception):
-            reader = NonSeekingReader(old, validate_crcs=True)
-            for schema, channel, message in reader.iter_messages(log_time_order=False):
-                if channel.message_encoding != "cdr" or schema is None:
-                    others[channel.topic] = channel.message_encoding
-                    continue
-                if channel.id not in ids:
-                    kind = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    ids[channel.id] = writer.register_channel(channel.topic, "cdr", kind)
-                times = message.log_time, message.publish_time
-                writer.add_message(ids[channel.id], times[0], message.data, times[1])
-                end = old.tell()
-            end = source.stat().st_size
-        writer.finish()
-    for topic in filter(others.get, wanted):
-        raise ValueError(
-            f"log '{source}': messages of topic '{topic}' are encoded as '{others[topic]}', "
-            "expected ROS's 'cdr'"
-        )
-    return end / max(source.stat().st_size, 1)
-
-
-def _channels(
-    path: Path, files: Sequence[Path], wanted: Wanted, time: LogTime
-) -> dict[str, Channel]:
+def _channels(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel]:
     import pandas as pd
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -111,7 +54,7 @@ def _channels(
             errors.setdefault((topic, name), ValueError(f"{where}: cannot read '{name}': {error}"))
             return math.nan
 
-    with AnyReader(files, default_typestore=get_typestore(Stores.LATEST)) as reader:
+    with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
         there = f"its topics are {listed(sorted({c.topic for c in reader.connections}))}"
         if "" in wanted:
             raise ValueError(
@@ -153,9 +96,8 @@ def _channels(
 def field_of(path: str) -> Callable[[Any], Any]:
     """Returns a function that reads a field of a message.
 
-    A path is ``pose.pose.position.x``; ``position[3]``; or ``position[NAME]``, the entry with the
-    index of NAME in the sibling field ``name``, as in sensor_msgs/JointState, or the entry with the
-    ``child_frame_id`` or ``name`` NAME, as in ``transforms[base]``.
+    An entry ``[NAME]`` has the index of NAME in the field ``name`` beside it, as in
+    sensor_msgs/JointState, or is itself called NAME, as in ``transforms[base]``.
     """
     if not path or "".join(match.group() for match in _STEP.finditer(path)) != path:
         raise ValueError(f"'{path}' is not a field path, such as pose.position.x or q[3]")

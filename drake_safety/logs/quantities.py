@@ -46,10 +46,6 @@ def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
 
     Returns also what is lost by that: nothing where rows of one time have values of other columns,
     as messages have that name some joints only.
-
-    Raises:
-        ValueError: A time is not finite, runs backwards by more than ``max_gap_s``, or is that of
-            another row in most of the rows.
     """
     time, clock = channel.time, channel.time_name
     if (is_bad := ~np.isfinite(time)).any():
@@ -69,9 +65,6 @@ def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
     groups = channel.frame.groupby(time)
     num_lost = (groups.count() - 1).clip(lower=0).sum().max()
     lost = []
-    if (is_back := step < 0).any():
-        where = channel.where(int(np.argmax(is_back)) + 1, clock)
-        lost.append(f"{where}: time runs backwards in {is_back.mean():.1%} of the rows: sorted")
     if num_lost:
         where = channel.where(int(np.argmax(pd.Index(time).duplicated())), clock)
         share = num_lost / len(time)
@@ -202,11 +195,7 @@ def cut(
 ) -> tuple[list[dict[str, Channel]], list[str]]:
     """Cuts quantities where a value is missing or a gap in time is longer than ``max_gap_s``.
 
-    Returns the channels of each piece in order of time, whose common time is covered by all without
-    a cut, and the reasons of the cuts.
-
-    Raises:
-        ValueError: A quantity has less than three rows, or rows that are implausibly far apart.
+    Returns the channels of each piece in order of time, and the reasons of the cuts.
     """
     pieces: list[tuple[float, float, dict[str, Channel]]] = [(-math.inf, math.inf, {})]
     reasons: dict[str, None] = {}

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.extras import require_extra
-from drake_safety.files.schema import check_times, load_typed
+from drake_safety.files.schema import load_typed
 from drake_safety.logs.channel import Wanted
 from drake_safety.logs.checks import check
 from drake_safety.logs.conversion import Source, common_span, rotations_at, values_at
@@ -111,39 +111,32 @@ class LogPieces:
         """How much of the log is kept, and the first cuts; "" if it is read as it is."""
         if not self.cuts:
             return ""
-        lines, num_more = self.cuts[:_MOST_CUTS], len(self.cuts) - _MOST_CUTS
-        if num_more > 0:
-            lines.append(f"... and {num_more} more; --strict refuses such a log")
-        what = "read with notes"
-        if self.lost:
-            what = "cut where values are missing and at gaps, or resampled"
-        kept = f"{100 * self.kept_share:.1f} % of {self.duration_s:.1f} s are kept"
-        head = f"log '{self.pieces[0].path}' is {what}: {kept}, in {len(self.pieces)} pieces"
-        return "\n".join([head, *lines])
+        num_more = len(self.cuts) - _MOST_CUTS
+        more = [f"... and {num_more} more; --strict refuses such a log"] if num_more > 0 else []
+        head = (
+            f"log '{self.pieces[0].path}': {100 * self.kept_share:.1f} % of {self.duration_s:.1f} s "
+            f"are kept, in {len(self.pieces)} pieces"
+        )
+        return "\n".join([head, *self.cuts[:_MOST_CUTS], *more])
 
 
 def read_pieces(
     path: str | PathLike[str],
     log_map: LogMap | str | PathLike[str],
     robot: RobotModel,
-    *,
-    step_s: float | None = None,
 ) -> LogPieces:
-    """Reads a log as :func:`read_log` does, but cuts it where values are missing and at gaps.
+    """Reads, checks and converts a log, cut where values are missing and at gaps.
 
-    The first piece is checked as a log is, since these checks are about the map: a later one may
-    begin in mid-motion, or after a fall.
-
-    Raises:
-        ValueError: See :func:`read_log`; or nothing is left.
+    Args:
+        path: A ``.csv``, ``.tsv``, ``.parquet``, ``.mcap`` or ``.bag`` file, or the folder of a
+            ROS 2 bag.
+        log_map: The map of its columns, or the path of a ``columns.yaml``.
     """
     path = Path(path)
     if isinstance(log_map, LogMap):  # Its values may have been set since the construction.
         log_map = load_typed(LogMap, asdict(log_map), "map")
     else:
         log_map = load_log_map(Path(log_map))
-    if step_s is not None:
-        check_times("read_log", step_s=step_s)
     kinematics = RobotKinematics(robot)
     joints = kinematics.joint_names
     require_extra("logs", f"log '{path}'", "pandas")
@@ -155,7 +148,8 @@ def read_pieces(
             f"log '{path}' has the suffix '{suffix}'; known are {list(FORMATS)} and the folder of "
             "a ROS 2 bag"
         )
-    topics, lost = _READERS[suffix](path, _wanted(log_map, kinematics), log_map.time)
+    topics = _READERS[suffix](path, _wanted(log_map, kinematics), log_map.time)
+    lost: list[str] = []
     restarts, row_share = dict[str, float | int](), 1.0
     for topic, channel in topics.items():
         if len(topics) == 1:  # Else all topics would have to begin anew together.
@@ -171,7 +165,7 @@ def read_pieces(
     found, reasons = cut(channels, log_map.max_gap_s)
     lost += [f"{where}: time begins anew, with another log" for where in restarts]
     lost += [one for one in reasons if not one.startswith(tuple(restarts))]
-    sources = [read(channels=part, step_s=step_s) for part in found]
+    sources = [read(channels=part) for part in found]
     sources = [source for source in sources if len(source.at_s) > 1]
     measured = {getattr(log_map, name).topic for name in channels if name not in COMMANDS}
     begin, end = common_span(topics[topic] for topic in measured)
@@ -211,25 +205,12 @@ def read_log(
     path: str | PathLike[str],
     log_map: LogMap | str | PathLike[str],
     robot: RobotModel,
-    *,
-    step_s: float | None = None,
 ) -> RobotLog:
-    """Reads, checks and converts a log without a gap.
-
-    Args:
-        path: A ``.csv``, ``.tsv``, ``.parquet``, ``.mcap`` or ``.bag`` file, or the folder of a
-            ROS 2 bag.
-        log_map: The map of its columns, or the path of a ``columns.yaml``.
-        step_s: Time between two rows of the result [s]; by default the times are those of the
-            base's positions.
-
-    Raises:
-        ValueError: A value is missing or implausible; the message names file, row and column.
-    """
-    found = read_pieces(path, log_map, robot, step_s=step_s)
-    if found.lost:
-        raise ValueError(f"{found.lost[0]}, expected a log of which nothing is lost")
-    return found.pieces[0]
+    """Reads a log as :func:`read_pieces` does, but refuses one of which something is lost."""
+    pieces = read_pieces(path, log_map, robot)
+    if pieces.lost:
+        raise ValueError(f"{pieces.lost[0]}, expected a log of which nothing is lost")
+    return pieces.pieces[0]
 
 
 def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> Wanted:
