@@ -18,7 +18,6 @@ from log_files import (
     frame_of,
     part,
     read,
-    recorded,
     save,
     walked,
     write,
