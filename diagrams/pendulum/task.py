@@ -108,13 +108,8 @@ class PendulumObserver(LeafSystem):
     .. pydrake_system::
 
         name: PendulumObserver
-        input_ports:
-        - pendulum_state
-        - desired_outlook
-        output_ports:
-        - plant_state
-        - output
-        - features
+        input_ports: [pendulum_state, desired_outlook]
+        output_ports: [plant_state, output, features]
 
     ``pendulum_state`` is Drake's, from hanging; ``plant_state`` is [φ, φ̇] from upright [rad,
     rad/s], and ``output`` the bob's position relative to the hinge, (3,) [m]. The safe set's
@@ -151,12 +146,8 @@ class PendulumController(LeafSystem):
     .. pydrake_system::
 
         name: PendulumController
-        input_ports:
-        - plant_state
-        - desired_output
-        - desired_output_rate
-        output_ports:
-        - torque
+        input_ports: [plant_state, desired_output, desired_output_rate]
+        output_ports: [torque]
 
     ``torque`` (1,) [N·m] is held for ``period_s`` [s].
     """

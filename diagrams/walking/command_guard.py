@@ -21,17 +21,9 @@ class CommandGuard(LeafSystem):
     .. pydrake_system::
 
         name: CommandGuard
-        input_ports:
-        - command: 3
-        - state: n_s
-        - features: n_f
-        - learned: abstract (optional)
-        output_ports:
-        - desired_output: n_z
-        - desired_preview: H n_z
-        - desired_outlook: M n_z
-        - is_changed: 1
-        - safety_probability: 1
+        input_ports: [command: 3, state: n_s, features: n_f, learned: abstract (optional)]
+        output_ports: [desired_output: n_z, desired_preview: H n_z, desired_outlook: M n_z,
+          is_changed: 1, safety_probability: 1]
 
     Every ``period_s`` the asked command, held from now on, is assessed. It is accepted, and passed
     on, if its probability reaches the threshold. Otherwise ``desired_output`` is the accepted

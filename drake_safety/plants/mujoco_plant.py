@@ -26,12 +26,8 @@ class MujocoPlant(LeafSystem):
     .. pydrake_system::
 
         name: MujocoPlant
-        input_ports:
-        - command
-        - applied_spatial_force (optional)
-        output_ports:
-        - state
-        - positions
+        input_ports: [command, applied_spatial_force (optional)]
+        output_ports: [state, positions]
 
     ``command`` has joint torques, or with ``servos`` the desired joint state ``[q; v]`` of
     robot.yaml's servos, in the order of ``joint_names``. ``applied_spatial_force`` is that of a

@@ -26,15 +26,10 @@ class AssessorInputs(LeafSystem):
     .. pydrake_system::
 
         name: AssessorInputs
-        input_ports:
-        - plant_state: n_q + n_v
-        - desired_outlook: M n_z
-        - desired_joint_state: 2 n_j (with ``servo_loads``)
-        - controller_memory: n_m (with ``memory``)
-        output_ports:
-        - state: n_s
-        - features: n_f
-        - margins: n_c
+        input_ports: [plant_state: n_q + n_v, desired_outlook: M n_z,
+          desired_joint_state: 2 n_j (with ``servo_loads``),
+          controller_memory: n_m (with ``memory``)]
+        output_ports: [state: n_s, features: n_f, margins: n_c]
 
     The features are those of the safe set, and behind them, where they are asked for, gravity in
     the plane of the feet, the loads of the servos and the controller's memory. The shipped

@@ -22,16 +22,9 @@ class ChangeMonitor(LeafSystem):
     .. pydrake_system::
 
         name: ChangeMonitor
-        input_ports:
-        - state: n_s
-        - desired_preview: H n_z
-        - features: n_f (only if the prediction reads some)
-        - hold: 1 (optional)
-        output_ports:
-        - alarm: 1
-        - levels: n_w
-        - alarm_cause: abstract
-        - judged_share: 1
+        input_ports: [state: n_s, desired_preview: H n_z,
+          features: n_f (only if the prediction reads some), hold: 1 (optional)]
+        output_ports: [alarm: 1, levels: n_w, alarm_cause: abstract, judged_share: 1]
 
     Every step of its training it predicts the state and updates the charts of a
     :class:`~drake_safety.learning.change_detector.ChangeDetector`. ``levels`` has the level of each

@@ -47,20 +47,10 @@ class FeedbackRecorder(LeafSystem):
     .. pydrake_system::
 
         name: FeedbackRecorder
-        input_ports:
-        - state: n_s
-        - true_state: n_s (optional)
-        - output: n_z
-        - desired_output: n_z
-        - desired_preview: H n_z
-        - features: n_f
-        - margins: n_c
-        - safe: 1
-        - plant_state: n_q + n_v
-        - controller_memory: n (with ``controller_memory_size``)
-        - recovery_active: 1 (optional)
-        output_ports:
-        - num_finished: 1
+        input_ports: [state: n_s, true_state: n_s (optional), output: n_z, desired_output: n_z,
+          desired_preview: H n_z, features: n_f, margins: n_c, safe: 1, plant_state: n_q + n_v,
+          controller_memory: n (with ``controller_memory_size``), recovery_active: 1 (optional)]
+        output_ports: [num_finished: 1]
 
     A row is recorded every ``info.step_s``. A window ends safe after ``num_steps`` steps, and the
     next one begins with its last row. It ends unsafe as soon as ``safe``, sampled every

@@ -21,13 +21,9 @@ class InverseKinematicsController(LeafSystem):
     .. pydrake_system::
 
         name: InverseKinematicsController
-        input_ports:
-        - plant_state: n_q + n_v
-        - desired_output: n_z
-        - desired_foot_positions: 3 n_p (optional)
-        - desired_yaw: 1 (optional)
-        output_ports:
-        - desired_joint_state: 2 n_j
+        input_ports: [plant_state: n_q + n_v, desired_output: n_z,
+          desired_foot_positions: 3 n_p (optional), desired_yaw: 1 (optional)]
+        output_ports: [desired_joint_state: 2 n_j]
 
     The command is a discrete state, so the output has no direct feedthrough. It goes to the plant's
     implicit joint servos; q̇ of the command is the rate of the set point. The static offset τ/k_p

@@ -25,27 +25,12 @@ class MonitoredSafetyAssessor(Diagram):
     .. pydrake_system::
 
         name: MonitoredSafetyAssessor
-        input_ports:
-        - state: n_s
-        - desired_preview: H n_z
-        - features: n_f (read in the sharpened mode only)
-        - margins: n_c
-        - hold: 1 (optional)
-        output_ports:
-        - safety_probability: 1
-        - belief: 3
-        - cause_probability: n_c
-        - embedding: 2
-        - predicted_margins: n_c
-        - novelty: 1
-        - probability_without_alarm: 1
-        - belief_without_alarm: 3
-        - fall_probability: 1
-        - learned: abstract
-        - alarm: 1
-        - levels: n_w
-        - alarm_cause: abstract
-        - judged_share: 1
+        input_ports: [state: n_s, desired_preview: H n_z,
+          features: n_f (read in the sharpened mode only), margins: n_c, hold: 1 (optional)]
+        output_ports: [safety_probability: 1, belief: 3, cause_probability: n_c, embedding: 2,
+          predicted_margins: n_c, novelty: 1, probability_without_alarm: 1, belief_without_alarm: 3,
+          fall_probability: 1, learned: abstract, alarm: 1, levels: n_w, alarm_cause: abstract,
+          judged_share: 1]
 
     The ports are those of its two systems.
 

@@ -19,15 +19,9 @@ class PolicyController(LeafSystem):
     .. pydrake_system::
 
         name: PolicyController
-        input_ports:
-        - plant_state: n_q + n_v
-        - command: 3
-        output_ports:
-        - desired_joint_state: 2 n_j
-        - action_state: n_m
-        - status: 1
-        - num_failures: 1
-        - memory: n
+        input_ports: [plant_state: n_q + n_v, command: 3]
+        output_ports: [desired_joint_state: 2 n_j, action_state: n_m, status: 1, num_failures: 1,
+          memory: n]
 
     ``command`` is (v_x, v_y, ω_z) in the base's heading frame [m/s, rad/s]. All outputs and the
     memory of a recurrent network are discrete states: a cloned Context continues from its phase of

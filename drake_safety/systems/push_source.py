@@ -23,8 +23,7 @@ class PushSource(LeafSystem):
     .. pydrake_system::
 
         name: PushSource
-        output_ports:
-        - applied_spatial_force: abstract
+        output_ports: [applied_spatial_force: abstract]
 
     The port fits the plant's ``applied_spatial_force`` input. A push begins and ends with the
     plant's first step after the first multiple of ``period_s`` that is not before its time.

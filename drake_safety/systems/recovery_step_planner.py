@@ -33,18 +33,9 @@ class RecoveryStepPlanner(LeafSystem):
     .. pydrake_system::
 
         name: RecoveryStepPlanner
-        input_ports:
-        - plant_state: n_q + n_v
-        - recovery_active: 1
-        - nominal_desired_output: n_z
-        output_ports:
-        - desired_output: n_z
-        - desired_foot_positions: 3 n_p
-        - desired_yaw: 1
-        - desired_preview: H n_z
-        - desired_outlook: M n_z
-        - stance_pose: 3
-        - recovery_done: 1
+        input_ports: [plant_state: n_q + n_v, recovery_active: 1, nominal_desired_output: n_z]
+        output_ports: [desired_output: n_z, desired_foot_positions: 3 n_p, desired_yaw: 1,
+          desired_preview: H n_z, desired_outlook: M n_z, stance_pose: 3, recovery_done: 1]
 
     While idle, the feet keep the positions of the first state that the planner sees when a
     simulation is initialised, put on level ground, or those of :meth:`set_stance`. When

@@ -17,21 +17,11 @@ class RecoverySwitch(Diagram):
     .. pydrake_system::
 
         name: RecoverySwitch
-        input_ports:
-        - safety_probability: 1
-        - belief: 3 (optional)
-        - plant_state: n_q + n_v
-        - nominal_desired_output: n_z
-        - nominal_desired_preview: H n_z
-        - nominal_desired_outlook: M n_z
-        output_ports:
-        - desired_output: n_z
-        - desired_preview: H n_z
-        - desired_outlook: M n_z
-        - desired_foot_positions: 3 n_p
-        - desired_yaw: 1
-        - stance_pose: 3
-        - recovery_active: 1
+        input_ports: [safety_probability: 1, belief: 3 (optional), plant_state: n_q + n_v,
+          nominal_desired_output: n_z, nominal_desired_preview: H n_z,
+          nominal_desired_outlook: M n_z]
+        output_ports: [desired_output: n_z, desired_preview: H n_z, desired_outlook: M n_z,
+          desired_foot_positions: 3 n_p, desired_yaw: 1, stance_pose: 3, recovery_active: 1]
 
     Connect ``stance_pose`` to the TrajectoryPlanner, so that the plan continues over the new
     footholds, and ``desired_foot_positions`` and ``desired_yaw`` to the controller. Connect

@@ -18,13 +18,8 @@ class RecoveryTrigger(LeafSystem):
     .. pydrake_system::
 
         name: RecoveryTrigger
-        input_ports:
-        - safety_probability: 1
-        - belief: 3 (optional)
-        - recovery_done: 1 (optional)
-        output_ports:
-        - port_selector: abstract
-        - recovery_active: 1
+        input_ports: [safety_probability: 1, belief: 3 (optional), recovery_done: 1 (optional)]
+        output_ports: [port_selector: abstract, recovery_active: 1]
 
     The trigger latches: once active it stays active until ``recovery_done`` is 1. A probability
     that is not finite activates it, such as 1 minus ``fall_probability`` where no falls were

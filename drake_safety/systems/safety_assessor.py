@@ -23,23 +23,12 @@ class SafetyAssessor(LeafSystem):
     .. pydrake_system::
 
         name: SafetyAssessor
-        input_ports:
-        - state: n_s
-        - desired_preview: H n_z
-        - features: n_f (read in the sharpened mode only)
-        - margins: n_c (with ``checks_margins``)
-        - alarm: 1 (with ``heeds_alarm``)
-        output_ports:
-        - safety_probability: 1
-        - belief: 3
-        - cause_probability: n_c
-        - embedding: 2
-        - predicted_margins: n_c
-        - novelty: 1
-        - probability_without_alarm: 1
-        - belief_without_alarm: 3
-        - fall_probability: 1
-        - learned: abstract
+        input_ports: [state: n_s, desired_preview: H n_z,
+          features: n_f (read in the sharpened mode only), margins: n_c (with ``checks_margins``),
+          alarm: 1 (with ``heeds_alarm``)]
+        output_ports: [safety_probability: 1, belief: 3, cause_probability: n_c, embedding: 2,
+          predicted_margins: n_c, novelty: 1, probability_without_alarm: 1, belief_without_alarm: 3,
+          fall_probability: 1, learned: abstract]
 
     Γ is evaluated every ``period_s`` and held, so no output but ``learned`` has direct feedthrough.
 

@@ -43,11 +43,8 @@ class SafetyMonitor(LeafSystem):
     .. pydrake_system::
 
         name: SafetyMonitor
-        input_ports:
-        - plant_state: n_q + n_v
-        output_ports:
-        - margins: n_c
-        - safe: 1
+        input_ports: [plant_state: n_q + n_v]
+        output_ports: [margins: n_c, safe: 1]
 
     Both outputs are direct functions of the state: margins that were sampled and held would lag a
     recorded row by one period. ``safe`` is 1 while every margin is finite and not negative. The

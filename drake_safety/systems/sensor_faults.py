@@ -20,10 +20,8 @@ class SensorFaults(LeafSystem):
     .. pydrake_system::
 
         name: SensorFaults
-        input_ports:
-        - input: n
-        output_ports:
-        - output: n
+        input_ports: [input: n]
+        output_ports: [output: n]
 
     :class:`~drake_safety.robots.shift.Fault` lists the kinds. Without faults, and before they
     start, the output has the input's bits. Delays, ``half_rate`` and ``freeze`` hold samples, which

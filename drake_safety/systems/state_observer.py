@@ -24,13 +24,8 @@ class StateObserver(LeafSystem):
     .. pydrake_system::
 
         name: StateObserver
-        input_ports:
-        - plant_state: n_q + n_v
-        - noise: 2 n_v (optional)
-        output_ports:
-        - measured_plant_state: n_q + n_v
-        - state: n_s
-        - output: n_z
+        input_ports: [plant_state: n_q + n_v, noise: 2 n_v (optional)]
+        output_ports: [measured_plant_state: n_q + n_v, state: n_s, output: n_z]
 
     Every output is a direct function of the inputs. Without the ``noise`` input, or with zero
     standard deviations, the measurement is exact. State and output of a measurement that is not

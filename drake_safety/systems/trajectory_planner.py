@@ -71,13 +71,9 @@ class TrajectoryPlanner(LeafSystem):
     .. pydrake_system::
 
         name: TrajectoryPlanner
-        input_ports:
-        - stance_pose: 3 (optional)
-        output_ports:
-        - desired_output: n_z
-        - desired_output_rate: n_z
-        - desired_preview: H n_z
-        - desired_outlook: M n_z
+        input_ports: [stance_pose: 3 (optional)]
+        output_ports: [desired_output: n_z, desired_output_rate: n_z, desired_preview: H n_z,
+          desired_outlook: M n_z]
 
     The plan is a trajectory of 3-D positions in the stance frame S, and a parameter of the Context
     (:meth:`set_plan`); without one, evaluation is an error. Before its start and after its end it

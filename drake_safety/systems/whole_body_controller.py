@@ -24,14 +24,9 @@ class WholeBodyController(LeafSystem):
     .. pydrake_system::
 
         name: WholeBodyController
-        input_ports:
-        - plant_state: n_q + n_v
-        - desired_output: n_z (optional)
-        - desired_output_rate: n_z (optional)
-        output_ports:
-        - actuation: n_j
-        - solver_status: 1
-        - num_failures: 1
+        input_ports: [plant_state: n_q + n_v, desired_output: n_z (optional),
+          desired_output_rate: n_z (optional)]
+        output_ports: [actuation: n_j, solver_status: 1, num_failures: 1]
 
     ``desired_output`` is the set point of the hand, or of the centre of mass for a controller
     without a hand, in the world [m], and ``desired_output_rate`` its rate [m/s]. While they are
