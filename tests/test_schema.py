@@ -82,9 +82,9 @@ CASES = {
         "shift: {joints: {a: {effort_scale: 0.0}}}": r"a\.effort_scale' must be gr.* 0; got 0.0",
     },
     Fault: {
-        "kind: noize, value: 1.0": r"'kind' must be 'bias', .*mean 'noise'\?\); got",
-        "kind: noise": "'noise' needs a value; got None",
-        "kind: swap, value: 1.0": "'swap' has no value; got 1.0",
+        "kind: scael, value: 1.0": r"'kind' must be 'bias', .*mean 'scale'\?\); got",
+        "kind: delay": "'delay' needs a value; got None",
+        "kind: zero, value: 1.0": "'zero' has no value; got 1.0",
         "kind: delay, value: -1.0": "value of 'delay' must not be negative; got -1.0",
     },
     ReachingParameters: {

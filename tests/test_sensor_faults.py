@@ -45,10 +45,9 @@ def true(time_s):
     "faults",
     [
         [],
-        [Fault(kind=kind, value=1.0, start_s=8.0) for kind in ("bias", "drift", "scale", "noise")],
+        [Fault(kind=kind, value=1.0, start_s=8.0) for kind in ("bias", "drift", "scale")],
         [Fault(kind="delay", value=0.5, start_s=8.0), Fault(kind="delay", value=0.0)],
-        [Fault(kind=kind, start_s=8.0) for kind in ("zero", "half_rate", "freeze")],
-        [Fault(kind="swap", entries=["fast_."], start_s=8.0)],
+        [Fault(kind=kind, start_s=8.0) for kind in ("zero", "freeze")],
     ],
 )
 def test_without_faults_and_before_their_start_the_bits_pass(faults):
@@ -65,10 +64,8 @@ def test_without_faults_and_before_their_start_the_bits_pass(faults):
         (Fault(kind="drift", value=0.5, start_s=1.0), true(1.25) + 0.125),
         (Fault(kind="zero"), np.zeros(3)),
         (Fault(kind="scale", value=2.0, entries=["slow"]), true(1.25) * [2.0, 1.0, 1.0]),
-        (Fault(kind="swap", entries=["slow", "fast_2"]), true(1.25)[[2, 1, 0]]),
         # Samples at multiples of 0.1 s; a reader between two finds the earlier one.
         (Fault(kind="delay", value=0.3), true(1.0)),
-        (Fault(kind="half_rate"), true(1.2)),
         (Fault(kind="freeze", start_s=0.85), true(0.8)),
     ],
 )
@@ -82,7 +79,6 @@ def test_each_fault_by_hand(fault, expected):
         (Fault(kind="delay", value=0.1), [0, 1, 1, 1, 1]),
         (Fault(kind="delay", value=0.3), [0, 1, 2, 3, 3]),
         (Fault(kind="delay", value=0.3, start_s=0.2), [0, 0, 2, 3, 3]),
-        (Fault(kind="half_rate"), [0, 1, 0, 1, 0]),
         (Fault(kind="freeze", start_s=0.2), [0, 0, 1, 2, 3]),
     ],
 )
@@ -95,8 +91,6 @@ def test_at_the_samples_a_fault_shows_an_input_of_exact_age(fault, ages):
 def test_a_delay_between_two_samples_and_an_entry_that_is_not_there_are_refused():
     with pytest.raises(ValueError, match="no entry 'slov'; they are"):
         Bench(Fault(kind="zero", entries=["slov"]))
-    with pytest.raises(ValueError, match="a swap is of two entries"):
-        Bench(Fault(kind="swap", entries=["slow"]))
     delay = Fault(kind="delay", value=0.004)
     with pytest.raises(ValueError, match=r"multiple of the period 0\.01 s"):
         Bench(delay, period_s=0.01)
@@ -109,23 +103,6 @@ def test_faults_act_one_after_the_other():
     np.testing.assert_allclose(Bench(double, add).at(1.0)[1], 2.0 * true(1.0) + 1.0)
     late = Bench(Fault(kind="drift", value=1.0), Fault(kind="delay", value=0.2)).at(1.0)[1]
     np.testing.assert_allclose(late, true(0.8) + 0.8)
-
-
-def test_noise_is_normal_is_held_for_a_period_and_follows_from_the_seed():
-    def noise(seed):
-        bench = Bench(Fault(kind="noise", value=0.5, entries=["slow"]))
-        bench.system.set_seed(bench.own, seed)
-        rows = [np.subtract(*bench.at(0.02 * k)) for k in range(440)]
-        assert not np.any([row[1:] for row in rows])
-        return np.array([row[0] for row in rows])
-
-    first = noise(1)
-    np.testing.assert_array_equal(noise(1), first)
-    assert not np.array_equal(noise(2), first)
-    held = first.reshape(88, 5)
-    np.testing.assert_allclose(np.ptp(held, axis=1), 0.0, atol=1e-12)
-    assert np.std(held[:, 0]) == pytest.approx(0.5, rel=0.2)
-    assert np.mean(held[:, 0]) == pytest.approx(0.0, abs=0.15)
 
 
 def test_the_example_of_the_documentation_runs():

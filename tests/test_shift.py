@@ -60,9 +60,7 @@ def test_a_steady_force_is_as_large_as_stated_and_in_its_direction():
 
 
 def test_a_weak_joint_has_less_torque_and_a_soft_one_lower_gains():
-    weaker = Shift(
-        joints={KNEE: JointShift(effort_scale=0.5, stiffness_scale=0.25, damping_scale=3.0)}
-    )
+    weaker = Shift(joints={KNEE: JointShift(effort_scale=0.5, stiffness_scale=0.25)})
     plain, shifted = loop_with(None).plant, loop_with(weaker).plant
 
     def actuator(plant, joint):
@@ -72,7 +70,7 @@ def test_a_weak_joint_has_less_torque_and_a_soft_one_lower_gains():
     weak, strong = actuator(shifted, KNEE), actuator(plain, KNEE)
     assert weak.effort_limit() == 0.5 * strong.effort_limit()
     assert weak.get_controller_gains().p == 0.25 * strong.get_controller_gains().p
-    assert weak.get_controller_gains().d == 0.75 * strong.get_controller_gains().d
+    assert weak.get_controller_gains().d == 0.25 * strong.get_controller_gains().d
     other = "FL_calf_joint"
     assert actuator(shifted, other).effort_limit() == actuator(plain, other).effort_limit()
 
@@ -108,20 +106,19 @@ def test_a_late_command_is_late():
     assert 1e-3 < difference.max() < 0.3
 
 
-def test_swapped_joints_get_each_other_s_command_from_the_start_of_the_fault():
-    knees = [KNEE, "FL_hip_joint"]
-    shift = Shift(command_faults=[Fault(kind="swap", entries=knees, start_s=0.1)])
+def test_a_joint_gets_a_faulty_command_from_the_start_of_the_fault():
+    shift = Shift(command_faults=[Fault(kind="zero", entries=[KNEE], start_s=0.1)])
     for time_s in (0.05, 0.2):
         loop, context = standing(shift, time_s)
         system = loop.GetSubsystemByName("command_faults")
-        one, other = (loop.kinematics.joint_names.index(name) for name in knees)
+        knee = loop.kinematics.joint_names.index(KNEE)
         own = system.GetMyContextFromRoot(context)
         sent, received = system.get_input_port().Eval(own), system.get_output_port().Eval(own)
         expected = sent.copy()
         if time_s > 0.1:
-            expected[[one, other]] = sent[[other, one]]
+            expected[knee] = 0.0
         np.testing.assert_array_equal(received, expected)
-        assert sent[one] != sent[other]
+        assert sent[knee] != 0.0
 
 
 RATES = Fault(kind="zero", entries=[".*_w", "trunk_[wv]."])
@@ -153,15 +150,6 @@ def test_the_delays_of_the_catalogue_fit_every_period():
     assert shifts["late_command"].variation.shift.command_delay_s == pytest.approx(0.152)
     (stale,) = shifts["stale"].variation.shift.sensor_faults
     assert stale.value == pytest.approx(0.21)
-
-
-def test_noise_of_a_fault_follows_from_the_episode():
-    loop = loop_with(Shift(sensor_faults=[Fault(kind="noise", entries=["FR_.*_w"], value=3.0)]))
-    first, again, other = (run_episode(loop, index, seed=5) for index in (0, 0, 1))
-    np.testing.assert_array_equal(first.state, again.state)
-    errors = [(one.state - one.true_state)[:20, 24:27] for one in (first, other)]
-    assert np.std(errors[0]) == pytest.approx(3.0, rel=0.3)
-    assert not np.allclose(*errors, atol=0.5)
 
 
 def test_a_plant_without_shift_has_the_hash_from_before_there_were_any():

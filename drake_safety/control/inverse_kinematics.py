@@ -29,10 +29,9 @@ def solve_inverse_kinematics(
 ) -> np.ndarray:
     """Returns joint positions (n_j,) [rad] with desired contact points at a given base pose.
 
-    Damped Gauss-Newton from ``guess`` (n_j,) [rad]; one step suffices from the previous tick's
-    solution. An unreachable goal ends at the nearest reachable point. Joints outside the legs keep
-    the guess, and every joint stays inside its limits. ``p_WC`` has the desired positions of the
-    contact spheres' centres, (n_c, 3) [m].
+    Damped Gauss-Newton from ``guess`` (n_j,) [rad]. An unreachable goal ends at the nearest
+    reachable point. Joints outside the legs keep the guess, and every joint stays inside its
+    limits. ``p_WC`` has the desired centres of the contact spheres, (n_c, 3) [m].
     """
     q = kinematics.positions_at(X_WB, guess)
     return solve_from(kinematics, q, p_WC, max_iterations=max_iterations)[0]
@@ -50,7 +49,8 @@ def solve_from(
     J = np.empty((3 * kinematics.num_contacts, kinematics.num_velocities))
     for _ in range(max_iterations):
         q[NUM_BASE_POSITIONS:] = joints
-        reached, J = kinematics.contact_positions_and_jacobian(q)
+        kinematics.set_positions(q)
+        reached, J = kinematics.present_contacts()
         error = (p_WC - reached).ravel()
         if max(error.max(), -error.min()) < _TOLERANCE_M:
             break

@@ -54,8 +54,8 @@ class RobotKinematics:
     """Kinematics of a robot without ground or scene.
 
     Positions are Drake's ``q = [q_WB (w, x, y, z), p_WB, joints]`` and velocities
-    ``v = [w_WB, v_WB, joint rates]``. The object keeps one scratch Context a thread, which every
-    method overwrites. Of a plant variation only the masses are used.
+    ``v = [w_WB, v_WB, joint rates]``. Every method overwrites the thread's scratch Context. Of a
+    plant variation only the masses are used.
     """
 
     def __init__(self, robot: RobotModel, variation: PlantVariation | None = None):
@@ -66,9 +66,8 @@ class RobotKinematics:
         add_robot(self.plant, robot)
         self.plant.Finalize()
         base = self.plant.GetBodyByName(robot.base)
-        if not base.is_floating_base_body() or self.plant.num_positions() != (
-            NUM_BASE_POSITIONS + self.plant.num_velocities() - NUM_BASE_VELOCITIES
-        ):
+        num_extra = self.plant.num_positions() - self.plant.num_velocities()
+        if not base.is_floating_base_body() or num_extra != 1:
             raise ValueError(
                 f"robot '{robot.name}': base '{robot.base}' must be the floating body and every "
                 f"joint must have one degree of freedom"
@@ -159,13 +158,8 @@ class RobotKinematics:
         self.set_positions(q)
         return self._jacobian()
 
-    def contact_positions_and_jacobian(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns :meth:`contact_positions` and :meth:`contact_jacobian` together."""
-        self.set_positions(q)
-        return self.present_contacts()
-
     def present_contacts(self) -> tuple[np.ndarray, np.ndarray]:
-        """As :meth:`contact_positions_and_jacobian`, at the scratch Context's positions."""
+        """Contact positions and their Jacobian at the scratch Context's positions."""
         return self._contacts(), self._jacobian()
 
     def _contacts(self) -> np.ndarray:
@@ -190,8 +184,8 @@ class RobotKinematics:
     ) -> np.ndarray:
         """Joint torques (n_j,) [N·m] for static equilibrium on the stance points, (n_c,).
 
-        The ground forces minimise the sum of squared point forces subject to the six floating-base
-        rows ``0 = g_b + J_bᵀ f``; J is the contact Jacobian at ``q``, if known.
+        The ground forces have the least squared norm subject to ``0 = g_b + J_bᵀ f`` of the base; J
+        is the contact Jacobian at ``q``, if known.
         """
         self.set_positions(q)
         J = self._jacobian() if J is None else J

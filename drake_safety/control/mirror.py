@@ -17,9 +17,8 @@ _SAME_AXIS = 1e-3  # Tolerance of axes' directions [rad] and positions [m].
 class Mirror:
     """The reflection of a symmetric robot through the x-z plane of its stance.
 
-    Each joint is exchanged with its partner in robot.yaml's ``mirror``. Its sign follows from the
-    joints' axes with all joints at zero, as pseudovectors are reflected to (-x, y, -z). The base's
-    x-z plane is its plane of symmetry. Reflecting twice is the identity.
+    Each joint is exchanged with its partner in robot.yaml's ``mirror``, with the sign of their axes
+    at zero. The base's x-z plane is its plane of symmetry.
     """
 
     def __init__(self, kinematics: RobotKinematics):
@@ -53,22 +52,18 @@ class Mirror:
                 raise ValueError(
                     f"robot '{kinematics.robot.name}': mirror pairs joint '{names[i]}' with "
                     f"'{names[order[i]]}', which is not its reflection: axis {axis} through "
-                    f"{point} against {partner_axis} through {partner_point}; its patterns are "
-                    f"{kinematics.robot.mirror}"
+                    f"{point} against {partner_axis} through {partner_point}"
                 )
         return signs
 
     def _axis(self, joint: Joint) -> tuple[np.ndarray, np.ndarray, bool]:
         """Direction, a point, and whether the joint turns about it, in the world."""
         X_WJ = joint.frame_on_parent().CalcPoseInWorld(self._kinematics.context)
-        if isinstance(joint, RevoluteJoint):
-            return X_WJ.rotation() @ joint.revolute_axis(), X_WJ.translation(), True
-        if isinstance(joint, PrismaticJoint):
-            return X_WJ.rotation() @ joint.translation_axis(), X_WJ.translation(), False
-        raise ValueError(
-            f"robot '{self._kinematics.robot.name}': joint '{joint.name()}' must be revolute or "
-            f"prismatic; it is {joint.type_name()}"
-        )
+        is_revolute = isinstance(joint, RevoluteJoint)
+        if not (is_revolute or isinstance(joint, PrismaticJoint)):
+            raise ValueError(f"mirror: joint '{joint.name()}' must be revolute or prismatic")
+        axis = joint.revolute_axis() if is_revolute else joint.translation_axis()
+        return X_WJ.rotation() @ axis, X_WJ.translation(), is_revolute
 
     def joints(self, values: np.ndarray) -> np.ndarray:
         """Reflects joint positions, rates or torques, (..., n_j)."""

@@ -42,14 +42,13 @@ def _rate_and_joint_names(kinematics: RobotKinematics) -> list[str]:
 def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Returns the state s_k: base pose and velocity in the stance frame S, joints and their rates.
 
-    S lies on the ground at the centroid of the contact points, with the yaw of the planar fit of
-    the standing posture's points to the measured ones, so that s_k does not depend on where the
-    robot stands. Departure: the paper's s_k has configurations only; without velocities a pushed
-    robot cannot be distinguished from one at rest, and the recall of unsafe states collapses.
+    S lies on the ground at the centroid of the contact points, with the yaw of their planar fit.
+    Departure: the paper's s_k has configurations only; without velocities a pushed robot cannot be
+    distinguished from one at rest.
 
     Returns:
-        (12 + 2 n_j,) [m, rad, m/s, rad/s], in the order of :func:`state_names`; all NaN if a
-        position or velocity is not finite, or the quaternion zero.
+        (12 + 2 n_j,) [m, rad, m/s, rad/s], in the order of :func:`state_names`; NaN without a
+        finite state with an orientation.
     """
     if not is_state(q, v):
         return np.full(12 + 2 * kinematics.num_joints, np.nan)
@@ -76,8 +75,8 @@ def walking_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> 
     direction of gravity and the velocities are in the base's frame.
 
     Returns:
-        (10 + 2 n_j,) [m, rad/s, m/s, rad], in the order of :func:`walking_state_names`; all NaN if
-        a position or velocity is not finite, or the quaternion zero.
+        (10 + 2 n_j,) [m, rad/s, m/s, rad], in the order of :func:`walking_state_names`; NaN without
+        a finite state with an orientation.
     """
     if not is_state(q, v):
         return np.full(10 + 2 * kinematics.num_joints, np.nan)
@@ -86,10 +85,7 @@ def walking_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> 
 
 
 def heading_velocity(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """(v_x, v_y, ω_z) [m/s, rad/s] of the base in its heading frame: a walking robot's output.
-
-    NaN if a position or velocity is not finite, or the quaternion zero.
-    """
+    """(v_x, v_y, ω_z) [m/s, rad/s] of the base in its heading frame; NaN without a state."""
     if not is_state(q, v):
         return np.full(3, np.nan)
     x_axis = RotationMatrix(quaternion_of(q)).matrix()[:2, 0]
@@ -104,8 +100,8 @@ def gravity_in_foot_plane(
     """Components (2,) of gravity's direction along the x and y axes of the stance frame.
 
     On level ground they are zero; on a slope, the sine of its inclination downhill. The plane is
-    fitted to the contact points; along a direction in which these do not extend it is level. NaN if
-    ``q`` or gravity (3,) [m/s²] is not finite, or the quaternion zero.
+    fitted to the contact points; along a direction in which these do not extend it is level. NaN
+    without a state.
     """
     if not is_state(q, gravity):
         return np.full(2, np.nan)
@@ -125,10 +121,7 @@ def gravity_in_foot_plane(
 def add_noise(
     q: np.ndarray, v: np.ndarray, unit_noise: np.ndarray, noise: ObservationNoise
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Adds noise to a state, from standard normal samples (2 n_v,) for positions and velocities.
-
-    Noise of the orientation is a small rotation.
-    """
+    """Adds noise to a state, from standard normal samples (2 n_v,); the base rotates a little."""
     n_v = len(v)
     dq = noise.position * unit_noise[:n_v]
     w, x, y, z = q[:4]

@@ -19,15 +19,13 @@ class RecoveryStepParameters:
     velocity_gain_s: float = 0.05
     """Raibert's gain: distance beyond the neutral point per speed [s]."""
     velocity_gain_growth: NotNegative = 0.1
-    """Growth of this gain with every swing, as a share of it. A large gain tips a fast robot over,
-    with a small one it walks on."""
+    """Growth of this gain with every swing, as a share of it."""
     max_reach_m: Positive = 0.18
     """Largest distance of a foothold from its hip's ground projection [m]."""
     min_lateral_m: float = 0.11
     """Smallest distance of a foothold from the base's midline, on its own side [m]."""
     max_twist_rad: NotNegative = 0.3
-    """Largest difference of the desired base yaw of stance legs from the measured yaw [rad]; with 0
-    no heading is held, and the base follows the yaw of its feet."""
+    """Largest difference of desired and measured base yaw; with 0 no heading is held [rad]."""
     yaw_damping_s: float = 0.1
     """Offset of the desired base yaw from the heading against the yaw rate, per yaw rate [s]."""
     min_steps: Count = 2
@@ -54,8 +52,7 @@ class RecoveryStepParameters:
 def gait_groups(foot_positions: np.ndarray) -> list[list[int]]:
     """Two groups of feet that swing together: every second foot around the body.
 
-    Two feet step alternately, four in diagonal pairs, six in tripods. ``foot_positions`` (n_feet,
-    2) [m] are relative to their centroid.
+    ``foot_positions`` (n_feet, 2) [m] are relative to their centroid.
     """
     around = np.argsort(np.arctan2(foot_positions[:, 1], foot_positions[:, 0]), kind="stable")
     return [sorted(around[0::2].tolist()), sorted(around[1::2].tolist())]
@@ -106,8 +103,7 @@ def foothold(
 
     Raibert's neutral point is the hip at touchdown plus half the distance travelled in the next
     stance, ``p + v (t_rem + T/2)``; the foothold adds ``k v``, where k grows with every swing. It
-    is within reach of the hip at touchdown, and on its own side of the base, so that legs do not
-    cross.
+    is within reach of the hip at touchdown, and on its own side of the base.
 
     Args:
         yaw: Yaw of the heading frame [rad].
@@ -131,11 +127,7 @@ def foothold(
 
 
 def swing_position(start: np.ndarray, goal: np.ndarray, phase: float, lift_m: float) -> np.ndarray:
-    """A point of the swing trajectory (3,) [m] at a phase in [0, 1].
-
-    It follows a minimum-jerk profile from start to goal, and rises over the line between them by
-    ``lift_m`` at mid-swing.
-    """
+    """A point (3,) [m] of a minimum-jerk swing from start to goal, ``lift_m`` higher halfway."""
     s = min(max(phase, 0.0), 1.0)
     point = start + minimum_jerk(s) * (goal - start)
     point[2] += lift_m * math.sin(math.pi * s) ** 2

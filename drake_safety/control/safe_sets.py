@@ -43,8 +43,8 @@ def signed_distance_to_polygon(
 ) -> float:
     """Signed distance of a point (2,) to a convex polygon's boundary, positive inside [m].
 
-    Corners are counter-clockwise. For a segment or a point (two or one corners) the distance is
-    never positive, without corners it is minus infinity.
+    Corners are counter-clockwise. The distance to a segment or a point is never positive, without
+    corners it is minus infinity.
     """
     if not corners:
         return -math.inf
@@ -118,13 +118,8 @@ class BalanceLimits:
 class BalanceSafeSet:
     """Safe set of a balancing robot: base over its feet, at a safe height, not fallen.
 
-    The constraints, in the order of :attr:`names`:
-
-    - ``support_polygon``: signed distance of the base's ground projection to the boundary of
-      the polygon of the feet on the ground [m];
-    - ``height``: distance to the nearer limit of the height [m];
-    - ``fall``: the smaller of the height over ``fall_height_m`` and the height that a rigid
-      pendulum of the standing height loses before ``fall_tilt_rad`` [m].
+    The constraints are :func:`support_margin`, the distance to the nearer limit of the height [m],
+    and :func:`fall_margin`.
     """
 
     names = ("support_polygon", "height", "fall")
@@ -168,7 +163,7 @@ class BalanceSafeSet:
 
         A directional margin is positive if the support polygon extends beyond the point in that
         direction. ``preview`` has the desired base positions from now to the goal, in the stance
-        frame, (M, 3) [m]. All are NaN if an argument is not finite, or the quaternion zero.
+        frame, (M, 3) [m]. NaN without a finite state with an orientation.
         """
         if not is_state(q, v, preview):
             return np.full(len(self.feature_names), np.nan)

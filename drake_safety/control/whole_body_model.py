@@ -28,21 +28,17 @@ class PointReference:
     """(3,) [m]."""
     rate: np.ndarray = field(default_factory=lambda: _REST)
     """(3,) [m/s]."""
-    acceleration: np.ndarray = field(default_factory=lambda: _REST)
-    """Feedforward (3,) [m/s²]."""
 
 
 @dataclass(kw_only=True)
 class WholeBodyReference:
-    """References of all tasks."""
+    """References of all tasks, with all feet at rest."""
 
     center_of_mass: PointReference
     orientations: list[RotationMatrix]
     """R_WB of every body with an orientation task, in the order of ``model.body_names``."""
     posture: np.ndarray
     """Joint positions (n_j,) [rad]."""
-    is_stance: np.ndarray
-    """Whether each foot stands, (n_feet,)."""
     reaching: PointReference | None = None
     """Reference of the hand; required by models with a hand."""
 
@@ -70,9 +66,9 @@ class Hand:
 class StandingFoot:
     """A foot's contact points and its contact constraint.
 
-    Rows for every point of a rigid foot would be redundant, and inconsistent while it rotates. The
-    constraint has the velocity of the points' centre and the rotations that move any point: six
-    rows for a sole, five for an edge, three for a point.
+    The constraint has the velocity of the points' centre and the rotations that move any point: six
+    rows for a sole, five for an edge, three for a point. Rows for every point of a rigid foot would
+    be redundant, and inconsistent while it rotates.
     """
 
     def __init__(self, body: RigidBody, points: np.ndarray):
@@ -132,28 +128,40 @@ class WholeBodyModel:
             actuator = plant.get_joint_actuator(index)
             joint = kinematics.joint_names.index(actuator.joint().name())
             self.torque_limits[joint] = actuator.effort_limit()
-        self._stances: dict[bytes, Stance] = {}
+        self._set_constraints()
 
-    def stance(self, is_stance: np.ndarray) -> Stance:
-        """Returns the constant part of programs with these stance feet."""
-        key = np.asarray(is_stance, dtype=bool).tobytes()
-        if key not in self._stances:
-            self._stances[key] = Stance(self, is_stance)
-        return self._stances[key]
+    def _set_constraints(self) -> None:
+        """Sets the constant entries of the program's constraints.
+
+        The rows are the equations of motion (n_v), the contact constraints and the friction
+        pyramids; the columns v̇ (n_v) and the forces of the feet's points (3 each).
+        """
+        n_v = self.num_velocities
+        num_points = sum(foot.num_points for foot in self.feet)
+        num_still = sum(foot.num_rows for foot in self.feet)
+        self.still_rows = slice(n_v, n_v + num_still)
+        num_rows = n_v + num_still + 4 * num_points
+        # |f_x| ≤ μ f_z and |f_y| ≤ μ f_z imply f_z ≥ 0.
+        mu = self.parameters.friction
+        pyramid = np.array([[1, 0, -mu], [-1, 0, -mu], [0, 1, -mu], [0, -1, -mu]])
+        self.A = np.zeros((num_rows, n_v + 3 * num_points))
+        self.A[n_v + num_still :, n_v:] = np.kron(np.eye(num_points), pyramid)
+        # The unactuated base has torque limits of zero.
+        limits = np.concatenate([np.zeros(NUM_BASE_VELOCITIES), self.torque_limits])
+        self.lower, self.upper = np.full(num_rows, -math.inf), np.zeros(num_rows)
+        self.lower[:n_v], self.upper[:n_v] = -limits, limits
+        self.sense = np.zeros(num_rows, np.int32)
+        self.sense[:n_v][limits == 0.0] = EQUALITY
+        self.sense[self.still_rows] = EQUALITY
 
     def reference(self, q: np.ndarray) -> WholeBodyReference:
-        """The reference for standing on the feet of ``q`` in the standing posture.
-
-        The centre of mass is over the stance at its height in ``q``, the bodies have the
-        orientations of the standing posture with the yaw of the stance, and the hand is at rest.
-        """
+        """The reference for standing on the feet of ``q``, with its height and its hand at rest."""
         kinematics = self.kinematics
         (x, y, yaw), height = kinematics.stance_pose(q), kinematics.center_of_mass(q)[2]
         reference = WholeBodyReference(
             center_of_mass=PointReference(position=np.array([x, y, height])),
             orientations=[],
             posture=np.array(kinematics.posture, dtype=float),
-            is_stance=np.ones(len(self.feet), bool),
         )
         if self.hand is not None:
             reference.reaching = PointReference(position=self.reaching_position(q))
@@ -166,23 +174,22 @@ class WholeBodyModel:
 
     def check_reference(self, reference: WholeBodyReference) -> None:
         """Checks that a reference is complete and finite, and of the right sizes."""
-        who = f"robot '{self.kinematics.robot.name}': the whole-body reference"
-        for name, entries in (
-            ("posture", self.kinematics.joint_names),
-            ("is_stance", self.kinematics.foot_names),
-            ("orientations", self.body_names),
-        ):
-            size = len(getattr(reference, name))
-            if size != len(entries):
-                raise ValueError(f"{who} must have {name} for {entries}; got {size} entries")
-        if self.hand is not None and reference.reaching is None:
-            raise ValueError(f"{who} must have reaching for the hand; got none")
-        vectors = [reference.posture]
-        for point in filter(None, (reference.center_of_mass, reference.reaching)):
-            vectors += [point.position, point.rate, point.acceleration]
-        is_sized = all(np.shape(vector) == (3,) for vector in vectors[1:])
-        if not is_sized or not np.isfinite(np.concatenate(vectors)).all():
-            raise ValueError(f"{who} must have finite numbers, three for a point; got {reference}")
+        points: list[PointReference | None] = [reference.center_of_mass]
+        if self.hand is not None:
+            points.append(reference.reaching)
+        vectors = [x for p in points if p is not None for x in (p.position, p.rate)]
+        is_sized = (
+            len(vectors) == 2 * len(points)
+            and all(np.shape(vector) == (3,) for vector in vectors)
+            and len(reference.orientations) == len(self.bodies)
+            and len(reference.posture) == self.num_joints
+        )
+        if not (is_sized and np.isfinite(np.concatenate([*vectors, reference.posture])).all()):
+            raise ValueError(
+                f"robot '{self.kinematics.robot.name}': the whole-body reference needs finite "
+                f"points (3,), orientations of {self.body_names}, a posture of {self.num_joints} "
+                f"joints and reaching for a hand; got {reference}"
+            )
 
     def reaching_position(self, q: np.ndarray) -> np.ndarray:
         """Returns the reaching point in the world, (3,) [m]."""
@@ -190,33 +197,3 @@ class WholeBodyModel:
             raise ValueError(f"robot '{self.kinematics.robot.name}': the model has no hand")
         self.kinematics.set_positions(q)
         return self.hand.present_position(self.kinematics)
-
-
-class Stance:
-    """Sizes and constant entries of programs with the same stance feet.
-
-    The rows are the equations of motion (n_v), the contact constraints and the friction pyramids;
-    the columns v̇ (n_v) and the forces of the stance feet's points (3 each).
-    """
-
-    def __init__(self, model: WholeBodyModel, is_stance: np.ndarray):
-        n_v, parameters = model.num_velocities, model.parameters
-        self.feet = [foot for foot, stands in zip(model.feet, is_stance, strict=True) if stands]
-        num_points = sum(foot.num_points for foot in self.feet)
-        num_still = sum(foot.num_rows for foot in self.feet)
-        self.still_rows = slice(n_v, n_v + num_still)
-        num_columns = n_v + 3 * num_points
-        num_rows = n_v + num_still + 4 * num_points
-
-        # |f_x| ≤ μ f_z and |f_y| ≤ μ f_z imply f_z ≥ 0.
-        mu = parameters.friction
-        pyramid = np.array([[1, 0, -mu], [-1, 0, -mu], [0, 1, -mu], [0, -1, -mu]])
-        self.A = np.zeros((num_rows, num_columns))
-        self.A[n_v + num_still :, n_v:] = np.kron(np.eye(num_points), pyramid)
-        # The unactuated base has torque limits of zero.
-        limits = np.concatenate([np.zeros(NUM_BASE_VELOCITIES), model.torque_limits])
-        self.lower, self.upper = np.full(num_rows, -math.inf), np.zeros(num_rows)
-        self.lower[:n_v], self.upper[:n_v] = -limits, limits
-        self.sense = np.zeros(num_rows, np.int32)
-        self.sense[:n_v][limits == 0.0] = EQUALITY
-        self.sense[self.still_rows] = EQUALITY

@@ -12,7 +12,7 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
 from drake_safety.control.observation import rotation_vector
-from drake_safety.control.whole_body_model import Stance, WholeBodyModel, WholeBodyReference
+from drake_safety.control.whole_body_model import WholeBodyModel, WholeBodyReference
 from drake_safety.learning.blas_threads import one_blas_thread
 
 SOLVED = 0
@@ -94,7 +94,7 @@ def build_qp(
     n_v = model.num_velocities
     # Rows of the stacked tasks, three per task, with accelerations J v̇ + J̇v.
     J = np.empty((model.num_task_rows, n_v))
-    Jdot_v, error, rate, feedforward = np.zeros((4, model.num_task_rows))
+    Jdot_v, error, rate = np.zeros((3, model.num_task_rows))
     J[_FIRST] = J_com
     Jdot_v[_FIRST] = C[3:NUM_BASE_VELOCITIES] / model.mass
     # The base's columns of J_com contain -[p]x of the centre of mass relative to the base.
@@ -102,12 +102,10 @@ def build_qp(
     error[_FIRST] = reference.center_of_mass.position - p_com
     _set_body_rows(model, reference, J, error)
     _set_body_biases(model, Jdot_v)
-    reaching = reference.reaching if model.hand else None
-    for rows, point in ((_FIRST, reference.center_of_mass), (_LAST, reaching)):
-        if point is not None:
-            rate[rows], feedforward[rows] = point.rate, point.acceleration
-    wanted = feedforward - Jdot_v
-    wanted += model.stiffness * error + model.damping * (rate - J @ v)
+    rate[_FIRST] = reference.center_of_mass.rate
+    if model.hand is not None and reference.reaching is not None:
+        rate[_LAST] = reference.reaching.rate
+    wanted = model.stiffness * error + model.damping * (rate - J @ v) - Jdot_v
     _check_size(wanted.dot(wanted))
     weighted = model.task_weights * J
     posture = model.parameters.posture
@@ -117,20 +115,19 @@ def build_qp(
         + posture.damping * v[NUM_BASE_VELOCITIES:]
     )
 
-    stance = model.stance(reference.is_stance)
-    A, lower, upper = stance.A.copy(), stance.lower.copy(), stance.upper.copy()
+    A, lower, upper = model.A.copy(), model.lower.copy(), model.upper.copy()
     A[:n_v, :n_v] = M
     lower[:n_v] -= bias
     upper[:n_v] -= bias
-    _add_contacts(model, stance, v, A, lower, upper)
+    _add_contacts(model, v, A, lower, upper)
     return WholeBodyQP(
         H=model.H + J.T @ weighted,
         g=g,
         A=A,
-        num_vdot_rows=stance.still_rows.stop,
+        num_vdot_rows=model.still_rows.stop,
         lower=lower,
         upper=upper,
-        sense=stance.sense,
+        sense=model.sense,
         bias=bias,
         force_scale=model.force_scale,
     )
@@ -142,19 +139,14 @@ def _check_size(*squared_norms: float) -> None:
 
 
 def _add_contacts(
-    model: WholeBodyModel,
-    stance: Stance,
-    v: np.ndarray,
-    A: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
+    model: WholeBodyModel, v: np.ndarray, A: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> None:
     """Sets the forces' columns in the equations of motion, and the contact constraints."""
     plant, context = model.kinematics.plant, model.kinematics.context
     world, n_v, kv = model.kinematics.world_frame, model.num_velocities, JacobianWrtVariable.kV
-    Jdot_v = np.empty(stance.still_rows.stop - n_v)
+    Jdot_v = np.empty(model.still_rows.stop - n_v)
     row, column = n_v, n_v
-    for foot in stance.feet:
+    for foot in model.feet:
         J = plant.CalcJacobianTranslationalVelocity(
             context, kv, foot.frame, foot.points, world, world
         )
@@ -175,7 +167,7 @@ def _add_contacts(
         Jdot_v[row - n_v : stop - n_v] = foot_bias[-foot.num_rows :]
         row = stop
     # J v̇ = -J̇v - K_d J v lets a foot's velocity decay.
-    rows = stance.still_rows
+    rows = model.still_rows
     lower[rows] = upper[rows] = -Jdot_v - model.parameters.contact_damping * (A[rows, :n_v] @ v)
 
 
@@ -236,8 +228,8 @@ def _set_body_biases(model: WholeBodyModel, Jdot_v: np.ndarray) -> None:
 def solve_qp(qp: WholeBodyQP) -> WholeBodySolution:
     """Solves the program by daqp's dual active-set method, deterministically without warm start.
 
-    The number of iterations is limited by that of constraints. Programs without a solution, as
-    those of a robot that has fallen, would take several times as many until that is certain.
+    The number of iterations is limited by that of constraints: programs of a robot that has fallen
+    have no solution, and would take several times as many.
     """
     n_v = len(qp.bias)
     n = qp.A.shape[1]

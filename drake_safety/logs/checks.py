@@ -282,7 +282,7 @@ def _poses(source: Source, kinematics: RobotKinematics) -> Iterator[_Pose]:
     p_BC = contacts(joints)
     for what, R, p in _readings(source.log_map.base_orientation.order, R_WB, p_WB):
         yield pose(what, R, p, joints, p_BC)
-    J = np.split(kinematics.contact_positions_and_jacobian(q[0])[1][:, 6:], kinematics.num_contacts)
+    J = np.split(kinematics.contact_jacobian(q[0])[:, 6:], kinematics.num_contacts)
     moves = np.array([np.any(J[s], axis=(0, 1)) for s in kinematics.foot_slices])
     legs = [np.flatnonzero(one & (moves.sum(axis=0) == 1)) for one in moves]
     if len(set(map(len, legs))) > 1 or len(legs[0]) > _LONGEST_LEG:

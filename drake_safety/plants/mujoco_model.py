@@ -24,6 +24,7 @@ from drake_safety.extras import require_extra
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot import PAYLOAD_RADIUS_M, PlantVariation, servo_joints
 from drake_safety.robots.robot_model import RobotModel
+from drake_safety.robots.urdf import remove
 
 if TYPE_CHECKING:
     import mujoco
@@ -61,12 +62,10 @@ def build_model(
 
     MuJoCo reads masses, inertias, joint frames, axes and stops from the URDF. Actuators, effort
     limits, collision shapes, friction coefficients and collision filters are those of the Drake
-    plant, so that both engines simulate the same scene. Other contact parameters are MuJoCo's
-    defaults, with an elliptic friction cone.
+    plant. Other contact parameters are MuJoCo's defaults, with an elliptic friction cone.
 
-    Returns the model, and for each of its controls the index of its value in the command: joint
-    positions and velocities with servos, joint torques without, in the order of
-    :func:`~drake_safety.robots.robot.servo_joints`.
+    Returns the model, and the index of each control in the command: joint positions and velocities
+    with servos, joint torques without.
     """
     mujoco = import_mujoco()
     path = model_file(robot.urdf, robot.source_dir, robot.requires)
@@ -94,10 +93,7 @@ def build_model(
     _add_geometries(spec, plant, scene_graph, robot)
     if variation.payload is not None:
         _add_payload(spec, robot, variation)
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise ValueError(f"robot '{robot.name}': MuJoCo cannot compile it: {error}") from error
+    model = spec.compile()
     if variation.mass_scale != 1.0:
         model.body_mass *= variation.mass_scale
         model.body_inertia *= variation.mass_scale
@@ -112,8 +108,8 @@ def _mechanics(urdf: str) -> str:
         if element.tag not in ("link", "joint", "mujoco"):
             root.remove(element)
     for link in root.findall("link"):
-        for element in link.findall("visual") + link.findall("collision"):
-            link.remove(element)
+        remove(link, "visual")
+        remove(link, "collision")
     return ElementTree.tostring(root, encoding="unicode")
 
 
@@ -216,10 +212,7 @@ def _add_geometries(
         if all(filtered):
             spec.add_exclude(bodyname1=name, bodyname2=other)
         elif any(filtered):
-            raise ValueError(
-                f"engine 'mujoco' filters collisions by body; of '{name}' and '{other}' only some "
-                "geometries are filtered"
-            )
+            raise ValueError(f"engine 'mujoco' cannot filter only some of '{name}' and '{other}'")
 
 
 def _add_payload(spec: mujoco.MjSpec, robot: RobotModel, variation: PlantVariation) -> None:
@@ -228,10 +221,7 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotModel, variation: PlantVariati
     name = payload.body or robot.base
     carrier = spec.body(name)
     if carrier is None:
-        raise ValueError(
-            f"robot '{robot.name}' has no body '{name}' for the payload; its bodies are "
-            f"{[body.name for body in spec.bodies]}"
-        )
+        raise ValueError(f"robot '{robot.name}' has no body '{name}' for the payload")
     # All masses are scaled after compiling; this cancels the payload's scale.
     mass_kg = payload.mass_kg / variation.mass_scale
     carrier.add_body(

@@ -30,14 +30,12 @@ class MujocoPlant(LeafSystem):
         output_ports: [state, positions]
 
     ``command`` has joint torques, or with ``servos`` the desired joint state ``[q; v]`` of
-    robot.yaml's servos, in the order of ``joint_names``. ``applied_spatial_force`` is that of a
-    MultibodyPlant. ``state`` is the MultibodyPlant's ``[q; v]``, ``positions`` its q.
+    robot.yaml's servos, in the order of ``joint_names``. The other ports are those of a
+    MultibodyPlant.
 
     The discrete state is MuJoCo's ``[qpos, qvel, qacc_warmstart]``, including the solver's warm
     start, so that steps are deterministic. MuJoCo's free joint has the position before the
-    quaternion, and the origin's velocity in the world before the angular velocity in the *body*;
-    Drake's has the quaternion before the position, and the angular velocity in the world before the
-    origin's. One scratch MjData a thread is overwritten by every step.
+    quaternion, and the origin's velocity in the world before the angular velocity in the *body*.
     """
 
     def __init__(
@@ -90,10 +88,7 @@ class MujocoPlant(LeafSystem):
         return np.split(state, [self.model.nq, self.model.nq + self.model.nv])
 
     def state_from(self, plant_state: np.ndarray) -> np.ndarray:
-        """MuJoCo's state, without a warm start, from Drake's ``[q; v]`` (n_q + n_v,).
-
-        The quaternion need not be normalised.
-        """
+        """MuJoCo's state, without a warm start, from Drake's ``[q; v]`` (n_q + n_v,)."""
         q, v = np.split(plant_state, [self.model.nq])
         state = np.zeros(self.model.nq + 2 * self.model.nv)
         qpos, qvel, _ = self._parts(state)
@@ -124,15 +119,9 @@ class MujocoPlant(LeafSystem):
         command: np.ndarray,
         forces: Sequence[ExternallyAppliedSpatialForce] = (),
     ) -> np.ndarray:
-        """Computes MuJoCo's next state.
+        """Computes MuJoCo's next state, or raises a `DivergenceError`.
 
-        Args:
-            command: Joint torques (n_j,) [N·m], or with servos joint positions and velocities
-                (2 n_j,) [rad, rad/s], in the order of ``joint_names``.
-            forces: External forces during the step, on bodies of the Drake plant.
-
-        Raises:
-            DivergenceError: The simulation is unstable, or an argument is not finite.
+        Forces act during the step on bodies of the Drake plant.
         """
         if not (np.isfinite(state).all() and np.isfinite(command).all()):
             raise DivergenceError(f"robot '{self._robot.name}': MuJoCo cannot step from NaN")

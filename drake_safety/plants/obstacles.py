@@ -49,20 +49,12 @@ def _add_obstacle(plant: MultibodyPlant, parser: Parser, obstacle: Obstacle) -> 
             f"{who}: model must be a package:// URL or the absolute path of an existing file"
         )
     check_meshes(path)
-    try:
-        instance, *others = parser.AddModels(str(path))
-    except RuntimeError as error:
-        raise ValueError(f"{who}: {error}") from error
+    instance, *others = parser.AddModels(str(path))
     joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
     held = {joint.child_body().index() for joint in joints}
     roots = [i for i in plant.GetBodyIndices(instance) if i not in held]
     if others or len(roots) != 1 or any(joint.num_velocities() for joint in joints):
-        raise ValueError(
-            f"{who}: expected one model with one root link and without moving joints; it has "
-            f"{1 + len(others)} models, and of the first the root links are "
-            f"{[plant.get_body(i).name() for i in roots]}, the joints "
-            f"{[joint.name() for joint in joints]}"
-        )
+        raise ValueError(f"{who}: expected one model with one root link, without moving joints")
     R_WO = RotationMatrix.MakeZRotation(obstacle.yaw_rad)
     X_WO = RigidTransform(R_WO, obstacle.position)
     plant.WeldFrames(plant.world_frame(), plant.get_body(roots[0]).body_frame(), X_WO)
@@ -99,10 +91,7 @@ def filter_collisions(
     robot: RobotModel,
     obstacles: list[ModelInstanceIndex],
 ) -> None:
-    """Filters all contacts except those of arms with obstacles and of other bodies with the ground.
-
-    The plant is finalised, and obstacles are their model instances.
-    """
+    """Filters all contacts but those of arms with obstacles and of other bodies with the ground."""
     arms = arm_geometries(plant, robot)
     everything = collision_geometries(plant, [plant.GetModelInstanceByName(robot.name)])
     rest = [geometry for geometry in everything if geometry not in set(arms)]
@@ -129,14 +118,9 @@ def remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph, context: Cont
 
 
 class Clearance:
-    """Signed distances of a robot's arms, and of points, to obstacles, clipped to ``range_m``.
-
-    It has its own plant and scene graph, without ground, and one scratch Context a thread.
-    """
+    """Signed distances of a robot's arms, and of points, to obstacles, clipped to ``range_m``."""
 
     def __init__(self, robot: RobotModel, obstacles: list[Obstacle], *, range_m: float):
-        if not 0 < range_m < math.inf:
-            raise ValueError(f"clearance: range_m must be finite and positive; got {range_m}")
         builder = DiagramBuilder()
         self._plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
         add_robot(self._plant, robot)
@@ -149,8 +133,7 @@ class Clearance:
         self._obstacles = set(collision_geometries(self._plant, instances))
         if self._obstacles and not arm_geometries(self._plant, robot):
             raise ValueError(
-                f"robot '{robot.name}': no body moved by joints of its reaching frames "
-                f"{list(robot.reaching_frames)} has collision geometry, so its distance to "
+                f"robot '{robot.name}': its arms have no collision geometry, so their distance to "
                 "obstacles is unknown"
             )
         self.range_m = range_m
@@ -174,10 +157,7 @@ class Clearance:
         return min((pair.distance for pair in pairs), default=self.range_m)
 
     def of_points(self, p_WP: np.ndarray, radius_m: float = 0.0) -> np.ndarray:
-        """Distance of spheres to the nearest obstacle, (N,) [m].
-
-        Their centres p_WP, (N, 3), are in the world.
-        """
+        """Distance of spheres at p_WP, (N, 3) [m], to the nearest obstacle, (N,) [m]."""
         query, range_m = self._query_port.Eval(self._scratch.value[2]), self.range_m + radius_m
         distances = np.full(len(p_WP), range_m)
         if self._obstacles:

@@ -293,7 +293,7 @@ def add_robot(
         gains = robot.gains_of(name)
         if gains is not None and servos:
             p, d = shift.stiffness_scale * gains.stiffness, shift.stiffness_scale * gains.damping
-            actuator.set_controller_gains(PdControllerGains(p=p, d=shift.damping_scale * d))
+            actuator.set_controller_gains(PdControllerGains(p=p, d=d))
         inertia = by_pattern(robot.rotor_inertia, name, "rotor inertia", robot.name)
         if inertia:
             actuator.set_default_rotor_inertia(inertia)

@@ -8,9 +8,7 @@ from pydantic import Field, FiniteFloat
 
 from drake_safety.files.schema import NotNegative, Positive, Triple, schema
 
-_WITHOUT_VALUE = ("zero", "swap", "half_rate", "freeze")
-_KINDS = ("bias", "drift", "zero", "scale", "swap", "noise", "delay", "half_rate", "freeze")
-FAULTS = {kind: kind not in _WITHOUT_VALUE for kind in _KINDS}
+FAULTS = {"bias": True, "drift": True, "zero": False, "scale": True, "delay": True, "freeze": False}
 """Kinds of faults, and whether they have a value."""
 
 
@@ -22,8 +20,6 @@ class JointShift:
     """Factor on the motor's largest torque."""
     stiffness_scale: Positive = 1.0
     """Factor on the position servo's gains."""
-    damping_scale: Positive = 1.0
-    """Further factor on its damping."""
     is_locked: bool = False
     """Whether the joint keeps its initial position."""
 
@@ -32,19 +28,16 @@ class JointShift:
 class Fault:
     """A fault of some entries of a vector signal; see `SensorFaults`.
 
-    ============= ==============================================================================
-    kind          the entries
-    ============= ==============================================================================
-    ``bias``      have ``value`` added
-    ``drift``     have ``value`` times the elapsed time [s] added
-    ``zero``      are 0
-    ``scale``     are multiplied by ``value``
-    ``swap``      are two, of which each shows the other
-    ``noise``     have normal noise of standard deviation ``value`` added, new in every sample
-    ``delay``     are those of ``value`` [s] ago, a multiple of the sampling period
-    ``half_rate`` are renewed by every second sample
-    ``freeze``    repeat the last sample before the fault
-    ============= ==============================================================================
+    ========== =================================================================================
+    kind       the entries
+    ========== =================================================================================
+    ``bias``   have ``value`` added
+    ``drift``  have ``value`` times the elapsed time [s] added
+    ``zero``   are 0
+    ``scale``  are multiplied by ``value``
+    ``delay``  are those of ``value`` [s] ago, a multiple of the sampling period
+    ``freeze`` repeat the last sample before the fault
+    ========== =================================================================================
     """
 
     kind: Literal[*FAULTS] = "zero"  # type: ignore[valid-type]
@@ -58,8 +51,8 @@ class Fault:
         if (self.value is not None) != FAULTS[self.kind]:
             needs = "needs a value" if FAULTS[self.kind] else "has no value"
             raise ValueError(f"'{self.kind}' {needs}; got {self.value}")
-        if self.kind in ("noise", "delay") and (self.value or 0.0) < 0:
-            raise ValueError(f"value of '{self.kind}' must not be negative; got {self.value}")
+        if self.kind == "delay" and (self.value or 0.0) < 0:
+            raise ValueError(f"value of 'delay' must not be negative; got {self.value}")
 
 
 @schema(kw_only=True)

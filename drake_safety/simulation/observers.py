@@ -33,7 +33,6 @@ class Observers:
         self._plant_state, self._period_s = plant_state, period_s
         self._observers: dict[tuple[float, float], StateObserver] = {}
         self._sources: list[RandomSource] = []
-        self._faults: list[SensorFaults] = []
 
     def add(
         self, name: str, noise: ObservationNoise, faults: Sequence[Fault] = ()
@@ -48,7 +47,6 @@ class Observers:
             faulty = add_faults(
                 self._builder, f"{name}_faults", measured, faults, names, period_s=self._period_s
             )
-            self._faults.append(faulty)
             return self._added(name, faulty.get_output_port(), ObservationNoise())
         key = (noise.position, noise.velocity)
         if key not in self._observers:
@@ -68,13 +66,11 @@ class Observers:
         return observer
 
     def reseed(self, context: Context, rng: np.random.Generator | None) -> None:
-        """Reseeds every noise source and the noise of faults; without ``rng`` with fixed seeds."""
+        """Reseeds every noise source; without ``rng`` with fixed seeds."""
         rng = np.random.default_rng(0) if rng is None else rng
         for source in self._sources:
             generator = RandomGenerator(int(rng.integers(2**31)))
             source.SetRandomContext(source.GetMyMutableContextFromRoot(context), generator)
-        for faulty in self._faults:
-            faulty.set_seed(faulty.GetMyMutableContextFromRoot(context), int(rng.integers(2**31)))
 
     def silence(self, context: Context) -> None:
         """Sets the noise to zero until the next sample."""

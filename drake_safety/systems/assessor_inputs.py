@@ -31,18 +31,14 @@ class AssessorInputs(LeafSystem):
           controller_memory: n_m (with ``memory``)]
         output_ports: [state: n_s, features: n_f, margins: n_c]
 
-    The features are those of the safe set, and behind them, where they are asked for, gravity in
-    the plane of the feet, the loads of the servos and the controller's memory. The shipped
-    assessments read: of balancing, gravity and loads; of reaching, gravity; of walking, the memory
-    of the policy. All outputs are direct functions of the inputs.
+    The features are those of the safe set. Gravity in the plane of the feet, the loads of the
+    servos and the controller's memory follow them where they are asked for.
 
     Args:
         num_outlook: M, samples of the outlook.
-        gravity: In the world of ``plant_state``, (3,) [m/s²]; on an actual robot, whose attitude is
-            estimated from gravity, a constant. It shows the slope of the ground, which a state
-            relative to the feet does not. None for no features of gravity.
-        servo_loads: Whether features are commanded minus measured joint positions, (n_j,) [rad], to
-            which the servos' loads are proportional.
+        gravity: In the world of ``plant_state``, (3,) [m/s²]; None for no features of gravity. They
+            show the slope of the ground, which a state relative to the feet does not.
+        servo_loads: Whether features are commanded minus measured joint positions, (n_j,) [rad].
         memory: Names of the entries of ``controller_memory``.
         mirror: If given, state and gravity are those of the robot's mirror image.
         is_walking: See :class:`~drake_safety.systems.state_observer.StateObserver`.

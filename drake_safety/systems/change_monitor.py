@@ -27,16 +27,14 @@ class ChangeMonitor(LeafSystem):
         output_ports: [alarm: 1, levels: n_w, alarm_cause: abstract, judged_share: 1]
 
     Every step of its training it predicts the state and updates the charts of a
-    :class:`~drake_safety.learning.change_detector.ChangeDetector`. ``levels`` has the level of each
-    watched state in units of its limit. When one exceeds 1, ``alarm`` becomes 1 and
-    ``alarm_cause`` says why; it ends when all were below 0.7 for five seconds, or with a reset.
-    Without enough motion for limits there is no alarm.
+    :class:`~drake_safety.learning.change_detector.ChangeDetector`. When a watched state's level
+    exceeds its limit of 1, ``alarm`` becomes 1 and ``alarm_cause`` says why. The alarm ends when
+    all levels were below 0.7 for five seconds, or with a reset.
 
     An input that is not finite cannot be judged, nor the two after it. ``judged_share`` is the
     share of the others over the last two seconds, and below a half every level is above 1. The
-    charts wait while a known disturbance acts, such as a ball, a push or a recovery step, and
-    `SETTLING_S` longer: while ``hold`` is above 0.5, or by :meth:`expect_disturbance`. The detector
-    is a parameter of the Context, see :meth:`adopt`.
+    charts wait while a known disturbance acts, by ``hold`` or :meth:`expect_disturbance`, and
+    `SETTLING_S` longer. The detector is a parameter of the Context, see :meth:`adopt`.
     """
 
     def __init__(self, assessment: SafetyAssessment):
@@ -94,18 +92,14 @@ class ChangeMonitor(LeafSystem):
             begin_s, end_s = min(begin_s, begin), max(end_s, end)
         context.SetDiscreteState(self._groups["expected_s"], [begin_s, end_s])
 
-    def row(self, context: Context) -> np.ndarray:
-        """(state, desired preview, features) at the ports, (n,); features not read are 0."""
+    def _row(self, context: Context) -> np.ndarray:
+        """State, preview and features at the ports, (n,); features not read are 0."""
         features = np.zeros(self._features_port.size())
         if self.reads_features:
             features = self._features_port.Eval(context)
         return np.concatenate(
             [self._state_port.Eval(context), self._preview_port.Eval(context), features]
         )
-
-    def is_held(self, context: Context) -> bool:
-        """Whether the port ``hold`` makes it wait."""
-        return self._hold_port.HasValue(context) and bool(self._hold_port.Eval(context)[0] > 0.5)
 
     def _value(self, context: Context, name: str) -> np.ndarray:
         value: np.ndarray = context.get_discrete_state(self._groups[name]).get_value()
@@ -119,7 +113,7 @@ class ChangeMonitor(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         part = {name: self._value(context, name).copy() for name in self._groups}
         now_s, (begin_s, end_s) = context.get_time(), part["expected_s"]
-        if self.is_held(context):
+        if self._hold_port.HasValue(context) and self._hold_port.Eval(context)[0] > 0.5:
             part["held_s"][0] = now_s
         if begin_s <= now_s:
             part["held_s"][0] = max(part["held_s"][0], min(now_s, end_s))
@@ -127,7 +121,7 @@ class ChangeMonitor(LeafSystem):
             part["x"][:] = part["previous"][:] = np.nan
             part["repeats"][0] = part["num_lost"][0] = 0.0
         else:
-            self._chart(part, self._detector_of(context), self.row(context))
+            self._chart(part, self._detector_of(context), self._row(context))
         for name, index in self._groups.items():
             discrete_state.set_value(index, part[name])
 

@@ -53,14 +53,13 @@ class FeedbackRecorder(LeafSystem):
         output_ports: [num_finished: 1]
 
     A row is recorded every ``info.step_s``. A window ends safe after ``num_steps`` steps, and the
-    next one begins with its last row. It ends unsafe as soon as ``safe``, sampled every
-    ``watch_period_s``, is below one, and the next one begins when it is one again. When time
-    jumps, as at a reset, the open window is dropped. So is a window with a row at which
-    ``recovery_active`` is not zero, since its twin has no recovery. The finished windows, at most
-    the newest 400, are state of the Context; :meth:`take_windows` removes them.
+    next one begins with its last row. It ends unsafe as soon as ``safe`` is below one, and the next
+    one begins when it is one again. The open window is dropped when time jumps, as at a reset, and
+    while ``recovery_active`` is not zero, since its twin has no recovery. The finished windows, at
+    most the newest 400, are state of the Context; :meth:`take_windows` removes them.
 
-    ``true_state`` defaults to ``state``, as on a robot. ``plant_state`` and ``controller_memory``
-    of a window's first row are where its twin begins.
+    ``true_state`` defaults to ``state``. ``plant_state`` and ``controller_memory`` of a window's
+    first row are where its twin begins.
 
     Args:
         num_steps: Steps of a safe window.

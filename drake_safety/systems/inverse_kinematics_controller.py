@@ -25,11 +25,10 @@ class InverseKinematicsController(LeafSystem):
           desired_foot_positions: 3 n_p (optional), desired_yaw: 1 (optional)]
         output_ports: [desired_joint_state: 2 n_j]
 
-    The command is a discrete state, so the output has no direct feedthrough. It goes to the plant's
-    implicit joint servos; q̇ of the command is the rate of the set point. The static offset τ/k_p
-    is added to the set points, with τ from the model's weight distributed over the feet on the
-    ground: it removes the sag of a servo of finite stiffness. Commands respect the joint limits,
-    and set points move at most at 0.7 of the joints' speed limits.
+    The command is a discrete state, for the plant's implicit joint servos; its rates are those of
+    the set points. The set points have the static offset τ/k_p, with τ from the weight distributed
+    over the feet on the ground, which removes the sag of a servo of finite stiffness. They respect
+    the joint limits, and move at most at 0.7 of the joints' speed limits.
 
     Without ``desired_foot_positions`` the feet are those of the first state that the controller
     sees when a simulation is initialised, put on level ground. Without ``desired_yaw`` the base's

@@ -32,14 +32,10 @@ class MonitoredSafetyAssessor(Diagram):
           fall_probability: 1, learned: abstract, alarm: 1, levels: n_w, alarm_cause: abstract,
           judged_share: 1]
 
-    The ports are those of its two systems.
-
     Args:
         period_s: Time between two evaluations [s]; the step of the training episodes by default.
-        checks_margins: Whether a state outside the safe set is always unsafe; otherwise there is no
-            port ``margins``.
-        on_alarm: Effect of the monitor's alarm, an `OnAlarm`; None for no monitor and no ports of
-            one.
+        checks_margins: Whether a state outside the safe set is always unsafe.
+        on_alarm: Effect of the monitor's alarm, an `OnAlarm`; None for no monitor.
 
     Attributes:
         assessor, monitor: Its two systems.
@@ -93,20 +89,13 @@ class MonitoredSafetyAssessor(Diagram):
         return any(system.reads_features for system in (self.assessor, self.monitor) if system)
 
     def connect_recovery(self, builder: DiagramBuilder, recovery: System) -> None:
-        """Connects a `RecoveryTrigger` or `RecoverySwitch`, which heeds no alarm of the monitor.
-
-        An alarm says that Γ cannot be relied on, not that the robot falls: during one, recovery
-        still follows Γ.
-        """
+        """Connects a recovery trigger or switch, which follows Γ also during an alarm."""
         for name, port in (("safety_probability", "probability"), ("belief", "belief")):
             output = self.GetOutputPort(f"{port}_without_alarm")
             builder.Connect(output, recovery.GetInputPort(name))
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
-        """Takes over what an assessment adapted from this system's own has learned.
-
-        The monitor begins anew: its alarm was about the robot before the adaptation.
-        """
+        """Takes over what an adapted assessment has learned; the monitor begins anew."""
         self.assessor.adopt(self.GetMutableSubsystemContext(self.assessor, context), adapted)
         if self.monitor is not None:
             own_context = self.GetMutableSubsystemContext(self.monitor, context)
@@ -132,14 +121,11 @@ def AddSafetyAssessor(
     monitor that never alarms.
 
     Args:
-        state: Port of the state, as in the training episodes.
-        desired_preview: Port of the desired preview, as in the training episodes.
+        state, desired_preview: Ports of the state and the desired preview, as in training.
         margins: Port of the measured state's margins; None if nothing checks them.
-        features: Port of the features, in the order of the assessment's ``feature_names``, such as
-            that of :class:`~drake_safety.systems.assessor_inputs.AssessorInputs`; not needed if the
-            assessment reads none.
-        hold: Port that is 1 while a known disturbance acts, such as a recovery step: the monitor
-            waits then.
+        features: Port of the features; not needed if the assessment reads none.
+        hold: Port that is 1 while a known disturbance acts: the monitor waits then.
+        period_s, on_alarm: See :class:`MonitoredSafetyAssessor`.
     """
     assessor = MonitoredSafetyAssessor(
         assessment, period_s=period_s, checks_margins=margins is not None, on_alarm=on_alarm
@@ -159,14 +145,9 @@ def AddSafetyAssessor(
     ports = {name: port for name, port in given.items() if port is not None}
     for name, port in ports.items():
         if port.size() != (size := assessor.GetInputPort(name).size()):
-            own_names = getattr(port.get_system(), "feature_names", None)
-            lacking = ""
-            if name == "features" and own_names is not None:
-                lacks = [name for name in assessment.info_.feature_names if name not in own_names]
-                lacking = f", of which it lacks {lacks}"
             raise ValueError(
                 f"AddSafetyAssessor: port '{port.get_name()}' for {name} has size {port.size()}; "
-                f"the assessment was fitted with {size}{lacking}"
+                f"the assessment was fitted with {size}"
             )
     warn_of_sampled_ports("AddSafetyAssessor", builder.GetSystems())
     if on_alarm is not None and math.isinf(assessment.detector_.alarm_level):

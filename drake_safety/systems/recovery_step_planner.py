@@ -46,12 +46,12 @@ class RecoveryStepPlanner(LeafSystem):
 
     Groups alternate until the capture point is well inside the support polygon and the heading
     error is small. The base then comes to rest like an inverted pendulum over its capture point,
-    and moves to the nominal planner's set point in the stance frame of the new footholds. If the
-    capture point comes near the polygon's edge meanwhile, the robot steps again. After that
+    and moves to the nominal set point in the stance frame of the new footholds. If the capture
+    point comes near the polygon's edge meanwhile, the robot steps again. After that
     ``recovery_done`` is 1 until ``recovery_active`` has fallen.
 
     Preview (H, ``horizon`` samples) and outlook (M, ``num_outlook``) are the base set point, held
-    constant, in the stance frame of the present set points. No output has direct feedthrough.
+    constant, in the stance frame. No output has direct feedthrough.
     """
 
     def __init__(
@@ -105,12 +105,7 @@ class RecoveryStepPlanner(LeafSystem):
         self.DeclareVectorOutputPort("recovery_done", 1, self._calc_done, ticket)
 
     def set_stance(self, context: Context, p_WC: np.ndarray, stance_pose: np.ndarray) -> None:
-        """Sets the foot positions, and the planner to idle.
-
-        Args:
-            p_WC: Centres of the contact spheres, (n_c, 3) [m].
-            stance_pose: [x, y, yaw] of the stance frame (3,) [m, rad].
-        """
+        """Sets contact positions (n_c, 3) [m] and stance pose (3,) [m, rad]; the planner idles."""
         self._set_stance(context.get_mutable_discrete_state(), p_WC, stance_pose)
 
     def _set_stance(

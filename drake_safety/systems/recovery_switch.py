@@ -24,16 +24,15 @@ class RecoverySwitch(Diagram):
           desired_foot_positions: 3 n_p, desired_yaw: 1, stance_pose: 3, recovery_active: 1]
 
     Connect ``stance_pose`` to the TrajectoryPlanner, so that the plan continues over the new
-    footholds, and ``desired_foot_positions`` and ``desired_yaw`` to the controller. Connect
-    ``desired_preview`` to the assessor, and ``desired_outlook`` to the features. It stands on the
-    feet of the first state that it sees when a simulation is initialised.
+    footholds, ``desired_foot_positions`` and ``desired_yaw`` to the controller,
+    ``desired_preview`` to the assessor, and ``desired_outlook`` to the features.
 
     Args:
-        threshold: Γ_thre; see :class:`~drake_safety.systems.recovery_trigger.RecoveryTrigger`.
+        threshold, persistence_s, initial_uncertainty: See
+            :class:`~drake_safety.systems.recovery_trigger.RecoveryTrigger`.
         period_s: Period of trigger and step planner [s].
         offset_s: Delay of the trigger after the assessor, and of the step planner after the
-            trigger [s]. Discrete updates of one time see the state before all of them, so each
-            would be a period late.
+            trigger [s]: updates of one time see the state before all of them.
     """
 
     def __init__(
@@ -72,25 +71,19 @@ class RecoverySwitch(Diagram):
                 num_outlook=num_outlook,
             ),
         )
-        for source, sink, name in (
-            (trigger, planner, "recovery_active"),
-            (planner, trigger, "recovery_done"),
-        ):
-            builder.Connect(source.GetOutputPort(name), sink.GetInputPort(name))
-        for system, name in (
-            (trigger, "safety_probability"),
-            (trigger, "belief"),
-            (planner, "plant_state"),
-            (planner, "nominal_desired_output"),
-        ):
-            builder.ExportInput(system.GetInputPort(name), name)
+        active, done = trigger.GetOutputPort("recovery_active"), "recovery_done"
+        builder.Connect(active, planner.GetInputPort("recovery_active"))
+        builder.Connect(planner.GetOutputPort(done), trigger.GetInputPort(done))
+        for name in ("safety_probability", "belief"):
+            builder.ExportInput(trigger.GetInputPort(name), name)
+        for name in ("plant_state", "nominal_desired_output"):
+            builder.ExportInput(planner.GetInputPort(name), name)
         sizes = {"output": 3, "preview": 3 * horizon, "outlook": 3 * num_outlook}
         for part, size in sizes.items():
             name = f"desired_{part}"
             switch = builder.AddNamedSystem(f"{name}_switch", PortSwitch(size))
-            builder.Connect(
-                trigger.GetOutputPort("port_selector"), switch.get_port_selector_input_port()
-            )
+            selector = trigger.GetOutputPort("port_selector")
+            builder.Connect(selector, switch.get_port_selector_input_port())
             nominal = switch.DeclareInputPort("nominal")
             if part == "output":
                 builder.ConnectInput(f"nominal_{name}", nominal)
@@ -100,5 +93,5 @@ class RecoverySwitch(Diagram):
             builder.ExportOutput(switch.GetOutputPort("value"), name)
         for name in ("desired_foot_positions", "desired_yaw", "stance_pose"):
             builder.ExportOutput(planner.GetOutputPort(name), name)
-        builder.ExportOutput(trigger.GetOutputPort("recovery_active"), "recovery_active")
+        builder.ExportOutput(active, "recovery_active")
         builder.BuildInto(self)

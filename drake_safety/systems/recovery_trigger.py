@@ -22,18 +22,15 @@ class RecoveryTrigger(LeafSystem):
         output_ports: [port_selector: abstract, recovery_active: 1]
 
     The trigger latches: once active it stays active until ``recovery_done`` is 1. A probability
-    that is not finite activates it, such as 1 minus ``fall_probability`` where no falls were
-    learned. ``belief`` tells a low probability from one that is 0 because the belief is "don't
-    know", as after an impact, which makes a single input unlike those of training. Then the
-    probability must have been below Γ_thre for ``persistence_s``. ``port_selector`` drives a
-    PortSwitch whose ports were declared ``nominal`` first, ``recovery`` second.
+    that is not finite activates it. ``belief`` tells a low probability from one that is 0 because
+    the belief is "don't know", as for an instant after an impact: then the probability must have
+    been below Γ_thre for ``persistence_s``. ``port_selector`` drives a PortSwitch whose ports were
+    declared ``nominal`` first, ``recovery`` second.
 
     Args:
         threshold: Γ_thre in [0, 1]; the paper's value is 0.6, of the belief's first entry.
-        persistence_s: Time that a belief of "don't know" must last to activate it [s]; none by
-            default, as in the paper.
-        initial_uncertainty: μ_ini of the assessment, which says what is "don't know"; see
-            :func:`~drake_safety.learning.prediction.is_unknown`.
+        persistence_s: Time that a belief of "don't know" must last to activate it [s].
+        initial_uncertainty: μ_ini of the assessment, which says what is "don't know".
     """
 
     def __init__(
@@ -61,18 +58,17 @@ class RecoveryTrigger(LeafSystem):
         self._done_port = self.DeclareVectorInputPort("recovery_done", 1)
         self._active = self.DeclareDiscreteState(1)
         self._num_below = self.DeclareDiscreteState(1)  # Updates below Γ_thre, up to now.
+        ticket = {self.discrete_state_ticket(self._active)}
         self.DeclareAbstractOutputPort(
-            "port_selector",
-            lambda: Value(InputPortIndex(1)),
-            lambda context, output: output.set_value(
-                InputPortIndex(2 if self._is_active(context) else 1)
-            ),
-            {self.discrete_state_ticket(self._active)},
+            "port_selector", lambda: Value(InputPortIndex(1)), self._calc_selector, ticket
         )
         self.DeclareStateOutputPort("recovery_active", self._active)
 
     def _is_active(self, context: Context) -> bool:
         return bool(context.get_discrete_state(self._active).GetAtIndex(0) > 0)
+
+    def _calc_selector(self, context: Context, output: Value) -> None:
+        output.set_value(InputPortIndex(2 if self._is_active(context) else 1))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         num_below = 0.0

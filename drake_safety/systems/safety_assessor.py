@@ -11,7 +11,6 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY, empty
 from drake_safety.learning.causes import is_on, is_outside, violated
-from drake_safety.learning.segments import floats
 from drake_safety.systems.periodic_update import declare_update
 
 _LARGEST_NOVELTY = 1e6
@@ -33,24 +32,18 @@ class SafetyAssessor(LeafSystem):
     Γ is evaluated every ``period_s`` and held, so no output but ``learned`` has direct feedthrough.
 
     - ``belief`` is (safe, unsafe, don't know); its first entry is the paper's Γ. It is (0, 0, 1)
-      for inputs that are novel or not finite, before the first evaluation, and while ``alarm`` is
-      above 0.5 or not finite.
+      for inputs that are novel or not finite, before the first evaluation, and during an alarm.
     - ``safety_probability`` is the probability of staying safe, by the maps' heads with the
-      correction from feedback; the paper's mode has no heads, and it is the belief's first entry.
-      It is 0 where the belief is "don't know".
-    - ``novelty`` is the distance of the inputs from those of training, novel above 1.
-    - ``fall_probability`` is 1 for inputs that are not finite, and NaN for an assessment that has
-      learned no falls.
-    - ``probability_without_alarm`` and ``belief_without_alarm`` ignore the alarm, for a recovery.
+      correction from feedback, or the belief's first entry in the paper's mode. It is 0 where the
+      belief is "don't know".
+    - ``fall_probability`` is 1 for inputs that are not finite, and NaN if no falls were learned.
     - ``learned`` has beliefs, correction and novelty, with empty beliefs during an alarm, for a
       :class:`~drake_safety.diagrams.walking.command_guard.CommandGuard`.
 
     While one of ``margins``, those of the measured state, is negative or not finite, no belief is
-    safe. Its mass for "safe" counts as unsafe by the first constraint that is not finite, else by
-    the most violated one.
-
-    What feedback changes (beliefs, correction and novelty) are parameters of the Context:
-    :meth:`adopt` replaces them between simulations and during them. The embedding is immutable.
+    safe: its mass for "safe" counts as unsafe by a constraint that is not finite, else by the most
+    violated one. What feedback changes (beliefs, correction and novelty) are parameters of the
+    Context, see :meth:`adopt`. The embedding is immutable.
 
     Args:
         period_s: Time between two evaluations [s].
@@ -112,16 +105,6 @@ class SafetyAssessor(LeafSystem):
         """Returns the beliefs in a Context, shaped as the assessment's ``beliefs_``."""
         return context.get_numeric_parameter(self._beliefs).get_value().reshape(self._shape)
 
-    def set_beliefs(self, context: Context, beliefs: np.ndarray) -> None:
-        """Replaces the beliefs of every cell."""
-        beliefs = floats(beliefs)
-        if beliefs.shape != self._shape or not np.isfinite(beliefs).all():
-            raise ValueError(
-                f"safety assessor: beliefs must be finite numbers of shape {self._shape}; got "
-                f"{beliefs} of shape {beliefs.shape}"
-            )
-        context.get_mutable_numeric_parameter(self._beliefs).SetFromVector(beliefs.ravel())
-
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
         """Takes over what an assessment adapted from this system's own has learned."""
         own, other = self._assessment.embedding_, adapted.embedding_
@@ -129,7 +112,8 @@ class SafetyAssessor(LeafSystem):
             raise ValueError(
                 "safety assessor: the assessment to adopt has other maps; build the diagram anew"
             )
-        self.set_beliefs(context, adapted.beliefs_)
+        beliefs = np.asarray(adapted.beliefs_, dtype=float).ravel()
+        context.get_mutable_numeric_parameter(self._beliefs).SetFromVector(beliefs)
         corrections = adapted.correction_, adapted.novelty_
         context.get_mutable_abstract_parameter(self._corrections).set_value(corrections)
 
@@ -137,7 +121,6 @@ class SafetyAssessor(LeafSystem):
         return self._alarm_port is not None and is_on(self._alarm_port.Eval(context)[0])
 
     def _learned(self, context: Context) -> dict[str, Any]:
-        """What has been learned, as arguments of a prediction."""
         correction, novelty = context.get_abstract_parameter(self._corrections).get_value()
         beliefs = self.get_beliefs(context)
         return {"beliefs": beliefs, "correction": correction, "novelty": novelty}

@@ -46,9 +46,8 @@ class SafetyMonitor(LeafSystem):
         input_ports: [plant_state: n_q + n_v]
         output_ports: [margins: n_c, safe: 1]
 
-    Both outputs are direct functions of the state: margins that were sampled and held would lag a
-    recorded row by one period. ``safe`` is 1 while every margin is finite and not negative. The
-    margins of a state that is not finite, or without an orientation, are minus infinity.
+    Both outputs are direct functions of the state. ``safe`` is 1 while every margin is finite and
+    not negative. The margins of a state that is not finite are minus infinity.
     """
 
     def __init__(self, safe_set: SafeSet, num_positions: int, num_velocities: int):
@@ -56,9 +55,8 @@ class SafetyMonitor(LeafSystem):
         self._safe_set = safe_set
         self._n_q = num_positions
         self.constraint_names = list(safe_set.names)
-        self._state_port = self.DeclareVectorInputPort(
-            "plant_state", num_positions + num_velocities
-        )
+        size = num_positions + num_velocities
+        self._state_port = self.DeclareVectorInputPort("plant_state", size)
         ticket = {self.input_port_ticket(self._state_port.get_index())}
         self._margins_port = self.DeclareVectorOutputPort(
             "margins", len(self.constraint_names), self._calc_margins, ticket

@@ -24,13 +24,12 @@ class SensorFaults(LeafSystem):
         output_ports: [output: n]
 
     :class:`~drake_safety.robots.shift.Fault` lists the kinds. Without faults, and before they
-    start, the output has the input's bits. Delays, ``half_rate`` and ``freeze`` hold samples, which
-    are taken at multiples of the period like those of Drake's discrete systems. At a sample, a
-    delay's output is the input of ``value / period_s`` samples ago, or the first sample until that
-    is so old. All memory is discrete state; the seed of noise is a parameter.
+    start, the output has the input's bits. Delays and ``freeze`` hold samples, taken at multiples
+    of the period: a delay's output is the input of ``value / period_s`` samples ago, or the first
+    sample until that is so old. All memory is discrete state.
 
     Args:
-        period_s: Sampling period of noise and of faults that hold samples [s].
+        period_s: Sampling period of faults that hold samples [s].
     """
 
     def __init__(
@@ -43,7 +42,7 @@ class SensorFaults(LeafSystem):
     ):
         super().__init__()
         check_times("sensor faults", or_zero=["offset_s"], period_s=period_s, offset_s=offset_s)
-        self._period_s, self._offset_s = period_s, offset_s
+        self._period_s = period_s
         self._input = self.DeclareVectorInputPort("input", len(names))
         self._faults = [(fault, _indices(fault, list(names))) for fault in faults]
         # Of each fault the samples that it holds, the latest first; NaN before the first one.
@@ -52,16 +51,11 @@ class SensorFaults(LeafSystem):
             self.DeclareDiscreteState(np.full(shape, np.nan).ravel())
         if any(num_held for num_held, _ in self._shapes):
             self.DeclarePeriodicDiscreteUpdateEvent(period_s, offset_s, self._update)
-        self._seed = self.DeclareNumericParameter(BasicVector([0.0]))
         self.DeclareVectorOutputPort("output", len(names), self._calc_output)
-
-    def set_seed(self, context: Context, seed: int) -> None:
-        """Sets the seed of the noise in this system's Context; it is 0 by default."""
-        context.get_mutable_numeric_parameter(self._seed).SetFromVector([float(seed)])
 
     def _num_held(self, fault: Fault) -> int:
         if fault.kind != "delay":
-            return int(fault.kind in ("half_rate", "freeze"))
+            return int(fault.kind == "freeze")
         periods = (fault.value or 0.0) / self._period_s
         if abs(periods - round(periods)) > 1e-6:  # Between samples nothing is known of the signal.
             raise ValueError(
@@ -69,11 +63,6 @@ class SensorFaults(LeafSystem):
                 f"got {fault.value:g}"
             )
         return round(periods)
-
-    def _num_samples(self, context: Context) -> int:
-        """The number of periods that have passed since the first sample."""
-        elapsed_s = context.get_time() - self._offset_s + _TOLERANCE_S
-        return int(elapsed_s // self._period_s)
 
     def _held(self, context: Context, index: int) -> np.ndarray:
         return context.get_discrete_state(index).get_value().reshape(self._shapes[index])
@@ -102,33 +91,17 @@ class SensorFaults(LeafSystem):
                 return np.zeros_like(x)
             case "scale":
                 return value * x
-            case "swap":
-                return x[::-1]
-            case "noise":
-                seed = int(context.get_numeric_parameter(self._seed).GetAtIndex(0))
-                # A generator a sample, so that the noise needs no state.
-                rng = np.random.default_rng([seed, index, self._num_samples(context) + 1])
-                return x + value * rng.standard_normal(len(x))
-        held, num_samples = self._held(context, index), self._num_samples(context)
-        if not len(held) or np.isnan(held).any():
-            return x
-        since_s = context.get_time() - self._offset_s - num_samples * self._period_s
-        is_sampled = num_samples % 2 == 0 and since_s < _TOLERANCE_S
-        return x if fault.kind == "half_rate" and is_sampled else held[-1]
+        held = self._held(context, index)
+        return x if not len(held) or np.isnan(held).any() else held[-1]
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         now = context.get_time() + _TOLERANCE_S
         for i, signal in enumerate(self._signals(context)[:-1]):
             fault, entries = self._faults[i]
             held, latest = self._held(context, i), signal[entries]
-            renews = {
-                "delay": True,
-                "half_rate": self._num_samples(context) % 2 == 0,
-                "freeze": now < fault.start_s,
-            }
             if np.isnan(held).any():
                 discrete_state.set_value(i, np.tile(latest, len(held)))
-            elif renews.get(fault.kind, False):
+            elif fault.kind == "delay" or (fault.kind == "freeze" and now < fault.start_s):
                 discrete_state.set_value(i, np.vstack([latest, held])[: len(held)].ravel())
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
@@ -136,16 +109,10 @@ class SensorFaults(LeafSystem):
 
 
 def _indices(fault: Fault, names: list[str]) -> list[int]:
-    def matching(entry: str) -> set[int]:
-        return {i for i, name in enumerate(names) if entry == name or re.fullmatch(entry, name)}
-
+    indices = set[int]()
     for entry in fault.entries:
-        if not matching(entry):
+        matching = {i for i, name in enumerate(names) if entry == name or re.fullmatch(entry, name)}
+        if not matching:
             raise ValueError(f"sensor faults: no entry '{entry}'; they are {names}")
-    indices = sorted(set().union(*map(matching, fault.entries)))
-    if fault.kind == "swap" and len(indices) != 2:
-        raise ValueError(
-            f"sensor faults: a swap is of two entries; {fault.entries} are "
-            f"{[names[i] for i in indices]}"
-        )
-    return indices
+        indices |= matching
+    return sorted(indices)

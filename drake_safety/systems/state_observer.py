@@ -27,13 +27,12 @@ class StateObserver(LeafSystem):
         input_ports: [plant_state: n_q + n_v, noise: 2 n_v (optional)]
         output_ports: [measured_plant_state: n_q + n_v, state: n_s, output: n_z]
 
-    Every output is a direct function of the inputs. Without the ``noise`` input, or with zero
-    standard deviations, the measurement is exact. State and output of a measurement that is not
-    finite, or without an orientation, are NaN; the base's position is as measured.
+    Every output is a direct function of the inputs. Without the ``noise`` input the measurement is
+    exact. State and output of a measurement that is not finite, or without an orientation, are NaN;
+    the base's position is as measured.
 
     Args:
-        noise: Standard deviations that scale the standard normal ``noise`` input, which has
-            2 n_v entries: for positions (tangent space), then for velocities.
+        noise: Standard deviations that scale the standard normal ``noise`` input.
         hand: Name of the reaching frame whose position is the output z_k; the base by default.
         mirror: If given, the state s_k is that of the robot's mirror image.
         is_walking: Whether s_k is :func:`~drake_safety.control.observation.walking_state`, and z_k

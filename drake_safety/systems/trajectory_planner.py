@@ -43,10 +43,7 @@ def interpolate(
 def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndarray:
     """Start, goal and detour, (3, n_z), of a plan of :func:`interpolate` from its samples [m].
 
-    Args:
-        preview: Samples from the plan's start; they may end before the plan, (M, n_z) [m].
-        step_s: Time between them [s].
-        duration_s: Duration of the whole plan [s].
+    The samples (M, n_z) [m] begin at the plan's start, ``step_s`` apart, and may end before it.
     """
     check_times("plan", step_s=step_s)
     times_s = step_s * np.arange(len(preview))
@@ -76,10 +73,9 @@ class TrajectoryPlanner(LeafSystem):
           desired_outlook: M n_z]
 
     The plan is a trajectory of 3-D positions in the stance frame S, and a parameter of the Context
-    (:meth:`set_plan`); without one, evaluation is an error. Before its start and after its end it
-    is constant. ``desired_output`` and its rate are in the world. ``desired_preview``, z*_{k:k+H},
-    is in S, row-major in time, so that it does not depend on the robot's position. So is
-    ``desired_outlook``, M samples at equal intervals from now to ``outlook_s`` ahead. The stance
+    (:meth:`set_plan`). Before its start and after its end it is constant. ``desired_output`` and
+    its rate are in the world. ``desired_preview``, z*_{k:k+H}, is in S, row-major in time, and so
+    is ``desired_outlook``, M samples at equal intervals from now to ``outlook_s`` ahead. The stance
     pose [x, y, yaw] is the input if it is connected, else a parameter.
 
     Args:
@@ -131,12 +127,7 @@ class TrajectoryPlanner(LeafSystem):
     def set_plan(
         self, context: Context, plan: PiecewisePolynomial, stance_pose: np.ndarray | None = None
     ) -> None:
-        """Sets the plan and, for an unconnected input, the stance pose.
-
-        Args:
-            plan: Positions in the stance frame over simulation time, (n_z, 1) [m].
-            stance_pose: [x, y, yaw] (3,) [m, rad]; unchanged by default.
-        """
+        """Sets the plan, (n_z, 1) [m], and for an unconnected input the stance pose (3,)."""
         value = context.get_mutable_abstract_parameter(self._plan_index)
         value.set_value(self._with_rate(plan))
         if stance_pose is not None:

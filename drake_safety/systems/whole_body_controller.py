@@ -29,20 +29,17 @@ class WholeBodyController(LeafSystem):
         output_ports: [actuation: n_j, solver_status: 1, num_failures: 1]
 
     ``desired_output`` is the set point of the hand, or of the centre of mass for a controller
-    without a hand, in the world [m], and ``desired_output_rate`` its rate [m/s]. While they are
-    not connected, the set point is that of :meth:`set_reference`, at rest. The command is a
-    discrete state, so the outputs have no direct feedthrough.
+    without a hand, in the world [m]. While it is not connected, the set point is that of
+    :meth:`set_reference`, at rest. The command is a discrete state.
 
-    ``solver_status`` is 0 if the last program was solved, negative if it was not (daqp's exit flag:
-    -1 infeasible, -4 too many iterations) and ``NOT_FINITE`` if its inputs were not finite. The
-    last command is then held, initially zero torque. ``num_failures`` counts the updates since the
-    initialisation whose status was not 0.
+    ``solver_status`` is 0 if the last program was solved, negative if it was not (daqp's exit
+    flag), and ``NOT_FINITE`` if its inputs were not finite. The last command is then held,
+    initially zero torque. ``num_failures`` counts these updates since the initialisation.
 
     Args:
         hand: Name of the reaching frame that follows ``desired_output``; None when none does.
-        actuation_matrix: Maps joint torques (n_j,) onto the plant's actuators, (n_u, n_j), see
-            :func:`~drake_safety.robots.robot.actuation_matrix`; the joints' own order by
-            default.
+        actuation_matrix: See :func:`~drake_safety.robots.robot.actuation_matrix`, (n_u, n_j); the
+            identity by default.
         offset_s: Time of the first update, after those of its inputs [s].
     """
 
