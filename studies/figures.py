@@ -21,7 +21,6 @@ from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.interval_figure import interval_figure
 from drake_safety.evaluation.results import Results
-from drake_safety.evaluation.robot_figure import robot_figure
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
@@ -49,10 +48,6 @@ def _embedding(folder: Path) -> Figure:
     scenario = load_scenario("atlas_reaching")
     episodes = run_episodes(scenario, 100, seed=_SEED, **scenario.options_for("evaluation"))
     return embedding_figure(load_assessment(shipped_folder(scenario.name), MODES[0]), episodes)
-
-
-def _shapes(folder: Path) -> Figure:
-    return robot_figure(load_scenario("g1_walking").make_loop())
 
 
 def _shifts(name: str, folder: Path) -> Figure:
@@ -87,7 +82,6 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
     "adaptation_study": _adaptation_study,
     "shifts_laikago": partial(_shifts, "laikago"),
     "shifts_atlas": partial(_shifts, "atlas"),
-    "collision_shapes": _shapes,
 }
 """Draws a picture, or writes it into a folder, by name."""
 

@@ -60,9 +60,6 @@ def test_the_events_of_a_run_have_begin_and_end_of_every_alarm():
     ]
     assert rows[1][0][1] == "monitor: inputs frozen. The promise is withdrawn"
     assert rows[2] == []
-    without = SimpleNamespace(calibrations_={})
-    of_other = event_rows([], Motion(time_s=time_s, ports=ports), without, "actual")
-    assert of_other[0][1] == "monitor: inputs frozen. Γ has not learned plant 'actual'"
 
 
 SAFE, UNSAFE, UNKNOWN = [0.7, 0.0, 0.3], [0.1, 0.6, 0.3], [0.0, 0.0, 1.0]

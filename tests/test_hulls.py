@@ -8,7 +8,6 @@ import pytest
 import yaml
 
 import urdf_files
-from command_line import invoked
 from drake_safety.evaluation.stills import StillCamera
 from drake_safety.importing.robot_template import write_robot
 from drake_safety.importing.urdf_survey import Survey
@@ -106,15 +105,6 @@ def test_collisions_of_a_hull_that_overlaps_another_link_are_off(tmp_path):
     assert_nothing_overlaps(written)
     readme = (written.folder / "README.md").read_text().lower()
     assert "which overlap or are excluded, are off" in readme
-
-
-def test_check_draws_the_standing_robot_beside_its_shapes(spider, tmp_path):
-    picture = tmp_path / "shapes.png"
-    words = "--quick", "--picture", picture
-    result = invoked("check", "pendulum", *words)
-    assert "--picture draws a legged robot" in str(result.exception) and not picture.exists()
-    assert invoked("check", spider.folder / "balancing.yaml", *words).exit_code == 0
-    assert picture.is_file() and "convex hulls" in picture.with_suffix(".svg").read_text()
 
 
 def test_new_gives_normals_to_meshes_of_visuals_and_of_links_without_one(tmp_path, caplog):

@@ -96,20 +96,7 @@ def test_logs_adapt_as_the_runs_that_they_are_of(folder, tmp_path, monkeypatch, 
         np.testing.assert_allclose(change, near.correction_.change, atol=0.05)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [(["--log"], "--log needs --map"), (["--log", "--log", "--map"], "logs must differ")],
-)
-def test_a_log_is_given_once_and_with_a_map(folder, capsys, monkeypatch, options, message):
-    log = folder / "short.yaml"
-    given = [word for option in options for word in (option, log)]
-    assert call(monkeypatch, "adapt", log, "--assessment", folder, *given) == 2
-    assert message in capsys.readouterr().out
-
-
-def test_a_log_is_cut_where_a_value_is_missing_and_strictly_refused(
-    folder, capsys, monkeypatch, tmp_path
-):
+def test_a_log_is_cut_where_a_value_is_missing(folder, capsys, monkeypatch, tmp_path):
     options = ("--assessment", folder, "--out", tmp_path / "out")
     log = logged(0, tmp_path, gyro_x=20)
     assert not call(monkeypatch, "adapt", folder / "short.yaml", *log, *options)
@@ -117,19 +104,6 @@ def test_a_log_is_cut_where_a_value_is_missing_and_strictly_refused(
     assert "99.2 % of 0.6 s are kept, in 2 pieces" in printed
     assert "line 22, column 'gyro_x': the value is nan" in printed
     assert load(tmp_path / "out", "sharpened").adaptation_.num_sets == 1
-    assert call(monkeypatch, "adapt", folder / "short.yaml", *log, *options, "--strict") == 2
-    assert "line 22, column 'gyro_x': the value is nan, expected" in capsys.readouterr().out
-
-
-def test_a_short_log_without_a_difference_is_said_to_change_nothing(
-    folder, capsys, monkeypatch, tmp_path
-):
-    options = ("--assessment", folder, "--out", tmp_path / "out")
-    log = logged(0, tmp_path)
-    assert not call(monkeypatch, "adapt", folder / "short.yaml", *log, *options)
-    printed = capsys.readouterr().out
-    assert "no correction of Γ (sharpened): the only pair ends as on the nominal plant" in printed
-    assert "about 40 pairs, as of 24 s of logs" in printed
     assert "sharpened: only one pair: nothing is held out" in printed
 
 

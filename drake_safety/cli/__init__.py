@@ -7,9 +7,7 @@ imported.
 
 from __future__ import annotations
 
-import errno
 import logging
-import os
 import signal
 import sys
 import traceback
@@ -111,16 +109,7 @@ def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
 
 
 def _not_called(scenario: console.ScenarioArgument) -> None:
-    """Stands for a command in the help of others, and where a shell completes a scenario."""
-
-
-def _called() -> list[str]:
-    """The words of the command line; where a shell completes a word, only if it is an option."""
-    line = os.environ.get("COMP_WORDS", os.environ.get("_TYPER_COMPLETE_ARGS"))
-    if line is None:
-        return sys.argv[1:]
-    words = line.split()
-    return words if words[-1].startswith("-") else []
+    """Stands for a command in the help of others."""
 
 
 def _print_version(is_wanted: bool) -> None:
@@ -145,7 +134,7 @@ def _common(
 def main() -> None:
     """Runs the command."""
     # An import that fails is an error of the command.
-    run_app(lambda *given, **options: make_app(_called())(*given, **options), "drake-safety")
+    run_app(lambda *given, **options: make_app(sys.argv[1:])(*given, **options), "drake-safety")
 
 
 def run_app(commands: Callable[..., Any], program: str) -> None:
@@ -173,7 +162,7 @@ def run_app(commands: Callable[..., Any], program: str) -> None:
         sys.exit(_STOPPED)
     except (Exception, SystemExit) as error:
         if isinstance(error, (ValueError, OSError, EpisodeError)) and _DEBUG not in sys.argv:
-            console.say("error", _sentence(error), style="red")
+            console.say("error", error, style="red")
             if isinstance(error, EpisodeError):
                 console.say(f"{_DEBUG} in the command line shows where")
         elif hasattr(error, "show"):  # Typer's own errors: unknown options, wrong types.
@@ -184,11 +173,3 @@ def run_app(commands: Callable[..., Any], program: str) -> None:
             raise
         sys.exit(_ERRORS.get(name, 2))
     sys.exit(code)
-
-
-def _sentence(error: Exception) -> str:
-    """An error in words, also one of the operating system."""
-    if not isinstance(error, OSError) or not error.filename:
-        return str(error)
-    why = f"cannot be read or written: {error.strerror}"
-    return f"'{error.filename}' {'does not exist' if error.errno == errno.ENOENT else why}"

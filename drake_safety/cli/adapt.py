@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -26,7 +26,7 @@ from drake_safety.logs.episodes import cut_log, motions_from_log
 from drake_safety.logs.robot_log import read_pieces
 from drake_safety.simulation.feedback import pair_starts, run_pairs
 from drake_safety.simulation.rollouts import run_motions
-from drake_safety.simulation.scenario import Scenario, load_scenario
+from drake_safety.simulation.scenario import load_scenario
 
 _NUM_FOLDS = 5  # Of the feedback, each of which is judged after adapting to the others.
 _MOTION_S = 1.25 * LEAST_MOTION_S  # Of a simulated actual plant, some of which may leave.
@@ -47,9 +47,6 @@ def adapt(
     out: Annotated[
         Path | None, Option(help="Folder to write; ASSESSMENT/adapted-VARIATION by default.")
     ] = None,
-    strict: Annotated[
-        bool, Option("--strict", help="Refuse a log with a missing value or a gap: do not cut it.")
-    ] = False,
     seed: Annotated[int, Option(help="Seed of the feedback.")] = ADAPTATION.first,
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
@@ -69,8 +66,6 @@ def adapt(
     logs = log or []
     if bool(logs) != (log_map is not None):
         raise ValueError("adapt: --log needs --map, and --map needs --log")
-    if len({path.resolve() for path in logs}) < len(logs):
-        raise ValueError(f"adapt: logs must differ; got {', '.join(map(str, logs))}")
     name = logs[0].stem if logs else variation
     folder = out or folders.adapted_folder(learned.out, name)
     folders.check_writable(folder)
@@ -80,8 +75,6 @@ def adapt(
             pieces, cut = [], []
             for path in logs:
                 read = read_pieces(path, log_map, loop.robot)
-                if strict and read.lost:
-                    raise ValueError(f"{read.lost[0]}, expected a log of which nothing is lost")
                 if summary := read.summary():
                     console.say(summary, style="yellow")
                 pieces += read.pieces
@@ -129,13 +122,6 @@ def adapt(
     Results(figures, console.made_by(loaded.name) | entries).write(folder / "adaptation.json")
     console.say(f"adapted to '{name}': {num_differing} of {len(sets)} pairs end differently")
     console.say(adapted[MODES[0]].detector_.describe())
-    unchanged = [
-        mode
-        for mode, gamma in adapted.items()
-        if gamma.base_logit_ is not None and not gamma.correction_.is_any
-    ]
-    if unchanged and not num_differing:
-        console.say(_why_unchanged(loaded, unchanged, len(sets)), style="yellow")
     for mode in MODES:
         console.say(f"{mode}: {_summary(scores[mode], held)}")
     for mode in adapted:
@@ -181,15 +167,4 @@ def _summary(scores: Mapping[str, Estimate], held: str) -> str:
     return (
         f"{verdict} on {change.n} held-out {held}: Brier score {before.value:.3f} before, "
         f"{after.value:.3f} after, {change.value:+.3f} ({change.low:+.3f} to {change.high:+.3f})"
-    )
-
-
-def _why_unchanged(scenario: Scenario, modes: Sequence[str], num_pairs: int) -> str:
-    num_needed = scenario.assessment.adaptation.update_interval
-    duration_s = num_needed * scenario.episode_duration_s
-    pairs = "the only pair ends" if num_pairs == 1 else f"all {num_pairs} pairs end"
-    return (
-        f"no correction of Γ ({', '.join(modes)}): {pairs} as on the nominal plant, and it learns "
-        f"from pairs that end differently. A first update takes about {num_needed} pairs, as of "
-        f"{duration_s:g} s of logs, some of which end otherwise. Its inputs are known from now on"
     )

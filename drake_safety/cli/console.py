@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import re
 import shlex
-import socket
 import sys
 from collections.abc import Iterable
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,19 +21,9 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
 
-def _scenario_names(incomplete: str) -> list[str]:
-    """The package's scenarios that begin with a word; without Drake, so that a shell is quick."""
-    paths = (Path(file.name) for file in files("drake_safety.diagrams").iterdir())
-    names = (path.stem for path in paths if path.suffix == ".yaml")
-    return sorted(name for name in names if name.startswith(incomplete))
-
-
 ScenarioArgument = Annotated[
     str,
-    Argument(
-        help="Name of a scenario (see `scenarios`), or the path of your own YAML file.",
-        autocompletion=_scenario_names,
-    ),
+    Argument(help="Name of a scenario (see `scenarios`), or the path of your own YAML file."),
 ]
 AssessmentOption = Annotated[
     Path | None,
@@ -115,40 +101,11 @@ def new_table(*columns: str, rows: Iterable[Iterable[str]] = (), title: str | No
     return table
 
 
-def open_viewer(host: str = LOOPBACK, port: int | None = None, *, has_rate: bool = True) -> Meshcat:
-    """Starts a Meshcat server, by default at a free port, with or without the real-time rate."""
+def open_viewer(host: str = LOOPBACK) -> Meshcat:
+    """Starts a Meshcat server at a free port, without the real-time rate."""
     from pydrake.geometry import Meshcat, MeshcatParams
 
-    try:
-        return Meshcat(MeshcatParams(host=host, port=port, show_stats_plot=has_rate))
-    except RuntimeError as error:
-        place = host if port is None else f"{host}:{port}"
-        raise ValueError(f"no page can be served at {place}: {error}") from error
-
-
-def open_recorder() -> Meshcat:
-    """Starts a Meshcat that records and serves nobody."""
-    viewer = open_viewer(port=0)
-    for place in Path("/dev/fd").iterdir():
-        number = int(place.name)
-        with contextlib.suppress(OSError):
-            opened = socket.socket(fileno=number)
-            try:
-                is_server = opened.getsockname()[1:] == (viewer.port(),)
-            finally:
-                opened.detach()
-            # Drake has no Meshcat without a server: an empty file takes the place of its socket.
-            if is_server:
-                with Path(os.devnull).open() as nothing:
-                    os.dup2(nothing.fileno(), number, inheritable=False)
-    return viewer
-
-
-def warn_of_empty_scene(meshcat: Meshcat, task: str) -> None:
-    """Prints a warning if a task has drawn nothing; only what was published counts as drawn."""
-    if not meshcat.HasPath("/drake"):
-        warning = f"warning: task '{task}' draws nothing in Meshcat (nothing is under /drake)"
-        say(warning, style="yellow")
+    return Meshcat(MeshcatParams(host=host, port=0, show_stats_plot=False))
 
 
 def given(**options: Any) -> dict[str, Any]:

@@ -206,7 +206,7 @@ def _record(
     """Writes recordings of one episode in all loops, side by side."""
     panels = [_PANELS]
     for side, (name, plant) in enumerate({"baseline": first, **others}.items()):
-        viewer = console.open_recorder()
+        viewer = console.open_viewer()
         loop = make_paired((first, plant), min(side, 1), meshcat=viewer)
         viewer.StartRecording()
         camera = follow(loop, viewer)

@@ -41,13 +41,6 @@ def play(
             "reaches it can use the controls: there is no password."
         ),
     ] = console.LOOPBACK,
-    allow_host: Annotated[
-        list[str] | None,
-        Option(
-            help="A further name by which browsers may ask for the page, repeatable. Others than "
-            "--host and this machine's are refused."
-        ),
-    ] = None,
 ) -> None:
     """Simulate a task on a page in the browser, in real time, until Stop or Ctrl-C.
 
@@ -71,14 +64,13 @@ def play(
         console.say(f"threshold {threshold:.3g}, {rule.origin}")
     page_port = _page_port(host, port)
     # The page forwards the scene, from an address that other pages cannot guess.
-    meshcat = console.open_viewer(_hidden_host(), 0, has_rate=False)
+    meshcat = console.open_viewer(_hidden_host())
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=meshcat, **options)
     session = LiveSession(
         loop, meshcat, threshold=threshold, unsafe_below=rule.unsafe_below, seed=seed
     )
-    console.warn_of_empty_scene(meshcat, loaded.task)
     served = {"host": host, "port": page_port, "scene_url": meshcat.web_url()}
-    with serve_page(session.panel, **served, names=allow_host or ()):
+    with serve_page(session.panel, **served):
         # An exception of a handler could be raised, and lost, inside Drake.
         numbers = (signal.SIGINT, signal.SIGTERM)
         handlers = {number: signal.signal(number, session.end) for number in numbers}

@@ -10,16 +10,11 @@ from typer import Argument, Exit, Option
 
 from drake_safety.assessments import assessed_scenarios
 from drake_safety.cli import console
-from drake_safety.cli.training_folder import MODES, load_assessment
-from drake_safety.evaluation.figure_style import save
-from drake_safety.evaluation.robot_figure import robot_figure
 from drake_safety.extras import MissingExtraError
 from drake_safety.importing.policy_template import survey_policy
 from drake_safety.importing.robot_check import check_urdf
 from drake_safety.importing.robot_template import write_robot
 from drake_safety.learning.seeds import DEMONSTRATION
-from drake_safety.simulation.legged_loop import LeggedLoop
-from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import load_scenario, scenario_names
 from drake_safety.simulation.scenario_check import check_scenario
 
@@ -96,8 +91,8 @@ def new(
         console.say("wrote", path)
     if written.num_hulls:
         console.say(
-            f"{written.num_hulls} convex hulls replace collision meshes that Drake does not read. "
-            f"Look at them: drake-safety check {written.files[-1]} --picture FILE"
+            f"{written.num_hulls} convex hulls replace collision meshes that Drake does not read: "
+            f"look at them by python -m pydrake.visualization.model_visualizer {files[0]}"
         )
     for what in written.decided:
         console.say("decided", what)
@@ -124,16 +119,6 @@ def check(
     episodes: Annotated[int, Option(help="Episodes for the share of unsafe ones.", min=0)] = 16,
     quick: Annotated[bool, Option("--quick", help="The same as --episodes 0.")] = False,
     seed: Annotated[int, Option(help="Seed of these episodes.")] = DEMONSTRATION.first,
-    assessment: Annotated[
-        Path | None, Option(help="Folder of `train`: says whether its monitor knows the episodes.")
-    ] = None,
-    picture: Annotated[
-        Path | None,
-        Option(
-            help="Draw the standing robot beside its collision shapes, as FILE.png and FILE.svg.",
-            dir_okay=False,
-        ),
-    ] = None,
     import_: Annotated[
         bool,
         Option(
@@ -147,8 +132,6 @@ def check(
 
     The exit code is 1 if there is a problem.
     """
-    if picture is not None and not import_:
-        raise ValueError("check: --picture needs the task, which --no-import does not import")
     num_problems = 0
     num_episodes = 0 if quick else episodes
     with console.open_stages() as stages:
@@ -171,20 +154,6 @@ def check(
                 remedy = finding.remedy.replace("\n", "\n    ")
                 text.append(f"\n         fix: {remedy}")
             console.say(text)
-    if picture is not None:
-        loop = load_scenario(scenario).make_loop()
-        if not isinstance(loop, LeggedLoop):
-            raise ValueError(
-                f"check: --picture draws a legged robot; task '{type(loop).__name__}' has none"
-            )
-        for path in save(robot_figure(loop), picture):
-            console.say("picture", path)
-    if assessment is not None and num_episodes and import_ and not num_problems:
-        loaded, detector = load_scenario(scenario), load_assessment(assessment, MODES[0]).detector_
-        duration_s = num_episodes * loaded.episode_duration_s
-        watched = run_motions(loaded, duration_s, seed=seed, are_episodes=True, num_workers=1)
-        sentence, is_ok = detector.describe_alarms(watched)
-        console.say(sentence, style=None if is_ok else "yellow")
     if num_problems:
         console.say(f"{num_problems} problem{'s' * (num_problems > 1)}", style="red")
         raise Exit(1)

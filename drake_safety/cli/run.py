@@ -51,9 +51,8 @@ _NUM_STILLS = 5  # Of a motion to a goal.
 _HAPPENING = {
     "guard_active": "the guard passes on another command",
     "recovery_active": "recovery triggered",
-    "controller_status": "the policy returns no finite action: the last one is held",
 }
-"""Ports that a loop may have, and what it means when they become positive."""
+"""Ports that a loop may have, and what it means when they become 1."""
 _GAMMA = ("safety_probability", "belief", "cause_probability", "predicted_margins")
 _WITHOUT_ALARM = ("probability_without_alarm", "belief_without_alarm")  # What recovery heeds.
 _COLUMNS = ("time [s]", "event", "probability")  # Of events.
@@ -93,7 +92,6 @@ def run(
             "runs/SCENARIO-shipped."
         ),
     ] = None,
-    meshcat: Annotated[bool, Option("--meshcat", help="Show it live, in real time.")] = False,
 ) -> None:
     """Simulate once with Γ in the loop; write a recording, a timeline and the events.
 
@@ -128,16 +126,12 @@ def run(
         simulated = partial(_throw, throws=parse_pushes(loaded, push or []))
     elif push:
         require(loop, HasBall, "run: --push")
-    viewer = console.open_viewer() if meshcat else console.open_recorder()
+    viewer = console.open_viewer()
     options |= console.given(guard=guard or None)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=viewer, **options)
-    if meshcat:
-        console.say(f"live at {viewer.web_url()}")
-        input("Press Enter when the browser shows the robot. ")
     viewer.StartRecording()
-    options = {"seed": seed, "realtime_rate": float(meshcat), "monitor": follow(loop, viewer)}
-    shown = simulated(loop, duration_s=duration or duration_s, **options)
-    console.warn_of_empty_scene(viewer, loaded.task)
+    camera = follow(loop, viewer)
+    shown = simulated(loop, duration_s=duration or duration_s, seed=seed, monitor=camera)
     _save(folder, viewer, loop, shown)
 
 
@@ -148,7 +142,6 @@ class _Shown(NamedTuple):
     """What is shown of a motion.
 
     Attributes:
-        threshold_text: The threshold in words.
         timeline: Further arguments of the timeline.
         instants: Times of stills, besides `num_stills` others [s]; None for no stills.
         marked: Times marked on the path in the map, by name [s]; without them there is no figure.
@@ -180,14 +173,8 @@ def _go(
     instants = [motion.leave_time_s, motion.fall_time_s]
     events: _Events = [(0.0, f"{words.subject} starts")]
     for port, happens in _HAPPENING.items():
-        if port not in motion.ports or not (motion[port] > 0).any():
-            continue
-        time_s = float(motion.time_s[np.argmax(motion[port][:, 0] > 0)])
-        if port == "recovery_active":
-            limit = loop.scenario.parameters.recovery.threshold
-            events += reason_events(loop, motion, [time_s], limit, f"{happens}: ")
-        else:
-            events.append((time_s, happens))
+        for start_s, _ in motion.intervals_s(port)[:1]:
+            events.append((start_s, happens))
     if push is not None:
         timeline["pushes"] = [push]
         instants += [push.time_s, push.time_s + push.duration_s + _AFTER_PUSH_S]
@@ -220,8 +207,7 @@ def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
     instants += [trigger_s + _AFTER_TRIGGER_S for trigger_s in triggers[:1]]
     marked = {"start": 0.0} | {f"ball {i}": one.time_s for i, one in enumerate(throws, start=1)}
     marked |= {f"recovery {i}": start_s for i, start_s in enumerate(triggers, start=1)}
-    name = loop.scenario.name
-    text = f"recovery where the probability is below {threshold:g}, that of scenario '{name}'"
+    text = f"recovery where the probability is below {threshold:g}, that of the scenario"
     timeline = {"throws": throws, "trigger_times_s": triggers, "trigger_label": "trigger"}
     return _Shown(motion, events, threshold, text, timeline, instants, marked=marked)
 
@@ -239,7 +225,8 @@ def _move(
         who=f"run of '{loop.scenario.name}' (seed {seed})",
         **options,
     )
-    alarms_s = _times_below(motion, rule.threshold)
+    is_below = ~(motion["safety_probability"][:, 0] >= rule.threshold)
+    alarms_s = motion.time_s[is_below][:1].tolist()
     end = "the end" if motion.has_left else "the end, inside the safe set throughout"
     if motion.failure:
         end = f"the simulation failed: {motion.failure}"
@@ -247,6 +234,13 @@ def _move(
     events = [(0.0, "the episode starts"), *outcome, (float(motion.time_s[-1]), end)]
     text = f"{rule.threshold:.3g}, {rule.origin}"
     return _Shown(motion, events, rule.threshold, text, {"trigger_times_s": alarms_s})
+
+
+def alarm_times(motion: Motion, threshold: float) -> list[float]:
+    """First time with the probability below the threshold [s]; none if it was so at the start."""
+    is_below = ~(motion["safety_probability"][:, 0] >= threshold)
+    times_s: list[float] = motion.time_s[is_below][:1].tolist()
+    return [time_s for time_s in times_s if time_s > motion.time_s[0]]
 
 
 def _outcome(loop: Any, motion: Motion, alarms_s: list[float], threshold: float) -> _Events:
@@ -268,7 +262,7 @@ def reason_events(
 ) -> _Events:
     """Why Γ was low at given times: "don't know" and its reason, or a cause.
 
-    What happens then, a recovery, heeds no alarm.
+    A recovery, which ``happens``, heeds no alarm.
     """
     names, parameters = loop.constraint_names, loop.assessment.parameters
     probability, belief = map(motion.__getitem__, _WITHOUT_ALARM if happens else _GAMMA[:2])
@@ -293,17 +287,6 @@ def _logged_ports(loop: ClosedLoop) -> tuple[str, ...]:
     """The ports of Γ and, if the loop has them, of the monitor and of what happens."""
     some = filter(loop.HasOutputPort, ("alarm", "alarm_cause", *_HAPPENING))
     return (*_GAMMA, *_WITHOUT_ALARM, *some)
-
-
-def _times_below(motion: Motion, threshold: float) -> list[float]:
-    """First time with the probability below the threshold [s], or none."""
-    is_below = ~(motion["safety_probability"][:, 0] >= threshold)
-    return motion.time_s[is_below][:1].tolist()
-
-
-def alarm_times(motion: Motion, threshold: float) -> list[float]:
-    """First time with the probability below the threshold [s]; none if it was so at the start."""
-    return [time_s for time_s in _times_below(motion, threshold) if time_s > motion.time_s[0]]
 
 
 def _timeline(loop: Any, shown: _Shown) -> Figure:
@@ -333,16 +316,11 @@ def _timeline(loop: Any, shown: _Shown) -> Figure:
 
 
 def event_rows(
-    events: _Events, motion: Motion, gamma: SafetyAssessment, other_plant: str = ""
+    events: _Events, motion: Motion, gamma: SafetyAssessment
 ) -> list[tuple[str, str, str]]:
-    """Rows of events and of the monitor's alarms: time [s], words, and the probability then.
-
-    Alarms on a plant that is not the one of training say so.
-    """
+    """Rows of events and of the monitor's alarms: time [s], words, and the probability then."""
     time_s, probability = motion.time_s, motion["safety_probability"][:, 0]
     withdrawn = ". The promise is withdrawn" if gamma.calibrations_ else ""
-    if other_plant:
-        withdrawn += f". Γ has not learned plant '{other_plant}'"
     alarms = []
     is_on = motion.ports.get("alarm", np.zeros((len(time_s), 1)))[:, 0] > 0.5
     for k in np.flatnonzero(np.diff(is_on, prepend=False)).tolist():
@@ -361,8 +339,7 @@ def _save(folder: Path, viewer: Meshcat, loop: Any, shown: _Shown) -> None:
     viewer.PublishRecording()
     recording = folder / "recording.html"
     write_file(recording, viewer.StaticHtml())
-    other_plant = loop.variation if loop.variation != loop.assessment.info_.variation else ""
-    rows = event_rows(shown.events, motion, loop.assessment, other_plant)
+    rows = event_rows(shown.events, motion, loop.assessment)
     content = console.made_by(loop.scenario.name) | {"columns": _COLUMNS, "rows": rows}
     write_file(folder / "run.json", json.dumps(content, indent=2, ensure_ascii=False) + "\n")
     console.show(console.new_table(*_COLUMNS, rows=rows))

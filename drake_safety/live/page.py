@@ -8,7 +8,7 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Awaitable, Callable, Collection, Iterator, MutableMapping
+from collections.abc import Awaitable, Callable, Iterator, MutableMapping
 from functools import partial
 from importlib.resources import files
 from ipaddress import ip_address
@@ -33,15 +33,13 @@ _KEYS = {"Escape": "Esc", "ArrowUp": "↑", "ArrowDown": "↓", "ArrowLeft": "�
 
 
 @contextlib.contextmanager
-def serve_page(
-    panel: LivePanel, *, host: str, port: int, scene_url: str, names: Collection[str] = ()
-) -> Iterator[None]:
-    """Serves the page, with the scene, in a thread; one page in a process.
+def serve_page(panel: LivePanel, *, host: str, port: int, scene_url: str) -> Iterator[None]:
+    """Serves the page, with the scene of a Meshcat, in a thread; one page in a process.
 
-    It answers requests for ``host``, this machine and further ``names`` of hosts only, and none of
-    other pages, which could read it or use its controls. Meshcat is reached at ``scene_url``.
+    It answers requests for ``host`` and this machine only, and none of other pages, which could
+    read it or use its controls.
     """
-    app.add_middleware(_only_own, host=host, names=names)
+    app.add_middleware(_only_own, host=host)
     app.mount(_SCENE, _forward(scene_url))
     serve = partial(
         ui.run,
@@ -73,13 +71,13 @@ def serve_page(
         thread.join(_WITHIN_S)
 
 
-def _only_own(application: _Application, host: str, names: Collection[str]) -> _Application:
+def _only_own(application: _Application, host: str) -> _Application:
     """Answers requests that name this server, and of pages only those of its own.
 
     A page elsewhere may reach it by a name that it resolves to this machine (DNS rebinding), and
     websockets have no rule of the same origin.
     """
-    known = {"127.0.0.1", "::1", *map(str.lower, ("localhost", host, *names))}
+    known = {"127.0.0.1", "::1", "localhost", host.lower()}
     # At all addresses of this machine, which cannot be forged as names can.
     if is_for_all := host in ("0.0.0.0", "::"):
         known.add(socket.gethostname().lower())

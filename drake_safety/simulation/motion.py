@@ -170,7 +170,6 @@ def simulate(
     monitor: Callable[[Context], object] | None = None,
     constraint_names: Sequence[str] = (),
     may_fail: bool = False,
-    realtime_rate: float = 0.0,
     index: int = 0,
     who: str = "motion",
 ) -> Motion:
@@ -195,7 +194,6 @@ def simulate(
         constraint_names: Names of the margins; by default the diagram's.
         may_fail: Whether a failure of the simulation is a result, ``Motion.failure``, with the rows
             that are finite; otherwise it raises ``EpisodeError``, as an error of a system does.
-        realtime_rate: Target real-time rate; 0 for as fast as possible.
         who: What is simulated, for messages.
     """
     times = {"step_s": step_s, "watch_period_s": min(watch_period_s, step_s)}
@@ -205,7 +203,6 @@ def simulate(
     safe = recorder.names.get("safe", "safe")
     safe_port = diagram.GetOutputPort(safe) if diagram.HasOutputPort(safe) else None
     simulator = Simulator(diagram)
-    simulator.set_target_realtime_rate(realtime_rate)
     if monitor is not None:
         simulator.set_monitor(monitor)
     context = simulator.get_mutable_context()

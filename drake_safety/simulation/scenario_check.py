@@ -49,7 +49,7 @@ _LINE_REMEDY = (
 )
 _GAINS_REMEDY = (
     "if it sinks, raise 'joint_gains' in robot.yaml, such as twofold [N·m/rad, N·m·s/rad]; if it "
-    "trembles, halve them; look for shapes that overlap by `check --picture FILE`"
+    "trembles, halve them; look for shapes that overlap"
 )
 _POLICY_REMEDY = (
     "compare policy.yaml with the policy's training: order of 'joints' and of the terms of "
@@ -352,7 +352,7 @@ def _off_the_ground(loop: LeggedLoop) -> _Check:
         "in the standing posture the feet alone touch it",
         "in the standing posture the robot rests on shapes that reach into the ground: "
         f"{', '.join(texts)}",
-        "look at them by `check --picture FILE`; make them smaller in the URDF [m]",
+        "make them smaller in the URDF [m]",
     )
 
 
