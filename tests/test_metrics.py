@@ -38,10 +38,7 @@ def test_a_proportion_has_the_clopper_pearson_interval_of_the_tables():
 
 def test_the_interval_of_the_median_covers_the_truth_about_as_often_as_promised():
     rng = np.random.default_rng(1)
-    estimates = [
-        median(rng.exponential(size=51), bootstrap=Bootstrap(num_resamples=300, seed=trial))
-        for trial in range(200)
-    ]
+    estimates = [median(rng.exponential(size=51)) for _ in range(200)]
     share = np.mean([estimate.low <= np.log(2.0) <= estimate.high for estimate in estimates])
     assert 0.90 <= share <= 0.99
     assert median(np.array([1.0, 2.0, math.inf])).value == 2.0
@@ -140,13 +137,13 @@ def test_segment_recalls_are_shares_of_segments_with_episodes_behind_them(segmen
 
 
 @pytest.mark.parametrize(
-    ("score", "label", "message"),
+    ("score", "label"),
     [
-        (np.zeros(3), np.zeros(3), r"boolean labels; got \(3,\) and \(3,\) of float64"),
-        (np.ones(2), np.zeros(2, bool), "0 of 2 samples are unsafe"),
-        (np.full(2, np.nan), np.array([False, True]), "none of the 2 scores is finite"),
+        (np.zeros(3), np.zeros(3)),
+        (np.ones(2), np.zeros(2, bool)),
+        (np.full(2, np.nan), np.array([False, True])),
     ],
 )
-def test_what_has_no_threshold_is_refused(score, label, message):
-    with pytest.raises(ValueError, match=message):
+def test_what_has_no_threshold_is_refused(score, label):
+    with pytest.raises(ValueError, match="scores"):
         threshold_at(score, label)

@@ -116,5 +116,3 @@ def test_logged_states_of_robot_and_ball_make_up_the_plants_positions(loop):
         ),
     }
     np.testing.assert_array_equal(stack_positions(loop, states), q)
-    with pytest.raises(ValueError, match=rf"states of \['ball'\], expected those of .*{name}"):
-        stack_positions(loop, {"ball": states["ball"]})

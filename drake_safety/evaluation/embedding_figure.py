@@ -30,8 +30,7 @@ _SAFETY = LinearSegmentedColormap.from_list(
 def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure:
     """Plots the map: segments in the embedding, beliefs of the cells, and causes.
 
-    It shows the first map of an ensemble, and causes if two of them have 5 % of what is unsafe. The
-    episodes should not be those of the training.
+    It shows the first map of an ensemble, and causes if two of them have 5 % of what is unsafe.
     """
     cells, grid = assessment.beliefs_[0], assessment.grid_
     count = assessment.training_.counts(grid)[0]
@@ -48,7 +47,12 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
         ink = np.where(is_empty, style.FAINT_INK, np.where(is_bright, style.INK, "white"))
         place: dict[str, Any] = {"ha": "center", "va": "center_baseline", "fontsize": 6.5}
         for i in np.flatnonzero(count):
-            middle.text(*grid.centres[i], _short(count[i]), color=ink[i], **place)
+            middle.text(
+                *grid.centres[i],
+                f"{count[i]}" if count[i] < 1000 else f"{count[i] / 1000:.1f}k",
+                color=ink[i],
+                **place,
+            )
         middle.set_title("Belief of each cell: safe")
         middle.set_xlabel("numbers: training segments; hatched: don't know")
         for last in others:
@@ -132,10 +136,3 @@ def _draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarra
 def _add_colour_bar(fig: Figure, axes: Axes, shade: ScalarMappable, label: str) -> None:
     bar = fig.colorbar(shade, ax=axes, shrink=0.8, pad=0.02, label=label)
     bar.outline.set_visible(False)
-
-
-def _short(count: int) -> str:
-    """A count in at most four characters: 12345 → 12k."""
-    if count < 1000:
-        return str(count)
-    return f"{count / 1000:.1f}k" if count < 9950 else f"{count / 1000:.0f}k"

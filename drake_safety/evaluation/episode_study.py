@@ -25,8 +25,7 @@ def evaluate_episodes(
 ) -> dict[Key, Estimate]:
     """Evaluates scorers on fresh episodes, on every segment and at k = 0.
 
-    Thresholds maximise the balanced accuracy on the calibration set, separately for all segments
-    and for k = 0.
+    Thresholds have the best balanced accuracy on the calibration set, separately for either.
     """
     segments, others = (split(one, stride=1, discount=1.0) for one in (test, calibration))
     rows_of = {
@@ -55,12 +54,9 @@ def evaluate_plans(
 ) -> dict[Key, Estimate]:
     """Evaluates verdicts on fresh plans with a goal, at k = 0, before anything moves.
 
-    Thresholds that are not given are chosen on the calibration set: each accepts most while a
-    future unsafe plan is refused with probability `PROMISED_UNSAFE_RECALL`, or what the number of
-    unsafe calibration plans allows. Estimates give thresholds as Γ_thre.
-
-    Args:
-        thresholds: The unsafe score above which a plan is refused, by scorer.
+    A scorer without a threshold of its unsafe score is given one on the calibration set: it accepts
+    most while a future unsafe plan is refused with probability `PROMISED_UNSAFE_RECALL`, or what
+    the number of unsafe calibration plans allows. Estimates give thresholds as Γ_thre.
     """
     first, others = _first_segments(test), _first_segments(calibration)
     miss_rate = promised_miss_rate(others.is_unsafe)

@@ -32,10 +32,9 @@ _EVEN = 0.5  # Share of the simulations that do not depend on Γ, in case that i
 
 @dataclass(frozen=True, kw_only=True)
 class FailureRate:
-    """An estimated failure rate.
+    """An estimated failure rate with its 95 % interval.
 
     Attributes:
-        rate: With its 95 % interval, of n rollouts.
         plain_rollouts: Number of random episodes whose share of failures has the same variance.
         failures: The episodes that failed, by time.
     """
@@ -61,15 +60,8 @@ def estimate_failure_rate(
     """Estimates how often a closed loop fails, from few simulations of many starts.
 
     Γ of each start, in its first undisturbed row, divides them into strata, and equally many starts
-    of each are simulated. The share of failures, weighted by that of the starts, is unbiased
-    however wrong Γ is: a poor Γ only makes the interval wide.
-
-    Args:
-        metric: What counts as a failure.
-        num_starts: Number of starts of which Γ is asked.
-        num_rollouts: Number of them that are simulated.
-        path: Folder in which starts and episodes are kept and continued.
-        progress: Called with the name of a stage, the number done and the number wanted.
+    of each are simulated, ``num_rollouts`` in all. The share of failures, weighted by that of the
+    starts, is unbiased however wrong Γ is. Starts and episodes are kept in the folder ``path``.
     """
     if not _NUM_STRATA <= num_rollouts <= num_starts:
         raise ValueError(
@@ -111,9 +103,8 @@ def estimate_failure_rate(
 def strata_of(score: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The stratum of each start, (N,) from 0, at most ten, from Γ's failure probabilities, (N,).
 
-    If equally many of each stratum are simulated, a start is with a probability in proportion to
-    the standard deviation of its outcome, as Γ has it (Neyman's allocation); but for half of the
-    simulations, which are spread evenly: a wrong Γ at most doubles the variance of plain sampling.
+    Half of the simulations are in proportion to the standard deviation of the outcome, as Γ has it
+    (Neyman's allocation), and half evenly: a wrong Γ at most doubles the variance.
     """
     # Equal scores in random order, so that the order of the starts says nothing within a stratum.
     mixed = rng.permutation(len(score))
@@ -126,7 +117,7 @@ def strata_of(score: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def in_turns(stratum: np.ndarray) -> list[int]:
-    """Starts in the order in which they are simulated, one of each stratum (N,) after the other."""
+    """Starts in the order of simulation, one of each stratum (N,) after the other."""
     order = np.argsort(stratum, kind="stable")
     turn = np.arange(len(order)) - np.searchsorted(stratum[order], stratum[order])
     starts: list[int] = order[np.argsort(turn, kind="stable")].tolist()

@@ -93,14 +93,11 @@ def proportion(count: int, n: int) -> Estimate:
     return Estimate(value=count / n, low=float(interval.low), high=float(interval.high), n=int(n))
 
 
-def median(values: np.ndarray, *, bootstrap: Bootstrap = _MEDIAN_BOOTSTRAP) -> Estimate:
-    """The median of independent values (N,), with its bootstrap interval.
-
-    Infinite values are allowed: a fall that never happens is later than any other.
-    """
+def median(values: np.ndarray) -> Estimate:
+    """The median of independent values (N,), some perhaps infinite, with its bootstrap interval."""
     if values.size == 0:
         return Estimate.exact(math.nan, 0)
-    return bootstrap.over_values(partial(np.median, axis=-1), np.sort(values))
+    return _MEDIAN_BOOTSTRAP.over_values(partial(np.median, axis=-1), np.sort(values))
 
 
 def quantile(values: np.ndarray, share: float, *, bootstrap: Bootstrap) -> Estimate:
@@ -109,10 +106,7 @@ def quantile(values: np.ndarray, share: float, *, bootstrap: Bootstrap) -> Estim
 
 
 def rate_per_hour(count: float, duration_s: float, n: int) -> Estimate:
-    """Events per hour, with the exact interval of a Poisson process, observed on n motions.
-
-    The count of events may be the mean of several.
-    """
+    """Events per hour on n motions, with the exact interval of a Poisson process."""
     from scipy.stats import chi2
 
     if not duration_s > 0:
@@ -128,10 +122,9 @@ def area_under_curve(
 ) -> float:
     """Area under the ROC curve: probability that an unsafe sample scores above a safe one.
 
-    Scores, labels and weights are (N,). A NaN score counts as the most unsafe, a tie one half. The
-    area is NaN unless both classes have weight.
+    Scores, labels and weights are (N,). A NaN score counts as the most unsafe, a tie one half.
     """
-    score, label = _checked("area_under_curve", unsafe_score, is_unsafe)
+    score, label = _checked(unsafe_score, is_unsafe)
     weight = np.ones(len(score)) if weight is None else np.asarray(weight, dtype=float)
     return _ranked_area(np.unique(score, return_inverse=True)[1], label, weight)
 
@@ -143,11 +136,8 @@ def auc(
     *,
     bootstrap: Bootstrap = _BOOTSTRAP,
 ) -> Estimate:
-    """The area under the ROC curve of samples (N,), with a bootstrap over their episodes (N,).
-
-    If the scores of the classes do not overlap, the bootstrap has no spread and `low` is 1 as well.
-    """
-    score, label = _checked("auc", unsafe_score, is_unsafe)
+    """The area under the ROC curve of samples (N,), with a bootstrap over their episodes (N,)."""
+    score, label = _checked(unsafe_score, is_unsafe)
     rank = np.unique(score, return_inverse=True)[1]
     return bootstrap.over_episodes(lambda weight: _ranked_area(rank, label, weight), episode)
 
@@ -157,8 +147,8 @@ def share(
 ) -> Estimate:
     """The share of samples (N,) that hit, with an interval over their episodes (N,).
 
-    It is a bootstrap; that of Clopper and Pearson with one sample an episode, where it is exact,
-    and, over the number of episodes, where all or no samples hit and resampling has no spread.
+    It is a bootstrap, but that of Clopper and Pearson with one sample an episode, and over the
+    number of episodes where all or no samples hit and resampling has no spread.
     """
     num_hits, num_samples = int(is_hit.sum()), len(is_hit)
     num_episodes = len(np.unique(episode))
@@ -180,16 +170,13 @@ def mean(values: np.ndarray, episode: np.ndarray, *, bootstrap: Bootstrap) -> Es
 
 
 def segment_estimates(
-    segments: Segments,
-    unsafe_score: np.ndarray,
-    *,
-    threshold: float,
+    segments: Segments, unsafe_score: np.ndarray, *, threshold: float
 ) -> dict[str, Estimate]:
     """AUC, recalls and Brier score of a scorer on segments, with intervals over episodes.
 
     Scores (N,) are in [0, 1], and unsafe above the threshold.
     """
-    score, label = _checked("segment_estimates", unsafe_score, segments.is_unsafe)
+    score, label = _checked(unsafe_score, segments.is_unsafe)
     episode, probability = segments.episode, np.minimum(score, 1.0)  # "Don't know" is infinite.
     return {
         "auc": auc(score, label, episode),
@@ -200,19 +187,14 @@ def segment_estimates(
 
 
 def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
-    """The threshold of scores (N,) with the best balanced accuracy, the mean of both recalls.
-
-    It is midway between two scores; of equally good ones, it is the middle one.
-    """
-    score, label = _checked("threshold_at", unsafe_score, is_unsafe)
-    num_unsafe = int(label.sum())
-    if num_unsafe in (0, len(label)):
-        raise ValueError(
-            f"threshold_at: {num_unsafe} of {len(label)} samples are unsafe; it takes both classes"
-        )
+    """The threshold of scores (N,) with the best balanced accuracy, midway between two scores."""
+    score, label = _checked(unsafe_score, is_unsafe)
     finite = np.unique(score[np.isfinite(score)])
-    if finite.size == 0:
-        raise ValueError(f"threshold_at: none of the {len(score)} scores is finite")
+    if label.all() or not label.any() or finite.size == 0:
+        raise ValueError(
+            f"a threshold takes finite scores of both classes; got {int(label.sum())} unsafe ones "
+            f"of {len(label)}, of which {len(finite)} differ"
+        )
     middle = 0.5 * (finite[:-1] + finite[1:])
     # Infinite scores stay above every threshold.
     candidates = np.array([np.nextafter(finite[0], -math.inf), *middle, finite[-1]])
@@ -225,15 +207,13 @@ def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
     return float(candidates[best[(len(best) - 1) // 2]])
 
 
-def _checked(
-    who: str, unsafe_score: np.ndarray, is_unsafe: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _checked(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Scores, infinite where they are NaN, and labels."""
     score, label = np.asarray(unsafe_score, dtype=float), np.asarray(is_unsafe)
     if label.dtype != bool or score.ndim != 1 or score.shape != label.shape:
         raise ValueError(
-            f"{who}: expected as many scores as boolean labels; got {score.shape} and "
-            f"{label.shape} of {label.dtype}"
+            f"expected as many scores as boolean labels; got {score.shape} and {label.shape} of "
+            f"{label.dtype}"
         )
     return np.where(np.isnan(score), math.inf, score), label
 

@@ -23,9 +23,8 @@ BELIEFS = ("safe", "unsafe", "don't know")
 """Names of the entries of a belief."""
 
 Metric = str | Callable[[Episode], float]
-"""How bad an episode is, in [0, 1]: ``unsafe``, ``fall``, a constraint, ``tracking=BOUND``, or a
-function of an episode. Episodes of the first and the last end where they leave the safe set, those
-of a constraint where it is violated; others go on until a fall."""
+"""How bad an episode is: ``unsafe``, ``fall``, a constraint, ``tracking=BOUND``, or a function with
+values in [0, 1]. Episodes of the first and the last end where they leave the safe set."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,9 +35,8 @@ class Outcome:
         value: How bad it is, in [0, 1].
         time_s: When it failed, or ended [s].
         cause: The constraint that it violated first, or `HELD`; "" for none.
-        commanded: The desired output as far ahead as Γ sees it, (n_z,).
-        belief: Γ's belief (safe, unsafe, don't know); None without Γ. This and what is commanded
-            are those of the first undisturbed row.
+        commanded: The desired output of the first undisturbed row, as far ahead as Γ sees, (n_z,).
+        belief: Γ's belief (safe, unsafe, don't know) in this row; None without Γ.
     """
 
     episode: int

@@ -35,9 +35,8 @@ def path_figure(
 ) -> Figure:
     """Plots Ψ(x) (N, 2) over the beliefs of the cells, and the probability (N,) over time [s].
 
-    As in the lower half of the paper's Fig. 6. It shows the first map of an ensemble. Points where
-    the belief is known, (N,), are dots; arrows join those farther apart than a cell, dotted ones
-    over "don't know". Events are times [s] by name, marked and numbered in both panels.
+    As in the lower half of the paper's Fig. 6, with the first map of an ensemble. Points where the
+    belief is known, (N,), are dots. Events are times [s] by name, numbered in both panels.
     """
     grid, cells = assessment.grid_, assessment.beliefs_[0]
     is_empty = cells[:, UNCERTAINTY] >= 1.0

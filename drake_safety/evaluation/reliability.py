@@ -18,11 +18,7 @@ _BOOTSTRAP = Bootstrap(num_resamples=100)
 def verdict_shares(
     calibration: Calibration, unsafe_score: np.ndarray, is_unsafe: np.ndarray
 ) -> dict[str, Estimate]:
-    """Shares of the verdicts of stored thresholds on fresh episodes (N,).
-
-    Scores are 1 - probability. `miss_rate` and `unsafe_unknown` are shares of the unsafe episodes,
-    `safe_recall`, `safe_unknown` and `false_alarm_rate` of the safe ones.
-    """
+    """Shares of the verdicts of stored thresholds on fresh episodes with scores (N,)."""
     verdict = calibration.verdicts(1.0 - unsafe_score)
 
     def share_of(rows: np.ndarray, expected: str) -> Estimate:
@@ -53,16 +49,9 @@ class Reliability(NamedTuple):
 
 
 def reliability(
-    unsafe_probability: np.ndarray,
-    is_unsafe: np.ndarray,
-    episode: np.ndarray,
-    *,
-    num_bins: int = 10,
+    unsafe_probability: np.ndarray, is_unsafe: np.ndarray, episode: np.ndarray, num_bins: int = 10
 ) -> Reliability:
-    """Compares 1 - probability of rows, (N,), with outcomes of their episodes.
-
-    There are fewer than ``num_bins`` bins if rows share probabilities.
-    """
+    """Compares 1 - probability of rows, (N,), with outcomes of their episodes."""
     p = unsafe_probability
 
     def error(weight: np.ndarray) -> float:

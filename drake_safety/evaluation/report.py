@@ -20,8 +20,7 @@ from drake_safety.simulation.dataset import read_info
 def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -> Path:
     """Writes ``report.html`` into the folder of a run, from what is there.
 
-    Assessments, results and pictures are those of `train`, `calibrate`, `evaluate`, `run` and
-    `adapt`. Recordings are linked, all else is inside the page. The command of the training names
+    Recordings are linked, all else is inside the page. The command of the training is in the folder
     ``episodes``.
     """
     require_extra("report", "report")

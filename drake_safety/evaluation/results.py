@@ -52,10 +52,7 @@ class Results(dict[Key, Estimate]):
         return cls(estimates, file.entries)
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Writes a JSON file: set, method, metric, value, ends of its interval, and n of each row.
-
-        Numbers have six significant digits; what is not finite becomes null.
-        """
+        """Writes a JSON file of rows (set, method, metric, value, low, high, n), in six digits."""
         rows = [
             [*key, *map(_rounded, (one.value, one.low, one.high)), int(one.n)]
             for key, one in self.items()

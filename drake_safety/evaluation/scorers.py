@@ -21,7 +21,6 @@ class Scorer:
         probability: Safety probability, (N,), of states (N, n_s), previews (N, H*n_z) and features
             (N, n_f); NaN where nothing is known.
         uses_true_state: Whether it takes the state without noise in nominal episodes.
-        used: Episodes used to train, calibrate or adapt it.
     """
 
     name: str

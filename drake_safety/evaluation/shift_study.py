@@ -74,10 +74,7 @@ _MEANING = (
 def safety_probability(
     assessment: SafetyAssessment, episode: Episode, rows: np.ndarray | slice
 ) -> np.ndarray:
-    """Γ of N rows as :class:`SafetyAssessor` with the port ``margins`` computes it, (N,).
-
-    It is NaN for "don't know".
-    """
+    """Γ of N rows as :class:`SafetyAssessor` computes it, (N,); NaN for "don't know"."""
     inputs = (getattr(episode, name)[rows] for name in SEEN)
     probability = assessment_scorer("gamma", assessment).probability(*inputs)
     is_unsafe = is_outside(episode.margins[rows]) & ~np.isnan(probability)
@@ -89,11 +86,8 @@ def shift_estimates(
 ) -> dict[tuple[str, str], Estimate]:
     """Shares of rows sure and wrong and "don't know", and the AUC of all rows, of each Γ.
 
-    Rows count from the first undisturbed one. "Don't know" counts as the lowest probability.
-    Intervals are over episodes.
-
-    Returns:
-        Estimates by name of Γ, "" for the episodes themselves, and metric.
+    Rows count from the first undisturbed one. Estimates are by name of Γ, "" for the episodes
+    themselves, and metric.
     """
     kept = [one for one in episodes if one.cause != DIVERGED]
     motion = np.repeat(np.arange(len(kept)), [len(one.state) - one.first_step for one in kept])
@@ -142,7 +136,6 @@ class Minute(NamedTuple):
 
     Attributes:
         alarm_s: Time of the first alarm [s]; infinite without one, as is the next.
-        leave_s: Time of first leaving the safe set [s].
         error_s: Durations of confident errors in the first 10 s and 60 s, outside alarms [s].
         silent_error_s: The same without a monitor [s].
     """
@@ -158,7 +151,10 @@ def monitored(motions: Sequence[Episode], assessment: SafetyAssessment) -> list[
     detector = assessment.detector_
     rows = [rows_of(one) for one in motions]
     every = max(1, round(assessment.info_.step_s / detector.step_s))
-    wrong_rows = [_sure_and_wrong(one, assessment, every) for one in motions]
+    wrong_rows = []
+    for one in motions:
+        last = last_rows(one, assessment, every)
+        wrong_rows.append(last[safety_probability(assessment, one, last) >= CONFIDENT])
     most = round(max(SPANS_S) / detector.step_s)
     minutes = []
     for start in range(len(motions)):
@@ -179,12 +175,6 @@ def monitored(motions: Sequence[Episode], assessment: SafetyAssessment) -> list[
         )
         minutes.append(Minute(alarm_s, leave_s, error_s, silent_error_s))
     return minutes
-
-
-def _sure_and_wrong(motion: Episode, assessment: SafetyAssessment, every: int) -> np.ndarray:
-    """Rows in which Γ is sure and wrong, of every n-th one."""
-    rows = last_rows(motion, assessment, every)
-    return rows[safety_probability(assessment, motion, rows) >= CONFIDENT]
 
 
 def last_rows(motion: Episode, assessment: SafetyAssessment, every: int) -> np.ndarray:
@@ -218,10 +208,7 @@ def error_estimates(error_s: Sequence[Sequence[float]]) -> dict[str, Estimate]:
 
 
 def false_alarms(motions: Episodes, detector: ChangeDetector) -> Estimate:
-    """False alarms per hour on motions of the nominal plant, each judged anew.
-
-    Rows shortly before leaving the safe set do not count.
-    """
+    """False alarms per hour on motions of the nominal plant, not shortly before they leave it."""
     rows = [one for one in usual_rows(motions) if len(one)]
     count = sum(len(detector.watch([one])[1]) for one in rows)
     return rate_per_hour(count, sum(map(len, rows)) * detector.step_s, len(rows))

@@ -35,10 +35,7 @@ class PlantShift:
 
 
 def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
-    """Shifts of plant and sensors from the nominal plant, and the scenario's variations, by name.
-
-    Robots with legs have more.
-    """
+    """The scenario's variations and, for robots with legs, shifts of plant and sensors, by name."""
     own = {
         f"variation {name}": PlantShift(
             kind="plant", variation=variation, options=scenario.options_for("pairs", name)

@@ -1,8 +1,4 @@
-"""Stills of the plant of a closed loop by a camera that follows the robot.
-
-They are rendered offscreen from the geometry of the loop, with everything that the task put into
-its plant. The diagram is not changed: the renderer belongs to a separate Context.
-"""
+"""Stills of the plant of a closed loop by a camera that follows the robot, rendered offscreen."""
 
 from __future__ import annotations
 
@@ -43,11 +39,7 @@ _LEAST_GAP_S = 0.3  # Between a still at an event and others.
 class StillCamera:
     """A camera that looks at a closed loop's robot from a fixed direction and follows its base.
 
-    Args:
-        positions: Positions of the plant, (n_q,) or (N, n_q). The camera aims by the first of
-            them, and from where it stands the robot is in view in all.
-        width: Width of the stills [pixels].
-        height: Their height [pixels].
+    It aims by the first of the plant's ``positions`` (N, n_q); the robot is in view in all.
     """
 
     def __init__(
@@ -106,8 +98,6 @@ class StillCamera:
         return np.append(base[:2] + self._offset, self._look_at_height)
 
     def _pose(self, positions: np.ndarray) -> None:
-        if not np.isfinite(positions).all():
-            raise ValueError("stills: the positions are not finite")
         self._plant.SetPositions(self._plant_context, positions)
 
     def _add_renderer(self, lighting: RenderEngineVtkParams) -> None:
@@ -147,8 +137,6 @@ class StillCamera:
                 else:
                     corners_B = signs * np.reshape(box.half_width(), (3, 1))
                     corners.append((X_WG @ box.pose()).multiply(corners_B))
-        if not corners:
-            raise ValueError("stills: the robot has no visible geometry")
         return np.hstack(corners)
 
 
@@ -157,10 +145,6 @@ def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.nd
     plant = loop.plant
     instances = map(ModelInstanceIndex, range(plant.num_model_instances()))
     moving = {plant.GetModelInstanceName(i): i for i in instances if plant.num_positions(i)}
-    if set(states) != set(moving):
-        raise ValueError(
-            f"stack_positions: states of {sorted(states)}, expected those of {sorted(moving)}"
-        )
     positions = np.zeros((len(next(iter(states.values()))), plant.num_positions()))
     for name, state in states.items():
         columns = plant.GetPositionsFromArray(moving[name], np.arange(plant.num_positions()))
@@ -171,10 +155,7 @@ def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.nd
 def still_times(
     time_s: np.ndarray, events_s: Iterable[float] = (), *, num_stills: int = 2
 ) -> list[float]:
-    """Logged instants [s] of stills: those of events, and ``num_stills`` others between them.
-
-    Others that are close to an event are dropped.
-    """
+    """Logged instants [s] of stills: those of events, and ``num_stills`` others apart from them."""
     kept = [*events_s]
     for instant in np.linspace(time_s[0], time_s[-1], num_stills).tolist():
         if all(abs(instant - event) >= _LEAST_GAP_S for event in kept):
@@ -193,7 +174,7 @@ def render_stills(
 ) -> list[tuple[float, np.ndarray]]:
     """Logged instants [s] and RGB images (height, width, 3) nearest to the times of stills [s].
 
-    ``time_s`` (N,) increases; ``positions`` (N, n_q) are all positions of the loop's plant.
+    ``positions`` (N, n_q) are all positions of the loop's plant at the instants ``time_s`` (N,).
     """
     rows = _nearest_rows(time_s, still_times_s)
     shown = np.array([positions[row] for row in (0, *rows)])

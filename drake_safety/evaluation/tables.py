@@ -20,8 +20,8 @@ class Column:
     """A column of a table: a metric and how it is written.
 
     Attributes:
-        unit: "", "%", "points" of percent, "ms", "s", "of" for counts out of n, "/h" for a rate, or
-            "=" and "=%" for values without interval.
+        unit: "", "%", "points", "ms", "s", "/h", "of" (counts out of n), or "=" and "=%" for values
+            without interval.
         better: 1 if larger is better, -1 if smaller is, 0 otherwise.
     """
 

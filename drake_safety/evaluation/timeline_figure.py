@@ -22,7 +22,7 @@ from drake_safety.plants.pushes import Push
 _WIDTH = 12.0  # All sizes are in inches.
 _CURVE_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 2.4, 1.0, 1.3
 _MAX_STILL_HEIGHT, _STILL_TITLE_HEIGHT, _AXIS_LABEL_HEIGHT = 2.6, 0.35, 0.6
-_LABEL_ROW_HEIGHT, _LETTER_WIDTH, _LABEL_OFFSET = 0.2, 0.066, 0.11  # Of labels above the curve.
+_LABEL_ROW_HEIGHT, _NUM_LABEL_ROWS = 0.2, 8  # Of names above the curve.
 _NUM_LEVELS, _MOST_POINTS = 4, 4000  # Curves of levels, and points of each.
 _Style = Mapping[str, Any]
 _THIN: _Style = {"color": style.FAINT_INK, "linewidth": 0.9}
@@ -62,17 +62,10 @@ def timeline_figure(
     constraint_names: Sequence[str] = (),
     angular_constraints: Sequence[str] = (),
 ) -> Figure:
-    """Plots the probability over time, with stills of the robot.
-
-    Names of events are in rows above the curve.
+    """Plots the probability (N,) over time, with names of events, stills, belief and margins.
 
     Args:
         time_s: Instants [s], (N,).
-        probability: Held until the next instant, (N,).
-        trigger_times_s: Times of triggers or alarms [s].
-        leave_time_s: Time at which the robot leaves the safe set [s]; infinite for never.
-        recovery_intervals_s: (start, end) of each recovery [s].
-        alarm_intervals_s: (start, end) of each alarm of the monitor [s].
         stills: (time [s], RGB image (height, width, 3)), each joined to its instant on the curve.
         belief: Masses (safe, unsafe, unknown), (N, 3); drawn stacked below.
         margins: Signed margins [m, rad], (N, n_c); drawn at the bottom.
@@ -92,8 +85,7 @@ def timeline_figure(
         events.append(_Event(leave_time_s, "leaves the safe set", style.INK, dashed))
     events += [_Event(s, "recovery", style.RECOVERY_COLOUR) for s, _ in recovery_intervals_s]
     events += [_Event(start, "monitor's alarm", unsafe) for start, _ in alarm_intervals_s]
-    rows = _label_rows(events, time_s[0], time_s[-1])
-    heights = [_CURVE_HEIGHT + _LABEL_ROW_HEIGHT * (1 + max(rows, default=-1))]
+    heights = [_CURVE_HEIGHT + _LABEL_ROW_HEIGHT * min(len(events), _NUM_LABEL_ROWS)]
     heights += [_BELIEF_HEIGHT] * (belief is not None) + [_MARGINS_HEIGHT] * (margins is not None)
     with style.drawing_style():
         fig, pictures, panels = _lay_out(heights, [image for _, image in stills])
@@ -118,7 +110,7 @@ def timeline_figure(
             _span(curve_axes, start, end, unsafe)
         for at_s in trigger_times_s:
             curve_axes.plot(at_s, threshold, "v", color=unsafe, markersize=8, zorder=5)
-        top = _write_names(curve_axes, events, rows, (-0.02, 1.05))
+        top = _write_names(curve_axes, events, (-0.02, 1.05))
         for axes, letter, (at_s, image) in zip(pictures, ascii_lowercase, stills, strict=False):
             axes.imshow(image, interpolation="antialiased")
             axes.set_axis_off()
@@ -138,8 +130,7 @@ def levels_figure(
     firsts = np.arange(0, len(time_s), max(1, len(time_s) // _MOST_POINTS))
     peaks, levels = levels.max(axis=0), np.maximum.reduceat(levels, firsts)
     events = [_Event(float(time_s[one.begin]), one.cause, style.UNSAFE_COLOUR) for one in alarms]
-    rows = _label_rows(events, time_s[0], time_s[-1])
-    height = _CURVE_HEIGHT + _LABEL_ROW_HEIGHT * (1 + max(rows, default=-1))
+    height = _CURVE_HEIGHT + _LABEL_ROW_HEIGHT * min(len(events), _NUM_LABEL_ROWS)
     with style.drawing_style():
         fig, _, (axes,) = _lay_out([height], [])
         axes.set(xlim=(time_s[0], time_s[-1]), xlabel="time [s]", ylabel="level")
@@ -151,7 +142,7 @@ def levels_figure(
             axes.axhline(limit, color=style.UNSAFE_COLOUR, linestyle="--", linewidth=1.2)
         for one in alarms:
             _span(axes, time_s[one.begin], time_s[one.end - 1], style.UNSAFE_COLOUR)
-        _write_names(axes, events, rows, (0.0, 1.05 * max(1.0, float(peaks.max()))))
+        _write_names(axes, events, (0.0, 1.05 * max(1.0, float(peaks.max()))))
         axes.legend(**_LEGEND)
     return fig
 
@@ -211,39 +202,14 @@ def _span(axes: Axes, start_s: float, end_s: float, colour: str, alpha: float = 
     axes.axvspan(start_s, end_s, color=colour, alpha=alpha, linewidth=0, zorder=0)
 
 
-def _is_left(event: _Event, start_s: float, end_s: float) -> tuple[bool, float, float]:
-    """Whether a name stands left of its instant, and the times from and to which it extends [s]."""
-    scale = (end_s - start_s) / (_WIDTH - 2.0)  # Seconds per inch, roughly.
-    offset_s = scale * _LABEL_OFFSET
-    length_s = scale * len(event.words) * _LETTER_WIDTH + 2 * offset_s
-    is_left = event.time_s + length_s > end_s
-    low = event.time_s - (length_s if is_left else offset_s)
-    return is_left, low, max(low + length_s, event.time_s + offset_s)
-
-
-def _label_rows(events: Sequence[_Event], start_s: float, end_s: float) -> list[int]:
-    """A row for each name, 0 at the top, so that none covers another or its instant."""
-    taken: list[list[tuple[float, float]]] = []
-    rows = []
-    for event in events:
-        _, low, high = _is_left(event, start_s, end_s)
-        is_free = [not any(low < b and a < high for a, b in row) for row in (*taken, [])]
-        rows.append(is_free.index(True))
-        taken += [[]] * (rows[-1] == len(taken))
-        taken[rows[-1]] = [*taken[rows[-1]], (low, high)]
-    return rows
-
-
-def _write_names(
-    axes: Axes, events: Sequence[_Event], rows: Sequence[int], ends: tuple[float, float]
-) -> float:
+def _write_names(axes: Axes, events: Sequence[_Event], ends: tuple[float, float]) -> float:
     """Writes names in rows above an axis with these ends; returns the new upper end."""
     row_height = (ends[1] - ends[0]) * _LABEL_ROW_HEIGHT / _CURVE_HEIGHT
-    top = ends[1] + row_height * (1 + max(rows, default=-1))
+    top = ends[1] + row_height * min(len(events), _NUM_LABEL_ROWS)
     axes.set_ylim(ends[0], top)
-    for event, row in zip(events, rows, strict=True):
-        is_left, _, _ = _is_left(event, *axes.get_xlim())
-        place = (event.time_s, top - (row + 0.5) * row_height)
+    for i, event in enumerate(events):
+        is_left = event.time_s > np.mean(axes.get_xlim())
+        place = (event.time_s, top - (i % _NUM_LABEL_ROWS + 0.5) * row_height)
         if event.is_ball:
             axes.plot(*place, "o", color=style.BALL_COLOUR, markersize=8, clip_on=False, zorder=5)
         axes.annotate(
