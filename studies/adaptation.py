@@ -134,14 +134,9 @@ def adaptation(
         }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class TestSet:
-    """Fresh actual episodes for evaluation.
-
-    Attributes:
-        episodes: The episodes.
-        segments: Their segments from every row.
-    """
+    """Fresh actual episodes for evaluation, and their segments from every row."""
 
     __test__ = False  # Not one of pytest's.
 
@@ -150,25 +145,14 @@ class TestSet:
 
     @classmethod
     def of(cls, episodes: Episodes, shortest: int) -> TestSet:
-        """Cuts episodes at every row.
-
-        Args:
-            episodes: The episodes.
-            shortest: Minimum length of a segment of a safe episode [steps].
-        """
-        return cls(
-            episodes=episodes, segments=split(episodes, stride=1, discount=1.0, shortest=shortest)
-        )
+        """Cuts episodes at every row."""
+        return cls(episodes, split(episodes, stride=1, discount=1.0, shortest=shortest))
 
 
 def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, float]]:
     """Metrics of an assessment on the test set, by form of Γ and metric.
 
     "FORM.k0" are those of first rows alone; "unknown" is the share of "don't know".
-
-    Args:
-        assessment: The assessment.
-        test: The test set.
     """
     segments = test.segments
     result = assessment.predict_rows(segments, test.episodes.info.variation)
@@ -195,12 +179,7 @@ def _metrics(unsafe: np.ndarray, label: np.ndarray) -> dict[str, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class Pool:
-    """Feedback and the test set on which it is judged, with seeds of their own.
-
-    Attributes:
-        feedback: Pairs of episodes.
-        test: Fresh actual episodes.
-    """
+    """Feedback and the test set on which it is judged, with seeds of their own."""
 
     feedback: Sequence[EpisodePair]
     test: TestSet
@@ -218,21 +197,11 @@ def pool_estimates(
 
     Orders of one pool would vary less than other feedback of the same robot does.
 
-    Args:
-        assessment: The assessment before feedback.
-        pools: Feedback, of which the first N pairs are used, each with a test set.
-        sizes: The N; those above the number of pairs are left out.
-        baselines: Other assessments by name.
-        progress: Called with a stage, the number done and the number wanted.
-
     Returns:
         By "FORM.ASSESSMENT.METRIC", where ASSESSMENT is "prior", "adapted N" or the name of a
         baseline, the mean over pools, with minimum and maximum as interval. "gap" is the share of
         pairs that differ, `pools_won` that of pools in which the Brier score is better than the
         prior's.
-
-    Raises:
-        ValueError: There is less feedback than the smallest N.
     """
     least = min(len(pool.feedback) for pool in pools)
     sizes = [size for size in sizes if size <= least]
@@ -321,12 +290,6 @@ def train_baselines(
     """Trains assessments from scratch on actual episodes, with the parameters of the prior.
 
     Those with too few episodes for t-SNE are left out.
-
-    Args:
-        assessment: The assessment before feedback.
-        episodes: Training episodes by name.
-        num_workers: Number of worker processes.
-        progress: Called with a stage, the number done and the number wanted.
     """
     # The largest first, so that no worker is left with it at the end.
     wanted = sorted(episodes.items(), key=lambda item: -len(item[1]))

@@ -65,13 +65,7 @@ class Watched:
 
     @classmethod
     def of(cls, alarm: Alarm, pushed: Sequence[Motion], undisturbed: Sequence[Motion]) -> Watched:
-        """Returns an alarm's values.
-
-        Args:
-            alarm: The alarm.
-            pushed: Motions that leave the safe set after the push, if at all.
-            undisturbed: Motions without a push that stay in the safe set.
-        """
+        """Returns an alarm's values."""
         warning, lowest = [], []
         for motion in pushed:
             value, time_s = _values(alarm, motion), motion.time_s
@@ -99,10 +93,6 @@ class Watched:
 
     def announced(self, cost: str, share: float) -> Callable[[np.ndarray], float]:
         """The share of falls announced if at most a share of the others has an alarm.
-
-        Args:
-            cost: Key of `COSTS`.
-            share: The share, in [0, 1).
 
         Returns:
             A function of the weights of the pushed motions, (N,); NaN without falls or others.
@@ -161,12 +151,6 @@ def equal_cost_estimates(
     """Shares of falls announced at equal cost, their differences, and false alarms an hour.
 
     Intervals are over pushed motions, those of differences paired.
-
-    Args:
-        watched: Values by method, the same motions for all; one for each seed of the method, of
-            which the mean counts.
-        ours: The methods that are compared.
-        rivals: Those they are compared with.
     """
     estimates: dict[Key, Estimate] = {}
     for cost in COSTS:
@@ -211,11 +195,7 @@ def _over_motions(
 
 
 def alarm_figure(watched: Mapping[str, Sequence[Watched]]) -> Figure:
-    """Plots falls announced over each cost: means over seeds, and each seed as a thin line.
-
-    Args:
-        watched: Values by method, as in `equal_cost_estimates`; the first six are drawn.
-    """
+    """Plots falls announced over each cost: means over seeds, and each seed as a thin line."""
     grid = np.linspace(0.0, _MOST_SHARE, 601)
     any_one = next(iter(watched.values()))[0]
     with style.drawing_style():

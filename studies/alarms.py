@@ -74,11 +74,6 @@ def threshold_alarms(
     They are the features that the task names, such as the margins of base and capture point to the
     edge of the support polygon; the tracking error; the base's tilt; and the smallest margin of the
     safe set. The last uses the true state, which cannot be measured, and so has an advantage.
-
-    Args:
-        state_names: Columns of the state.
-        feature_names: Columns of the features.
-        watched: Monitored features, by the name of the alarm.
     """
     features, states = list(feature_names), list(state_names)
 
@@ -118,14 +113,7 @@ def tilt(rotation: np.ndarray) -> np.ndarray:
 def first_alarm(
     motion: Motion, value: np.ndarray, threshold: float, *, since_s: float = 0.0
 ) -> float:
-    """Time of the first value below a threshold [s]; infinite if there is none.
-
-    Args:
-        motion: The motion.
-        value: Value of each row, (N,); NaN is below every threshold.
-        threshold: The threshold.
-        since_s: Earliest time that counts [s].
-    """
+    """Time of the first value below a threshold [s]; infinite if there is none."""
     is_alarm = ~(value >= threshold) & (motion.time_s >= since_s - _SLACK_S)
     return float(motion.time_s[int(np.argmax(is_alarm))]) if is_alarm.any() else math.inf
 
@@ -149,15 +137,7 @@ def persisting(value: np.ndarray, num_rows: int) -> np.ndarray:
 
 
 def equal_share_threshold(lowest: np.ndarray, share: float) -> float:
-    """The highest threshold with which at most a share of motions has an alarm.
-
-    Args:
-        lowest: Lowest value of each motion that stays safe, (N,).
-        share: The share, in [0, 1).
-
-    Raises:
-        ValueError: There is no motion.
-    """
+    """The highest threshold with which at most a share of motions has an alarm."""
     if len(lowest) == 0:
         raise ValueError("alarms: no calibration motion stays in the safe set")
     return float(np.sort(lowest)[math.floor(share * len(lowest))])
@@ -174,13 +154,6 @@ def evaluate_alarms(
     """Compares alarms at the same share of false alarms on calibration motions.
 
     Motions that leave the safe set before the push are left out.
-
-    Args:
-        alarms: The alarms.
-        calibration: Motions on which thresholds are chosen.
-        test: Fresh motions.
-        false_alarm_share: Allowed share of safe calibration motions with a false alarm.
-        num_rows: Successive rows below the threshold that give an alarm.
     """
     calm = [motion for motion in calibration if not motion.has_left]
     judged = [motion for motion in test if not motion.leave_time_s < motion.push_time_s]

@@ -28,13 +28,6 @@ class DirectClassifier:
     It learns from the segments that the assessment learns from (every start row, labelled by the
     end of its episode), with early stopping on a held-out tenth of the *episodes*. It runs on one
     thread, so that the same seed gives the same bits.
-
-    Args:
-        kind: "gradient_boosting" (scikit-learn's HistGradientBoostingClassifier) or "mlp" (its
-            MLPClassifier on standardised inputs).
-        uses_features: Whether x includes the features, as in the sharpened mode of the assessment.
-        seed: Seed of the held-out episodes and of the training.
-        shortest: Minimum length of a segment of a safe episode [steps]; the horizon by default.
     """
 
     def __init__(
@@ -66,11 +59,6 @@ class DirectClassifier:
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> np.ndarray:
         """Probability of an unsafe end.
-
-        Args:
-            state: States as the assessor sees them, (N, n_s).
-            desired_preview: Coming desired outputs, row-major in time, (N, H*n_z).
-            features: Features, (N, n_f).
 
         Returns:
             The probabilities, (N,); NaN for an input that is not finite.
@@ -168,14 +156,7 @@ def classifier_scorers(
     shortest: int | None = None,
     seeds: Sequence[int] = (0,),
 ) -> list[Scorer]:
-    """The baseline classifiers, trained on the training episodes of the assessment.
-
-    Args:
-        episodes: Training episodes.
-        progress: Called with a stage, the number done and the number wanted.
-        shortest: Minimum length of a segment of a safe episode [steps]; the horizon by default.
-        seeds: Seeds of the training; with several, a scorer is named after its kind and seed.
-    """
+    """The baseline classifiers, trained on the training episodes of the assessment."""
     scorers = []
     wanted = list(itertools.product(KINDS, seeds))
     for i, (kind, seed) in enumerate(wanted):
@@ -202,15 +183,7 @@ def auc_difference(
     *,
     bootstrap: Bootstrap | None = None,
 ) -> Estimate:
-    """The AUC of one scorer minus that of another on the same samples, from paired resamples.
-
-    Args:
-        unsafe_score: Unsafe scores of the first, (N,).
-        other_score: Unsafe scores of the second, (N,).
-        is_unsafe: Labels, (N,).
-        episode: Index of each sample's episode, (N,).
-        bootstrap: Settings of the interval.
-    """
+    """The AUC of one scorer minus that of another on the same samples, from paired resamples."""
     difference = auc_difference_of(unsafe_score, other_score, is_unsafe)
     return (bootstrap or Bootstrap()).over_episodes(difference, episode)
 
@@ -239,11 +212,6 @@ def classifier_differences(
 
     The AUC and the Brier score of a kind are means over its seeds; intervals are of paired
     resamples of the episodes.
-
-    Args:
-        gamma: The probability of Γ.
-        classifiers: Those of each kind, one for each seed.
-        test: The episodes.
     """
     segments = split(test, stride=1, discount=1.0, shortest=1)
     scores = {one.name: one.unsafe_score(segments) for one in (gamma, *classifiers)}

@@ -49,13 +49,7 @@ _FORMATS = {
 
 
 def render(kind: str, results: Results, **more: Any) -> str:
-    """The text of a template.
-
-    Args:
-        kind: Name of the template.
-        results: The results.
-        **more: What else the template uses.
-    """
+    """The text of a template."""
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES), trim_blocks=True, lstrip_blocks=True
     )
@@ -102,14 +96,7 @@ def _table(
     rows: Mapping[str, tuple[str, str] | Sequence[tuple[str, str]]],
     columns: Sequence[tuple[str, ...]],
 ) -> str:
-    """Markdown of a table; rows and columns without any result are left out.
-
-    Args:
-        results: The results.
-        corner: Heading of the row labels.
-        rows: By label, set and method of the row, or those of each of its columns.
-        columns: Metric, title and format of each.
-    """
+    """Markdown of a table; rows and columns without any result are left out."""
     made = [_column(*column) for column in columns]
     cells = []
     for label, places in rows.items():
@@ -144,15 +131,7 @@ def _with_columns(table: Table, shown: Sequence[int]) -> Table:
 
 
 def generate(text: str, folder: Path = RESULTS_FOLDER) -> str:
-    """Replaces every block of results in a text by the stored ones.
-
-    Args:
-        text: The Markdown.
-        folder: Folder of the stored results.
-
-    Raises:
-        ValueError: There is no block, a block does not end, or results are missing.
-    """
+    """Replaces every block of results in a text by the stored ones."""
     blocks = [match["name"] for match in _BLOCK.finditer(text)]
     opened = [match["name"] for match in re.finditer(_OPEN, text)]
     if not blocks:
@@ -177,12 +156,7 @@ def generate(text: str, folder: Path = RESULTS_FOLDER) -> str:
 
 
 def card_text(folder: Path, scenario: Scenario) -> str:
-    """The card of a shipped folder, as Markdown.
-
-    Args:
-        folder: Folder with the assessments and their evaluation.
-        scenario: The scenario.
-    """
+    """The card of a shipped folder, as Markdown."""
     results = Results.read(folder / EVALUATION_FILE)
     assessments = {
         mode: SafetyAssessment.load(folder / f"{mode}.safetensors")

@@ -47,17 +47,12 @@ Arrays = dict[str, np.ndarray]
 
 @dataclass(kw_only=True)
 class Study:
-    """A running study.
+    """A running study of the training in a folder.
 
     Attributes:
-        name: Its name, and that of its files.
-        scenario: The scenario.
-        folder: Folder of the training.
         seed: First seed of the fresh episodes.
-        workers: Number of worker processes; None for one a core.
-        stages: Shows progress.
         entries: What the file says besides rows.
-        rows: The rows, by set, method and metric.
+        rows: By set, method and metric.
     """
 
     name: str
@@ -113,18 +108,7 @@ def open_study(
     out: Path | None = None,
     plotted: Callable[[Key], bool] | None = None,
 ) -> Iterator[Study]:
-    """Runs a study in the block; afterwards its rows are written, printed and plotted.
-
-    Args:
-        name: Name of the study and of its files.
-        scenario: Name or path of the scenario.
-        folder: Folder of the training.
-        seed: First seed of the fresh episodes.
-        release: Whether `RELEASE` is added to it.
-        workers: Number of worker processes; None for one a core.
-        out: Folder of the files; that of the training by default.
-        plotted: Whether the row of a key is in the plot; there is none by default.
-    """
+    """Runs a study in the block; afterwards its rows are written, printed and plotted."""
     loaded, seed = load_scenario(scenario), seed + RELEASE * release
     with open_stages() as stages:
         study = Study(
@@ -157,15 +141,7 @@ def kept(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Arrays]:
-    """Calls a function of arrays for every part in worker processes, and keeps what it returns.
-
-    Args:
-        folder: The folder, named after all that the parts depend on; one file a part.
-        work: Arguments by name of the part; parts that are there are not called again.
-        function: A function at module level.
-        workers: Number of worker processes; None for one a core.
-        progress: Called with the number done and the number wanted.
-    """
+    """Calls a function of arrays for every part in worker processes, and keeps what it returns."""
     folder.mkdir(parents=True, exist_ok=True)
     files = {name: folder / f"{name}.npz" for name in work}
     missing = [name for name, file in files.items() if not file.is_file()]
@@ -201,15 +177,3 @@ def fingerprint(*things: Any) -> str:
     plain = [asdict(one) if is_dataclass(one) else one for one in things]  # type: ignore[arg-type]
     text = json.dumps(plain, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
-
-
-def parse_sizes(text: str) -> tuple[int, ...]:
-    """The numbers in '512,1024'.
-
-    Raises:
-        ValueError: The text is no list of integers.
-    """
-    try:
-        return tuple(int(part) for part in text.split(",")) if text else ()
-    except ValueError:
-        raise ValueError(f"--sizes '{text}': give numbers, such as 512,1024,2048") from None

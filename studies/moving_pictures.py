@@ -136,16 +136,7 @@ def first_saved(
     run: Callable[[Any, Any, Sequence[str]], Motion],
     acts: str,
 ) -> tuple[Any, list[Take]]:
-    """The first disturbance after which a robot falls without recovery only, and both runs.
-
-    Args:
-        loops: Without and with recovery.
-        run: Simulates a loop with a disturbance, and logs further ports.
-        acts: What the robot does after the trigger.
-
-    Raises:
-        ValueError: There is none.
-    """
+    """The first disturbance after which a robot falls without recovery only, and both runs."""
     plain, guarded = loops
     threshold = guarded.scenario.parameters.recovery.threshold
     for one in disturbances:
@@ -174,15 +165,7 @@ def save_moving_picture(
     path: Path,
     push: Push | None = None,
 ) -> Path:
-    """Writes a GIF of runs side by side, with the probability of the last one below.
-
-    Args:
-        loop: A loop with their plant, and the threshold of recovery.
-        takes: The runs; the picture stops for a moment at each caption.
-        hit: Time of the disturbance [s], and its caption in all of them.
-        path: Path of the GIF, which is returned.
-        push: Shown by an arrow while it acts.
-    """
+    """Writes a GIF of runs side by side, with the probability of the last one below."""
     takes = [one._replace(captions=[hit, *one.captions]) for one in takes]
     stops = sorted({round(time_s, 2) for one in takes for time_s, _ in one.captions})
     begin_s = max(hit[0] - _BEFORE_S, 0.0)

@@ -141,9 +141,6 @@ def evaluated(folder: Path) -> Results:
     """The evaluation in the folder of a training and its studies, as they are published.
 
     Absolute paths of folders in commands are replaced by ``runs/NAME``.
-
-    Raises:
-        ValueError: There is no evaluation.
     """
     file = folder / EVALUATION_FILE
     if not file.is_file():
@@ -182,17 +179,8 @@ def check_shipped(folder: Path, scenario: Scenario, *, num_workers: int | None =
 
     Simulates the first fresh episodes of the evaluation again.
 
-    Args:
-        folder: Folder written by `ship`.
-        scenario: The scenario.
-        num_workers: Number of worker processes; one a core by default.
-
     Returns:
         Results of the evaluation.
-
-    Raises:
-        ValueError: A file or the scenario has changed, or outcomes or verdicts of the first
-            episodes differ from the stored ones.
     """
     results = Results.read(folder / EVALUATION_FILE)
     stored = results.entries
@@ -234,14 +222,6 @@ def first_verdicts(
     progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
     """Simulates the first fresh episodes of a seed, with their verdicts at k = 0.
-
-    Args:
-        scenario: The scenario.
-        assessments: Calibrated assessments, by mode.
-        seed: Seed of the episodes.
-        num_episodes: Number of episodes.
-        num_workers: Number of worker processes; one a core by default.
-        progress: Called with the number done and the number wanted.
 
     Returns:
         An entry for each episode: "episode", its index; "cause" of its end, "" if it stayed safe;

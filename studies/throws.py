@@ -21,16 +21,6 @@ def choose_threshold(
     """The highest threshold whose share of false triggers stays within a bound.
 
     A higher threshold triggers earlier and misses fewer falls, but has more false triggers.
-
-    Args:
-        logs: Calibration throws without recovery.
-        scorer: Scorer of the trigger.
-        persistence_s: Time for which "don't know" must have lasted to trigger [s].
-        max_false_share: Bound on the share of false triggers among the throws that stay in the
-            safe set without recovery.
-
-    Raises:
-        ValueError: No throw stays in the safe set.
     """
     # A throw that stays safe has a false trigger if its lowest probability is below Γ_thre.
     lowest = np.array(

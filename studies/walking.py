@@ -152,11 +152,6 @@ def walking_alarms(
 ) -> dict[str, list[Alarm]]:
     """Alarms on Γ, classifiers, tilt, capture point and the policy's own change of action.
 
-    Args:
-        scenario: A scenario of the walking task.
-        assessment: Γ.
-        classifiers: Those of each kind, one for each seed.
-
     Returns:
         By method; one for each seed of a kind.
     """
@@ -193,12 +188,7 @@ def _in_logits(scorer: Scorer) -> Alarm:
 
 
 def push_estimates(pushed: Sequence[Motion], push_s: float) -> dict[Key, Estimate]:
-    """Share of pushed motions with a fall, and its time after the push.
-
-    Args:
-        pushed: Motions with a push; those that leave the safe set before are left out.
-        push_s: Duration of a push [s].
-    """
+    """Share of pushed motions with a fall, and its time after the push."""
     judged = [motion for motion in pushed if not motion.leave_time_s < motion.push_time_s]
     fallen = [motion for motion in judged if motion.has_fallen]
     until = np.array([motion.fall_time_s - motion.push_time_s for motion in fallen])
@@ -224,13 +214,7 @@ def tour_estimates(tours: Sequence[Motion]) -> dict[Key, Estimate]:
 def recovery_estimates(
     branch: str, alone: Sequence[Motion], again: Sequence[Motion]
 ) -> dict[Key, Estimate]:
-    """Share of falls saved by a branch, and impact speeds of those that it does not save.
-
-    Args:
-        branch: Name of the branch.
-        alone: Motions that fell without recovery.
-        again: The same with recovery.
-    """
+    """Share of falls saved by a branch, and impact speeds of those that it does not save."""
     not_saved = [(a, b) for a, b in zip(alone, again, strict=True) if b.has_fallen]
     return {
         ("recovery", branch, "saved"): proportion(len(alone) - len(not_saved), len(alone)),
@@ -252,13 +236,7 @@ def guard_estimates(
     guarded: Sequence[Motion],
     inside: Sequence[Motion],
 ) -> dict[Key, Estimate]:
-    """Falls with and without the guard, and the share of time in which it changes a command.
-
-    Args:
-        unguarded: Commands past the ranges.
-        guarded: The same with the guard.
-        inside: Tours of commands inside the ranges, with the guard.
-    """
+    """Falls with and without the guard, and the share of time in which it changes a command."""
     kept = np.array([float(np.mean(motion["guard_active"] == 0)) for motion in inside])
     estimates = {
         ("guard", "", "falls_without"): proportion(
@@ -279,12 +257,7 @@ def guard_estimates(
 
 
 def speed_estimates(ours: Sequence[Motion], theirs: Sequence[Motion]) -> dict[Key, Estimate]:
-    """Difference of mean planar velocities between two engines, over the same commands.
-
-    Args:
-        ours: Tours in Drake.
-        theirs: The same in MuJoCo; of tours that last differently the common part counts.
-    """
+    """Difference of mean planar velocities between two engines, over the same commands."""
     pairs = []
     for a, b in zip(ours, theirs, strict=True):
         rows = min(len(a.time_s), len(b.time_s))

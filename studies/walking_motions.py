@@ -98,21 +98,7 @@ def run_motions(
     num_workers: int | None = None,
     progress: Progress | None = None,
 ) -> list[Motion]:
-    """Simulates motions in worker processes, and keeps them in a folder; existing ones are reused.
-
-    Args:
-        scenario: A scenario of the walking task.
-        kind: One of `KINDS`.
-        indices: Numbers of the motions.
-        seed: Seed of the set.
-        duration_s: Duration of each [s].
-        folder: The set's folder.
-        variation: The plant.
-        assessment: Γ, for loops with a guard or recovery.
-        options: Options of the loop.
-        num_workers: Number of worker processes; one a core by default.
-        progress: Called with the number done and in all.
-    """
+    """Simulates motions in worker processes; those that the folder holds are reused."""
     # The folder is named after all that a loop depends on.
     loop = partial(scenario.make_loop, variation, assessment=assessment, **(options or {}))
     make = MadeOnce(str(folder), loop)

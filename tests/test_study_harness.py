@@ -5,7 +5,7 @@ from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.learning.seeds import RELEASE
-from studies.harness import fingerprint, kept, open_study, parse_sizes
+from studies.harness import fingerprint, kept, open_study
 
 CALLS = []
 
@@ -69,14 +69,11 @@ def test_rows_are_written_printed_and_plotted(tmp_path, capsys):
     assert {path.suffix for path in (tmp_path / "out").iterdir()} == {".json", ".png", ".svg"}
 
 
-def test_a_study_that_fails_writes_nothing_and_sizes_are_numbers_between_commas(tmp_path):
+def test_a_study_that_fails_writes_nothing(tmp_path):
     with pytest.raises(RuntimeError), open_study("tried", "pendulum", tmp_path) as study:
         study.rows["pushes", "", "fallen"] = Estimate(0.125, 0.0, 0.5, 8)
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
-    assert (parse_sizes("512,1024"), parse_sizes("")) == ((512, 1024), ())
-    with pytest.raises(ValueError, match="--sizes 'many': give numbers"):
-        parse_sizes("many")
     one, other = AssessmentParameters(), AssessmentParameters(min_count=7)
     assert fingerprint(one, 3) == fingerprint(AssessmentParameters(), 3)
     assert len({fingerprint(one, 3), fingerprint(other, 3), fingerprint(one, 4)}) == 3
