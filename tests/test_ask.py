@@ -264,7 +264,7 @@ def test_the_numbers_of_a_target_become_one_word(words, joined):
 def test_a_push_is_one_that_the_scenario_names(loop):
     assert named_push(loop, []) is None
     assert named_push(loop, ["torso"]) is loop.pushes["torso"]
-    with pytest.raises(ValueError, match=r"which has \['torso'\]; got \['head'\]"):
+    with pytest.raises(ValueError, match=r"one of \['torso'\]; got \['head'\]"):
         named_push(loop, ["head"])
 
 

@@ -148,7 +148,7 @@ def test_motion_for_one_piece_is_refused_before_anything_is_simulated(
     train = ("train", "laikago_balancing", "--out", tmp_path / "run", "--motion")
     for minutes in (1, 0.5):
         assert call(monkeypatch, *train, minutes) == 2
-        told = f"error train: --motion {minutes} gives one motion, and the monitor needs one for"
+        told = f"error train: --motion {minutes} gives one motion, and the monitor needs two"
         assert told in capsys.readouterr().out
     assert not (tmp_path / "run").exists()
 

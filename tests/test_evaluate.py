@@ -3,12 +3,9 @@ import shutil
 import pytest
 
 from command_line import call
-from drake_safety.assessments import shipped_folder
-from drake_safety.cli import training_folder as folders
-from drake_safety.cli.evaluate import evaluating
 from drake_safety.cli.training_folder import MODES, fresh_episodes_folder, load_assessment
 from drake_safety.evaluation.results import Results
-from drake_safety.learning.seeds import SHIFTS, SeedBlock
+from drake_safety.learning.seeds import SHIFTS
 from drake_safety.simulation import rollouts
 from drake_safety.simulation.dataset import completed
 from drake_safety.simulation.scenario import load_scenario
@@ -152,21 +149,3 @@ def test_what_cannot_be_evaluated_is_refused_before_anything_is_simulated(
     monkeypatch.setattr(rollouts, "run_episode", None)
     assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) == 2
     assert message in " ".join(capsys.readouterr().out.split())
-
-
-@pytest.mark.train
-def test_an_assessment_that_is_written_while_it_is_read_is_refused(tmp_path, monkeypatch):
-    name, load = "laikago_balancing", folders.load_assessments
-    for file in shipped_folder(name).glob("*.safetensors"):
-        shutil.copy(file, tmp_path)
-
-    def written(folder):
-        loaded = load(folder)
-        shutil.copy(folder / "paper.safetensors", folder / "sharpened.safetensors")
-        return loaded
-
-    monkeypatch.setattr(folders, "load_assessments", written)
-    block = SeedBlock(7, ("evaluation",))
-    with pytest.raises(ValueError, match=f"an assessment in {tmp_path} was written meanwhile"):
-        with evaluating(load_scenario(name), tmp_path, tmp_path, block, None, 1):
-            pytest.fail("it evaluates")

@@ -208,7 +208,7 @@ def test_where_none_is_shipped_or_the_scenario_is_another_one_train_is_named(
     package, monkeypatch, capsys, tmp_path
 ):
     for name in (tmp_path / "carrying.yaml", tmp_path / f"{NAME}.yaml"):
-        message = f"no assessment of what scenario '{name.stem}' simulates comes with the package"
+        message = f"the package has no assessment of what scenario '{name.stem}' simulates"
         name.write_text(SCENARIO.replace("duration_s: 0.8", "duration_s: 1.2"))
         for command in ("run", "play", "adapt", "calibrate"):
             assert call(monkeypatch, command, name) == 2

@@ -52,7 +52,7 @@ def ask(
         )
     if target is None:
         raise ValueError("ask: pass --target, or for a walking robot --command")
-    goal, rule = parse_target(loop, target), folders.goal_threshold(folder.path, gamma)
+    goal, rule = parse_target(loop, target), folders.goal_threshold(gamma)
     verdict, nearest = judge_target(loop, goal, rule)
     if as_json:
         answer = verdict.to_json() | {

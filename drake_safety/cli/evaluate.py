@@ -50,13 +50,7 @@ _MOST_JUDGED = 1000  # Nominal motions under `--shifts`.
 
 @dataclass
 class Evaluation:
-    """An evaluation under way: what is judged, where the results go, and what was found.
-
-    Attributes:
-        assessments: Γ by mode.
-        seeds: Seeds of fresh simulations by purpose.
-        entries: What the file says besides estimates.
-    """
+    """An evaluation under way: Γ by mode, where results go, and seeds by purpose."""
 
     scenario: Scenario
     assessments: Mapping[str, SafetyAssessment]
@@ -75,9 +69,13 @@ class Evaluation:
 
     def fresh(self, what: str, number: int, purpose: str) -> Episodes:
         """Fresh nominal episodes, kept in the run's folder."""
-        progress, seed = partial(self.stages, what), self.seeds[purpose]
         return folders.run_fresh_episodes(
-            self.scenario, self.run_folder, number, seed, progress, self.workers
+            self.scenario,
+            self.run_folder,
+            number,
+            self.seeds[purpose],
+            partial(self.stages, what),
+            self.workers,
         )
 
     def add(self, estimates: Mapping[Key, Estimate], **figures: Figure) -> None:
@@ -153,16 +151,10 @@ def evaluating(
     tables: Callable[[Results], Sequence[Table]] = verdict_tables,
     program: str = "drake-safety",
 ) -> Iterator[Evaluation]:
-    """Yields an evaluation of a run; after the `with` statement its results are written.
-
-    Seeds are those of `block`, from `seed` or its default on.
-    """
-    files = {mode: folders.assessment_file(run_folder, mode) for mode in MODES}
-    before = {mode: file_hash(file) for mode, file in files.items() if file.is_file()}
+    """Yields an evaluation of a run; after the `with` statement its results are written."""
     assessments = folders.load_assessments(run_folder)
-    hashes = {mode: file_hash(files[mode]) for mode in assessments}
-    if hashes != before:
-        raise ValueError(f"an assessment in {run_folder} was written meanwhile: start again")
+    files = {mode: folders.assessment_file(run_folder, mode) for mode in assessments}
+    hashes = {mode: file_hash(file) for mode, file in files.items()}
     seeds = block.seeds(seed)
     for gamma in assessments.values():
         folders.check_fresh(gamma, scenario, seeds.values())

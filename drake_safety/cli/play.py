@@ -50,11 +50,11 @@ def play(
     """
     from drake_safety.live.page import serve_page  # Of the extra "live".
 
-    loaded, folder, gamma = folders.open_assessment(scenario, assessment, mode)
+    loaded, _, gamma = folders.open_assessment(scenario, assessment, mode)
     options = console.given(hand=hand, recovery=recovery)
     # Check the capabilities of the task before a browser is opened.
     task = loaded.make_loop(variation, assessment=gamma, **options)
-    rule = folders.goal_threshold(folder.path, gamma)
+    rule = folders.goal_threshold(gamma)
     threshold = rule.threshold
     if isinstance(task, FollowsCommands):
         options["guard"], threshold = True, loaded.parameters.guard.threshold

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -44,10 +44,8 @@ from drake_safety.simulation.scenario import Scenario
 _WITH_BALLS_S = 5.0  # Duration of a run with balls.
 _AFTER_EPISODE_S = 1.0  # Beyond an episode, to show whether the robot stays at the target.
 _AFTER_LEAVING_S = 0.5  # Time for which a motion without a goal goes on outside the safe set.
-_AROUND_IMPACT_S = (-0.02, 0.16)  # The ball in the air, and its effect.
-_AFTER_TRIGGER_S = 0.3  # Feet in the air.
-_AFTER_PUSH_S = 0.15  # Time at which the effect of a push is visible.
-_NUM_STILLS = 5  # Of a motion to a goal.
+_AFTER_EVENT_S = 0.15  # Time of a still: when the effect of a push or a trigger is visible.
+_NUM_STILLS, _MOST_EVENTS = 3, 5  # Stills besides those of events, and of events at most.
 _HAPPENING = {
     "guard_active": "the guard passes on another command",
     "recovery_active": "recovery triggered",
@@ -100,7 +98,7 @@ def run(
     loaded, learned, gamma = folders.open_assessment(scenario, assessment, mode)
     folder = (out or learned.out) / "run"
     folders.check_writable(folder)
-    rule = folders.goal_threshold(learned.path, gamma)
+    rule = folders.goal_threshold(gamma)
     options = console.given(hand=hand, recovery=recovery)
     # Check the capabilities of the task before a browser is opened. The verdict is on what is
     # asked, whatever a guard would pass on.
@@ -142,8 +140,8 @@ class _Shown(NamedTuple):
     """What is shown of a motion.
 
     Attributes:
+        threshold_text: The threshold in words.
         timeline: Further arguments of the timeline.
-        instants: Times of stills, besides `num_stills` others [s]; None for no stills.
         marked: Times marked on the path in the map, by name [s]; without them there is no figure.
     """
 
@@ -152,8 +150,6 @@ class _Shown(NamedTuple):
     threshold: float
     threshold_text: str
     timeline: dict[str, Any]
-    instants: Sequence[float] | None = None
-    num_stills: int = 2
     marked: Mapping[str, float] | None = None
 
 
@@ -170,14 +166,12 @@ def _go(
         threshold, origin = promise.threshold, promise.origin
     alarms_s = alarm_times(motion, threshold)
     timeline: dict[str, Any] = {"trigger_times_s": alarms_s}
-    instants = [motion.leave_time_s, motion.fall_time_s]
     events: _Events = [(0.0, f"{words.subject} starts")]
     for port, happens in _HAPPENING.items():
         for start_s, _ in motion.intervals_s(port)[:1]:
             events.append((start_s, happens))
     if push is not None:
         timeline["pushes"] = [push]
-        instants += [push.time_s, push.time_s + push.duration_s + _AFTER_PUSH_S]
         strength = f"{push.force_n} N for {push.duration_s:g} s"
         events.append((push.time_s, f"{push.body} is pushed with {strength}"))
     place = "" if motion.has_left else ", inside the safe set throughout"
@@ -188,7 +182,7 @@ def _go(
         end = f"on its feet{place}; mean of the second half {words.value(reached)}"
     events += _outcome(loop, motion, alarms_s, threshold) + _end(motion, end)
     text = f"alarm where the probability is below {threshold:.3f} in any row, {origin}"
-    return _Shown(motion, events, threshold, text, timeline, instants, _NUM_STILLS)
+    return _Shown(motion, events, threshold, text, timeline)
 
 
 def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
@@ -203,13 +197,11 @@ def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
         events.append((throw.time_s, f"ball of {throw.mass_kg:g} kg at {flight}"))
     events += reason_events(loop, motion, triggers, threshold, "recovery triggered: ")
     events += _end(motion, "standing")
-    instants = [throw.time_s + after_s for throw in throws for after_s in _AROUND_IMPACT_S]
-    instants += [trigger_s + _AFTER_TRIGGER_S for trigger_s in triggers[:1]]
     marked = {"start": 0.0} | {f"ball {i}": one.time_s for i, one in enumerate(throws, start=1)}
     marked |= {f"recovery {i}": start_s for i, start_s in enumerate(triggers, start=1)}
     text = f"recovery where the probability is below {threshold:g}, that of the scenario"
     timeline = {"throws": throws, "trigger_times_s": triggers, "trigger_label": "trigger"}
-    return _Shown(motion, events, threshold, text, timeline, instants, marked=marked)
+    return _Shown(motion, events, threshold, text, timeline, marked)
 
 
 def _move(
@@ -245,10 +237,8 @@ def alarm_times(motion: Motion, threshold: float) -> list[float]:
 
 def _outcome(loop: Any, motion: Motion, alarms_s: list[float], threshold: float) -> _Events:
     """The alarms of a motion, and where it leaves the safe set."""
-    events = reason_events(loop, motion, alarms_s, threshold)
-    if motion.has_left:
-        events.append((motion.leave_time_s, f"left the safe set: {motion.cause}"))
-    return events
+    left = [(motion.leave_time_s, f"left the safe set: {motion.cause}")] if motion.has_left else []
+    return reason_events(loop, motion, alarms_s, threshold) + left
 
 
 def _end(motion: Motion, standing: str) -> _Events:
@@ -292,12 +282,12 @@ def _logged_ports(loop: ClosedLoop) -> tuple[str, ...]:
 def _timeline(loop: Any, shown: _Shown) -> Figure:
     """The probability along a motion, with stills of a robot."""
     motion, options = shown.motion, {"trigger_label": "alarm"} | shown.timeline
-    if shown.instants is not None and isinstance(loop, LeggedLoop):
+    if isinstance(loop, LeggedLoop) and "plant_state" in motion.ports:
         states = {loop.robot.name: motion["plant_state"]}
         if "ball_state" in motion.ports:
             states["ball"] = motion["ball_state"]
-        instants = [one for one in shown.instants if one <= motion.time_s[-1]]
-        times_s = still_times(motion.time_s, instants, num_stills=shown.num_stills)
+        instants = sorted(at_s + _AFTER_EVENT_S for at_s, _ in shown.events)[1 : 1 + _MOST_EVENTS]
+        times_s = still_times(motion.time_s, instants, num_stills=_NUM_STILLS)
         positions = stack_positions(loop, states)
         options["stills"] = render_stills(loop, motion.time_s, positions, times_s)
     return timeline_figure(
@@ -361,10 +351,7 @@ def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
         return None
     pushes = require(loop, CanBePushed, "--push").pushes
     if len(names) > 1 or names[0] not in pushes:
-        raise ValueError(
-            f"--push: a motion to a target takes one push of scenario '{loop.scenario.name}', "
-            f"which has {list(pushes)}; got {names}"
-        )
+        raise ValueError(f"--push: expected one of {list(pushes)}; got {names}")
     return pushes[names[0]]
 
 

@@ -13,7 +13,7 @@ from typer import Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
-from drake_safety.files.progress import StageProgress, stage_of
+from drake_safety.files.progress import stage_of
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.learning_curve import describe, learning_curve
@@ -81,9 +81,8 @@ def train(
     motion_s = max(min(6.0 * episodes, 2880.0), 2.0 * piece_s) if motion is None else 60.0 * motion
     if 0.0 < motion_s <= piece_s:
         raise ValueError(
-            f"train: --motion {motion_s / 60.0:g} gives one motion, and the monitor needs one for "
-            "its prediction and one for its limits: give 2 or more, or 0 to learn it from the "
-            "episodes"
+            f"train: --motion {motion_s / 60.0:g} gives one motion, and the monitor needs two: "
+            "give 2 or more, or 0 to learn it from the episodes"
         )
     with console.open_stages() as stages:
         for folder, options in sets.items():
@@ -93,7 +92,7 @@ def train(
                 seed=seed,
                 num_workers=workers,
                 path=folder,
-                progress=partial(stages, f"nominal {folder.name.replace('_', ', ')}"),
+                progress=partial(stages, f"nominal {folder.name}"),
                 extra={"command": console.command_line(), "scenario_yaml": loaded.to_yaml()},
                 **options,
             )
@@ -138,7 +137,9 @@ def train(
             # Γ is that of the scenario's diagram, whatever the options of its training episodes.
             data.info = replace(data.info, scenario_hash=loaded.simulation_hash())
             gamma = SafetyAssessment(parameters).fit(
-                data, partial(_report, stages, name), detector=detector
+                data,
+                lambda stage, *counts, name=name: stages(f"{name}: {stage}", *counts),
+                detector=detector,
             )
             if fallen is not None and name == MODES[0]:
                 _fit_falls(gamma, fallen, loop)
@@ -157,10 +158,6 @@ def train(
         console.say("episodes  ", folder)
     for name in modes:
         console.say("assessment", folders.assessment_file(out, name))
-
-
-def _report(stages: StageProgress, mode: str, stage: str, done: int, total: int) -> None:
-    stages(f"{mode}: {stage}", done, total)
 
 
 def _fit_falls(gamma: SafetyAssessment, fallen: Episodes, loop: ClosedLoop) -> None:

@@ -29,10 +29,7 @@ class AssessmentFolder(NamedTuple):
 
 
 class GoalThreshold(NamedTuple):
-    """Thresholds of verdicts on goals, and where they come from.
-
-    A goal is safe from ``threshold`` on, unsafe below ``unsafe_below``, "don't know" in between.
-    """
+    """Thresholds from which a goal is safe and below which it is unsafe, and their origin."""
 
     threshold: float
     unsafe_below: float
@@ -103,10 +100,7 @@ def assessment_file(folder: Path, mode: str) -> Path:
 def open_assessment(
     scenario: str, given: Path | None, mode: str = MODES[0], *, is_printed: bool = True
 ) -> tuple[Scenario, AssessmentFolder, SafetyAssessment]:
-    """Loads a scenario, and the assessment of a mode from the given or the shipped folder.
-
-    Prints what is used by default, and what its monitor promises, if `is_printed`.
-    """
+    """Loads a scenario, and the assessment of a mode from the given or the shipped folder."""
     loaded = load_scenario(scenario)
     folder = assessment_folder(loaded, given, is_printed=is_printed)
     assessment = load_assessment(folder.path, mode)
@@ -130,9 +124,8 @@ def assessment_folder(
             break
     else:
         raise ValueError(
-            f"no assessment of what scenario '{scenario.name}' simulates comes with the package, "
-            f"which has those of {names}: `drake-safety train` learns one, in a folder to be "
-            "passed as --assessment"
+            f"the package has no assessment of what scenario '{scenario.name}' simulates, only of "
+            f"{names}: pass --assessment with a folder of `drake-safety train`"
         )
     if is_printed:
         console.say("assessment        comes with the package,", shipped)
@@ -161,27 +154,20 @@ def load_assessments(folder: Path) -> dict[str, SafetyAssessment]:
 def check_fresh(
     assessment: SafetyAssessment, scenario: Scenario, seeds: Iterable[int] = ()
 ) -> None:
-    """Checks that the scenario is that of the training, and that no seed has been used.
-
-    Its hashes are then those of the training, also if its file was copied or renamed since.
-    """
+    """Checks that the scenario is that of the training, and that no seed has been used."""
     trained = assessment.info_
     if not scenario.adopt(trained):
         own = scenario.simulation_hash()
         raise ValueError(
             f"the assessment was trained on scenario '{trained.scenario}' of robot "
             f"'{trained.robot}' with hash {trained.scenario_hash[:12]}; '{scenario.name}' of robot "
-            f"'{scenario.robot_name}' now has hash {own[:12]}: name the folder that `drake-safety "
-            "train` wrote for it, or train again"
+            f"'{scenario.robot_name}' now has hash {own[:12]}"
         )
     assessment.check_unused(*seeds)
 
 
 def check_writable(*folders: Path) -> None:
-    """Checks that files can be written into folders, before hours of simulations.
-
-    Nothing is left behind; folders that do not exist are not made.
-    """
+    """Checks that files can be written into folders, and makes nothing."""
     for folder in folders:
         path = folder.absolute()
         nearest = next(one for one in (path, *path.parents) if one.exists())
@@ -189,17 +175,12 @@ def check_writable(*folders: Path) -> None:
             with tempfile.TemporaryFile(dir=nearest):
                 pass
         except OSError as error:
-            raise ValueError(
-                f"folder '{folder}' cannot be written: {error.strerror}; choose another"
-            ) from error
+            raise ValueError(f"folder '{folder}' cannot be written: {error.strerror}") from error
 
 
-def goal_threshold(folder: Path, assessment: SafetyAssessment) -> GoalThreshold:
+def goal_threshold(assessment: SafetyAssessment) -> GoalThreshold:
     """The thresholds of verdicts on goals that `calibrate` has chosen; else the default."""
     if (stored := assessment.calibrations_.get("plan")) is not None:
         return GoalThreshold(stored.threshold, stored.unsafe_below, stored.origin)
-    origin = (
-        "the default, which promises nothing: `drake-safety calibrate` chooses one with a promised "
-        f"miss rate and keeps it in {folder}"
-    )
+    origin = "the default, which promises nothing: `drake-safety calibrate` chooses one"
     return GoalThreshold(DEFAULT_THRESHOLD, DEFAULT_THRESHOLD, origin)
