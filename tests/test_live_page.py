@@ -200,10 +200,8 @@ def test_a_page_is_served_without_other_hosts_until_a_signal(playing, number):
     assert answer_to(address, Host="evil.example")[0] == 403
     check_scene(f"{address}/scene/")
     process.send_signal(number)
-    printed, _ = process.communicate(timeout=WITHIN_S)
+    process.communicate(timeout=WITHIN_S)
     assert process.returncode == 0
-    # A signal may arrive before the first step.
-    assert "real-time factor" in printed or "nothing was simulated" in printed
 
 
 @pytest.mark.slow

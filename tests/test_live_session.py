@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
@@ -154,7 +155,7 @@ def test_a_robot_that_has_fallen_is_stood_up_again_after_a_while(throws):
 
 
 @train
-def test_stop_ends_a_session_and_its_pace_is_what_was_simulated(throws, monkeypatch):
+def test_stop_ends_a_session_that_runs_in_real_time(throws, monkeypatch):
     tick, results = throws.tick, []
 
     def tick_and_stop_after_ten():
@@ -164,14 +165,12 @@ def test_stop_ends_a_session_and_its_pace_is_what_was_simulated(throws, monkeypa
         return results[-1]
 
     monkeypatch.setattr(throws, "tick", tick_and_stop_after_ten)
+    begin_s = time.perf_counter()
     throws.run()
     assert len(results) == 10
     assert throws.panel.is_stopped
-    pace = throws.pace
-    assert pace.simulated_s == pytest.approx(throws.context.get_time())
-    assert 0 < pace.busy_s <= pace.elapsed_s
-    # Paced by the clock, but for what is caught up with.
-    assert pace.simulated_s / pace.elapsed_s <= 1.3
+    # Paced by the clock.
+    assert time.perf_counter() - begin_s >= 0.9 * throws.context.get_time()
 
 
 @train
@@ -325,7 +324,7 @@ def test_starts_are_those_of_the_seed_and_a_click_begins_the_next(cart_loop, mes
 @pytest.mark.parametrize(
     ("state", "shown_after_s", "what"),
     [
-        ((0.0, 0.0, 0.0, 0.0), 2.0, "the episode's 2 s have passed; the next start follows"),
+        ((0.0, 0.0, 0.0, 0.0), 2.0, "the next start follows"),
         ((0.95, 0.0, 10.0, 0.0), TICK_S, "left the safe set: rail"),
     ],
 )
@@ -372,8 +371,6 @@ def test_a_task_is_pushed_by_a_button_and_must_export_what_is_shown(meshcat):
     assert value_of(session, "state")[1] >= 2.0
     with pytest.raises(ValueError, match=r"'FewPorts' exports no port \['cause_probability'"):
         LiveSession(FewPorts(scenario, assessment=assessment), meshcat, threshold=0.5)
-    with pytest.raises(ValueError, match="without an assessment"):
-        LiveSession(scenario.make_loop(), meshcat, threshold=0.4)
 
 
 def test_play_without_an_assessment_or_a_library_for_pages_says_what_to_do_first(

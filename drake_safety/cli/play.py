@@ -79,14 +79,6 @@ def play(
         session.run()
         for number, handler in handlers.items():
             signal.signal(number, handler)
-    pace = session.pace
-    if pace.simulated_s == 0.0:
-        console.say("nothing was simulated")
-        return
-    console.say(
-        f"real-time factor {pace.simulated_s / pace.elapsed_s:.2f} over {pace.simulated_s:.1f} s "
-        f"simulated; this machine could run it at {pace.simulated_s / pace.busy_s:.2f}"
-    )
 
 
 def _page_port(host: str, port: int | None) -> int:

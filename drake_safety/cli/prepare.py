@@ -18,6 +18,8 @@ from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.simulation.scenario import load_scenario, scenario_names
 from drake_safety.simulation.scenario_check import check_scenario
 
+_NUM_EPISODES = 16  # For the share of unsafe ones.
+
 
 def scenarios() -> None:
     """List the scenarios that come with the package."""
@@ -116,9 +118,7 @@ def _names(text: str | None) -> list[str]:
 
 def check(
     scenario: console.ScenarioArgument,
-    episodes: Annotated[int, Option(help="Episodes for the share of unsafe ones.", min=0)] = 16,
-    quick: Annotated[bool, Option("--quick", help="The same as --episodes 0.")] = False,
-    seed: Annotated[int, Option(help="Seed of these episodes.")] = DEMONSTRATION.first,
+    quick: Annotated[bool, Option("--quick", help="Without the share of unsafe episodes.")] = False,
     import_: Annotated[
         bool,
         Option(
@@ -133,12 +133,11 @@ def check(
     The exit code is 1 if there is a problem.
     """
     num_problems = 0
-    num_episodes = 0 if quick else episodes
     with console.open_stages() as stages:
         for finding in check_scenario(
             scenario,
-            num_episodes=num_episodes,
-            seed=seed,
+            num_episodes=0 if quick else _NUM_EPISODES,
+            seed=DEMONSTRATION.first,
             is_imported=import_,
             check_robot=check_urdf,
             progress=stages,
@@ -163,7 +162,7 @@ def check(
             "network, diagram, standing, episodes"
         )
         return
-    if not num_episodes:
+    if quick:
         console.say(
             "not checked: the share of unsafe episodes; check without --quick before you train"
         )

@@ -7,7 +7,7 @@ import math
 import textwrap
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import count, repeat
 from types import FrameType
@@ -71,29 +71,18 @@ _NUM_CHARACTERS = 160  # Of an error.
 _GOAL, _NEAREST = f"{WORLD}/target", f"{WORLD}/nearest_accepted"
 
 
-@dataclass
-class Pace:
-    """Simulated time, and the real time that it took with waiting and without, so far [s]."""
-
-    simulated_s: float = 0.0
-    elapsed_s: float = 0.0
-    busy_s: float = 0.0
-
-
 class LiveSession:
     """A closed loop with Γ in Meshcat that reacts to the controls of its panel.
 
-    The loop is built with this Meshcat and with an assessment. Its capabilities decide what the
-    controls do: change commands, choose a goal, or throw balls. Any other task runs episode after
-    episode from random starts. A fall, a failure or the end of an episode is shown for 1.5 s before
-    the next start; with goals, Start again or Go begins it. Every start has a new Context.
+    The capabilities of the loop, which is built with this Meshcat and an assessment, decide what
+    the controls do: change commands, choose a goal, or throw balls. Any other task runs episode
+    after episode from random starts.
 
     Attributes:
         threshold: Lowest probability that is shown as "safe", and of accepted goals.
         unsafe_below: Probability below which a goal is unsafe; in between is "don't know".
         cause: The constraint that was violated first since the start; "" for none.
         command: The present command, (3,), of a loop that follows commands.
-        is_guarded: Whether a guard replaces commands that are not accepted.
         verdict, nearest: On the present goal, and the nearest accepted one; None if not asked.
     """
 
@@ -106,13 +95,12 @@ class LiveSession:
         unsafe_below: float | None = None,
         seed: int = 0,
     ):
-        if loop.assessment is None:
-            raise ValueError("live session: the loop was built without an assessment")
         require_ports(loop, _PORTS)
         self.loop: Any = loop  # What it can do is asked below.
-        self.assessment, self.meshcat = loop.assessment, meshcat
+        self.assessment: Any = loop.assessment
+        self.meshcat = meshcat
         self.threshold, self.unsafe_below = threshold, unsafe_below
-        self.pace, self.cause = Pace(), ""
+        self.cause, self._rate = "", 0.0
         self.command, self.is_guarded = np.zeros(3), True
         self.verdict: GoalVerdict | None = None
         self.nearest: GoalVerdict | None = None
@@ -188,30 +176,19 @@ class LiveSession:
             status = self._status()
             if self._is_on("alarm"):
                 alarm = f"monitor: {self._eval('alarm_cause')}"
-                if self.loop.variation != self.assessment.info_.variation:
-                    alarm += f" (Γ has not learned plant '{self.loop.variation}')"
                 status = replace(status, note="; ".join(filter(None, [status.note, alarm])))
             self.panel.status = status
         return self._num_waits == 0
 
     def run(self) -> None:
         """Ticks in real time until Stop is clicked or :meth:`end` is called."""
-        late_s = 0.0
+        self._rate = 1.0
+        self._simulator.set_target_realtime_rate(self._rate)
+        self._simulator.ResetStatistics()
         try:
             while not (self._is_ended or self.panel.take_click(STOP)):
-                begin = time.perf_counter()
                 if not self.tick():
                     time.sleep(BREAK_S)
-                    late_s = 0.0
-                    continue
-                busy_s = time.perf_counter() - begin
-                # A delay is made up for, up to a few ticks.
-                spare_s = TICK_S - busy_s - late_s
-                time.sleep(max(spare_s, 0.0))
-                late_s = min(max(-spare_s, 0.0), 5 * TICK_S)
-                self.pace.simulated_s += TICK_S
-                self.pace.busy_s += busy_s
-                self.pace.elapsed_s += time.perf_counter() - begin
         finally:
             self.panel.stop()
 
@@ -227,6 +204,7 @@ class LiveSession:
         """Resets the robot, with a Context of default values."""
         loop, end_s = self.loop, math.inf
         self._simulator = Simulator(loop)
+        self._simulator.set_target_realtime_rate(self._rate)
         self.context = self._simulator.get_mutable_context()
         self.cause, self._num_waits = "", 0
         match self._use:
@@ -306,18 +284,15 @@ class LiveSession:
         return Status(f"unsafe{doing}", self._cause(), note, "unsafe")
 
     def _note(self) -> str:
-        """What was said last, or what a key does."""
+        """What was said last, the command, or what a key does."""
         now_s, duration_s = self.context.get_time(), self.loop.scenario.episode_duration_s
-        notes = {"balls": "Space throws a ball", "goals": "R stands it up again"}
-        note = notes.get(self._use, "R starts anew")
+        note = "Space throws a ball" if self._use == "balls" else "R starts anew"
         if now_s < self._said_until_s:
             note = self._said
         elif self._use == "commands":
             note = goal_words(self.loop).value(self.command)
-        elif self._use == "episodes" and self.cause:
+        elif self._use == "episodes" and (self.cause or now_s >= duration_s):
             note = "the next start follows"
-        elif self._use == "episodes" and now_s >= duration_s:
-            note = f"the episode's {duration_s:g} s have passed; the next start follows"
         return note if self.is_guarded else f"{note}; guard off"
 
     def _say(self, note: str, seconds: float) -> None:
