@@ -30,7 +30,7 @@ def panel():
     panel = LivePanel(title="a robot", threshold=0.3)
     panel.buttons |= {"Stop": "Escape", "Throw": "Space"}
     panel.sliders["mass [kg]"] = Slider(1.0, 5.0, 0.5, 3.0)
-    panel.status = Status("safe: balancing", note="a remark", tone="safe")
+    panel.status = Status("safe", note="a remark", tone="safe")
     panel.show_belief(0.75, np.array([0.7, 0.1, 0.2]), 0.0)
     return panel
 
@@ -85,7 +85,7 @@ def test_two_viewers_see_and_control_the_same(panel, recwarn):
             second = testing.User(first.http_client)
             for user in (first, second):
                 await user.open("/")
-                for text in ("safe: balancing", "probability 0.75", "a remark", "unsafe 10%"):
+                for text in ("safe", "probability 0.75", "a remark", "unsafe 10%"):
                     await user.should_see(text)
             first.find(kind=ui.slider).elements.pop().set_value(4.0)
             await second.should_see("4")

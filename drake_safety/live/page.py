@@ -72,11 +72,7 @@ def serve_page(panel: LivePanel, *, host: str, port: int, scene_url: str) -> Ite
 
 
 def _only_own(application: _Application, host: str) -> _Application:
-    """Answers requests that name this server, and of pages only those of its own.
-
-    A page elsewhere may reach it by a name that it resolves to this machine (DNS rebinding), and
-    websockets have no rule of the same origin.
-    """
+    """Answers requests that name this server (against DNS rebinding), and only its own pages."""
     known = {"127.0.0.1", "::1", "localhost", host.lower()}
     # At all addresses of this machine, which cannot be forged as names can.
     if is_for_all := host in ("0.0.0.0", "::"):
@@ -225,13 +221,12 @@ def _build_controls(panel: LivePanel) -> Callable[[], None]:
 
 
 def _chart_options(threshold: float) -> dict[str, Any]:
-    position = f"insideStart{'Top' if threshold < 0.5 else 'Bottom'}"
     limit = {
         "silent": True,
         "symbol": "none",
-        "data": [{"yAxis": threshold, "name": f"threshold {threshold:.2f}"}],
+        "data": [{"yAxis": threshold}],
         "lineStyle": {"color": _css("unsafe"), "type": "solid", "width": 1.5},
-        "label": {"formatter": "{b}", "position": position, "color": _css("unsafe")},
+        "label": {"formatter": "threshold {c}", "position": "insideStartTop"},
     }
     curve = {
         "type": "line",
@@ -241,12 +236,11 @@ def _chart_options(threshold: float) -> dict[str, Any]:
         "data": [],
         "markLine": limit,
     }
-    font = {"fontSize": 13, "fontWeight": "normal"}
     return {
         "animation": False,
         "grid": {"left": 30, "right": 10, "top": 30, "bottom": 22},
-        "title": {"text": "probability over time [s]", "textStyle": font, "left": 0, "padding": 0},
-        "xAxis": {"type": "value", "min": -HISTORY_S, "max": 0, "splitLine": {"show": False}},
+        "title": {"text": "probability over time [s]", "textStyle": {"fontSize": 13}},
+        "xAxis": {"type": "value", "min": -HISTORY_S, "max": 0},
         "yAxis": {"type": "value", "min": 0, "max": 1, "interval": 0.5},
         "series": [curve],
     }

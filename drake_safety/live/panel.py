@@ -51,7 +51,6 @@ class LivePanel:
 
     Attributes:
         probability: The probability; NaN before the first.
-        belief: (safe, unsafe, don't know), of sum one.
         buttons: Key of each button by its name, as `KeyboardEvent.code`; "" for none.
     """
 

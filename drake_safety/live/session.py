@@ -175,8 +175,7 @@ class LiveSession:
                 self._camera.follow(self.context)
             status = self._status()
             if self._is_on("alarm"):
-                alarm = f"monitor: {self._eval('alarm_cause')}"
-                status = replace(status, note="; ".join(filter(None, [status.note, alarm])))
+                status = replace(status, note=f"monitor: {self._eval('alarm_cause')}")
             self.panel.status = status
         return self._num_waits == 0
 
@@ -240,8 +239,7 @@ class LiveSession:
         """Shows why a simulation failed, and lets the next one begin a while later."""
         try:
             yield
-        except RuntimeError as error:
-            # Drake's solvers raise it, and so does a task whose simulation diverges.
+        except RuntimeError as error:  # Of Drake's solvers, or a simulation that diverges.
             note = textwrap.shorten(str(error), _NUM_CHARACTERS)
             self.panel.status = Status("the simulation failed", note=note, tone="unsafe")
             self._num_waits = round(_SHOWN_S / BREAK_S)
@@ -266,22 +264,18 @@ class LiveSession:
             return Status("recovering", self._cause(), note, "recovery")
         if left:
             return Status(f"left the safe set: {left.replace('_', ' ')}", note=note, tone="unsafe")
-        if self._use == "goals" and self._is_over:
-            miss_m = float(np.linalg.norm(self._eval("output") - self._goal))
-            return Status("there", note=f"{100 * miss_m:.1f} cm off", tone="recovery")
         if self._use == "goals":
-            return Status("on the way", note=f"the {loop.hand} hand reaches", tone="safe")
+            miss_m = float(np.linalg.norm(self._eval("output") - self._goal))
+            state, tone = ("there", "recovery") if self._is_over else ("on the way", "safe")
+            return Status(state, note=f"{100 * miss_m:.1f} cm off", tone=tone)
         if self._is_on("guard_active") and self.is_guarded:
             passed = goal_words(loop).value(np.round(self._eval("desired_output"), 2))
             return Status("guard: another command", "", f"{passed}; asked: {note}", "recovery")
-        doing = ": balancing" if self._use == "balls" else ""
-        if self._use == "commands":
-            doing = ": walking" if self.command.any() else ": standing"
         if self.panel.probability >= self.threshold:
-            return Status(f"safe{doing}", note=note, tone="safe")
+            return Status("safe", note=note, tone="safe")
         if is_unknown(self._eval("belief"), self.assessment.parameters.initial_uncertainty):
-            return Status(f"don't know{doing}", note=note)
-        return Status(f"unsafe{doing}", self._cause(), note, "unsafe")
+            return Status("don't know", note=note)
+        return Status("unsafe", self._cause(), note, "unsafe")
 
     def _note(self) -> str:
         """What was said last, the command, or what a key does."""
@@ -295,8 +289,8 @@ class LiveSession:
             note = "the next start follows"
         return note if self.is_guarded else f"{note}; guard off"
 
-    def _say(self, note: str, seconds: float) -> None:
-        self._said, self._said_until_s = note, self.context.get_time() + seconds
+    def _say(self, note: str) -> None:
+        self._said, self._said_until_s = note, self.context.get_time() + 3.0
 
     def _cause(self) -> str:
         """The constraint that is most likely to be violated, in words; "" for none."""
@@ -319,7 +313,7 @@ class LiveSession:
         push = self.loop.sample_push(next(self._rngs))
         start_s = self.context.get_time() + 0.5 * TICK_S
         self.loop.set_push(self.context, replace(push, time_s=start_s))
-        self._say(f"pushed with {push.strength_n:.0f} N for {push.duration_s:g} s", 2.0)
+        self._say(f"pushed with {push.strength_n:.0f} N for {push.duration_s:g} s")
 
     def _throw(self) -> None:
         sliders = self.panel.sliders
@@ -327,9 +321,9 @@ class LiveSession:
         throw = Throw(mass_kg=mass, speed_m_s=speed, direction_rad=math.radians(direction))
         try:
             self.loop.throw_ball(self.context, throw, _FLIGHT_S)
-            self._say(f"ball of {mass:g} kg at {speed:g} m/s towards {direction:g}°", 3.0)
+            self._say(f"ball of {mass:g} kg at {speed:g} m/s towards {direction:g}°")
         except ValueError:  # The robot has fallen, or the ball's path misses its base.
-            self._say("this ball would miss the robot", 3.0)
+            self._say("this ball would miss the robot")
 
     def _step(self, entry: int, sign: int) -> None:
         box = self.loop.target_box
@@ -338,9 +332,8 @@ class LiveSession:
         self._set_command(np.clip(command, *box))
 
     def _set_command(self, command: np.ndarray) -> None:
-        if not np.array_equal(command, self.command):
-            self.command = command
-            self.loop.set_command(self.context, command)
+        self.command = command
+        self.loop.set_command(self.context, command)
 
     def _switch_guard(self) -> None:
         self.is_guarded = not self.is_guarded
@@ -374,21 +367,16 @@ class LiveSession:
                 num_candidates=_NUM_CANDIDATES,
             )
         self.panel.show_belief(verdict.probability, verdict.belief)
-        probability = f"probability {verdict.probability:.2f}"
         if verdict.is_accepted:
-            state = f"accepted: {probability}"
-            self.panel.status = Status(state, note="Space goes there", tone="safe")
+            self.panel.status = Status("accepted", note="Space goes there", tone="safe")
             return verdict
         cause = ": ".join(filter(None, verdict.cause_words(self.loop.angular_constraints)))
-        notes = [] if cause else [verdict.reason]
+        note = "nothing near is accepted" if is_thorough else verdict.reason
         if self.nearest is not None:
             distance_m = float(np.linalg.norm(self.nearest.goal - verdict.goal))
-            notes.append(f"accepted {100 * distance_m:.0f} cm away")
+            note = f"accepted {100 * distance_m:.0f} cm away"
             self.meshcat.SetTransform(_NEAREST, RigidTransform(self.nearest.goal))
             self.meshcat.SetProperty(_NEAREST, "visible", True)
-        elif is_thorough:
-            notes.append("nothing near is accepted")
-        state = "refused: don't know" if verdict.reason else f"refused: {probability}"
-        note = "; ".join(filter(None, notes))
+        state = "refused: don't know" if verdict.reason else "refused"
         self.panel.status = Status(state, cause, note, "unsafe")
         return verdict
