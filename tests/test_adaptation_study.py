@@ -12,7 +12,6 @@ from studies.adaptation import (
     boosting_estimates,
     pool_estimates,
     scores,
-    train_baselines,
 )
 
 pytestmark = pytest.mark.train
@@ -45,15 +44,6 @@ def test_scores_are_those_of_what_is_published(assessment, judged):
         assert found[name]["unsafe_recall"] == pytest.approx(caught)
         unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
         assert found[name]["unknown"] == unknown.mean()
-
-
-def test_too_few_episodes_give_no_baseline(assessment):
-    episodes = make_episodes(40, seed=5, noise=0.002)
-    few = {"scratch 1": episodes[:1], "scratch 40": episodes}
-    baselines = train_baselines(assessment, few, num_workers=1)
-    assert list(baselines) == ["scratch 40"]
-    assert baselines["scratch 40"].parameters == assessment.parameters
-    np.testing.assert_array_equal(baselines["scratch 40"].correction_.change, 0.0)
 
 
 def test_pools_differ(assessment, judged):

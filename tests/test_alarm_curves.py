@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drake_safety.simulation.motion import Motion
-from studies.alarm_curves import COSTS, SHARES, Watched, alarm_figure, equal_cost_estimates
+from studies.alarm_curves import COSTS, SHARES, Watched, equal_cost_estimates
 from studies.alarms import Alarm, first_alarm
 
 ALARM = Alarm(name="value", value=lambda motion: motion["value"])
@@ -87,16 +87,6 @@ def test_at_every_share_the_highest_allowed_threshold_is_applied(cost):
         assert np.searchsorted(costs, share, side="right") == sum(fallen)
 
 
-def test_weights_count_motions_as_often():
-    pushed = random_motions(np.random.default_rng(2))
-    weight = np.random.default_rng(3).integers(0, 3, size=len(pushed))
-    repeated = watched([m for m, n in zip(pushed, weight, strict=True) for _ in range(n)])
-    for share in SHARES:
-        weighted = watched(pushed).announced("without_fall", share)(weight)
-        assert weighted == pytest.approx(announced(repeated, "without_fall", share))
-    assert math.isnan(watched(pushed).announced("without_fall", 0.1)(np.zeros(len(pushed))))
-
-
 def test_a_false_alarm_is_a_row_below_the_threshold_after_one_that_is_not():
     found = watched([motion([0.5] * 9, push_s=0.2, leave_s=0.5, fall_s=0.8)])
     assert found.undisturbed_s == pytest.approx(0.9) and found.num_undisturbed == 2
@@ -129,16 +119,3 @@ def test_differences_are_paired_and_seeds_averaged():
     rate = found["alarm.without_leaving", "sharpened", "false_alarms_per_hour_at_50"]
     threshold = sets[0].threshold("without_leaving", 0.5)
     assert rate.value == pytest.approx(sets[0].num_false_alarms(threshold) * 3600 / 0.9)
-
-
-def test_the_figure_has_a_curve_for_each_method_in_each_panel():
-    rng = np.random.default_rng(5)
-    sets = [watched(random_motions(rng)) for _ in range(3)]
-    figure = alarm_figure({"sharpened": sets[:1], "gradient_boosting": sets[1:]})
-    assert len(figure.axes) == 3
-    for axes in figure.axes:
-        labels = [line.get_label() for line in axes.lines if not line.get_label().startswith("_")]
-        assert labels == ["Γ", "gradient boosting"]
-        assert len(axes.lines) == 4  # And one for each seed.
-        heights = axes.lines[0].get_ydata()
-        assert np.all(np.diff(heights) >= 0) and heights[0] >= 0 and heights[-1] <= 1

@@ -10,7 +10,6 @@ from studies.alarms import (
     evaluate_alarms,
     first_alarm,
     lowest_value,
-    threshold_alarms,
     tilt,
 )
 
@@ -100,13 +99,6 @@ def test_an_unknown_row_is_an_alarm():
     assert first_alarm(motion_of(0, {}), np.ones(37), 1.0) == math.inf
 
 
-def test_rows_outside_push_and_leaving_do_not_count_in_a_motion_that_leaves():
-    motion = motion_of(0, {0.2: 0.0, 0.4: 0.8, 1.3: 0.5, 1.4: 0.1}, leaves=True)
-    assert lowest_value(motion, motion["state"][:, 0]) == 0.5
-    at_once = motion_of(0, {1.4: 0.1}, leaves=True, push_time_s=1.4)
-    assert lowest_value(at_once, at_once["state"][:, 0]) == math.inf
-
-
 def test_tilt_is_the_angle_to_the_vertical_whatever_the_yaw():
     about_x = np.array([0.3, 0.0, 0.0])
     yaw = np.array([0.0, 0.0, 2.0])
@@ -116,21 +108,3 @@ def test_tilt_is_the_angle_to_the_vertical_whatever_the_yaw():
     angles = tilt(np.array([about_x, yaw, upside_down, sideways, np.zeros(3)]))
     assert angles == pytest.approx([0.3, 0.0, np.pi, np.pi / 2, 0.0], abs=1e-7)
     assert np.isnan(tilt(np.full((1, 3), np.nan))).all()
-
-
-def test_threshold_alarms_watch_tilt_and_margins_by_name():
-    names = ["edge", "tracking_error_x", "tracking_error_y"]
-    alarms = threshold_alarms(
-        ["rotation_x", "rotation_y", "rotation_z"], names, {"support_margin": "edge"}
-    )
-    motion = motion_of(0, {})
-    motion.ports |= {
-        "features": np.array([[0.1, 3.0, -4.0]]),
-        "state": np.array([[0.0, -0.2, 0.0]]),
-        "margins": np.array([[0.5, -0.1]]),
-    }
-    values = {alarm.name: alarm.value(motion)[0] for alarm in alarms}
-    assert values == pytest.approx(
-        {"support_margin": 0.1, "tracking_error": -5.0, "tilt": -0.2, "smallest_margin": -0.1}
-    )
-    assert [alarm.name for alarm in threshold_alarms(["x"], ["y"], {})] == ["smallest_margin"]

@@ -8,12 +8,11 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-import typer
 
 import drake_safety
 from command_line import call
 from drake_safety.assessments import assessed_scenarios
-from drake_safety.cli import COMMANDS, main, make_app
+from drake_safety.cli import main
 from drake_safety.cli.run import parse_pushes
 from drake_safety.learning.segments import EpisodeError
 from drake_safety.plants.balls import Throw
@@ -34,13 +33,6 @@ def test_a_mistake_in_a_task_names_its_episode_and_debug_shows_where(tmp_path, m
     with pytest.raises(EpisodeError) as caught:
         main()
     assert isinstance(caught.value.__cause__, RuntimeError)
-
-
-def test_every_command_says_in_a_sentence_what_it_does():
-    commands = typer.main.get_command(make_app()).commands
-    assert commands.keys() == COMMANDS.keys()
-    for command in commands.values():
-        assert command.help.splitlines()[0].endswith(".") and command.short_help.endswith(".")
 
 
 def test_only_the_module_of_the_called_command_is_imported():
@@ -139,18 +131,6 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_simulated(
     assert call(monkeypatch, *arguments, what) == 2
     assert f"error folder '{what}" in (printed := capsys.readouterr().out)
     assert "cannot be written" in printed
-
-
-@pytest.mark.train
-def test_motion_for_one_piece_is_refused_before_anything_is_simulated(
-    monkeypatch, capsys, stopped, tmp_path
-):
-    train = ("train", "laikago_balancing", "--out", tmp_path / "run", "--motion")
-    for minutes in (1, 0.5):
-        assert call(monkeypatch, *train, minutes) == 2
-        told = f"error train: --motion {minutes} gives one motion, and the monitor needs two"
-        assert told in capsys.readouterr().out
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.train

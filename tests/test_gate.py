@@ -200,7 +200,6 @@ def test_a_violation_between_two_rows_is_a_failure_at_its_instant(dips, metric, 
         ({}, {}, "the candidate is the baseline: scenario 'pendulum', variation 'nominal'"),
         (WEAK, {"metric": "frnt"}, "metric 'frnt': expected one of"),
         (WEAK, {"metric": lambda episode: 2}, "episode 0 has 2.0, expected 0 to 1"),
-        (WEAK, {"worse_by": 0.0}, r"worse_by and alpha must be in \(0, 1\)"),
         (
             {"parameters.start_angle_rad": 0.1},
             {},
@@ -212,19 +211,6 @@ def test_a_violation_between_two_rows_is_a_failure_at_its_instant(dips, metric, 
 def test_what_cannot_be_compared_is_refused_by_name(candidate, options, message):
     with pytest.raises(ValueError, match=message):
         COMPARED(pendulum(), load_scenario("pendulum", candidate), **options)
-
-
-def test_another_ball_is_another_disturbance():
-    changes = {"parameters.push.share": 0.99}
-    heavy = changes | {"parameters.push.mass_kg": [9.0, 10.0]}
-    starts = []
-    for values in (changes, heavy):
-        loop = load_scenario("laikago_balancing", values).make_loop()
-        context = loop.CreateDefaultContext()
-        loop.reset(context, episode_rng(0, 0))
-        starts.append(loop_comparison._start_of(loop, context))
-    with pytest.raises(ValueError, match=r"pair 0 .*: entry 0 of 'ball' is \S+ in the baseline"):
-        loop_comparison._check_alike(0, loop, *starts)
 
 
 @pytest.mark.train
@@ -246,12 +232,6 @@ def test_what_was_simulated_is_kept_and_continued_with_the_same_result(tmp_path,
     (baseline,) = (one for one in kept_sets if one.info.scenario_hash == own)
     ordinary = run_episodes(pendulum(), worse.pairs, seed=11_000_000, num_workers=1)
     assert_identical(baseline, ordinary)
-
-
-@pytest.mark.slow
-def test_the_verdict_does_not_depend_on_the_number_of_workers(worse):
-    two = COMPARED(pendulum(), pendulum(effort_share=0.2), num_workers=2)
-    assert numbers(two) == numbers(worse)
 
 
 GATE = ("gate", "pendulum", "--workers", 1, "--worse-by", 0.2)
@@ -310,17 +290,10 @@ def test_a_scenario_file_is_a_candidate_and_ctrl_c_tells_what_is_known_so_far(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "gate: name different candidates"),
-        (["--candidate", "actual"], "a change is KEY=VALUE, such as variation=actual"),
-        (["--alpha", "much"], ""),
-        (["--debug", "--candidate", "variation=actul"], ""),
-    ],
+    "arguments", [[], ["--alpha", "much"], ["--debug", "--candidate", "variation=actul"]]
 )
-def test_an_error_has_an_exit_code_of_its_own(monkeypatch, capsys, tmp_path, arguments, message):
+def test_an_error_has_an_exit_code_of_its_own(monkeypatch, tmp_path, arguments):
     assert call(monkeypatch, *GATE, *arguments, "--out", tmp_path) == 3
-    assert message in " ".join(capsys.readouterr().out.split())
 
 
 BROKEN = """
@@ -331,15 +304,6 @@ class Aborted(Pendulum):
     def __init__(self, *arguments, **options):
         raise SystemExit("Failure at plant.cc: condition failed")
 
-
-class Late(Pendulum):
-    count = 0
-
-    def reset(self, context, rng):
-        Late.count += 1
-        if Late.count > 12:
-            raise TypeError("worn out")
-        return super().reset(context, rng)
 """
 
 
@@ -377,12 +341,6 @@ def test_what_nobody_expects_is_an_error_too_with_its_traceback(monkeypatch, cap
         assert "ZeroDivisionError: of the package" in capsys.readouterr().err
 
 
-@pytest.mark.train
-def test_a_candidate_that_fails_later_is_an_error(monkeypatch, capsys, tmp_path, broken):
-    assert call(monkeypatch, *GATE, broken("Late"), "--out", tmp_path) == 3
-    assert "TypeError: worn out" in capsys.readouterr().err
-
-
 GO2, _ = policy_files(load_scenario("go2_walking"))
 
 
@@ -412,14 +370,6 @@ def test_another_policy_takes_over_where_the_baselines_has_walked(tmp_path):
         loop_comparison._check_alike(5, baseline.make_loop(), there, alone)
     taking_over = loop_comparison.make_paired((ComparedPlant(baseline), ComparedPlant(crouched)), 1)
     loop_comparison._check_alike(5, taking_over, there, start_of(taking_over))
-
-
-def test_a_policy_that_remembers_other_things_cannot_take_over_in_mid_stride(tmp_path):
-    clipped = go2(tmp_path, **{"{name: last_action}": "{name: last_action, clip: 5}"})
-    pair = ComparedPlant(load_scenario("go2_walking")), ComparedPlant(clipped)
-    loop = loop_comparison.make_paired(pair, 1)
-    with pytest.raises(ValueError, match=r"begin all episodes at rest, parameters\.start\.stand"):
-        start_of(loop)
 
 
 def test_a_network_alone_is_a_policy(tmp_path):

@@ -4,13 +4,11 @@ import asyncio
 import math
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
 import sys
 import threading
-import time
 import urllib.error
 import urllib.request
 from unittest.mock import AsyncMock
@@ -20,8 +18,6 @@ import pytest
 
 from drake_safety.live.panel import HISTORY_S, LivePanel, Slider, Status
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
 WITHIN_S = 120
 
 
@@ -202,43 +198,3 @@ def test_a_page_is_served_without_other_hosts_until_a_signal(playing, number):
     process.send_signal(number)
     process.communicate(timeout=WITHIN_S)
     assert process.returncode == 0
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=f"no browser on the path: none of {NAMES}")
-@pytest.mark.parametrize(
-    ("number", "state"), [(signal.SIGTERM, "stopped"), (signal.SIGKILL, "disconnected")]
-)
-def test_a_browser_shows_a_throw_and_the_end(playing, number, state):
-    sync_api = pytest.importorskip("playwright.sync_api")
-    process, address = playing
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        pages = [
-            browser.new_page(viewport={"width": width, "height": 844}) for width in (1280, 390)
-        ]
-        for page in pages:
-            page.set_default_timeout(1000 * WITHIN_S)
-            # The scene costs a browser without a graphics card all of the processor.
-            page.route("**/*reconnect_ms*", lambda route: route.abort())
-            page.goto(address)
-            page.locator(".chart canvas").wait_for()
-            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-            stop = page.get_by_role("button", name="Stop").bounding_box()
-            assert stop["y"] >= 0 and stop["y"] + stop["height"] <= 844
-            scene, panel = (page.locator(name).bounding_box() for name in (".scene", ".panel"))
-            assert scene["y"] + scene["height"] <= panel["y"] + 1 or (
-                scene["x"] + scene["width"] <= panel["x"] + 1
-            )
-        is_shown, end = False, time.monotonic() + WITHIN_S
-        while not is_shown and time.monotonic() < end:
-            pages[0].keyboard.press("Space")  # Without effect until the page is connected.
-            pages[0].wait_for_timeout(500)
-            is_shown = all(page.get_by_text("ball of 3 kg at 8 m/s").is_visible() for page in pages)
-        assert is_shown
-        process.send_signal(number)
-        for page in pages:
-            page.locator(f".status :text-is('{state}')").locator("visible=true").wait_for()
-            time.sleep(1.0)
-            assert page.locator(".state:visible").inner_text() == state
-        browser.close()

@@ -1,7 +1,6 @@
 """Live sessions: clicks and sliders, as a browser sends them, and what comes of them."""
 
 import dataclasses
-import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +11,6 @@ import pytest
 from pydrake.geometry import Meshcat
 
 from cart_pole_task import SCENARIO as CART_POLE
-from command_line import call
 from drake_safety import AddSafetyAssessor, load_scenario
 from drake_safety.cli.console import open_viewer
 from drake_safety.live import session as live
@@ -23,7 +21,6 @@ from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import Gliding, gliding
 from live_scenarios import learned, quick
 from reaching_targets import FAR, NEAR, SCENARIO, learned_targets
-from shuttle_task import shuttling
 
 train = pytest.mark.train
 SHOWN_S = 1.5
@@ -222,15 +219,6 @@ def test_the_robot_goes_to_an_accepted_goal_or_by_force_to_any(goals, goal, butt
 
 
 @train
-def test_goals_need_no_legs(meshcat):
-    scenario = quick(shuttling())
-    session = LiveSession(scenario.make_loop(assessment=learned(scenario)), meshcat, threshold=0.5)
-    assert not session.tick()
-    ticks(session, live.FORCE, num=10)
-    assert not session.has_fallen
-
-
-@train
 def test_keys_change_the_command_within_the_range_of_training(commands):
     ticks(commands, "Faster", "Turn left")
     high = commands.loop.target_box[1]
@@ -281,14 +269,6 @@ def test_the_verdict_is_that_of_the_probability(cart):
             assert status.tone == (status.state if is_known else "plain")
             states.add(status.state)
     assert {"safe", "unsafe"} <= states
-
-
-@train
-def test_a_state_unlike_training_is_not_called_unsafe_but_unknown(cart):
-    set_cart(cart, 0.0, 0.0, 15.0, 0.0)
-    ticks(cart)
-    assert cart.panel.belief == (0.0, 0.0, 1.0)
-    assert (cart.panel.status.state, cart.panel.status.cause) == ("don't know", "")
 
 
 @train
@@ -371,18 +351,6 @@ def test_a_task_is_pushed_by_a_button_and_must_export_what_is_shown(meshcat):
     assert value_of(session, "state")[1] >= 2.0
     with pytest.raises(ValueError, match=r"'FewPorts' exports no port \['cause_probability'"):
         LiveSession(FewPorts(scenario, assessment=assessment), meshcat, threshold=0.5)
-
-
-def test_play_without_an_assessment_or_a_library_for_pages_says_what_to_do_first(
-    monkeypatch, capsys, tmp_path
-):
-    play = ("play", "laikago_balancing", "--assessment", tmp_path)
-    assert call(monkeypatch, *play) == 2
-    assert "run `drake-safety train` first" in capsys.readouterr().out
-    monkeypatch.setitem(sys.modules, "nicegui", None)
-    monkeypatch.delitem(sys.modules, "drake_safety.live.page", raising=False)
-    assert call(monkeypatch, *play[:2]) == 2
-    assert "pip install 'drake_safety[live]'" in capsys.readouterr().out
 
 
 def test_only_this_machine_reaches_a_viewer():

@@ -66,17 +66,6 @@ def test_a_score_that_is_nan_counts_as_the_most_unsafe():
     assert threshold_at(np.array([np.inf, 0.2, np.inf]), label[1:]) < math.inf
 
 
-def test_repeating_the_segments_of_an_episode_adds_no_certainty():
-    rng = np.random.default_rng(2)
-    label = rng.random(60) < 0.5
-    score = label + rng.normal(size=60)
-    once = auc(score, label, np.arange(60))
-    often = auc(np.tile(score, 20), np.tile(label, 20), np.tile(np.arange(60), 20))
-    as_if_independent = auc(np.tile(score, 20), np.tile(label, 20), np.arange(1200))
-    assert often == once
-    assert as_if_independent.high - as_if_independent.low < 0.4 * (once.high - once.low)
-
-
 def test_the_interval_of_the_area_covers_the_truth_about_as_often_as_promised():
     rng = np.random.default_rng(3)
     truth = 0.5 * (1.0 + math.erf(0.5))  # Normal scores one standard deviation apart.
@@ -134,16 +123,3 @@ def test_segment_recalls_are_shares_of_segments_with_episodes_behind_them(segmen
     estimates = segment_estimates(first, score, threshold=0.5)
     unsafe = score[first.is_unsafe] > 0.5
     assert estimates["unsafe_recall"] == proportion(unsafe.sum(), len(unsafe))
-
-
-@pytest.mark.parametrize(
-    ("score", "label"),
-    [
-        (np.zeros(3), np.zeros(3)),
-        (np.ones(2), np.zeros(2, bool)),
-        (np.full(2, np.nan), np.array([False, True])),
-    ],
-)
-def test_what_has_no_threshold_is_refused(score, label):
-    with pytest.raises(ValueError, match="scores"):
-        threshold_at(score, label)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from drake_safety.evaluation.metrics import proportion
-from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
+from drake_safety.evaluation.reliability import reliability, verdict_shares
 from drake_safety.learning.calibration import PLAN, calibrate
 from lip_assessments import scored_episodes
 
@@ -54,13 +54,3 @@ def test_repeating_the_rows_of_an_episode_adds_no_certainty():
         assert many.high - many.low > 3.0 * (alone.high - alone.low)
         assert many.high - many.low == pytest.approx(few.high - few.low, rel=0.3)
     assert often.error.value == pytest.approx(single.error.value)
-
-
-@pytest.mark.train
-def test_the_diagram_shows_each_curve_with_its_error():
-    label = np.array([True, False] * 20)
-    one = once(np.linspace(0, 1, 40), label)
-    fig = reliability_figure({"sharpened": one, "paper": one})
-    (legend,) = fig.legends
-    told = [text.get_text() for text in legend.get_texts()]
-    assert told == [f"{name}   {one.error.value:.3f}" for name in ("sharpened", "paper")]

@@ -88,15 +88,6 @@ def test_every_picture_is_in_the_page_and_the_recording_beside_it(whole):
     assert whole.page.all("a", "href") == ["run/recording.html"]
 
 
-def test_what_a_half_finished_run_lacks_is_left_out_and_the_rest_shown(copy):
-    shutil.rmtree(copy / "episodes")
-    shutil.rmtree(copy / "run")
-    (copy / "evaluation.json").unlink()
-    words = Page(page_of(copy)).words
-    assert "What was learned" in words
-    assert not any(one in words for one in ("Trained with", "How it did", "Recorded motion"))
-
-
 def test_a_folder_that_is_no_run_or_is_damaged_and_a_missing_extra_are_named(
     copy, tmp_path, monkeypatch
 ):

@@ -4,7 +4,6 @@ from pathlib import Path
 import pytest
 
 from cart_episodes import make_episode, make_info
-from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.simulation.dataset import EpisodeWriter
 from report_runs import make_figures
@@ -73,25 +72,3 @@ def test_the_text_between_the_markers_is_rewritten_and_no_other(tmp_path):
     # Whatever is changed by hand is written again.
     forged = text.replace("0.900 (0.795–0.962)", "0.990 (0.795–0.962)", 1)
     assert generate(forged, tmp_path) == generate(text, tmp_path) == text
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("nothing", "no block of results"),
-        (BLOCK.replace("lip", "other"), r"no results 'other' in .*there are \['lip'\]"),
-    ],
-)
-def test_a_text_that_cannot_be_filled_in_is_refused(tmp_path, text, message):
-    Results(make_figures(), ENTRIES).write(tmp_path / "lip.json")
-    with pytest.raises(ValueError, match=message):
-        generate(text, tmp_path)
-
-
-def test_verdicts_on_targets_stand_beside_the_papers_own(tmp_path):
-    estimates = {("plans", "outcomes", "safe"): proportion(20, 50)}
-    for column in ("safe_recall", "unsafe_recall", "auc"):
-        estimates["plans", "sharpened", column] = proportion(19, 20)
-    text = filled(tmp_path, estimates)
-    assert "| *the paper's own* | *0.952* | *0.987* | |" in text
-    assert "of which 40.0 % (26.4–54.8) are safe" in text

@@ -4,7 +4,6 @@ import math
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.interval_figure import interval_figure
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
@@ -64,19 +63,3 @@ def test_a_table_has_a_row_a_method_and_marks_the_best_in_every_form():
     assert [column.key for column in narrow(table, ["brier", "auc"]).columns] == ["auc", "brier"]
     titles = [one.title for one in verdict_tables(results)]
     assert "Stored calibrations on fresh motions: before the motion" in titles
-
-
-def test_the_plot_has_each_value_and_its_interval_where_its_method_is():
-    rows = {key: one for key, one in make_figures().items() if key[2] == "auc"}
-    (axes,) = interval_figure(rows).axes
-    labels = [label.get_text() for label in axes.get_yticklabels()]
-    assert labels == ["sharpened", "paper", "gradient boosting"]
-    assert len(axes.containers) == 2  # Segments and episodes.
-    first = rows["segments", "sharpened", "auc"]
-    for container in axes.containers:
-        points, _, (bars,) = container
-        x, y = points.get_data()
-        np.testing.assert_allclose(x, [0.9, 40 / 60, 0.95])
-        assert [round(place) for place in y] == [0, 1, 2]
-        (left, _), (right, _) = bars.get_segments()[0]
-        assert (left, right) == pytest.approx((first.low, first.high))

@@ -2,25 +2,21 @@
 
 import math
 from types import SimpleNamespace
-from unittest import mock
 
 import numpy as np
 import pytest
 
 from cart_episodes import make_episode, make_info
-from drake_safety import AssessmentParameters, SafetyAssessment, load_assessment, load_scenario
+from drake_safety import load_assessment, load_scenario
 from drake_safety.evaluation import shift_study
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.shift_study import (
     CONFIDENT,
-    Minute,
     false_alarms,
-    monitor_estimates,
     monitored,
     run_monitored,
-    safety_probability,
     shift_estimates,
     shifts_figure,
     shifts_tables,
@@ -28,9 +24,6 @@ from drake_safety.evaluation.shift_study import (
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
 from drake_safety.learning.change_detector import Alarm
 from drake_safety.learning.segments import Episodes
-from drake_safety.robots.robot_model import as_pattern
-from lip_assessments import QUICK
-from lip_episodes import make_episodes
 from studies.monitor import _estimates
 
 STEP_S = 0.5
@@ -96,16 +89,6 @@ def test_a_confident_error_is_a_row_called_safe_in_a_motion_that_ends_unsafely()
     assert found["gamma", "auc"].value == pytest.approx((70 + 0.5 * 10) / 80)
 
 
-@pytest.mark.train
-def test_outside_the_safe_set_gamma_is_not_safe():
-    episodes = make_episodes(80, noise=0.002)
-    gamma = SafetyAssessment(AssessmentParameters(**QUICK)).fit(episodes)
-    one = make_episodes(1, seed=5, noise=0.002)[0]
-    one.margins[:] = -1.0
-    probability = safety_probability(gamma, one, slice(None))
-    assert (probability == 0.0).any() and not np.nan_to_num(probability).any()
-
-
 def test_a_minute_goes_on_with_the_next_motions_and_an_alarm_is_dont_know():
     # Γ is asked every second row, and speaks of the next five seconds.
     motions = [
@@ -127,24 +110,6 @@ def test_a_minute_goes_on_with_the_next_motions_and_an_alarm_is_dont_know():
     found = monitored(late, Gamma())
     assert [one.alarm_s for one in found] == [math.inf, math.inf, 25.0]
     assert [one.leave_s for one in found] == [math.inf, 50.0, math.inf]
-
-
-def test_estimates_are_of_all_minutes():
-    found = monitor_estimates(
-        [
-            Minute(30.0, 40.0, [6.0, 20.0], [6.0, 20.0]),
-            Minute(2.0, math.inf, [0.0, 0.0], [0.0, 4.0]),
-            Minute(1.0, math.inf, [0.0, 0.0], [0.0, 0.0]),
-            Minute(math.inf, math.inf, [0.0, 0.0], [0.0, 0.0]),
-        ]
-    )
-    assert found["alarmed"].value == 0.75
-    assert found["delay_s"].value == 30.0
-    assert found["delay_s"].low <= 2.0 and found["delay_s"].high == math.inf
-    assert found["delay_95_s"].value == math.inf
-    assert found["confident_error_10s"].value == pytest.approx(0.6 / 4)
-    assert found["confident_error_60s"].value == pytest.approx(20 / 60 / 4)
-    assert {one.n for one in found.values()} == {4}
 
 
 def test_a_promise_is_missed_where_neither_threshold_nor_alarm_announces_the_end():
@@ -225,28 +190,3 @@ def test_a_variation_may_have_any_name(tmp_path):
     assert [row.label for row in table.rows] == [f"variation {n}".replace("_", " ") for n in NAMES]
     assert all(None not in row.estimates for row in table.rows)
     save(shifts_figure(found), tmp_path / "shifts")
-
-
-@pytest.mark.parametrize("has_motor", [True, False])
-def test_the_loaded_joint_may_have_no_motor_or_no_limit(monkeypatch, has_motor):
-    scenario = load_scenario("laikago_balancing")
-    loop = scenario.make_loop()
-    usual = plant_shifts(scenario, loop)
-    (pattern,) = usual["weak_joint"].variation.shift.joints
-    plant = loop.kinematics.plant
-    motors = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
-    others = [one for one in motors if as_pattern(one.joint().name()) != pattern]
-    (own,) = set(motors) - set(others)
-    if has_motor:
-        joint = own.joint()
-        others.append(SimpleNamespace(joint=lambda: joint, effort_limit=lambda: math.inf))
-    changed = mock.Mock(wraps=plant)
-    changed.GetJointActuatorIndices = lambda: range(len(others))
-    changed.get_joint_actuator = others.__getitem__
-    monkeypatch.setattr(loop.kinematics, "plant", changed)
-    found = plant_shifts(scenario, loop)
-    if has_motor:
-        assert usual.keys() - found.keys() == {"weak_joint"}
-    else:
-        (other,) = found["weak_joint"].variation.shift.joints
-        assert other != pattern

@@ -10,19 +10,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import typer
 from PIL import Image
 
 from command_line import call, study
 from drake_safety.assessments import shipped_folder
 from drake_safety.cli.training_folder import MODES, assessment_file
-from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import train_shuttle
-from studies.__main__ import app
 from studies.figures import PICTURES
 from studies.moving_pictures import Take, first_saved, save_moving_picture
 from studies.publish import DOCUMENTS
@@ -190,19 +187,6 @@ def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypat
     assert set(re.findall(r"pictures/(\w+)\.", text)) == there
 
 
-def test_studies_are_stored_with_the_evaluation_of_their_run(monkeypatch, tmp_path):
-    Results({("plans", "sharpened", "auc"): proportion(29, 30)}, {"command": "x"}).write(
-        tmp_path / "evaluation.json"
-    )
-    row = {("monitor", "nominal", "alarmed"): proportion(3, 4)}
-    Results(row, {"command": "y", "seed": 100}).write(tmp_path / "monitor.json")
-    stored = tmp_path / "stored.json"
-    assert study(monkeypatch, "store", "--assessment", tmp_path, "--out", stored) == 0
-    found = Results.read(stored)
-    assert {("plans", "sharpened", "auc"), ("monitor", "nominal", "alarmed")} <= set(found)
-    assert found.entries["monitor"]["seed"] == 100
-
-
 def test_documents_are_written_again_as_they_are(monkeypatch, tmp_path):
     monkeypatch.chdir(ROOT)
     text, copy = DOCUMENTS[1].read_text(encoding="utf-8"), tmp_path / "results.md"
@@ -210,11 +194,3 @@ def test_documents_are_written_again_as_they_are(monkeypatch, tmp_path):
     assert "forged" in copy.read_text(encoding="utf-8")
     assert study(monkeypatch, "readme", copy) == 0
     assert copy.read_text(encoding="utf-8") == text
-
-
-def test_every_study_is_tried_and_says_in_a_sentence_what_it_does():
-    commands = typer.main.get_command(app).commands
-    assert all(command.help for command in commands.values())
-    others = {"walking", "figures", "store", "readme"}
-    elsewhere = {"ship", "gate"}  # In test_shipped_assessments, test_gate.
-    assert {line.split(" ")[0] for line in STUDIES} | others | elsewhere == set(commands)

@@ -2,11 +2,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex
 
-from drake_safety.evaluation.figure_style import BALL_COLOUR, UNSAFE_COLOUR
 from drake_safety.evaluation.timeline_figure import timeline_figure
-from drake_safety.plants.pushes import Push
 
 
 @pytest.fixture
@@ -82,23 +79,3 @@ def test_the_timeline_s_belief_is_stacked_to_one_and_margins_are_in_centimetres(
     drawn = {line.get_label(): line.get_ydata() for line in margins.lines}
     np.testing.assert_allclose(drawn["support polygon"][0], 10.0)
     np.testing.assert_allclose(drawn["height [°]"], np.degrees(0.05))
-
-
-def test_the_timeline_marks_a_push_and_an_alarm_for_as_long_as_they_last_and_the_leaving(run):
-    push = Push(force_n=[0.0, 300.0, 400.0], time_s=0.8, duration_s=0.1)
-    fig = timeline_figure(
-        **run | {"throws": [], "recovery_intervals_s": []},
-        pushes=[push],
-        leave_time_s=1.4,
-        trigger_label="alarm",
-        alarm_intervals_s=[(0.5, 0.7)],
-    )
-    for panel in fig.axes[2:5]:
-        (span,) = [p for p in panel.patches if to_hex(p.get_facecolor()) == BALL_COLOUR]
-        assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx((0.8, 0.9))
-        assert [1.4, 1.4] in [list(line.get_xdata()) for line in panel.lines]
-    axes = fig.axes[2]
-    (alarm,) = [one for one in axes.patches if to_hex(one.get_facecolor()) == UNSAFE_COLOUR]
-    assert (alarm.get_x(), alarm.get_x() + alarm.get_width()) == pytest.approx((0.5, 0.7))
-    labels = {text.get_text() for text in axes.texts}
-    assert {"push of 500 N for 0.1 s", "alarm", "leaves the safe set", "monitor's alarm"} <= labels

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from command_line import call
-from drake_safety.cli import train as training
 from drake_safety.cli.training_folder import MODES, adapted_folder, load_assessment
 from drake_safety.learning.change_detector import usual_rows
 from drake_safety.learning.seeds import FALLS, MOTION
@@ -59,24 +58,3 @@ def test_the_monitor_is_learned_from_undisturbed_motion_that_is_kept(monkeypatch
     assert not (alone / "motion").exists()
     assert load_assessment(alone, "paper").detector_.step_s == 0.04
     assert not (alone / "falls").exists()
-
-
-@pytest.mark.train
-@pytest.mark.parametrize(
-    ("given", "wanted_s"),
-    [
-        (("--episodes", 4), 24.0),
-        (("--episodes", 2048), 2880.0),
-        (("--episodes", 64, "--motion", 5), 300.0),
-    ],
-)
-def test_there_is_more_motion_for_more_episodes(monkeypatch, capsys, tmp_path, given, wanted_s):
-    def stopped(scenario, duration_s, **options):
-        raise ValueError(f"asked for {duration_s:g} s")
-
-    monkeypatch.setattr(training, "run_episodes", lambda *arguments, **options: None)
-    monkeypatch.setattr(training, "run_motions", stopped)
-    file = tmp_path / "shuttling.yaml"
-    file.write_text(SCENARIO)
-    assert call(monkeypatch, "train", file, "--out", tmp_path / "run", *given) == 2
-    assert f"asked for {wanted_s:g} s" in capsys.readouterr().out

@@ -10,9 +10,8 @@ from studies.walking import (
     push_estimates,
     recovery_estimates,
     speed_estimates,
-    tour_estimates,
 )
-from studies.walking_motions import run_motions, run_push, unusual_command
+from studies.walking_motions import run_motions, run_push
 
 
 def motion(values, *, push_s=math.inf, leave_s=math.inf, fall_s=math.inf, changed=0.0, impact=0.0):
@@ -43,12 +42,6 @@ def test_falls_and_their_times_are_those_of_motions_that_leave_after_the_push():
     assert push_estimates(pushed, push_s=0.4)["pushes", "", "fallen_soon"].value == 1.0
 
 
-def test_the_hours_of_tours_are_those_that_stay_safe():
-    found = tour_estimates([motion([1] * 7), motion([1] * 3, leave_s=0.2, fall_s=0.2)])
-    assert found["tours", "", "without_fall"].value == 0.5
-    assert found["tours", "", "hours"].value == pytest.approx(0.6 / 3600)
-
-
 def test_guard_recovery_and_speeds_compare_the_same_motions():
     falls, stays = motion([1, 1], leave_s=0.1, fall_s=0.1, impact=3.0), motion([1, 1])
     softer = motion([1, 1], leave_s=0.1, fall_s=0.1, impact=2.0)
@@ -63,16 +56,6 @@ def test_guard_recovery_and_speeds_compare_the_same_motions():
     assert saved["recovery", "slower", "impact_m_s"].value == 2.0
     assert saved["recovery", "slower", "impact_without_m_s"].value == 3.0
     assert speed_estimates([stays], [stays])["speed", "", "difference_to_mujoco_m_s"].value == 0.0
-
-
-def test_unusual_commands_are_past_the_ranges_and_usual_ones_inside():
-    loop = load_scenario("go2_walking").make_loop()
-    limits, rng = loop.policy.parameters.command, np.random.default_rng(0)
-    for _ in range(30):
-        inside = loop.usual_command(rng)
-        assert np.all(inside >= limits.lowest) and np.all(inside <= limits.highest)
-        past = unusual_command(loop, rng)
-        assert np.any(past < limits.lowest) or np.any(past > limits.highest)
 
 
 def test_a_motion_that_is_kept_is_the_one_that_was_simulated(tmp_path):
