@@ -4,7 +4,6 @@ import itertools
 import math
 
 import numpy as np
-from scipy.special import betainc, betaln
 
 from drake_safety.learning.change_detector import TIME_CONSTANTS_S
 
@@ -161,13 +160,6 @@ def capital(outcomes, mean, shares, weights, is_above):
                 each *= 1 - share / (1 - mean) * (outcome - mean)
         total += weight * each
     return total
-
-
-def mixture_log_e(more, less):
-    """Logarithm of the e-value of discordant pairs with the mixture Beta(1/2, 1/2) on (1/2, 1]."""
-    b, c = more + 0.5, less + 0.5
-    with np.errstate(divide="ignore"):
-        return (b + c) * math.log(2) + betaln(b, c) + np.log(betainc(c, b, 0.5) / math.pi)
 
 
 def in_triangle(p, a, b, c):

@@ -16,7 +16,6 @@ from drake_safety.evaluation.paired_test import (
 
 ALPHA = 0.05
 OUTCOMES = np.array([-1.0, 0.0, 1.0])
-LOOKS = np.arange(16, 5001, 16)
 NUM_REPLAYS = 500
 
 

@@ -56,7 +56,7 @@ _RESUMED = {"train": "--resume"} | dict.fromkeys(_KEEPING, "")
 """Commands that the same line continues after Ctrl-C, and the option that does so."""
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.
-_ERRORS = {"gate": 3}  # Exit codes of errors of commands for which 1 and 2 are results.
+_ERRORS = {"gate": 3}  # Exit codes of errors where 1 and 2 are results.
 
 
 class _Command(TyperCommand):
@@ -83,7 +83,7 @@ class _Command(TyperCommand):
 def join_targets(args: Sequence[str]) -> list[str]:
     """Joins the three numbers of a target or command, which may as well be a name."""
     words = list(args)
-    for i, word in enumerate(words):  # Which become fewer.
+    for i, word in enumerate(words):
         numbers = words[i + 1 : i + 4]
         if word in ("--target", "--command") and len(numbers) == 3 and all(map(is_number, numbers)):
             words[i + 1 : i + 4] = [" ".join(numbers)]

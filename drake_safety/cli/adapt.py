@@ -53,9 +53,8 @@ def adapt(
 ) -> None:
     """Adapt Γ to an actual robot, and say whether it is better on episodes or logs held out.
 
-    Writes ASSESSMENT/adapted-VARIATION, which other commands take in place of ASSESSMENT; with
-    --log it is named after the first log. Episodes are kept in ASSESSMENT: a stopped adaptation
-    continues when called again. For a shipped assessment, ASSESSMENT is runs/SCENARIO-shipped.
+    Other commands take the folder in place of ASSESSMENT. Episodes are kept: a stopped adaptation
+    continues when called again.
     """
     loaded = load_scenario(scenario)
     learned = folders.assessment_folder(loaded, assessment)

@@ -11,7 +11,6 @@ from typer import Exit, Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
-from drake_safety.diagrams.balancing.throws import HasBall
 from drake_safety.files.reading import did_you_mean, is_number
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
@@ -37,7 +36,6 @@ def ask(
 ) -> None:
     """Print the verdict on a target, or on a command of a walking robot; nothing moves.
 
-    Prints belief and verdict; for a refusal also the likely cause and the nearest accepted target.
     Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
     """
     loaded, folder, gamma = folders.open_assessment(
@@ -45,10 +43,9 @@ def ask(
     )
     loop = loaded.make_loop(assessment=gamma, **console.given(hand=hand, command_s=duration))
     if not isinstance(loop, HasGoals):
-        balls = ", and throws balls with --push ball" if isinstance(loop, HasBall) else ""
         raise ValueError(
             f"ask: task '{type(loop).__name__}' has no targets or commands to ask about; "
-            f"`drake-safety run {scenario}` shows what Γ says during its motion{balls}"
+            f"`drake-safety run {scenario}` shows what Γ says during its motion"
         )
     if target is None:
         raise ValueError("ask: pass --target, or for a walking robot --command")

@@ -42,11 +42,8 @@ def calibrate(
 ) -> None:
     """Choose thresholds with a promised miss rate on fresh episodes.
 
-    The promise holds for the plant of the episodes: calibrate again after `adapt`, or before
-    `adapt --log`, whose robot no plant simulates. `ask`, `run` and
-    `evaluate` use the thresholds. Episodes are kept in ASSESSMENT: a stopped calibration
-    continues, and another promise reuses them. A shipped assessment is not changed; its calibrated
-    copy is written to runs/SCENARIO-shipped.
+    The promise holds for the plant of the episodes: calibrate again after `adapt`. Episodes are
+    kept in ASSESSMENT: a stopped calibration continues, and another promise reuses them.
     """
     check_share("--miss-rate", miss_rate)
     check_share("--false-alarm-rate", false_alarm_rate)
@@ -61,8 +58,7 @@ def calibrate(
     if (is_of_logs := NOT_DRAWN in drawn) and variation is None:
         raise ValueError(
             f"calibrate: '{folder.path}' is adapted to a robot of logs, which no plant simulates: "
-            f"nothing can be promised for it. --variation {plant} promises for that simulated "
-            f"plant alone; plants are {list(loaded.variations)}"
+            f"nothing can be promised for it, only for a simulated plant by --variation {plant}"
         )
     for gamma in learned.values():
         folders.check_fresh(gamma, loaded)
@@ -94,12 +90,9 @@ def calibrate(
         gamma.save(folders.assessment_file(folder.out, mode))
         for one in chosen[mode]:
             thresholds = f"{one.threshold:.4f}", f"{one.unsafe_below:.4f}"
-            counts = (
-                f"{one.num_missed} of {one.num_unsafe}",
-                f"{one.num_accepted} of {one.num_safe}",
-            )
-            rows.append((label_of(f"{mode}.{one.kind}"), *thresholds, *counts))
-    columns = ("score", "safe from probability", "unsafe below", "misses", "safe recall")
+            missed = f"{one.num_missed} of {one.num_unsafe}"
+            rows.append((label_of(f"{mode}.{one.kind}"), *thresholds, missed))
+    columns = ("score", "safe from probability", "unsafe below", "misses")
     title = f"Promised: {chosen[MODES[0]][0].promise}"
     console.show(console.new_table(*columns, rows=rows, title=title))
     for mode in learned:

@@ -54,10 +54,7 @@ RecoveryOption = Annotated[
 WorkersOption = Annotated[int | None, Option(help="Worker processes; one a core by default.")]
 ClusterOption = Annotated[
     str | None,
-    Option(
-        help="Address of dask's scheduler, such as tcp://10.0.0.1:8786, whose workers simulate in "
-        "place of this machine's; without --workers.",
-    ),
+    Option(help="Address of dask's scheduler, whose workers simulate in place of this machine's."),
 ]
 LOOPBACK = "127.0.0.1"
 """Address that only this machine reaches."""

@@ -99,11 +99,7 @@ def evaluate(
     ] = None,
     shifts: Annotated[
         int,
-        Option(
-            help="Motions of each changed plant and faulty sensor, to evaluate Γ's \"don't know\" "
-            "and the monitor instead of all else.",
-            min=0,
-        ),
+        Option(help="Evaluate changed plants and sensors instead, by so many motions.", min=0),
     ] = 0,
     seed: Annotated[
         int | None, Option(help=f"First seed; {EVALUATION.first}, or {SHIFTS.first} with --shifts.")
@@ -116,8 +112,7 @@ def evaluate(
 ) -> None:
     """Evaluate Γ, and the paper's form, on fresh episodes, throws and, with --shifts, other plants.
 
-    It gives AUC, recalls and reliability, in every row and in the first of an episode, and falls
-    with and without recovery. Episodes are kept in ASSESSMENT: a stopped evaluation continues.
+    Episodes are kept in ASSESSMENT: a stopped evaluation continues.
     """
     loaded, folder = load_scenario(scenario), out or assessment
     folders.check_writable(assessment, folder)
@@ -239,8 +234,7 @@ def _add_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> N
     names = {"gamma" if mode == MODES[0] else mode: g for mode, g in evaluation.assessments.items()}
     shifts = plant_shifts(scenario, scenario.make_loop())
     nominal = evaluation.fresh("nominal motions", num_nominal, "shifts")
-    judged = shift_study.shift_estimates(names, nominal[:_MOST_JUDGED])
-    estimates = {("shifts.nominal", *key): one for key, one in judged.items()}
+    judged = {"nominal": shift_study.shift_estimates(names, nominal[:_MOST_JUDGED])}
     for i, (name, shift) in enumerate(shifts.items()):
         stages("shifted motions", i, len(shifts))
         shifted = shifted_scenario(scenario, name, shift.variation)
@@ -248,13 +242,12 @@ def _add_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> N
         episodes = folders.run_fresh_episodes(
             shifted, evaluation.run_folder, num_motions, seed, None, workers, name, **options
         )
-        judged = shift_study.shift_estimates(names, episodes)
         motions = shift_study.run_monitored(
             shifted, name, num_motions, seed, gamma.detector_, options=options, num_workers=workers
         )
         watched = shift_study.monitor_estimates(shift_study.monitored(motions, gamma))
-        judged |= {("monitor", metric): one for metric, one in watched.items()}
-        estimates |= {(f"shifts.{name}", *key): one for key, one in judged.items()}
+        judged[name] = shift_study.shift_estimates(names, episodes)
+        judged[name] |= {("monitor", metric): one for metric, one in watched.items()}
     stages("shifted motions", len(shifts), len(shifts))
     fresh_seed = FRESH_MOTION.first_beside(seed)
     usual = run_motions(
@@ -266,8 +259,10 @@ def _add_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> N
         progress=partial(stages, "undisturbed nominal motion"),
     )
     alarms = shift_study.false_alarms(usual, gamma.detector_)
-    estimates["shifts.nominal", "monitor", "false_alarms_per_hour"] = alarms
-    evaluation.add(estimates, shifts=shift_study.shifts_figure(estimates))
-    evaluation.entries["kinds"] = {"nominal": "nominal"} | {
-        name: shift.kind for name, shift in shifts.items()
+    judged["nominal"]["monitor", "false_alarms_per_hour"] = alarms
+    estimates = {
+        (f"shifts.{name}", *key): one for name, each in judged.items() for key, one in each.items()
     }
+    evaluation.add(estimates, shifts=shift_study.shifts_figure(estimates))
+    kinds = {name: shift.kind for name, shift in shifts.items()}
+    evaluation.entries["kinds"] = {"nominal": "nominal"} | kinds

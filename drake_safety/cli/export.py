@@ -18,19 +18,11 @@ def export(
     mode: console.ModeOption = MODES[0],
     out: Annotated[Path, Option(help="The file.", dir_okay=False)] = Path("gamma.onnx"),
 ) -> None:
-    """Write Γ as one ONNX file, which runs without this package and without Drake.
-
-    It holds the maps, the grid, the beliefs and the correction of the assessment, adapted or not;
-    its metadata say what its inputs are and what its thresholds promise.
-    """
+    """Write Γ as one ONNX file, which runs without this package and without Drake."""
     *_, gamma = folders.open_assessment(scenario, assessment, mode)
     folders.check_writable(out.parent)
     gamma.to_onnx(out)
     for one in gamma.calibrations_.values():
         verdicts = f"safe from {one.threshold:.4f}, unsafe below {one.unsafe_below:.4f}"
         console.say(f"{one.kind:<16}  {verdicts}: {one.promise}")
-    if not gamma.calibrations_:
-        console.say(
-            "thresholds        none: `drake-safety calibrate` chooses them for a promised miss rate"
-        )
     console.say(f"written           {out.stat().st_size / 1e6:.2f} MB,", out)

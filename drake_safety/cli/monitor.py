@@ -39,10 +39,7 @@ def monitor(
         Path | None, Option(help="Folder to write; ASSESSMENT/monitor by default.")
     ] = None,
 ) -> None:
-    """Run the change monitor over logs of a robot: its alarms, their causes, and its levels.
-
-    Writes monitor.json and a picture of each log, or sequence of an .npz file.
-    """
+    """Run the change monitor over logs of a robot: its alarms, their causes, and its levels."""
     loaded, learned, gamma = folders.open_assessment(scenario, assessment)
     folder = out or learned.out / "monitor"
     folders.check_writable(folder)
@@ -64,7 +61,7 @@ def monitor(
     if short := [entry["log"] for entry in logs if _is_too_short(entry)]:
         raise ValueError(
             f"{len(short)} of {len(logs)} logs have less than {_LEAST_S:g} s of motion without a "
-            f"missing value, which is too short to judge: {', '.join(short[:3])}"
+            f"missing value: {', '.join(short[:3])}"
         )
 
 
@@ -140,13 +137,12 @@ def _rows(entry: Mapping[str, Any]) -> list[list[str]]:
     name = f"{Path(*Path(entry['log']).parts[-2:])}{number}"
     head = [name, f"{entry['end_s']:.2f}{left}", f"{share:.0%}"]
     if _is_too_short(entry):
-        why = f"not judged: {entry['judged_s']:.2f} s, expected at least {_LEAST_S:g} s"
-        return [[*head, "-", "-", "-", why]]
+        return [[*head, "-", "-", "-", f"not judged: {entry['judged_s']:.2f} s"]]
     if not entry["alarms"]:
         return [[*head, "-", "-", f"{entry['level']:.2f}", f"no alarm; largest: {entry['state']}"]]
-    rows: list[list[str]] = []
+    rows = []
     for alarm in entry["alarms"]:
         numbers = (alarm[key] for key in ("begin_s", "end_s", "level"))
         cells = ["goes on" if value is None else f"{value:.2f}" for value in numbers]
-        rows.append([*(["", "", ""] if rows else head), *cells, alarm["cause"]])
+        rows.append([*head, *cells, alarm["cause"]])
     return rows

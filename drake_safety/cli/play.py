@@ -31,23 +31,13 @@ def play(
     seed: Annotated[int, Option(help="Seed of start and noise.")] = DEMONSTRATION.first,
     mode: console.ModeOption = MODES[0],
     port: Annotated[
-        int | None,
-        Option(help="Of the page; the first free one from 7000 on by default."),
+        int | None, Option(help="Of the page; the first free one from 7000 on by default.")
     ] = None,
     host: Annotated[
-        str,
-        Option(
-            help="Address that serves the page; 0.0.0.0 for every one of this machine. Whoever "
-            "reaches it can use the controls: there is no password."
-        ),
+        str, Option(help="Address that serves the page; whoever reaches it can use the controls.")
     ] = console.LOOPBACK,
 ) -> None:
-    """Simulate a task on a page in the browser, in real time, until Stop or Ctrl-C.
-
-    Sliders and buttons throw a ball or move the target; keys walk a robot that follows commands,
-    push it, and switch its guard. Any other task begins anew from random starts. Γ, belief and
-    verdict are shown.
-    """
+    """Simulate a task on a page in the browser, in real time, until Stop or Ctrl-C."""
     from drake_safety.live.page import serve_page  # Of the extra "live".
 
     loaded, _, gamma = folders.open_assessment(scenario, assessment, mode)

@@ -47,25 +47,15 @@ def new(
     task: Annotated[str, Option(help="'balancing', 'reaching' or 'walking'.")] = "balancing",
     policy: Annotated[
         Path | None,
-        Option(
-            help="For 'walking': its network (.onnx, .pt), a deploy.yaml of unitree_rl_lab or a "
-            "config.yaml of rl_sar.",
-            dir_okay=False,
-        ),
+        Option(help="For 'walking': a network, a deploy.yaml or a config.yaml.", dir_okay=False),
     ] = None,
     motors: Annotated[
-        str | None,
-        Option(
-            help="Joints in the order of the motors, with commas: a deploy.yaml only numbers them."
-        ),
+        str | None, Option(help="Joints in the order of a deploy.yaml's motors, with commas.")
     ] = None,
     feet: Annotated[
         str | None, Option(help="Links that touch the ground, with commas; the lowest by default.")
     ] = None,
-    hands: Annotated[
-        str | None,
-        Option(help="Links that arms end in, with commas; of four joints or more by default."),
-    ] = None,
+    hands: Annotated[str | None, Option(help="Links that arms end in, with commas.")] = None,
     out: Annotated[Path | None, Option(help="Folder to write; NAME by default.")] = None,
 ) -> None:
     """Write the folder of a robot and a first scenario from a URDF or an MJCF, for review.
@@ -73,10 +63,7 @@ def new(
     Values that the file does not have are marked ASK in the files, with their units.
     """
     if (task == "walking") != (policy is not None):
-        raise ValueError(
-            f"new: --policy is that of --task walking, and of no other; got task '{task}' and "
-            f"policy {policy}"
-        )
+        raise ValueError(f"new: --policy is that of --task walking; got '{task}' and {policy}")
     # Before anything is written.
     template = None if policy is None else survey_policy(policy, _names(motors), console.say)
     moved = () if template is None else template.joints or None
@@ -122,9 +109,7 @@ def check(
     import_: Annotated[
         bool,
         Option(
-            "--import/--no-import",
-            help="Import the scenario's task, which runs its code. Without, only its files are "
-            "checked: for a scenario from a stranger.",
+            "--import/--no-import", help="Import the scenario's task, which runs a stranger's code."
         ),
     ] = True,
 ) -> None:

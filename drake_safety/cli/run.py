@@ -70,9 +70,8 @@ def run(
     push: Annotated[
         list[str] | None,
         Option(
-            help="With a target: the name of a push in the scenario. Otherwise: 'ball' for the "
-            "scenario's balls, or a ball, repeatable: 'time=1 mass=3 speed=9 direction=90' "
-            "[s, kg, m/s, degrees from x]."
+            help="With a target: a push of the scenario. Otherwise, repeatable: 'ball' for the "
+            "scenario's balls, or 'time=1 mass=3 speed=9 direction=90' [s, kg, m/s, degrees]."
         ),
     ] = None,
     variation: console.VariationOption = "nominal",
@@ -85,10 +84,7 @@ def run(
     mode: console.ModeOption = MODES[0],
     out: Annotated[
         Path | None,
-        Option(
-            help="Folder of run/: recording, figures, events; by default ASSESSMENT, or else "
-            "runs/SCENARIO-shipped."
-        ),
+        Option(help="Folder of run/: recording, figures, events; ASSESSMENT by default."),
     ] = None,
 ) -> None:
     """Simulate once with Γ in the loop; write a recording, a timeline and the events.

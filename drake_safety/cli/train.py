@@ -36,16 +36,15 @@ def train(
     motion: Annotated[
         float | None,
         Option(
-            help="Minutes of undisturbed motion, half for the monitor's limits; by default 6 s an "
-            "episode, 48 at most.",
+            help="Minutes of undisturbed motion for the monitor; by default 6 s an episode, up to "
+            "48.",
             min=0.0,
         ),
     ] = None,
     falls: Annotated[
         int | None,
         Option(
-            help="Episodes that the probability of a fall is fitted to; 0 for none. A quarter of "
-            "the others by default, where the robot can fall.",
+            help="Episodes for the probability of a fall; a quarter of the others by default.",
             min=0,
         ),
     ] = None,
