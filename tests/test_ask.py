@@ -13,7 +13,7 @@ import pytest
 import command_line
 from drake_safety.cli import join_targets
 from drake_safety.cli.ask import parse_target
-from drake_safety.cli.run import alarm_times, named_push
+from drake_safety.cli.run import alarm_times
 from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
@@ -146,7 +146,7 @@ def test_without_a_training_the_shipped_assessment_answers_and_is_named(call, as
     assert answer == ask("--target", *NEAR)[1].splitlines()
     code, printed = call("ask", "talos_reaching", "--target", *NEAR)
     assert code == 2
-    assert f"which has those of ['{SCENARIO}']: `drake-safety train` learns one" in printed
+    assert f"only of ['{SCENARIO}']: pass --assessment" in printed
 
 
 def test_an_answer_takes_none_of_the_packages_that_training_takes(folder):
@@ -172,7 +172,7 @@ def test_for_a_task_without_targets_the_answer_is_the_command_to_use_instead(cal
     code, printed = call("ask", "laikago_balancing", "--target", "1", "0", "0")
     assert code == 2
     assert "task 'Balancing' has no targets or commands to ask about" in printed
-    assert "`drake-safety run laikago_balancing`" in printed and "--push ball" in printed
+    assert "`drake-safety run laikago_balancing`" in printed
 
 
 def test_a_named_target_is_the_point_of_that_name(loop):
@@ -199,9 +199,7 @@ def test_what_does_not_exist_is_answered_with_what_does(call, folder, arguments,
     ("arguments", "message"),
     [
         ([], "needs a target: pass --target x y z, or one of the names ['blue_box', 'red_can']"),
-        (["--push", "torso"], "needs a target"),
-        (["--target", "blue_box", "--push", "ball"], "takes one push"),
-        (["--target", "blue_box", "--push", "torso", "--push", "torso"], "takes one push"),
+        (["--target", "blue_box", "--push", "ball"], "--push: expected one of ['torso']"),
         (["--target", "blue_box", "--no-recovery"], "no options ['recovery']; it has ['hand', 'ex"),
     ],
 )
@@ -259,13 +257,6 @@ def test_a_run_that_is_forced_leaves_recording_and_timeline(call, folder, nothin
 )
 def test_the_numbers_of_a_target_become_one_word(words, joined):
     assert join_targets(words) == joined
-
-
-def test_a_push_is_one_that_the_scenario_names(loop):
-    assert named_push(loop, []) is None
-    assert named_push(loop, ["torso"]) is loop.pushes["torso"]
-    with pytest.raises(ValueError, match=r"one of \['torso'\]; got \['head'\]"):
-        named_push(loop, ["head"])
 
 
 @pytest.mark.parametrize(

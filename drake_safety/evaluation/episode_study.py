@@ -85,10 +85,7 @@ def _first_segments(episodes: Episodes) -> Segments:
 
 
 def promised_miss_rate(is_unsafe: np.ndarray) -> float:
-    """Miss rate that thresholds promise if chosen on plans with these labels, (N,).
-
-    It is higher than wanted with few unsafe plans.
-    """
+    """Miss rate that thresholds chosen on plans with these labels, (N,), can promise."""
     num_unsafe, wanted = int(is_unsafe.sum()), 1.0 - PROMISED_UNSAFE_RECALL
     if num_unsafe == 0:
         raise ValueError(

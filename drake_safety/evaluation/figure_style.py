@@ -1,8 +1,4 @@
-"""Common style of all figures: colours distinct for colour-blind readers, fonts, and saving.
-
-Blue is safe, vermilion unsafe, grey unknown. Figures have no window, and the global settings of
-matplotlib are not changed.
-"""
+"""Common style of all figures: colours distinct for colour-blind readers, fonts, and saving."""
 
 from __future__ import annotations
 
@@ -103,10 +99,7 @@ def draw_threshold(axes: Axes, threshold: float, colour: str) -> None:
 
 
 def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:
-    """Writes a figure as PNG, at twice the usual resolution, and as SVG; returns both paths.
-
-    The suffix of the path is replaced.
-    """
+    """Writes a figure as PNG and as SVG, whatever the path's suffix; returns both paths."""
     paths = [Path(path).with_suffix(suffix) for suffix in (".png", ".svg")]
     for one in paths:
         # Without the date, equal figures are equal files.

@@ -91,9 +91,8 @@ def compare_loops(
         assessment: Γ of the baseline's scenario, which says whether a change was foreseen.
         each_look: Called with what is known at each look.
     """
-    if not (0.0 < worse_by < 1.0 and 0.0 < alpha < 1.0 and max_pairs > 0):
-        got = f"{worse_by}, {alpha} and {max_pairs}"
-        raise ValueError(f"worse_by and alpha must be in (0, 1), max_pairs at least 1; got {got}")
+    if not (0.0 < worse_by < 1.0 and 0.0 < alpha < 1.0):
+        raise ValueError(f"worse_by and alpha must be in (0, 1); got {worse_by} and {alpha}")
     first, second = (
         ComparedPlant(one) if isinstance(one, Scenario) else one for one in (baseline, candidate)
     )
@@ -158,25 +157,22 @@ def check_pair(
     if hashes[0] == hashes[1]:
         name, variation = pair[0].scenario.name, pair[0].variation
         raise ValueError(
-            f"the candidate is the baseline: scenario '{name}', variation '{variation}', with hash "
-            f"{hashes[0][:12]}"
+            f"the candidate is the baseline: scenario '{name}', variation '{variation}'"
         )
     starts = []
     for side, who in enumerate(("baseline", "candidate")):
         loop = make_paired(pair, side)
         OutcomeReader(loop, metric)
+
+        def after_one_step(context: Context, loop: ClosedLoop = loop) -> EventStatus:
+            is_over = context.get_time() > 0.0
+            return EventStatus.ReachedTermination(loop, "") if is_over else EventStatus.DidNothing()
+
         try:
-            starts.append(
-                _run_with_start(loop, 0, seed=seed, monitor=partial(_after_one_step, loop))[1]
-            )
+            starts.append(_run_with_start(loop, 0, seed=seed, monitor=after_one_step)[1])
         except EpisodeError as error:
             raise ValueError(f"the {who}: {error}") from error
     _check_alike(0, loop, *starts)
-
-
-def _after_one_step(loop: ClosedLoop, context: Context) -> EventStatus:
-    is_over = context.get_time() > 0.0
-    return EventStatus.ReachedTermination(loop, "") if is_over else EventStatus.DidNothing()
 
 
 def _verdict(

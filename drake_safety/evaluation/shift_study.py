@@ -1,11 +1,9 @@
 """Γ and its monitor under shifts: "don't know", rows sure and wrong, alarms.
 
-A row is sure and wrong (a confident error) where it is called safe with at least 0.9, with a belief
-that is not "don't know", in a motion that ends unsafely. Figures with monitor are of undisturbed
-motions that follow each other: when one leaves the safe set, the robot begins anew and the charts
-go on, as on a robot that is put on its feet. There a row counts if the motion leaves the safe set
-within an episode's duration, and rows during an alarm are "don't know", as with
-``on_alarm: unknown``.
+A row is sure and wrong (a confident error) where it is called safe with at least 0.9 in a motion
+that ends unsafely. Figures with monitor are of undisturbed motions that follow each other, as on a
+robot that is put on its feet. There a row counts if the motion leaves the safe set within an
+episode's duration, and rows during an alarm are "don't know".
 """
 
 from __future__ import annotations

@@ -73,10 +73,7 @@ _KINDS: dict[str, Kind] = {
 def verdict_table(
     results: Results, set: str, *, corner: str = "method", kind: Kind | None = None
 ) -> Table:
-    """The table of a judged set: a row for each method, with the columns of its kind.
-
-    A method without the second column, such as a difference of two methods, has no row.
-    """
+    """The table of a judged set: a row for each method that has the second column of its kind."""
     title, meaning, columns = kind or _KINDS[set]
     methods = [key[1] for key in results if (key[0], key[2]) == (set, columns[1].key) and key[1]]
     if methods and (first := results.get((set, methods[0], "auc"))):
