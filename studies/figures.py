@@ -32,7 +32,7 @@ _REACHING: dict[str, Any] = {"target": "blue_box", "push": ["torso"], "force": T
 _WALKING: dict[str, Any] = {"target": "0.5 0 0", "push": ["side"], "force": True}
 _WALKING |= {"variation": "nominal"}  # On another one the monitor may alarm before the push.
 _ELSEWHERE = (
-    "adaptation.png and region.png, of commit f358026; compose.svg, which "
+    "adaptation.png and region.png, of commit f358026; path.png, of b310981; compose.svg, which "
     "`python docs/generator/diagram_picture.py` draws by GraphViz; alarms_*.png of "
     "`python -m studies walking`"
 )
@@ -75,7 +75,6 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
     "recovery": recovery,
     "walking": walking,
     "timeline": partial(_of_run, "timeline.png", "laikago_balancing", push=["ball"]),
-    "path": partial(_of_run, "path.png", "laikago_balancing", push=["ball"], mode="paper"),
     "reaching": partial(_of_run, "timeline.png", "atlas_reaching", **_REACHING),
     "walking_timeline": partial(_of_run, "timeline.png", "g1_walking", **_WALKING),
     "embedding": _embedding,

@@ -179,6 +179,7 @@ def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypat
         *PICTURES,
         "adaptation",
         "region",
+        "path",
         "compose",
         "alarms_go2_walking",
         "alarms_g1_walking",

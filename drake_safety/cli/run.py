@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -21,7 +20,6 @@ from drake_safety.cli.ask import judge_target, parse_target, print_verdict
 from drake_safety.cli.training_folder import MODES
 from drake_safety.diagrams.balancing.throws import HasBall, run_throw
 from drake_safety.evaluation.figure_style import save
-from drake_safety.evaluation.path_figure import path_figure
 from drake_safety.evaluation.stills import render_stills, stack_positions, still_times
 from drake_safety.evaluation.timeline_figure import timeline_figure
 from drake_safety.files.atomic import write_file
@@ -138,7 +136,6 @@ class _Shown(NamedTuple):
     Attributes:
         threshold_text: The threshold in words.
         timeline: Further arguments of the timeline.
-        marked: Times marked on the path in the map, by name [s]; without them there is no figure.
     """
 
     motion: Motion
@@ -146,7 +143,6 @@ class _Shown(NamedTuple):
     threshold: float
     threshold_text: str
     timeline: dict[str, Any]
-    marked: Mapping[str, float] | None = None
 
 
 def _go(
@@ -183,7 +179,7 @@ def _go(
 
 def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
     """Throws balls at a robot in undisturbed motion."""
-    ports = (*_logged_ports(loop), "embedding", "ball_state")
+    ports = (*_logged_ports(loop), "ball_state")
     motion = run_throw(loop, 0, throws=throws, ports=ports, **options)
     threshold = loop.scenario.parameters.recovery.threshold
     triggers = [start_s for start_s, _ in motion.recovery_intervals_s]
@@ -193,11 +189,9 @@ def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
         events.append((throw.time_s, f"ball of {throw.mass_kg:g} kg at {flight}"))
     events += reason_events(loop, motion, triggers, threshold, "recovery triggered: ")
     events += _end(motion, "standing")
-    marked = {"start": 0.0} | {f"ball {i}": one.time_s for i, one in enumerate(throws, start=1)}
-    marked |= {f"recovery {i}": start_s for i, start_s in enumerate(triggers, start=1)}
     text = f"recovery where the probability is below {threshold:g}, that of the scenario"
     timeline = {"throws": throws, "trigger_times_s": triggers, "trigger_label": "trigger"}
-    return _Shown(motion, events, threshold, text, timeline, marked)
+    return _Shown(motion, events, threshold, text, timeline)
 
 
 def _move(
@@ -331,14 +325,8 @@ def _save(folder: Path, viewer: Meshcat, loop: Any, shown: _Shown) -> None:
     console.show(console.new_table(*_COLUMNS, rows=rows))
     console.say("threshold", shown.threshold_text)
     console.say("recording", recording)
-    figures = {"timeline": _timeline(loop, shown)}
-    if shown.marked is not None:
-        unknown = is_unknown(motion["belief"], loop.assessment.parameters.initial_uncertainty)
-        curve = motion.time_s, motion["embedding"], ~unknown, motion["safety_probability"][:, 0]
-        figures["path"] = path_figure(loop.assessment, *curve, shown.threshold, shown.marked)
-    for name, figure in figures.items():
-        for path in save(figure, folder / name):
-            console.say("picture  ", path)
+    for path in save(_timeline(loop, shown), folder / "timeline"):
+        console.say("picture  ", path)
 
 
 def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
