@@ -244,7 +244,7 @@ def test_a_run_that_is_forced_leaves_recording_and_timeline(call, folder, nothin
     assert code == 0
     written = {path.name for path in (folder / "run").iterdir()}
     assert written == {"recording.html", "run.json", "timeline.png", "timeline.svg"}
-    assert "standing, inside the safe set throughout" in printed
+    assert ", inside the safe set throughout" in printed
 
 
 @pytest.mark.parametrize(

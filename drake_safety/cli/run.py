@@ -44,11 +44,6 @@ _AFTER_EPISODE_S = 1.0  # Beyond an episode, to show whether the robot stays at 
 _AFTER_LEAVING_S = 0.5  # Time for which a motion without a goal goes on outside the safe set.
 _AFTER_EVENT_S = 0.15  # Time of a still: when the effect of a push or a trigger is visible.
 _NUM_STILLS, _MOST_EVENTS = 3, 5  # Stills besides those of events, and of events at most.
-_HAPPENING = {
-    "guard_active": "the guard passes on another command",
-    "recovery_active": "recovery triggered",
-}
-"""Ports that a loop may have, and what it means when they become 1."""
 _GAMMA = ("safety_probability", "belief", "cause_probability", "predicted_margins")
 _WITHOUT_ALARM = ("probability_without_alarm", "belief_without_alarm")  # What recovery heeds.
 _COLUMNS = ("time [s]", "event", "probability")  # Of events.
@@ -131,12 +126,7 @@ _Events = list[tuple[float, str]]  # Times [s] and words.
 
 
 class _Shown(NamedTuple):
-    """What is shown of a motion.
-
-    Attributes:
-        threshold_text: The threshold in words.
-        timeline: Further arguments of the timeline.
-    """
+    """What is shown of a motion: its threshold also in words, and more arguments of a timeline."""
 
     motion: Motion
     events: _Events
@@ -156,24 +146,19 @@ def _go(
     threshold, origin = rule.threshold, "that of the verdict"
     if promise is not None:
         threshold, origin = promise.threshold, promise.origin
-    alarms_s = alarm_times(motion, threshold)
-    timeline: dict[str, Any] = {"trigger_times_s": alarms_s}
     events: _Events = [(0.0, f"{words.subject} starts")]
-    for port, happens in _HAPPENING.items():
-        for start_s, _ in motion.intervals_s(port)[:1]:
-            events.append((start_s, happens))
     if push is not None:
-        timeline["pushes"] = [push]
         strength = f"{push.force_n} N for {push.duration_s:g} s"
         events.append((push.time_s, f"{push.body} is pushed with {strength}"))
-    place = "" if motion.has_left else ", inside the safe set throughout"
     if words.is_point:
-        end = f"standing{place}; {words.distance(output[-1] - goal)} from the {words.goal}"
+        end = f"standing, {words.distance(output[-1] - goal)} from the {words.goal}"
     else:
         reached = np.round(output[len(output) // 2 :].mean(axis=0), 2)
-        end = f"on its feet{place}; mean of the second half {words.value(reached)}"
-    events += _outcome(loop, motion, alarms_s, threshold) + _end(motion, end)
+        end = f"on its feet; mean of the second half {words.value(reached)}"
+    alarms_s = alarm_times(motion, threshold)
+    events = _all_events(loop, motion, events, end, alarms_s, threshold)
     text = f"alarm where the probability is below {threshold:.3f} in any row, {origin}"
+    timeline = {"trigger_times_s": alarms_s, "pushes": [] if push is None else [push]}
     return _Shown(motion, events, threshold, text, timeline)
 
 
@@ -182,14 +167,13 @@ def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
     ports = (*_logged_ports(loop), "ball_state")
     motion = run_throw(loop, 0, throws=throws, ports=ports, **options)
     threshold = loop.scenario.parameters.recovery.threshold
-    triggers = [start_s for start_s, _ in motion.recovery_intervals_s]
     events: _Events = []
     for throw in throws:
         flight = f"{throw.speed_m_s:g} m/s towards {np.degrees(throw.direction_rad):.0f}°"
         events.append((throw.time_s, f"ball of {throw.mass_kg:g} kg at {flight}"))
-    events += reason_events(loop, motion, triggers, threshold, "recovery triggered: ")
-    events += _end(motion, "standing")
+    events = _all_events(loop, motion, events, "standing", [], threshold)
     text = f"recovery where the probability is below {threshold:g}, that of the scenario"
+    triggers = [start_s for start_s, _ in motion.recovery_intervals_s]
     timeline = {"throws": throws, "trigger_times_s": triggers, "trigger_label": "trigger"}
     return _Shown(motion, events, threshold, text, timeline)
 
@@ -209,11 +193,9 @@ def _move(
     )
     is_below = ~(motion["safety_probability"][:, 0] >= rule.threshold)
     alarms_s = motion.time_s[is_below][:1].tolist()
-    end = "the end" if motion.has_left else "the end, inside the safe set throughout"
-    if motion.failure:
-        end = f"the simulation failed: {motion.failure}"
-    outcome = _outcome(loop, motion, alarms_s, rule.threshold)
-    events = [(0.0, "the episode starts"), *outcome, (float(motion.time_s[-1]), end)]
+    end = f"the simulation failed: {motion.failure}" if motion.failure else "the end"
+    begin = [(0.0, "the episode starts")]
+    events = _all_events(loop, motion, begin, end, alarms_s, rule.threshold)
     text = f"{rule.threshold:.3g}, {rule.origin}"
     return _Shown(motion, events, rule.threshold, text, {"trigger_times_s": alarms_s})
 
@@ -225,16 +207,23 @@ def alarm_times(motion: Motion, threshold: float) -> list[float]:
     return [time_s for time_s in times_s if time_s > motion.time_s[0]]
 
 
-def _outcome(loop: Any, motion: Motion, alarms_s: list[float], threshold: float) -> _Events:
-    """The alarms of a motion, and where it leaves the safe set."""
-    left = [(motion.leave_time_s, f"left the safe set: {motion.cause}")] if motion.has_left else []
-    return reason_events(loop, motion, alarms_s, threshold) + left
-
-
-def _end(motion: Motion, standing: str) -> _Events:
-    """The fall of a robot, or how it stands at the end."""
+def _all_events(
+    loop: Any, motion: Motion, events: _Events, end: str, alarms_s: list[float], threshold: float
+) -> _Events:
+    """Events, and recoveries, the guard, alarms, where it leaves the safe set, and the end."""
+    if recoveries := motion.recovery_intervals_s:
+        starts, limit = [start for start, _ in recoveries], loop.scenario.parameters.recovery
+        words = "recovery triggered: "
+        events = events + reason_events(loop, motion, starts, limit.threshold, words)
+    for start_s, _ in motion.intervals_s("guard_active")[:1]:
+        events = [*events, (start_s, "the guard passes on another command")]
+    events = events + reason_events(loop, motion, alarms_s, threshold)
+    if motion.has_left:
+        events = [*events, (motion.leave_time_s, f"left the safe set: {motion.cause}")]
+    else:
+        end += ", inside the safe set throughout"
     fall = (motion.fall_time_s, "the robot fell")
-    return [fall if motion.has_fallen else (float(motion.time_s[-1]), standing)]
+    return [*events, fall if motion.has_fallen else (float(motion.time_s[-1]), end)]
 
 
 def reason_events(
@@ -264,8 +253,8 @@ def reason_events(
 
 
 def _logged_ports(loop: ClosedLoop) -> tuple[str, ...]:
-    """The ports of Γ and, if the loop has them, of the monitor and of what happens."""
-    some = filter(loop.HasOutputPort, ("alarm", "alarm_cause", *_HAPPENING))
+    """The ports of Γ and, if the loop has them, of the monitor, the guard and recovery."""
+    some = filter(loop.HasOutputPort, ("alarm", "alarm_cause", "guard_active", "recovery_active"))
     return (*_GAMMA, *_WITHOUT_ALARM, *some)
 
 
@@ -276,7 +265,7 @@ def _timeline(loop: Any, shown: _Shown) -> Figure:
         states = {loop.robot.name: motion["plant_state"]}
         if "ball_state" in motion.ports:
             states["ball"] = motion["ball_state"]
-        instants = sorted(at_s + _AFTER_EVENT_S for at_s, _ in shown.events)[1 : 1 + _MOST_EVENTS]
+        instants = sorted(at_s + _AFTER_EVENT_S for at_s, _ in shown.events if at_s)[:_MOST_EVENTS]
         times_s = still_times(motion.time_s, instants, num_stills=_NUM_STILLS)
         positions = stack_positions(loop, states)
         options["stills"] = render_stills(loop, motion.time_s, positions, times_s)

@@ -114,8 +114,8 @@ class LogPieces:
         num_more = len(self.cuts) - _MOST_CUTS
         more = [f"... and {num_more} more"] if num_more > 0 else []
         head = (
-            f"log '{self.pieces[0].path}': {100 * self.kept_share:.1f} % of {self.duration_s:.1f} s "
-            f"are kept, in {len(self.pieces)} pieces"
+            f"log '{self.pieces[0].path}': {100 * self.kept_share:.1f} % of {self.duration_s:.1f} s"
+            f" are kept, in {len(self.pieces)} pieces"
         )
         return "\n".join([head, *self.cuts[:_MOST_CUTS], *more])
 
