@@ -1,8 +1,6 @@
 """CPU time, wall time and memory, measured so that they can be compared."""
 
 import multiprocessing
-import resource
-import sys
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
@@ -50,10 +48,8 @@ def in_fresh_process(function: Callable[..., Any], *arguments: Any) -> Any:
 
 def peak_memory_gb() -> float:
     """Peak memory of this process."""
-    status = Path("/proc/self/status")
-    if status.is_file():
-        # getrusage would count the parent's memory at the time of the fork.
-        fields = dict(line.split(":", 1) for line in status.read_text().splitlines())
-        return int(fields["VmHWM"].split()[0]) / 1024**2
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1024**3
+    # getrusage would count the parent's memory at the time of the fork.
+    status = Path("/proc/self/status").read_text()
+    return (
+        int(dict(line.split(":", 1) for line in status.splitlines())["VmHWM"].split()[0]) / 1024**2
+    )

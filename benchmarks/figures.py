@@ -30,17 +30,11 @@ PACKAGES = (
 
 @dataclass(kw_only=True)
 class Figure:
-    """A measured value with its limit and the values of peers.
+    """A measured value with its limits and the values of peers in the same run.
 
     Attributes:
-        name: What was measured, then in what: a scenario, a robot, a size.
-        value: Of this library.
         unit: Of the value; "x" for a ratio.
-        at_most: The largest value within the limit.
-        at_least: The smallest value within the limit.
-        peers: By name, what others need for the same, or what the value is made of; measured in
-            the same run. The first is the one that runs are compared by.
-        note: Sizes, and how it was measured.
+        peers: What others need, or what the value is made of; runs are compared by the first.
     """
 
     name: str

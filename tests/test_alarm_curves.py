@@ -59,15 +59,6 @@ def test_a_fall_is_announced_by_a_row_between_the_push_and_0_2_s_before_the_fall
     np.testing.assert_array_equal(found.share_costs("without_fall"), [0, 1, 1, math.inf])
 
 
-def test_a_motion_that_leaves_without_a_fall_counts_as_not_fallen():
-    falls = motion([1, 0.2, 1, 1, 1], push_s=0.1, leave_s=0.3, fall_s=0.4)
-    leaves = motion([1, 0.1, 1], push_s=0.1, leave_s=0.1)
-    found = watched([falls, leaves, motion([1, 0.3], push_s=0.1)])
-    assert announced(found, "without_leaving", 0.0) == 1.0
-    assert announced(found, "without_fall", 0.0) == 0.0
-    assert announced(found, "without_fall", 0.5) == 1.0
-
-
 @pytest.mark.parametrize("cost", COSTS)
 def test_at_every_share_the_highest_allowed_threshold_is_applied(cost):
     pushed = random_motions(np.random.default_rng(1))

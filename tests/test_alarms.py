@@ -6,7 +6,6 @@ import pytest
 from drake_safety.simulation.motion import Motion
 from studies.alarms import (
     Alarm,
-    equal_share_threshold,
     evaluate_alarms,
     first_alarm,
     lowest_value,
@@ -77,17 +76,6 @@ def test_an_alarm_of_two_rows_comes_a_row_later_and_ignores_a_single_one():
     # 3.6 s of each of three safe motions.
     key = "sharpened.false_alarms_per_hour"
     assert [found[key] * 3 * 3.6 / 3600 for found in (one, two)] == pytest.approx([2, 1])
-
-
-def test_thresholds_give_all_methods_the_same_rate_of_false_alarms():
-    lowest = np.array([lowest_value(motion, motion["state"][:, 0]) for motion in CALM])
-    for share, count in ((0.0, 0), (0.05, 1), (0.25, 5), (0.26, 5)):
-        threshold = equal_share_threshold(lowest, share)
-        assert (lowest < threshold).sum() == count < (lowest < threshold + 0.011).sum()
-        found = evaluate_alarms([SEEN], CALM, TEST, num_rows=1, false_alarm_share=share)
-        assert found["monitoring", "sharpened", "threshold"].value == threshold
-    with pytest.raises(ValueError, match="no calibration motion stays in the safe set"):
-        equal_share_threshold(np.array([]), 0.1)
 
 
 def test_an_unknown_row_is_an_alarm():

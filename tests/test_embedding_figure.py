@@ -52,22 +52,3 @@ def test_the_map_shows_every_segment_at_its_point_and_every_count(assessment, fr
     points = assessment.training_.points[0]
     inside = np.abs(points).max(axis=1) < assessment.grid_.half_width
     assert sum(int(count) for count in [text.get_text() for text in middle.texts]) == inside.sum()
-
-
-def test_empty_cells_are_hatched_the_others_show_their_belief_and_causes_are_named(
-    assessment, fresh, monkeypatch
-):
-    monkeypatch.setattr("drake_safety.evaluation.embedding_figure._LEAST_CAUSE", 0.0)
-    _, middle, right, *_ = embedding_figure(assessment, fresh).axes
-    legend = right.get_legend().get_texts()
-    assert [text.get_text() for text in legend] == ["support", "height"]
-    hollow, filled = middle.collections[:2]
-    is_empty = assessment.beliefs_[0, :, 2] == 1.0
-    assert 0 < is_empty.sum() < 36
-    assert len(hollow.get_paths()) == is_empty.sum()
-    assert hollow.get_hatch()
-    # Bluer where safer: the blue share grows with the belief.
-    colours = filled.get_facecolor()
-    safe = assessment.beliefs_[0, ~is_empty, 0]
-    assert colours[np.argmax(safe), 2] > colours[np.argmax(safe), 0]
-    assert colours[np.argmin(safe), 0] > colours[np.argmin(safe), 2]

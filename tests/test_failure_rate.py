@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from command_line import call
 from drake_safety import load_scenario, run_episodes
 from drake_safety.evaluation import failure_rate
 from drake_safety.evaluation.failure_rate import (
@@ -16,8 +15,6 @@ from drake_safety.evaluation.failure_rate import (
     stratified_rate,
 )
 from drake_safety.evaluation.metrics import proportion
-from drake_safety.evaluation.results import Results
-from shuttle_task import train_shuttle
 
 NUM_STARTS, NUM_ROLLOUTS, NUM_REPLAYS = 4000, 400, 200
 RANDOM = "random"
@@ -139,17 +136,3 @@ def test_an_estimate_is_that_of_ordinary_episodes_and_is_continued(monkeypatch, 
     assert found.rate.low <= len(failed) / 120 <= found.rate.high
     all_of_them = estimate_failure_rate(scenario, Angle(), **(options | {"num_rollouts": 120}))
     assert all_of_them.rate.value == pytest.approx(len(failed) / 120)
-
-
-@pytest.mark.train
-def test_the_command_prints_the_rate_and_the_failures(monkeypatch, capsys, tmp_path):
-    file = train_shuttle(tmp_path)
-    options = ("--assessment", tmp_path, "--starts", 60, "--episodes", 40, "--workers", 1)
-    assert call(monkeypatch, "rate", file, *options, "--out", tmp_path / "out") == 0
-    printed = capsys.readouterr().out
-    results = Results.read(tmp_path / "out/rate.json")
-    rate, entries = results["", "", "failure_rate"], results.entries
-    assert rate.n == 40
-    assert 0.0 < rate.low < rate.value < rate.high < 1.0
-    assert f"{100 * rate.value:.2f} % (" in printed
-    assert len(entries["failures"]) > 0

@@ -232,17 +232,6 @@ def test_keys_change_the_command_within_the_range_of_training(commands):
 
 
 @train
-def test_without_the_guard_what_is_asked_is_passed_on(commands):
-    ticks(commands, live.GUARD)
-    assert not commands.is_guarded
-    ticks(commands, "Faster", num=4)
-    np.testing.assert_allclose(value_of(commands, "desired_output"), commands.command)
-    assert value_of(commands, "guard_active")[0] == 0.0
-    ticks(commands, live.GUARD)
-    assert commands.is_guarded
-
-
-@train
 def test_a_push_moves_the_robot(commands):
     ticks(commands, num=3)
     before = value_of(commands, "output")
@@ -283,21 +272,6 @@ def test_an_alarm_of_the_monitor_is_shown_with_its_cause(cart):
     cause = cart.loop.GetOutputPort("alarm_cause").Eval(cart.context)
     assert cause
     assert cart.panel.status.note == f"monitor: {cause}"
-
-
-@train
-def test_starts_are_those_of_the_seed_and_a_click_begins_the_next(cart_loop, meshcat):
-    starts = []
-    for _ in range(2):
-        session = LiveSession(cart_loop, meshcat, threshold=0.5, seed=3)
-        starts.append(value_of(session, "state"))
-        ticks(session, num=10)
-        ticks(session, START)
-        assert session.context.get_time() == pytest.approx(TICK_S)
-        starts.append(value_of(session, "state"))
-    np.testing.assert_array_equal(starts[:2], starts[2:])
-    assert np.abs(starts[0] - starts[1]).max() > 0.1
-    assert session.panel.buttons == {STOP: "Escape", START: "KeyR"}
 
 
 @train

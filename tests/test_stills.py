@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.stills import StillCamera, render_stills, stack_positions, still_times
+from drake_safety.evaluation.stills import StillCamera, render_stills, stack_positions
 from drake_safety.simulation.scenario import load_scenario
 
 SIZE = {"width": 96, "height": 72}
@@ -59,15 +59,6 @@ def test_a_robot_that_fell_is_in_the_picture(loop, standing):
         is_dark = image.max(axis=-1) < 90
         assert 0.01 < is_dark.mean()
         assert not is_dark[[0, -1]].any() and not is_dark[:, [0, -1]].any()
-
-
-def test_stills_are_spread_evenly_and_give_way_to_events():
-    time_s = 0.02 * np.arange(201)
-    np.testing.assert_allclose(still_times(time_s, num_stills=5), [0, 1, 2, 3, 4])
-    times = still_times(time_s, [1.215, 1.3, 3.9], num_stills=5)
-    np.testing.assert_allclose(times, [0.0, 1.22, 1.3, 2.0, 3.0, 3.9], atol=0.011)
-    assert set(times) <= set(time_s)
-    assert still_times(time_s) == [0.0, 4.0]
 
 
 def test_logged_states_of_robot_and_ball_make_up_the_plants_positions(loop):

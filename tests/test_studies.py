@@ -4,9 +4,7 @@ import itertools
 import math
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +19,7 @@ from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import load_scenario
 from shuttle_task import train_shuttle
 from studies.figures import PICTURES
-from studies.moving_pictures import Take, first_saved, save_moving_picture
+from studies.moving_pictures import Take, save_moving_picture
 from studies.publish import DOCUMENTS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -143,30 +141,6 @@ def test_a_moving_picture_stops_where_something_happens(standing_twice, tmp_path
     # The arrow is there while it is pushed.
     orange = [np.abs(one - [232, 115, 12]).max(axis=-1) < 25 for one in frames]
     assert orange[stop].sum() > 100 > orange[0].sum()
-
-
-def test_the_picture_shows_the_first_disturbance_that_only_recovery_survives(standing_twice):
-    loop, motion = standing_twice
-    scenario, active = loop.scenario, np.zeros((26, 1))
-    active[10:20] = 1.0
-    lying = np.full((26, 3), -1.0)
-
-    guarded = SimpleNamespace(scenario=scenario, assessment=SimpleNamespace())
-    guarded.assessment.parameters = SimpleNamespace(initial_uncertainty=0.3)
-
-    def run(one, strength, logged):
-        falls = strength > (2 if one is guarded else 1)
-        ports = motion.ports | {"recovery_active": active, "margins": lying if falls else -lying}
-        return replace(motion, ports=ports, fall_time_s=0.3 if falls else math.inf)
-
-    strength, takes = first_saved([loop, guarded], [3, 1, 2], run, "steps")
-    assert strength == 2
-    assert [one.motion.has_fallen for one in takes] == [True, False]
-    words = [told for _, told in takes[1].captions]
-    threshold = scenario.parameters.recovery.threshold
-    assert words == [f"probability below {threshold:g}: recovery", "steps", "stands"]
-    with pytest.raises(ValueError, match="no disturbance of 'laikago_balancing'"):
-        first_saved([loop, guarded], [3, 1], run, "steps")
 
 
 def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypatch, tmp_path):
