@@ -53,3 +53,9 @@ def peak_memory_gb() -> float:
     return (
         int(dict(line.split(":", 1) for line in status.splitlines())["VmHWM"].split()[0]) / 1024**2
     )
+
+
+def test_a_fingerprint_is_of_all_that_determines_a_result():
+    one, other = AssessmentParameters(), AssessmentParameters(min_count=7)
+    assert fingerprint(one, 3) == fingerprint(AssessmentParameters(), 3)
+    assert len({fingerprint(one, 3), fingerprint(other, 3), fingerprint(one, 4)}) == 3

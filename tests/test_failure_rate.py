@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from command_line import call
 from drake_safety import load_scenario, run_episodes
 from drake_safety.evaluation import failure_rate
 from drake_safety.evaluation.failure_rate import (
@@ -15,6 +16,8 @@ from drake_safety.evaluation.failure_rate import (
     stratified_rate,
 )
 from drake_safety.evaluation.metrics import proportion
+from drake_safety.evaluation.results import Results
+from shuttle_task import train_shuttle
 
 NUM_STARTS, NUM_ROLLOUTS, NUM_REPLAYS = 4000, 400, 200
 RANDOM = "random"
@@ -136,3 +139,14 @@ def test_an_estimate_is_that_of_ordinary_episodes_and_is_continued(monkeypatch, 
     assert found.rate.low <= len(failed) / 120 <= found.rate.high
     all_of_them = estimate_failure_rate(scenario, Angle(), **(options | {"num_rollouts": 120}))
     assert all_of_them.rate.value == pytest.approx(len(failed) / 120)
+
+
+@pytest.mark.train
+def test_the_command_writes_the_rate_and_the_failures(monkeypatch, tmp_path):
+    file = train_shuttle(tmp_path)
+    options = ("--assessment", tmp_path, "--starts", 60, "--episodes", 40, "--workers", 1)
+    assert call(monkeypatch, "rate", file, *options, "--out", tmp_path / "out") == 0
+    results = Results.read(tmp_path / "out/rate.json")
+    rate = results["", "", "failure_rate"]
+    assert rate.n == 40 and 0.0 < rate.low < rate.value < rate.high < 1.0
+    assert len(results.entries["failures"]) > 0
