@@ -49,13 +49,6 @@ def in_fresh_process(function: Callable[..., Any], *arguments: Any) -> Any:
 def peak_memory_gb() -> float:
     """Peak memory of this process."""
     # getrusage would count the parent's memory at the time of the fork.
-    status = Path("/proc/self/status").read_text()
-    return (
-        int(dict(line.split(":", 1) for line in status.splitlines())["VmHWM"].split()[0]) / 1024**2
-    )
-
-
-def test_a_fingerprint_is_of_all_that_determines_a_result():
-    one, other = AssessmentParameters(), AssessmentParameters(min_count=7)
-    assert fingerprint(one, 3) == fingerprint(AssessmentParameters(), 3)
-    assert len({fingerprint(one, 3), fingerprint(other, 3), fingerprint(one, 4)}) == 3
+    lines = Path("/proc/self/status").read_text().splitlines()
+    fields = dict(line.split(":", 1) for line in lines)
+    return int(fields["VmHWM"].split()[0]) / 1024**2

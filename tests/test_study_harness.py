@@ -3,8 +3,9 @@ import pytest
 
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
+from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.learning.seeds import RELEASE
-from studies.harness import kept, open_study
+from studies.harness import fingerprint, kept, open_study
 
 CALLS = []
 
@@ -66,3 +67,9 @@ def test_rows_are_written_printed_and_plotted(tmp_path, capsys):
     for words in ("0.500 (0.250–0.750)", "0.900 (0.800–1.000)", "fallen", "0.125 (0.000–0.500)"):
         assert words in printed
     assert {path.suffix for path in (tmp_path / "out").iterdir()} == {".json", ".png", ".svg"}
+
+
+def test_a_fingerprint_is_of_all_that_determines_a_result():
+    one, other = AssessmentParameters(), AssessmentParameters(min_count=7)
+    assert fingerprint(one, 3) == fingerprint(AssessmentParameters(), 3)
+    assert len({fingerprint(one, 3), fingerprint(other, 3), fingerprint(one, 4)}) == 3
