@@ -25,7 +25,6 @@ _PERIOD_S = 0.1  # Between updates of a page.
 _SCENE = "/scene"  # Path of the scene on the page's server.
 _FAREWELL_S = 1.0  # From the end of a session to that of its page, so that the page shows it.
 _WITHIN_S = 20.0  # For the server to start, and to stop.
-_NAMED = (b"host", b"origin")  # Headers: the server that is asked, and the page that asks.
 _Message = MutableMapping[str, Any]  # Of ASGI, the interface of servers and applications.
 _Application = Callable[[_Message, Any, Any], Awaitable[None]]
 _BELIEF = {"safe": "safe", "unsafe": "unsafe", "unknown": "don't know"}
@@ -79,7 +78,9 @@ def _only_own(application: _Application, host: str) -> _Application:
         known.add(socket.gethostname().lower())
 
     def is_own(headers: dict[bytes, bytes]) -> bool:
-        server, page = (headers.get(key, b"").decode("latin-1").lower() for key in _NAMED)
+        server, page = (
+            headers.get(key, b"").decode("latin-1").lower() for key in (b"host", b"origin")
+        )
         with contextlib.suppress(ValueError):
             name = urlsplit(f"//{server}").hostname or ""
             if name in known or (is_for_all and ip_address(name)):

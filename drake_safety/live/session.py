@@ -33,7 +33,6 @@ from drake_safety.simulation.capabilities import (
     FollowsCommands,
     HasGoals,
     goal_words,
-    require,
 )
 from drake_safety.simulation.closed_loop import ClosedLoop, require_ports
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -48,9 +47,7 @@ THROW, PUSH = "Throw", "Push"
 ASK, GO, FORCE = "Ask", "Go", "Go all the same"
 HALT, GUARD = "Halt", "Guard on/off"
 MASS, SPEED, DIRECTION = "mass [kg]", "speed [m/s]", "towards [deg]"
-"""Sliders of a ball."""
 AXES = ("x [m]", "y [m]", "z [m]")
-"""Sliders of a goal."""
 STEPS = (
     ("Faster", "ArrowUp", 0, 1),
     ("Slower", "ArrowDown", 0, -1),
@@ -67,7 +64,6 @@ _FLIGHT_S = 0.2  # From a ball's release to its impact, so that it is visible.
 _NUM_CANDIDATES = 24  # Per batch of the search: few, because the user waits for the answer.
 _SIZE_M = 1.0  # Of a plant without legs, for markers.
 _NUM_STEPS = 8  # Key presses from zero to the farthest command of training.
-_NUM_CHARACTERS = 160  # Of an error.
 _GOAL, _NEAREST = f"{WORLD}/target", f"{WORLD}/nearest_accepted"
 
 
@@ -117,7 +113,6 @@ class LiveSession:
         self._use: Literal["commands", "goals", "balls", "episodes"] = "episodes"
         if isinstance(loop, FollowsCommands):
             self._use = "commands"
-            require(loop, HasGoals, "live session")
             for name, key, entry, sign in STEPS:
                 self._add(name, key, partial(self._step, entry, sign))
             self._add(HALT, "KeyH", partial(self._set_command, np.zeros(3)))
@@ -240,7 +235,7 @@ class LiveSession:
         try:
             yield
         except RuntimeError as error:  # Of Drake's solvers, or a simulation that diverges.
-            note = textwrap.shorten(str(error), _NUM_CHARACTERS)
+            note = textwrap.shorten(str(error), 160)
             self.panel.status = Status("the simulation failed", note=note, tone="unsafe")
             self._num_waits = round(_SHOWN_S / BREAK_S)
             self._end_s = -math.inf
@@ -278,16 +273,13 @@ class LiveSession:
         return Status("unsafe", self._cause(), note, "unsafe")
 
     def _note(self) -> str:
-        """What was said last, the command, or what a key does."""
-        now_s, duration_s = self.context.get_time(), self.loop.scenario.episode_duration_s
-        note = "Space throws a ball" if self._use == "balls" else "R starts anew"
-        if now_s < self._said_until_s:
-            note = self._said
-        elif self._use == "commands":
-            note = goal_words(self.loop).value(self.command)
-        elif self._use == "episodes" and (self.cause or now_s >= duration_s):
-            note = "the next start follows"
-        return note if self.is_guarded else f"{note}; guard off"
+        """What was said last, or the command."""
+        if self.context.get_time() < self._said_until_s:
+            return self._said
+        if self._use != "commands":
+            return ""
+        command = goal_words(self.loop).value(self.command)
+        return command if self.is_guarded else f"{command}; guard off"
 
     def _say(self, note: str) -> None:
         self._said, self._said_until_s = note, self.context.get_time() + 3.0
