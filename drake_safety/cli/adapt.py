@@ -65,6 +65,8 @@ def adapt(
     logs = log or []
     if bool(logs) != (log_map is not None):
         raise ValueError("adapt: --log needs --map, and --map needs --log")
+    if len({path.resolve() for path in logs}) < len(logs):
+        raise ValueError("adapt: logs must differ, as each is judged by the others")
     name = logs[0].stem if logs else variation
     folder = out or folders.adapted_folder(learned.out, name)
     folders.check_writable(folder)
