@@ -26,24 +26,6 @@ def run():
     }
 
 
-def test_the_timeline_joins_each_still_to_its_instant_on_the_curve(run):
-    fig = timeline_figure(**run)
-    fig.draw_without_rendering()
-    stills, gamma = fig.axes[:2], fig.axes[2]
-    lines = [artist for artist in fig.artists if hasattr(artist, "coords2")]
-    assert len(lines) == 2
-    for line, axes, instant, value in zip(lines, stills, (0.5, 1.2), (0.9, 0.2), strict=True):
-        assert line.coords2 is gamma.transData
-        assert line.coords1 is axes.transAxes
-        np.testing.assert_allclose(line.xy2, (instant, gamma.get_ylim()[1]))
-        down = [
-            c.get_segments()[0] for c in gamma.collections if c.get_segments()[0][0, 0] == instant
-        ]
-        np.testing.assert_allclose(down, [[(instant, value), (instant, gamma.get_ylim()[1])]])
-    assert stills[0].get_title(loc="left") == "(a)  0.50 s"
-    assert [axes.images[0].get_array().max() for axes in stills] == [0, 255]
-
-
 @pytest.mark.parametrize("times_s", [(0.3, 1.9, 1.96)])
 def test_names_of_events_are_above_the_curve_and_cover_neither_another_nor_its_instant(
     run, times_s

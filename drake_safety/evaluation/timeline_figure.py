@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from string import ascii_lowercase
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import ConnectionPatch
 from matplotlib.patheffects import withStroke
 
 from drake_safety.evaluation import figure_style as style
@@ -25,7 +23,6 @@ _MAX_STILL_HEIGHT, _STILL_TITLE_HEIGHT, _AXIS_LABEL_HEIGHT = 2.6, 0.35, 0.6
 _LABEL_ROW_HEIGHT, _NUM_LABEL_ROWS = 0.2, 8  # Of names above the curve.
 _NUM_LEVELS, _MOST_POINTS = 4, 4000  # Curves of levels, and points of each.
 _Style = Mapping[str, Any]
-_THIN: _Style = {"color": style.FAINT_INK, "linewidth": 0.9}
 _LEGEND: _Style = {
     "loc": "center left",
     "bbox_to_anchor": (1.0, 0.5),
@@ -35,13 +32,11 @@ _LEGEND: _Style = {
 
 
 class _Event(NamedTuple):
-    """A named instant, with the style of its line, if it has one."""
+    """A named instant."""
 
     time_s: float
     words: str
     colour: str
-    line: _Style | None = None
-    is_ball: bool = False
 
 
 def timeline_figure(
@@ -66,23 +61,22 @@ def timeline_figure(
 
     Args:
         time_s: Instants [s], (N,).
-        stills: (time [s], RGB image (height, width, 3)), each joined to its instant on the curve.
+        stills: (time [s], RGB image (height, width, 3)), drawn above the curve.
         belief: Masses (safe, unsafe, unknown), (N, 3); drawn stacked below.
         margins: Signed margins [m, rad], (N, n_c); drawn at the bottom.
         angular_constraints: Constraints whose margins are angles.
     """
-    dotted, dashed = ({"linestyle": (0, dash), "linewidth": 1.2} for dash in ((1, 2), (4, 2)))
     unsafe = style.UNSAFE_COLOUR
     events = []
     for ball in throws:
         words = f"{ball.mass_kg:.1f} kg, {ball.speed_m_s:.1f} m/s"
-        events.append(_Event(ball.time_s, words, style.INK, dotted, is_ball=True))
+        events.append(_Event(ball.time_s, words, style.BALL_COLOUR))
     for push in pushes:
         words = f"push of {push.strength_n:.0f} N for {push.duration_s:g} s"
-        events.append(_Event(push.time_s, words, style.INK))
-    events += [_Event(at_s, trigger_label, unsafe, {"linewidth": 1.2}) for at_s in trigger_times_s]
+        events.append(_Event(push.time_s, words, style.BALL_COLOUR))
+    events += [_Event(at_s, trigger_label, unsafe) for at_s in trigger_times_s]
     if math.isfinite(leave_time_s):
-        events.append(_Event(leave_time_s, "leaves the safe set", style.INK, dashed))
+        events.append(_Event(leave_time_s, "leaves the safe set", style.INK))
     events += [_Event(s, "recovery", style.RECOVERY_COLOUR) for s, _ in recovery_intervals_s]
     events += [_Event(start, "monitor's alarm", unsafe) for start, _ in alarm_intervals_s]
     heights = [_CURVE_HEIGHT + _LABEL_ROW_HEIGHT * min(len(events), _NUM_LABEL_ROWS)]
@@ -99,24 +93,17 @@ def timeline_figure(
         if margins is not None:
             _draw_margins(others.pop(0), time_s, margins, constraint_names, angular_constraints)
         for panel in panels:
-            for push in pushes:
-                _span(panel, push.time_s, push.time_s + push.duration_s, style.BALL_COLOUR, 0.25)
             for event in events:
-                if event.line is not None:
-                    panel.axvline(event.time_s, color=event.colour, **event.line)
+                panel.axvline(event.time_s, color=event.colour, linewidth=0.9)
         for start, end in recovery_intervals_s:
             _span(curve_axes, start, end, style.RECOVERY_COLOUR)
         for start, end in alarm_intervals_s:
             _span(curve_axes, start, end, unsafe)
-        for at_s in trigger_times_s:
-            curve_axes.plot(at_s, threshold, "v", color=unsafe, markersize=8, zorder=5)
-        top = _write_names(curve_axes, events, (-0.02, 1.05))
-        for axes, letter, (at_s, image) in zip(pictures, ascii_lowercase, stills, strict=False):
+        _write_names(curve_axes, events, (-0.02, 1.05))
+        for axes, (at_s, image) in zip(pictures, stills, strict=True):
             axes.imshow(image, interpolation="antialiased")
             axes.set_axis_off()
-            axes.set_title(f"({letter})  {at_s:.2f} s", fontsize=10, pad=4)
-            row = max(int(np.searchsorted(time_s, at_s + 1e-9, side="right")) - 1, 0)
-            _join(fig, axes, curve_axes, (at_s, float(np.nan_to_num(probability[row]))), top)
+            axes.set_title(f"{at_s:.2f} s", fontsize=10, pad=4)
         panels[-1].set_xlabel("time [s]")
         curve_axes.figure.align_ylabels(panels)
     return fig
@@ -202,16 +189,14 @@ def _span(axes: Axes, start_s: float, end_s: float, colour: str, alpha: float = 
     axes.axvspan(start_s, end_s, color=colour, alpha=alpha, linewidth=0, zorder=0)
 
 
-def _write_names(axes: Axes, events: Sequence[_Event], ends: tuple[float, float]) -> float:
-    """Writes names in rows above an axis with these ends; returns the new upper end."""
+def _write_names(axes: Axes, events: Sequence[_Event], ends: tuple[float, float]) -> None:
+    """Writes names in rows above an axis with these ends."""
     row_height = (ends[1] - ends[0]) * _LABEL_ROW_HEIGHT / _CURVE_HEIGHT
     top = ends[1] + row_height * min(len(events), _NUM_LABEL_ROWS)
     axes.set_ylim(ends[0], top)
     for i, event in enumerate(events):
         is_left = event.time_s > np.mean(axes.get_xlim())
         place = (event.time_s, top - (i % _NUM_LABEL_ROWS + 0.5) * row_height)
-        if event.is_ball:
-            axes.plot(*place, "o", color=style.BALL_COLOUR, markersize=8, clip_on=False, zorder=5)
         axes.annotate(
             event.words,
             place,
@@ -222,20 +207,6 @@ def _write_names(axes: Axes, events: Sequence[_Event], ends: tuple[float, float]
             color=event.colour,
             fontsize=9,
             zorder=6,
-            # Lines of events and stills pass behind.
+            # Lines of events pass behind.
             path_effects=[withStroke(linewidth=3.0, foreground="white")],
         )
-    return top
-
-
-def _join(
-    fig: Figure, picture: Axes, curve_axes: Axes, point: tuple[float, float], top: float
-) -> None:
-    """Draws a line from the lower edge of an image to its instant, and down to the curve of Γ."""
-    ends = (0.5, 0.0), (point[0], top), picture.transAxes, curve_axes.transData
-    above = ConnectionPatch(*ends, **_THIN)
-    above.set_in_layout(False)
-    fig.add_artist(above)
-    curve_axes.vlines(point[0], point[1], top, alpha=0.6, zorder=1, **_THIN)
-    ring: _Style = {"color": "white", "markeredgecolor": style.INK, "markersize": 6, "zorder": 6}
-    curve_axes.plot(*point, "o", clip_on=False, **ring)
