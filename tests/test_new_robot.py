@@ -200,7 +200,7 @@ def test_new_and_check_tell_what_was_lost_and_changed(tmp_path):
     result = invoked("new", "spider", "--urdf", bare, "--out", out)
     assert result.exit_code == 0
     for text in (
-        "WARNING  2 links have lost their collision meshes, which are missing",
+        "WARNING  2 links have lost their collision meshes",
         "note  velocity",
         "decided mass_scale: 0.8  Γ learns from lighter links",
         "decided on_alarm: unknown",

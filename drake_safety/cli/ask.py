@@ -97,7 +97,7 @@ def judge_target(
 def print_verdict(
     loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None, origin: str
 ) -> None:
-    """Prints a verdict, where its threshold is from, and for a refusal what would be accepted."""
+    """Prints a verdict, and for a refusal what would be accepted."""
     words = goal_words(require(loop, HasGoals))
     probability, threshold = verdict.probability, verdict.threshold
     subject = f" of {words.subject}" if words.is_point else ""

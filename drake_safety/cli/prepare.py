@@ -89,9 +89,8 @@ def new(
         console.say(f"note  {what}", style="yellow")
     if bare := written.copy.bare_links:
         console.say(
-            f"WARNING  {len(bare)} links have lost their collision meshes, which are "
-            "missing or cannot be read: everything passes through "
-            f"{', '.join(bare)}. Add boxes or capsules to {files[0]}; `check` reminds you",
+            f"WARNING  {len(bare)} links have lost their collision meshes, and everything passes "
+            f"through {', '.join(bare)}: add boxes or capsules to {files[0]}",
             style="bold red",
         )
     for what in asked:
@@ -131,13 +130,10 @@ def check(
             word = ("problem", "red")
             if finding.is_ok:
                 word = ("warning", "bold yellow") if finding.is_warning else ("OK     ", "green")
+            remedy = f"\n     fix: {finding.remedy}" if finding.remedy else ""
             # A line of a file cannot look like a finding.
-            lines = f"  {finding.item}: {finding.message}".replace("\n", "\n    ")
-            text = Text.assemble(word, lines)
-            if finding.remedy:
-                remedy = finding.remedy.replace("\n", "\n    ")
-                text.append(f"\n         fix: {remedy}")
-            console.say(text)
+            lines = f"  {finding.item}: {finding.message}{remedy}".replace("\n", "\n    ")
+            console.say(Text.assemble(word, lines))
     if num_problems:
         console.say(f"{num_problems} problem{'s' * (num_problems > 1)}", style="red")
         raise Exit(1)
@@ -148,7 +144,5 @@ def check(
         )
         return
     if quick:
-        console.say(
-            "not checked: the share of unsafe episodes; check without --quick before you train"
-        )
+        console.say("not checked: the share of unsafe episodes")
     console.say("ready: drake-safety train", scenario, "--out FOLDER")

@@ -70,10 +70,7 @@ def train(
         sets[out / (f"episodes_{name}" if options else "episodes")] = options
     for folder in sets:
         if not resume and folder.exists() and (kept := completed(folder)):
-            raise ValueError(
-                f"{folder} already holds {len(kept)} episodes: pass --resume to "
-                "continue with them, or choose another --out"
-            )
+            raise ValueError(f"{folder} already holds {len(kept)} episodes: pass --resume")
     folders.check_writable(out)
     loop = loaded.make_loop()
     piece_s = motion_piece_s(loop)
@@ -162,10 +159,7 @@ def train(
 def _fit_falls(gamma: SafetyAssessment, fallen: Episodes, loop: ClosedLoop) -> None:
     """Fits the probability of a fall to the features that tell of one."""
     if not 0 < fallen.num_unsafe < len(fallen):
-        console.say(
-            f"{fallen.num_unsafe} of {len(fallen)} episodes end in a fall: it takes both to "
-            "learn its probability; give more with --falls"
-        )
+        console.say(f"{fallen.num_unsafe} of {len(fallen)} episodes fall: none is learned of")
         return
     watched = require(loop, CanFall).watched_features.values()
     names = fallen.info.feature_names

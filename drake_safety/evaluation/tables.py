@@ -109,10 +109,7 @@ class Table:
 
     def to_rich(self) -> rich.table.Table:
         """The table for a terminal, with its explanation; cells fold if they do not fit."""
-        ahead = self.better_baselines()
-        better = f"\nBetter than {_OURS}: {'; '.join(ahead)}" if ahead else ""
-        caption = f"{self.meaning}{better}" or None
-        table = rich.table.Table(title=self.title or None, caption=caption)
+        table = rich.table.Table(title=self.title or None, caption=self.meaning or None)
         for title in (self.corner, *(column.title for column in self.columns)):
             table.add_column(title, overflow="fold")
         for row in self.rows:
