@@ -237,8 +237,6 @@ def test_state_outside_the_context_is_found_in_many_episodes_and_by_check(
     if not is_leaking:
         assert len(run_episodes(load_scenario(file), 64, num_workers=1)) == 64
         return
-    message = r"differs, first at 0.* s in output port '.*' of system '[^']*Leaking':"
-    assert re.search(message, repeated.message)
-    told = f"episode 0 of 'mine', simulated a second time, {message}"
-    with pytest.raises(ValueError, match=told):
+    assert "keeps state outside its Context" in repeated.message
+    with pytest.raises(ValueError, match="episode 0 of 'mine', .* keeps state outside"):
         run_episodes(load_scenario(file), 64, num_workers=1)

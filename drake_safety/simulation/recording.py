@@ -68,12 +68,10 @@ def record_episodes(
     ``safe``, below 1 once the state is unsafe, by default where a margin is negative.
 
     Episode i depends on the diagram, the seed and i alone: its arrays are identical for any number
-    of workers. The first one is simulated again after the second: an error names the system whose
-    output differs first.
+    of workers. The first one is simulated again after the second, and must be the same.
 
     Args:
-        make_diagram: Builds the diagram; called with ``parameters``, once in each worker, and once
-            more for the repetition of the first episode.
+        make_diagram: Builds the diagram in each worker; called with ``parameters``.
         reset: Called with diagram, root Context and generator; samples a start into the Context,
             the diagram's default one with seeded random sources of Drake; rows count from its time.
             It may return the first row whose future is undisturbed, if that is not 0.
@@ -82,8 +80,7 @@ def record_episodes(
         state_names: Names of the n_s entries of ``state``; numbered by default.
         name: Name of the set; that of ``make_diagram`` by default.
         monitor_period_s: Sampling period of ``safe`` [s]; a tenth of ``step_s`` by default.
-        num_workers, path, progress: See `Execution`. A set is identified by name, parameters,
-            ports, times and seed, and by one of its episodes, which is simulated again.
+        num_workers, path, progress: See `Execution`.
 
     Returns:
         The episodes, for ``SafetyAssessment.fit``. Those whose simulation failed have the cause
@@ -129,9 +126,7 @@ def record_episodes(
     )
     start = CloudPickled(reset)
 
-    def run(
-        diagram: Diagram, index: int, monitor: Callable[[Context], object] | None = None
-    ) -> Episode:
+    def run(diagram: Diagram, index: int) -> Episode:
         who = f"episode {index} of '{name}' (seed {seed})"
 
         def begin(context: Context) -> int | None:
@@ -148,7 +143,6 @@ def record_episodes(
             End(duration_s=num_steps * step_s, after_leaving_s=0.0),
             step_s=step_s,
             watch_period_s=period_s,
-            monitor=monitor,
             constraint_names=info.constraint_names,
             may_fail=True,
             index=index,

@@ -41,7 +41,6 @@ from drake_safety.simulation.capabilities import (
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import EpisodeWriter, is_same, load_episodes
 from drake_safety.simulation.episode_start import EpisodeStart
-from drake_safety.simulation.hidden_state import difference
 from drake_safety.simulation.motion import End, Motion, simulate
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import BATCH_SIZE, MadeOnce, Progress, map_items
@@ -52,6 +51,10 @@ MOTION_PIECE_S = 60.0
 _AFTER_LEAVING_S = 1.0  # Until a robot has fallen, if it does.
 _MANY = 64  # Episodes of which two more are a small share.
 _LOGGER = logging.getLogger("drake_safety")
+HIDDEN_STATE = (
+    "differs: the diagram, or its reset, keeps state outside its Context, such as a memory, a "
+    "random generator or a cache in an attribute of a system; declare it as state"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +63,8 @@ class Execution:
 
     Attributes:
         num_workers: Number of processes; that of cores by default. 1 runs in this process.
-        path: Folder for the episodes; those of the same set that it already holds are kept, if one
-            of them, simulated again, is the same to the last bit.
+        path: Folder for the episodes. Those that it holds are kept, if one of them, simulated
+            again, is the same to the last bit.
         progress: Called with the number done and in all; True shows it.
         extra: Further content of the folder's ``info.json``.
     """
@@ -140,15 +143,13 @@ def run_episode(
     """Simulates one episode, which ends when it leaves the safe set or its time is over.
 
     Args:
-        loop: The closed loop; it has no state and can be used again.
-        goal: Goal of the plan, in place of a random one; for tasks with goals.
-        start: Initial state and plan, in place of random ones. The noise is that of the seed and
-            the index.
+        goal: Goal of the plan, in place of a random one.
+        start: Initial state and plan, in place of random ones.
         at_start: Called with the root Context at the start.
         until_fall: Whether it goes on for a second after it leaves the safe set, and only a fall is
-            an unsafe end; of a :class:`CanFall`.
+            an unsafe end.
         monitor: Called with the Context after each step of the simulator.
-        **end: Fields of :class:`~drake_safety.simulation.motion.End` in place of the usual ones.
+        **end: Fields of :class:`~drake_safety.simulation.motion.End`.
 
     Returns:
         The episode. If the simulation fails, its cause is ``diverged`` and it has the rows that
@@ -205,9 +206,8 @@ def run_to_goal(
 
     Args:
         goal: In the world, (3,) [m].
-        after_fall_s: Time for which it goes on after a fall [s].
         ports: Ports to log besides ``output``, ``margins`` and ``plant_state``.
-        **options: As for :func:`~drake_safety.simulation.motion.simulate`, such as ``monitor``.
+        **options: As for :func:`~drake_safety.simulation.motion.simulate`.
     """
 
     def begin(context: Context) -> None:
@@ -226,10 +226,7 @@ def run_to_goal(
 def inputs_at(loop: ClosedLoop, start: EpisodeStart) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the assessment's inputs for a hypothetical state and plan; nothing is simulated.
 
-    ``assessment.predict_one(*inputs_at(loop, start))`` is the verdict on them.
-
-    Returns:
-        State (n_s,) without noise, desired preview (H*n_z,), and features (n_f,).
+    They are the state (n_s,) without noise, the desired preview (H n_z,) and the features (n_f,).
     """
     context = loop.CreateDefaultContext()
     require(loop, CanStartAnywhere).reset_to(context, None, start)
@@ -253,15 +250,14 @@ def run_motions(
     extra: dict[str, Any] | None = None,
     **loop_options: Any,
 ) -> Episodes:
-    """Simulates undisturbed motion, in worker processes, for a `ChangeDetector`.
+    """Simulates undisturbed motion for a `ChangeDetector`; arguments are as for `run_episodes`.
 
     A task that :class:`~drake_safety.simulation.capabilities.MovesUndisturbed` moves for a minute
-    at a time; of others these are ordinary episodes. Rows are `scenario.monitor_step_s` apart. A
-    motion ends when it leaves the safe set. Arguments not named here are as for `run_episodes`.
+    at a time, unless ``are_episodes``; of others these are ordinary episodes. Rows are
+    `scenario.monitor_step_s` apart, and a motion ends when it leaves the safe set.
 
     Args:
         duration_s: Duration of all motions together, if none leaves the safe set [s].
-        are_episodes: Whether they are ordinary episodes of any task.
     """
     check_times("run_motions", duration_s=duration_s)
     make = worker_loop(scenario, variation, **loop_options)
@@ -293,22 +289,16 @@ def run_motion(
     until_s: float = math.inf,
     with_features: bool = False,
     is_episode: bool = False,
-    start: Callable[[Context], None] | None = None,
 ) -> Episode:
     """Simulates one undisturbed motion, at most until a time; see `run_motions`.
 
-    Args:
-        start: Sets state and plan of the root Context, in place of random ones.
-        with_features: Whether to record features that the monitor does not read, too.
-        is_episode: Whether it is an ordinary episode, with the monitor's rows.
+    Features that the monitor does not read are zero, unless ``with_features``.
     """
     scenario, piece_s = loop.scenario, motion_piece_s(loop, is_episode)
     step_s = scenario.monitor_step_s
 
     def begin(context: Context) -> int | None:
         seed_random_sources(loop, context, seed, index)
-        if start is not None:
-            return start(context)
         rng = episode_rng(seed, index)
         if isinstance(loop, MovesUndisturbed) and not is_episode:
             return loop.reset_undisturbed(context, rng, piece_s)
@@ -345,17 +335,13 @@ def run_episodes(
     """Simulates a set of episodes, in worker processes.
 
     Episode i depends on the scenario, the variation, the seed and i alone: the arrays are
-    identical for any number of workers.
+    identical for any number of workers. A folder with another set, or one that is not the same any
+    more, is refused.
 
     Args:
         num_workers, path, progress, extra: See :class:`Execution`.
         until_fall: As of `run_episode`.
         **loop_options: Options of the task; part of the set's hash.
-
-    Raises:
-        ValueError: The folder holds another set or one that is not the same any more, or an
-            episode, simulated again, differs.
-        EpisodeError: A system of the loop raised an error, which is its cause.
     """
     make = worker_loop(scenario, variation, **loop_options)
     info = episodes_info(make(), seed, loop_options | ({"until_fall": True} if until_fall else {}))
@@ -383,9 +369,8 @@ def collect_episodes(
 ) -> Episodes:
     """Simulates the episodes of a set that a folder does not hold yet, in worker processes.
 
-    ``run`` returns the episode of a diagram and an index. If ``is_repeated``, the first episode is
-    simulated again after the next, by a new diagram, and must be the same; ``run`` then takes a
-    ``monitor``.
+    ``run`` returns the episode of a diagram and an index. If ``is_repeated``, the first episode,
+    simulated again after the next by a new diagram, must be the same.
     """
     path, wanted = execution.path, set(indices)
     with nullcontext() if path is None else EpisodeWriter(path, info, execution.extra) as writer:
@@ -412,11 +397,9 @@ def collect_episodes(
         with closing(results):
             for episode in results:
                 if is_repeated and episode.index == pending[0]:
-                    with ONE_BLAS_THREAD:
-                        text = difference(episode, make.make, run)
-                    if text:
+                    if not is_repeatable(episode, make.make(), run):
                         who = f"episode {episode.index} of '{info.scenario}'"
-                        raise ValueError(f"{who}, simulated a second time, {text}")
+                        raise ValueError(f"{who}, simulated again after the next, {HIDDEN_STATE}")
                 episodes.append(episode)
                 if writer is not None:
                     writer.append(episode)
@@ -432,6 +415,13 @@ def collect_episodes(
             counts = (len(numbers), len(indices), info.scenario)
             _LOGGER.warning("%d of %d simulations of '%s' %s: episodes %s", *counts, problem, first)
     return collected
+
+
+def is_repeatable(episode: Episode, diagram: Diagram, run: Callable[..., Episode]) -> bool:
+    """Whether a new diagram simulates an episode alike, to the last bit, after the next one."""
+    with ONE_BLAS_THREAD:
+        run(diagram, episode.index + 1)
+        return is_same(episode, run(diagram, episode.index))
 
 
 def check_kept(path: Path, kept: Sequence[Episode], run: Callable[[int], Episode]) -> None:
