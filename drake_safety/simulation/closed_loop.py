@@ -21,17 +21,15 @@ ASSESSMENT_PORTS = ("safety_probability", "belief")
 Purpose = Literal["evaluation", "paper", "pairs"]
 """What a diagram is built for; see :meth:`ClosedLoop.options_for`."""
 
-_MOST_NAMES = 8  # Of a list that an error quotes whole.
 _NAMES = ("state_names", "output_names", "feature_names", "constraint_names")
 
 
 class ClosedLoop(Diagram):
     """A task's diagram: plant, controller, planner, monitor, and optionally an assessor.
 
-    The contract consists of the output ports below, :meth:`reset`, and the names of the ports'
-    entries. Optional features are the protocols of :mod:`~drake_safety.simulation.capabilities`. A
-    subclass sets the names and connects its systems in ``__init__``, calls :meth:`export`, and
-    finally ``builder.BuildInto(self)``.
+    A subclass sets the names of the ports' entries and connects its systems in ``__init__``, calls
+    :meth:`export`, and finally ``builder.BuildInto(self)``. Optional features are the protocols of
+    :mod:`~drake_safety.simulation.capabilities`.
 
     ====================== ======= ============================================================
     output port            size    meaning
@@ -50,21 +48,17 @@ class ClosedLoop(Diagram):
     ``recovery_active``    1       1 during recovery, with recovery
     ====================== ======= ============================================================
 
-    An optional port ``num_controller_failures`` counts the control periods since the start for
-    which the controller found no command; episodes store its last value.
-    ``controller_memory`` is what the controller remembers, ``EpisodeStart.controller_state``.
+    Optional are ``num_controller_failures``, the control periods since the start for which the
+    controller found no command, and ``controller_memory``, ``EpisodeStart.controller_state``.
 
     Attributes:
         Parameters: Schema of the task's part of the scenario file, a dataclass. It may also have
-            ``online``, names of parameters on which no episode depends, which the scenario's hash
-            leaves out, and a class method ``completed(stated, robot)``, which adds defaults that
-            depend on the robot to the parameters in the file.
+            ``online``, names of parameters on which no episode depends, and a class method
+            ``completed(stated, robot)``, which adds defaults that depend on the robot.
         angular_constraints: Constraints whose margins are angles [rad]; others are lengths [m].
         fall_name: The constraint whose violation is a fall, which ends a motion; "" for none.
-        monitored: What the change monitor reads: ``states`` that it predicts, such as those that a
-            real robot measures, and ``features`` by which it predicts them beside the desired
-            preview, such as what the controller commands; by default all states and all features.
-        state_names, output_names, feature_names, constraint_names: Names of the ports' entries.
+        monitored: What the change monitor reads: ``states`` that it predicts, and ``features`` by
+            which it predicts them beside the desired preview; by default all.
     """
 
     Parameters: type
@@ -86,8 +80,7 @@ class ClosedLoop(Diagram):
     def options_for(cls, purpose: Purpose, scenario: Any, variation: str) -> dict[str, Any]:
         """Options of the diagram that differ from those of training in the sharpened mode.
 
-        Training of the "paper" mode has no disturbances but the offsets of the initial state; with
-        those for "pairs" an actual variation and its nominal twin can start alike.
+        Those for "pairs" let an actual variation and its nominal twin start alike.
         """
         del purpose, scenario, variation
         return {}
@@ -121,9 +114,7 @@ class ClosedLoop(Diagram):
     def reset(self, context: Context, rng: np.random.Generator) -> int:
         """Samples an initial state and a plan into the root Context, at time zero.
 
-        Returns:
-            The first step whose future is undisturbed: 0, or later if the episode begins with a
-            push.
+        Returns the first step whose future is undisturbed: 0, or later after an initial push.
         """
         raise TypeError(f"task '{type(self).__name__}' must override reset")
 
@@ -137,8 +128,6 @@ class ClosedLoop(Diagram):
         hold: OutputPort | None = None,
     ) -> MonitoredSafetyAssessor | None:
         """Exports output ports by name; adds an assessor and its ports, if there is an assessment.
-
-        The names of the ports' entries must have been set.
 
         Args:
             period_s: Time between two evaluations of the assessment [s].
@@ -176,19 +165,10 @@ class ClosedLoop(Diagram):
         for name, own in here.items():
             learned = getattr(info, name)
             if (learned := list(learned) if name in _NAMES else learned) != own:
-                texts = _describe_difference(learned, own), _describe_difference(own, learned)
                 raise ValueError(
                     f"assessment and diagram differ in {name}: the assessment was learned with "
-                    f"{texts[0]}, the diagram has {texts[1]}"
+                    f"{learned}, the diagram has {own}"
                 )
-
-
-def _describe_difference(value: Any, other: Any) -> str:
-    """A value; of a long list of names what the other one does not have."""
-    if not isinstance(value, list) or len(value) <= _MOST_NAMES:
-        return f"{value}"
-    own = [name for name in value if name not in other]
-    return f"{len(value)} names, of which {own} are its own"
 
 
 def port_sizes(diagram: Diagram) -> dict[str, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,16 +14,13 @@ from drake_safety.simulation.motion import advance_to
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Result of a check.
-
-    Attributes:
-        remedy: How to correct a failure, or what a warning is about; "" if all is well.
-    """
+    """Result of a check."""
 
     item: str
     is_ok: bool
     message: str
     remedy: str = ""
+    """How to correct a failure, or what a warning is about; "" if all is well."""
 
     @property
     def is_warning(self) -> bool:
@@ -33,7 +29,7 @@ class Finding:
 
 
 def passed(item: str, message: str, remedy: str = "") -> Finding:
-    """Returns the finding of a check that passed; with a warning, if there is a remedy."""
+    """The finding of a check that passed; with a warning, if there is a remedy."""
     return Finding(item=item, is_ok=True, message=message, remedy=remedy)
 
 
@@ -46,36 +42,33 @@ def check_contract(diagram: ClosedLoop, *, seed: int = 0) -> list[Finding]:
     """Checks that a task's diagram keeps the contract of :class:`ClosedLoop`.
 
     Its ports exist and have the sizes of its names, `reset` samples a start, and the ports' values
-    are finite at the start and one assessment step later. Checks that depend on a failed one are
-    left out.
+    are finite at the start and one step later. Checks that depend on a failed one are left out.
     """
-    return list(_findings(diagram, seed))
-
-
-def _findings(diagram: ClosedLoop, seed: int) -> Iterator[Finding]:
+    findings = []
     item, remedy = "ports", "set the names and export the ports in __init__; one name per entry"
     try:
         check_ports(diagram)
-        yield passed(item, "complete, with the sizes of their names")
+        findings.append(passed(item, "complete, with the sizes of their names"))
         item, remedy = "reset", "reset(context, rng) samples a start and a plan into the Context"
         simulator = Simulator(diagram)
         context = simulator.get_mutable_context()
         first_step: object = diagram.reset(context, np.random.default_rng(seed))
         if isinstance(first_step, int | np.integer):
-            yield passed(item, "samples a start")
+            findings.append(passed(item, "samples a start"))
         else:
             remedy = "return the first step whose future is undisturbed, mostly 0"
-            yield failed(item, f"returns {first_step!r}", remedy)
+            findings.append(failed(item, f"returns {first_step!r}", remedy))
         item, remedy = "simulation", "correct the system named"
         begin_s, step_s = context.get_time(), diagram.scenario.step_s
         simulator.Initialize()
-        yield _finite(diagram, context, "at the start")
+        findings.append(_finite(diagram, context, "at the start"))
         if advance_to(simulator, begin_s + step_s):
             ended = "let an episode last: no system may return EventStatus.ReachedTermination yet"
-            yield failed(item, f"ends at {context.get_time():g} s", ended)
-        yield _finite(diagram, context, f"after {step_s:g} s")
+            findings.append(failed(item, f"ends at {context.get_time():g} s", ended))
+        findings.append(_finite(diagram, context, f"after {step_s:g} s"))
     except (RuntimeError, TypeError, ValueError) as error:
-        yield failed(item, str(error), remedy)
+        findings.append(failed(item, str(error), remedy))
+    return findings
 
 
 def _finite(diagram: ClosedLoop, context: Context, when: str) -> Finding:

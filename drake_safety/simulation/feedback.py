@@ -53,11 +53,7 @@ def run_pairs(
     """Simulates actual episodes and their nominal twins, in worker processes.
 
     Both episodes of a pair draw from the same generator, so their initial states are the same.
-
-    Args:
-        path: Folder for the episodes, with a folder for either plant; episodes that it already
-            holds are not simulated again.
-        **options: As for `run_episodes`; options of the task replace those for pairs.
+    ``path`` has a folder for either plant; arguments are as for `run_episodes`.
     """
     options = scenario.options_for("pairs", variation) | options
     sets = {}
@@ -102,8 +98,7 @@ def AddFeedbackRecorder(builder: DiagramBuilder, loop: ClosedLoop) -> FeedbackRe
 def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
     """Returns initial state and plan of the nominal twin of a recorded window.
 
-    The plan interpolates the desired outputs of the window and of its last preview, and is constant
-    after that.
+    The plan interpolates the desired outputs of the window and of its last preview.
     """
     preview = window.episode.desired_preview
     num_outputs = len(loop.output_names)
@@ -122,17 +117,14 @@ def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
 
 
 def _memory_size(loop: ClosedLoop) -> int:
-    """Size of the memory with which a loop's controller begins a twin; 0 without one.
-
-    A window begins at a row, so a row must be a time at which the controller updates.
-    """
+    """Size of the memory with which a loop's controller begins a twin; 0 without one."""
     size = port_sizes(loop).get("controller_memory", 0)
+    # A window begins at a row, so a row must be a time at which the controller updates.
     period_s, step_s = getattr(loop, "memory_period_s", loop.scenario.step_s), loop.scenario.step_s
     if abs(step_s / period_s - round(step_s / period_s)) > 1e-6:
         raise ValueError(
             f"feedback of '{loop.scenario.name}': a row every {step_s:g} s is not when the "
-            f"controller updates, every {period_s:g} s, so that no twin can begin as a window "
-            "does; choose a step_s that is a multiple"
+            f"controller updates, every {period_s:g} s; choose a step_s that is a multiple"
         )
     return size
 
@@ -169,8 +161,7 @@ def pair_windows(
         if (got := 0 if memory is None else len(memory)) != size:
             raise ValueError(
                 f"feedback of '{scenario.name}': a window has {got} entries of the controller's "
-                f"memory, expected {size}: without it its twin begins in mid-stride as if at rest. "
-                "Connect the recorder's 'controller_memory', as AddFeedbackRecorder does"
+                f"memory, expected {size}: connect the recorder's 'controller_memory'"
             )
     actual = Episodes(recorder.info, [window.episode for window in windows])
     starts = [window_start(loop, window) for window in windows]

@@ -27,9 +27,8 @@ class OnlineAdaptation:
 
     "For computational efficiency, the online adaptation process is performed once every k_u sets of
     feedback data" (paper). Nominal twins of the recorder's windows are simulated; after every k_u
-    windows the prior assessment is adapted to the feedback and the motion so far, at most ten
-    minutes, and the assessor adopts the result. The simulation waits meanwhile. An object is for
-    one simulation.
+    windows the prior assessment is adapted to the feedback and the motion of at most ten minutes,
+    and the assessor adopts the result. The simulation waits meanwhile.
 
     ```python
     online = OnlineAdaptation(scenario, prior, recorder, assessor)
@@ -68,11 +67,9 @@ class OnlineAdaptation:
         self.num_updates = 0
 
     def advance(self, simulator: Simulator, until_s: float) -> SimulatorStatus:
-        """Advances the simulation as `AdvanceTo` does, with the updates that become due.
-
-        Updates are between two calls of `AdvanceTo`, at the times of the recorder's rows: events
-        and monitors of a simulation must not change its Context.
-        """
+        """Advances the simulation as `AdvanceTo` does, with the updates that become due."""
+        # Events and monitors of a simulation must not change its Context: updates are between two
+        # calls of `AdvanceTo`, at the times of the recorder's rows.
         context, step_s = simulator.get_mutable_context(), self._recorder.info.step_s
         while True:
             status = self._advance_to_row(simulator, min(_next_row_s(context, step_s), until_s))

@@ -24,7 +24,6 @@ from drake_safety.learning.segments import DIVERGED
 from drake_safety.models import load_robot, robot_files
 from drake_safety.policies.policy_network import network_kinds
 from drake_safety.robots.plausibility import effort_unit, odd_inertias, odd_limits
-from drake_safety.robots.robot_model import RobotModel
 from drake_safety.simulation.capabilities import FollowsCommands
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed
@@ -67,10 +66,9 @@ def check_scenario(
     check_robot: Callable[[RobotKinematics], Iterator[Finding]] | None = None,
     progress: StageProgress = ignore,
 ) -> Iterator[Finding]:
-    """Checks a scenario item by item, the cheap ones first.
+    """Checks a scenario item by item, the cheap ones first; no error in its files is raised.
 
-    An error in a user's files is a finding, never an exception. Checks that depend on a scenario,
-    robot or diagram that cannot be made are left out.
+    Checks that depend on a scenario, robot or diagram that cannot be made are left out.
 
     Args:
         num_episodes: Number of episodes simulated to estimate the share of unsafe ones.
@@ -82,10 +80,7 @@ def check_scenario(
     if scenario is None:
         return
     if scenario.robot:
-        robot = yield from _guarded("robot.yaml", _robot, scenario)
-        if robot is None:
-            return
-        kinematics = yield from _guarded("bodies and joints", _kinematics, robot)
+        kinematics = yield from _guarded("robot.yaml", _robot, scenario)
         if kinematics is None:
             return
         yield from _guarded("standing posture", _posture, kinematics)
@@ -101,26 +96,24 @@ def check_scenario(
     if loop is None:
         return
     if isinstance(loop, LeggedLoop):
-        yield from _guarded("contact spheres", _contacts, loop)
-        yield from _guarded("off the ground", _off_the_ground, loop)
-        yield from _guarded("shape of the base", _target, loop)
+        yield from _guarded("shapes", _shapes, loop)
         progress(_STANDS, 0, 1)
         yield from _guarded(_STANDS, _stands, loop)
         progress(_STANDS, 1, 1)
     remedy = ""
     if isinstance(loop, FollowsCommands):
         remedy = yield from _guarded(_WALKS, _walks, loop)
-    yield from _guarded("contract", check_contract, loop, seed=seed)
+    yield from _guarded("contract", partial(check_contract, seed=seed), loop)
     if num_episodes:
         yield from _guarded("episodes", _episodes, loop, num_episodes, seed, progress, remedy)
 
 
 def _guarded(
-    item: str, check: Callable[..., Any], *arguments: Any, **options: Any
+    item: str, check: Callable[..., Any], *arguments: Any
 ) -> Generator[Finding, None, Any]:
     """A check's findings and result; an exception is a finding, and the result None."""
     try:
-        return (yield from check(*arguments, **options))
+        return (yield from check(*arguments))
     # A user's task may raise anything, and so may Drake's parser.
     except Exception as error:
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
@@ -134,12 +127,11 @@ def _judged(item: str, is_ok: bool, message: str, problem: str, remedy: str) -> 
 
 def _scenario(name: str | Path, is_imported: bool) -> Generator[Finding, None, Scenario | None]:
     scenario: Scenario = load_scenario(name) if is_imported else read_scenario(name)
-    what, where = ", but for its parameters", "which was not imported; read it before you do"
+    where = "which was not imported; read it before you do"
     if is_imported:
-        task = scenario.task_class()
-        what = f" of {task.__name__}"
-        where = f"{getattr(sys.modules[task.__module__], '__file__', None)}"
-    yield passed("scenario", f"'{scenario.name}' fits the schema{what}")
+        module = sys.modules[scenario.task_class().__module__]
+        where = f"{getattr(module, '__file__', None)}"
+    yield passed("scenario", f"'{scenario.name}' fits the schema")
     yield passed("code", f"the scenario runs {scenario.task}, {where}")
     missing = [name for name in ("nominal", "actual") if name not in scenario.variations]
     yield _judged(
@@ -150,12 +142,10 @@ def _scenario(name: str | Path, is_imported: bool) -> Generator[Finding, None, S
         "add them under 'variations': `nominal` is the plant of the training episodes, `actual` "
         "the real robot, which `run` simulates",
     )
-    if "nominal" in missing:
-        return None
-    return scenario
+    return None if "nominal" in missing else scenario
 
 
-def _robot(scenario: Scenario) -> Generator[Finding, None, RobotModel | None]:
+def _robot(scenario: Scenario) -> Generator[Finding, None, RobotKinematics | None]:
     robot = load_robot(scenario.robot)
     yield passed("robot.yaml", f"'{robot.name}' fits the schema")
     if missing := [str(path) for path in robot_files(scenario.robot) if not path.is_file()]:
@@ -166,10 +156,6 @@ def _robot(scenario: Scenario) -> Generator[Finding, None, RobotModel | None]:
     if asked := [line.strip() for line in text.splitlines() if "# ASK the motor's" in line]:
         message = f"those of {len(asked)} joints are estimates, such as {asked[0]}"
         yield passed("effort limits", message, f"{_EFFORT_REMEDY}, and delete the remark")
-    return robot
-
-
-def _kinematics(robot: RobotModel) -> Generator[Finding, None, RobotKinematics]:
     kinematics = RobotKinematics(robot)
     yield passed(
         "bodies and joints",
@@ -283,25 +269,8 @@ def _motors(kinematics: RobotKinematics) -> _Check:
     )
 
 
-def _target(loop: LeggedLoop) -> _Check:
-    """Checks that a thrown ball can hit the base."""
-    if not hasattr(loop, "throw_ball"):
-        return
-    plant, robot = loop.plant, loop.robot
-    base = plant.GetBodyByName(robot.base, loop.robot_instance)
-    bodies = plant.GetBodiesWeldedTo(base)
-    count = sum(len(plant.GetCollisionGeometriesForBody(body)) for body in bodies)
-    yield _judged(
-        "shape of the base",
-        count > 0,
-        f"{count} collision shapes for balls to hit",
-        f"base '{robot.base}' has no collision geometry, so balls fly through it",
-        f"add a <collision> with a box as large as the trunk [m] to link '{robot.base}' in "
-        f"{Path(robot.urdf).name}; with 'collision: stated', name it under 'shapes' in robot.yaml",
-    )
-
-
-def _contacts(loop: LeggedLoop) -> _Check:
+def _shapes(loop: LeggedLoop) -> _Check:
+    """Checks that the feet have their spheres, alone touch the ground, and balls hit the base."""
     plant, robot = loop.plant, loop.robot
     inspector = loop.GetSubsystemByName("scene_graph").model_inspector()
     missing = []
@@ -324,15 +293,10 @@ def _contacts(loop: LeggedLoop) -> _Check:
         "the model file has no such sphere (x, y, z, r): " + "; ".join(missing),
         "add a collision sphere to the URDF, or correct contact_points and radius_m [m]",
     )
-
-
-def _off_the_ground(loop: LeggedLoop) -> _Check:
-    """Checks that nothing but the feet is in the ground in the standing posture."""
-    plant, context = loop.plant, loop.CreateDefaultContext()
+    context = loop.CreateDefaultContext()
     loop.reset_to(context, None, loop.standing_start())
     query = plant.get_geometry_query_input_port().Eval(plant.GetMyContextFromRoot(context))
-    names = [foot.body for foot in loop.robot.feet.values()]
-    feet = [plant.GetBodyByName(name, loop.robot_instance) for name in names]
+    feet = [plant.GetBodyByName(foot.body, loop.robot_instance) for foot in robot.feet.values()]
     allowed = {body.index() for foot in feet for body in plant.GetBodiesWeldedTo(foot)}
     depths: dict[str, float] = {}
     for pair in query.ComputePointPairPenetration():
@@ -352,6 +316,18 @@ def _off_the_ground(loop: LeggedLoop) -> _Check:
         "in the standing posture the robot rests on shapes that reach into the ground: "
         f"{', '.join(texts)}",
         "make them smaller in the URDF [m]",
+    )
+    if not hasattr(loop, "throw_ball"):
+        return
+    bodies = plant.GetBodiesWeldedTo(plant.GetBodyByName(robot.base, loop.robot_instance))
+    count = sum(len(plant.GetCollisionGeometriesForBody(body)) for body in bodies)
+    yield _judged(
+        "shape of the base",
+        count > 0,
+        f"{count} collision shapes for balls to hit",
+        f"base '{robot.base}' has no collision geometry, so balls fly through it",
+        f"add a <collision> with a box as large as the trunk [m] to link '{robot.base}' in "
+        f"{Path(robot.urdf).name}; with 'collision: stated', name it under 'shapes' in robot.yaml",
     )
 
 
