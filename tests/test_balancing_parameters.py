@@ -8,7 +8,6 @@ from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.diagrams.balancing.parameters import (
     BalancingParameters,
     fitted_to_robot,
-    largest_twist,
 )
 from drake_safety.models import load_robot
 from legged_robots import robot_kinematics
@@ -59,14 +58,6 @@ def with_stiffness(factor):
     for gains in robot.joint_gains.values():
         gains.stiffness *= factor
     return RobotKinematics(robot)
-
-
-def test_a_twist_slips_the_sooner_the_stiffer_the_legs_and_the_more_slippery_the_ground():
-    soft, stiff = with_stiffness(1.0), with_stiffness(4.0)
-    assert largest_twist(stiff) == pytest.approx(0.25 * largest_twist(soft))
-    stiff.robot.foot_friction *= 4.0
-    assert largest_twist(stiff) == pytest.approx(largest_twist(soft))
-    assert largest_twist(with_stiffness(0.0)) == math.inf
 
 
 @pytest.mark.parametrize(("factor", "is_held"), [(1.0, True), (4.0, False)])

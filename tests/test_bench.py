@@ -58,15 +58,3 @@ def test_one_table_says_values_limits_verdicts_and_peers_and_where_it_is_stored(
     row |= {"peers": {"solver alone": 4.0}, "note": "7 joints", "limit": "<= 2.5", "verdict": "OK"}
     assert tick == row
     assert speed_up["verdict"] == "UNDER THE LIMIT" and memory["verdict"] == ""
-
-
-@pytest.mark.train
-def test_a_value_that_is_no_number_is_within_no_limit_and_a_name_is_taken_once(run_benchmarks):
-    body = "def test_nan(benchmark, report):\n    benchmark(int)\n"
-    body += "    for key in ('at_most', 'at_least'):\n"
-    body += "        report(key, float('nan'), 's', **{key: 1.0})\n"
-    result, _ = run_benchmarks(body)
-    assert "0 of 2 within their limits" in result.stdout.str()
-    result, _ = run_benchmarks(f"{body}    report('at_most', 2.0, 's')\n")
-    result.assert_outcomes(failed=1)
-    assert "there is a figure 'at_most' already" in result.stdout.str()

@@ -11,11 +11,8 @@ from drake_safety.simulation.capabilities import (
     FollowsCommands,
     HasGoals,
     MovesUndisturbed,
-    require,
 )
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
-from gliding_task import Gliding, gliding
-from shuttle_task import Shuttling, shuttling
 
 OF_LEGS = {CanFall, CanStartAnywhere, MovesUndisturbed}
 ASKED = (HasGoals, HasBall, CanBePushed, FollowsCommands, *OF_LEGS)
@@ -38,18 +35,3 @@ def test_a_task_of_the_package_keeps_the_contract_and_has_its_capabilities(name)
     # What the hash leaves out are parameters that the task has.
     parameters = scenario.parameters
     assert set(getattr(parameters, "online", ())) <= {field.name for field in fields(parameters)}
-
-
-def test_a_task_is_asked_for_a_capability_without_evaluating_its_properties():
-    class Unevaluated(Shuttling):
-        @property
-        def target_box(self):
-            raise AssertionError("evaluated")
-
-    loop = Unevaluated(shuttling())
-    for capability in (HasGoals, CanFall):
-        assert require(loop, capability) is loop
-    with pytest.raises(ValueError, match=r"^run: task 'Unevaluated' has no ball to throw"):
-        require(loop, HasBall, "run")
-    with pytest.raises(ValueError, match=r"^task 'Gliding' has no episodes from a given start"):
-        require(Gliding(gliding()), CanStartAnywhere)

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from cart_episodes import assert_identical
-from command_line import call
 from drake_safety import load_scenario, run_episodes
-from drake_safety.simulation import cluster, worker_processes
+from drake_safety.simulation import worker_processes
 from drake_safety.simulation.cluster import connected
 from drake_safety.simulation.worker_processes import map_items
 from gliding_task import gliding
@@ -94,36 +93,7 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed(two_workers):
     assert_identical(glided, run_episodes(own_task, 8, num_workers=1))
 
 
-@pytest.mark.train
-def test_a_scheduler_that_does_not_answer_or_has_no_workers_is_an_error(tmp_path):
-    with running_scheduler(tmp_path) as address:
-        for where in ("tcp://127.0.0.1:9", address):
-            told = f"no dask scheduler with workers answers at '{where}'.* start workers by"
-            with pytest.raises(ValueError, match=told), connected(where, timeout_s=1.0):
-                pass
-
-
 def test_a_worker_with_other_versions_is_refused_by_name(monkeypatch):
     monkeypatch.setattr(worker_processes, "_versions", iter([{"drake": "0.1"}, {}]).__next__)
     with pytest.raises(ValueError, match=r"has {}, expected {'drake': '0.1'}, as here"):
         next(map_items(abs, [1], num_workers=1))
-
-
-@pytest.mark.train
-@pytest.mark.parametrize("command", ["train", "gate", "adapt"])
-def test_every_long_command_takes_a_cluster(command, monkeypatch, tmp_path):
-    seen = []
-
-    @contextlib.contextmanager
-    def recorded(address):
-        seen.append(address)
-        try:
-            yield
-        finally:
-            seen.append("left")
-
-    monkeypatch.setattr(cluster, "connected", recorded)
-    out = ["--assessment" if command == "adapt" else "--out", str(tmp_path)]
-    code = call(monkeypatch, command, "no_such_scenario", *out, "--cluster", "tcp://here:1")
-    assert code == (3 if command == "gate" else 2)
-    assert seen == ["tcp://here:1", "left"]

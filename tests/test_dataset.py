@@ -1,4 +1,3 @@
-import dataclasses
 import json
 import logging
 import shutil
@@ -10,12 +9,10 @@ import numpy as np
 import pytest
 
 from cart_episodes import assert_identical, make_episode, make_info
-from drake_safety.learning.segments import Episode
 from drake_safety.simulation import dataset
 from drake_safety.simulation.dataset import EpisodeWriter, completed, load_episodes, read_info
 
 pytestmark = pytest.mark.train
-pd = pytest.importorskip("pandas")
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
@@ -54,17 +51,6 @@ def test_episodes_come_back_bit_for_bit_sorted_and_writable(tmp_path, info, writ
     assert_identical(episodes[1:2], [make_episode(1, num_rows=2)][: len(episodes) - 1])
 
 
-def test_pandas_reads_one_row_per_episode_and_step(tmp_path):
-    write(tmp_path, [1, 0], shard=1)
-    frame = pd.read_parquet(sorted(tmp_path.glob("episodes-*.parquet")))
-    fields = {field.name for field in dataclasses.fields(Episode)} - {"index"}
-    assert set(frame.columns) == fields | {"episode", "step"}
-    assert frame.episode.tolist() == [1] * 5 + [0] * 5
-    assert frame.step.tolist() == [0, 1, 2, 3, 4] * 2
-    assert frame.cause.tolist() == ["wall"] * 5 + [""] * 5
-    assert np.array_equal(np.stack(frame.state[:5]), make_episode(1).state)
-
-
 def test_info_and_extra_are_plain_json_and_tell_the_command_that_a_set_goes_on_with(tmp_path):
     info = make_info()
     for extra, expected in [
@@ -77,9 +63,6 @@ def test_info_and_extra_are_plain_json_and_tell_the_command_that_a_set_goes_on_w
         assert read_info(tmp_path) == (info, {"command": expected, "gain": 0.1})
     content = json.loads((tmp_path / "info.json").read_text())
     assert content["info"]["scenario"] == "cart"
-    with pytest.raises(ValueError, match="JSON types"):
-        EpisodeWriter(tmp_path / "other", make_info(), {"when": object()})
-    assert names_in(tmp_path / "other") == []
 
 
 def test_a_shard_is_written_after_some_episodes_or_when_the_last_one_is_old(tmp_path, monkeypatch):
@@ -96,12 +79,11 @@ def test_a_shard_is_written_after_some_episodes_or_when_the_last_one_is_old(tmp_
         writer.append(make_episode(5))
 
 
-@pytest.mark.parametrize("interruption", [RuntimeError, KeyboardInterrupt])
-def test_finished_episodes_are_on_disk_after_an_interruption(tmp_path, interruption):
-    with pytest.raises(interruption):
+def test_finished_episodes_are_on_disk_after_an_interruption(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
         with EpisodeWriter(tmp_path, make_info()) as writer:
             writer.append(make_episode(0))
-            raise interruption
+            raise KeyboardInterrupt
     assert completed(tmp_path) == {0}
 
 
@@ -142,10 +124,7 @@ def test_a_set_goes_on_after_its_last_shard_and_takes_an_index_once(tmp_path):
     assert completed(tmp_path) == {0, 1, 2, 3}
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{"scenario_hash": "cd" * 32}, {"seed": 8}, {"horizon": 3}, {"state_names": ["x", "v", "j"]}],
-)
+@pytest.mark.parametrize("changes", [{"scenario_hash": "cd" * 32}, {"seed": 8}])
 def test_another_set_is_refused_with_both_sides_named(tmp_path, changes):
     write(tmp_path, [0])
     ((name, here),) = changes.items()
@@ -209,14 +188,11 @@ def test_a_folder_has_one_writer_at_a_time_and_the_lock_of_a_killed_one_is_gone(
     write(tmp_path, [0])
 
 
-def test_an_episode_in_two_shards_is_taken_once_if_both_are_equal(tmp_path):
+def test_an_episode_in_two_shards_is_refused(tmp_path):
     write(tmp_path, [0, 1], shard=1)
     first = tmp_path / "episodes-00000.parquet"
     (tmp_path / "episodes-00002.parquet").write_bytes(first.read_bytes())
-    assert [episode.index for episode in load_episodes(tmp_path)] == [0, 1]
-    write(tmp_path / "b", [make_episode(0, num_rows=4)])
-    first.write_bytes((tmp_path / "b" / first.name).read_bytes())
-    with pytest.raises(ValueError, match=r"00000\.parquet differs from that of episodes-00002"):
+    with pytest.raises(ValueError, match=r"episode 0 of .*00002\.parquet is in another shard"):
         load_episodes(tmp_path)
 
 
@@ -227,21 +203,6 @@ def test_shards_without_an_info_are_refused(tmp_path):
         with pytest.raises(ValueError, match=r"no info\.json"):
             read(tmp_path)
     assert names_in(tmp_path) == ["episodes-00000.parquet"]
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", "is not JSON"),
-        ("[]", "expected schema version 1"),
-        ('{"schema_version": 99}', "its version is 99"),
-        ('{"schema_version": 1, "info": {"scenario": "cart"}, "extra": {}}', "does not describe"),
-    ],
-)
-def test_a_foreign_info_is_refused(tmp_path, content, message):
-    (tmp_path / "info.json").write_text(content)
-    with pytest.raises(ValueError, match=message):
-        read_info(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -256,10 +217,7 @@ def test_an_info_with_forged_values_is_refused(tmp_path, name, value):
         load_episodes(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{"state": np.zeros((5, 2))}, {"margins": np.zeros((4, 2))}, {"cause": "moon"}],
-)
+@pytest.mark.parametrize("changes", [{"state": np.zeros((5, 2))}, {"cause": "moon"}])
 def test_an_episode_that_does_not_fit_the_info_is_refused(tmp_path, changes):
     with EpisodeWriter(tmp_path, make_info()) as writer:
         with pytest.raises(ValueError, match=next(iter(changes))):
@@ -306,15 +264,11 @@ def test_a_shard_of_other_columns_or_too_many_steps_is_refused(tmp_path):
     with pytest.raises(ValueError, match="episode 0: it has more than 3 steps"):
         load_episodes(tmp_path)
     shard = tmp_path / "episodes-00000.parquet"
-    pd.DataFrame({"a": [1]}).to_parquet(shard)
-    with pytest.raises(ValueError, match="expected columns"):
-        completed(tmp_path)
     info = make_info(state_names=["x", "v"])
     write(tmp_path / "b", [make_episode(1, info)], info)
-    for other in (shard, tmp_path / "b" / shard.name):
-        shard.write_bytes(other.read_bytes())
-        with pytest.raises(ValueError, match="no episodes of this set: expected full columns"):
-            load_episodes(tmp_path)
+    shard.write_bytes((tmp_path / "b" / shard.name).read_bytes())
+    with pytest.raises(ValueError, match="no episodes of this set: expected full columns"):
+        load_episodes(tmp_path)
 
 
 def test_a_shard_that_takes_too_much_memory_is_refused_by_its_header(tmp_path, monkeypatch):

@@ -1,15 +1,12 @@
-import dataclasses
 import math
 
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from drake_safety import load_scenario
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import gravity_in_foot_plane
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
-from drake_safety.robots.shift import Shift
 from drake_safety.systems.assessor_inputs import AssessorInputs
 from legged_robots import robot_kinematics
 from system_doubles import Bench
@@ -38,15 +35,6 @@ def test_a_slope_is_its_sine_downhill_in_the_stance_frame_wherever_the_robot_sta
         np.testing.assert_allclose(seen, expected, atol=1e-9)
 
 
-def test_feet_on_tilted_ground_see_the_same_slope_as_gravity_that_is_tilted():
-    kinematics = robot_kinematics("laikago")
-    tilted = RotationMatrix(RollPitchYaw(0.0, 0.15, 0.0))
-    X_WB = RigidTransform(tilted) @ RigidTransform([0.0, 0.0, kinematics.standing_height])
-    q = kinematics.positions_at(X_WB, kinematics.posture)
-    seen = gravity_in_foot_plane(kinematics, q, DOWN)
-    np.testing.assert_allclose(seen, [math.sin(0.15), 0.0], atol=2e-3)
-
-
 def test_feet_in_a_line_define_no_slope_across_it():
     kinematics = robot_kinematics("laikago")
     q = kinematics.standing_positions()
@@ -68,19 +56,3 @@ def test_the_mirrored_robot_sees_the_mirrored_slope():
     assert system.feature_names[-2:] == ["gravity_x", "gravity_y"]
     np.testing.assert_allclose(seen[0], 0.1 * np.array([math.cos(0.7), math.sin(0.7)]), atol=1e-3)
     np.testing.assert_allclose(seen[1], seen[0] * (1.0, -1.0))
-
-
-def test_a_loop_on_a_slope_shows_it_before_the_first_step():
-    scenario = load_scenario("laikago_balancing")
-    slope = Shift(slope_rad=0.17, slope_direction_rad=1.0)
-    scenario.variations["sloped"] = dataclasses.replace(scenario.variation("nominal"), shift=slope)
-    seen = {}
-    for variation in ("nominal", "sloped"):
-        loop = scenario.make_loop(variation)
-        context = loop.CreateDefaultContext()
-        loop.reset_to(context, None, loop.standing_start())
-        first = loop.feature_names.index("gravity_x")
-        seen[variation] = loop.GetOutputPort("features").Eval(context)[first : first + 2]
-    np.testing.assert_allclose(seen["nominal"], 0.0, atol=1e-3)
-    expected = math.sin(0.17) * np.array([math.cos(1.0), math.sin(1.0)])
-    np.testing.assert_allclose(seen["sloped"], expected, atol=1e-3)

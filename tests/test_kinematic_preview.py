@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import null_space
 
-from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.control.whole_body_model import PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import task_errors
 from drake_safety.diagrams.reaching.kinematic_preview import KinematicPreview, chain_joints
-from drake_safety.robots.robot_model import load_robot_file
-from legged_robots import edited, robot_kinematics, write_porter
+from legged_robots import robot_kinematics
 
 
 @functools.cache
@@ -65,17 +63,6 @@ def test_the_hand_arrives_with_fixed_feet_where_the_cost_is_minimal(name, hand):
     np.testing.assert_array_equal(q, before)
 
 
-def test_a_path_does_not_depend_on_the_one_before_and_may_be_one_sample():
-    preview = preview_of("porter", "left")
-    q = preview.model.kinematics.standing_positions()
-    first, second = easy_paths(preview, num=2)
-    before = preview.follow(q, first)
-    preview.follow(preview.follow(q, second)[-1], second)
-    np.testing.assert_array_equal(preview.follow(q, first), before)
-    (ahead,) = preview.follow(q, first[:1])
-    assert np.linalg.norm(preview.model.reaching_position(ahead) - first[0]) < 5e-3
-
-
 def test_the_chain_has_the_joints_that_move_the_hand():
     model = preview_of("porter", "left").model
     kinematics, body = model.kinematics, model.hand.body
@@ -89,17 +76,3 @@ def test_the_chain_has_the_joints_that_move_the_hand():
     shifts = 0.1 * np.eye(len(q))[7:]
     moving = [i for i, dq in enumerate(shifts) if np.abs(pose(q + dq) - pose(q)).max() > 1e-9]
     assert chain_joints(kinematics, model.hand) == moving
-
-
-def test_a_hand_beyond_its_arm_misses_less_with_a_larger_weight(tmp_path):
-    misses = []
-    for weight in (5.0, 500.0):
-        tasks = {"reaching": {"weight": weight}, "orientation": {"pelvis": {"weight": 20.0}}}
-        robot = load_robot_file(edited(write_porter(tmp_path), whole_body=tasks))
-        model = WholeBodyModel(RobotKinematics(robot), "left")
-        q = model.kinematics.standing_positions()
-        # Farther than its arm.
-        path = model.reaching_position(q) + np.linspace(0, 1, 8)[1:, None] * [0.4, 0.0, 0.0]
-        ahead = KinematicPreview(model).follow(q, path)[-1]
-        misses.append(np.linalg.norm(model.reaching_position(ahead) - path[-1]))
-    assert misses[1] < 0.5 * misses[0]

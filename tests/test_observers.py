@@ -5,7 +5,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_safety.robots.robot import ObservationNoise
-from drake_safety.simulation.observers import Observers, combined
+from drake_safety.simulation.observers import Observers
 from legged_robots import robot_kinematics
 
 NOISE = ObservationNoise(position=0.01, velocity=0.02)
@@ -42,12 +42,6 @@ def bench():
     return Bench()
 
 
-def test_an_observer_is_shared_by_all_that_have_the_same_noise(bench):
-    assert bench.same is bench.noisy
-    names = [system.get_name() for system in bench.diagram.GetSystems()]
-    assert names[1:] == ["exact", "noisy", "noisy_noise"]
-
-
 def test_noise_follows_from_the_generator_is_held_for_a_period_and_can_be_silenced(bench):
     exact, noisy = bench.observed(bench.seeded(0))
     np.testing.assert_array_equal(bench.observed(bench.seeded(0)), [exact, noisy])
@@ -63,8 +57,3 @@ def test_noise_follows_from_the_generator_is_held_for_a_period_and_can_be_silenc
         values.append(bench.observed(context)[1])
     np.testing.assert_array_equal(values[0], values[1])
     assert not np.array_equal(values[1], values[2]) and not np.array_equal(values[0], exact)
-
-
-def test_independent_noise_adds_in_squares():
-    both = combined(ObservationNoise(position=3.0), ObservationNoise(position=4.0, velocity=2.0))
-    assert both == ObservationNoise(position=5.0, velocity=2.0)

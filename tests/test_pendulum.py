@@ -8,12 +8,10 @@ from pydrake.systems.analysis import Simulator
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.diagrams.pendulum.task import (
     PendulumController,
-    PendulumObserver,
     PendulumParameters,
     PendulumSafeSet,
     bob_position,
 )
-from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.rollouts import run_episode
 from system_doubles import Bench
@@ -83,12 +81,6 @@ def test_what_a_plan_asks_of_the_motor_is_that_of_its_minimum_jerk(loop):
     assert values["plan_effort_reserve_back"] == pytest.approx(0.35 - effort.max(), abs=0.01)
 
 
-def test_what_a_pendulum_cannot_have_is_refused(scenario):
-    odd = replace(scenario, variations={"nominal": PlantVariation(foot_friction=0.3)})
-    with pytest.raises(ValueError, match="'nominal' sets foot_friction; entries of this plant are"):
-        odd.make_loop()
-
-
 @pytest.mark.train
 def test_gamma_finds_the_true_safe_set_from_few_episodes(scenario, loop):
     parameters = replace(scenario.assessment, ensemble_size=1, perplexity=20.0)
@@ -102,21 +94,6 @@ def test_gamma_finds_the_true_safe_set_from_few_episodes(scenario, loop):
     assert np.sum(is_safe & is_accepted) / np.sum(is_safe | is_accepted) >= 0.75
     # The pendulum is the same in the mirror, and so is what becomes of it.
     np.testing.assert_array_equal(is_safe, is_safe[::-1])
-
-
-@pytest.mark.parametrize(
-    ("angle", "bob"),
-    [
-        (math.pi, [0.0, 0.0, LENGTH_M]),
-        (math.pi + math.pi / 6, [0.25, 0.0, 0.5 * math.sqrt(0.75)]),
-        (0.0, [0.0, 0.0, -LENGTH_M]),
-    ],
-)
-def test_the_observer_counts_from_upright_and_places_the_bob(angle, bob):
-    observer = PendulumObserver(LENGTH_M, PendulumSafeSet(PendulumParameters(), 0.05))
-    bench = Bench(observer, pendulum_state=[angle, 0.7])
-    np.testing.assert_allclose(bench.get("plant_state"), [angle - math.pi, 0.7], atol=1e-15)
-    np.testing.assert_allclose(bench.get("output"), bob, atol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from drake_safety.learning.segments import Episodes
 from drake_safety.policies.policy_network import load_network
 from drake_safety.simulation.feedback import AddFeedbackRecorder, pair_windows, window_start
 from policy_networks import TERMS, new, recurrent_module, save_onnx, save_script
-from system_doubles import Bench, controller
 
 pytestmark = pytest.mark.train
 torch = pytest.importorskip("torch")
@@ -48,7 +47,6 @@ def checked(path):
         (script(is_replaced=True), 2),
         (onnx(), 0),
         (onnx(memory=LSTM), 2),
-        (onnx(memory=LSTM[:1]), 1),
         (onnx(memory=OTHER, shape=[1, "time", N_IN]), 2),
     ],
 )
@@ -132,25 +130,6 @@ def test_a_memory_of_another_kind_is_refused(tmp_path, network, message):
     with pytest.raises(ValueError, match=message) as refusal:
         checked(path)
     assert "\n" not in str(refusal.value)
-
-
-def test_a_cloned_context_continues_alike_and_a_new_one_from_the_start():
-    def count(batch, parts):
-        return batch[:, :2] + parts["count"], {"count": parts["count"] + 1.0}
-
-    system = controller(count, count=np.zeros(1))
-    inputs = {"plant_state": np.eye(1, 17), "command": [0.2, 0.4, 0.0]}
-    bench = Bench(system, **inputs)
-    bench.advance(0.05)
-    copy = bench.context.Clone()
-    bench.advance(0.06)
-    Simulator(system, copy).AdvanceTo(0.11)
-    for port in ("desired_joint_state", "action_state"):
-        theirs = system.GetOutputPort(port).Eval(copy)
-        np.testing.assert_array_equal(theirs, bench.get(port))
-    fresh = Bench(system, **inputs)
-    fresh.advance(0.01)
-    np.testing.assert_allclose(fresh.get("action_state")[:2], [0.2, 0.4])  # Of count 0.
 
 
 @pytest.fixture(scope="module")

@@ -14,18 +14,6 @@ def lines_of(file):
     return file.getvalue().splitlines()
 
 
-def test_without_a_terminal_lines_come_while_a_stage_is_silent():
-    file = io.StringIO()
-    with open_stages(Console(file=file, width=200), period_s=0.05) as stages:
-        stages("throws", 0, 40)
-        stages("throws", 5, 40)
-        time.sleep(0.1)
-        stages("throws", 10, 40)
-        time.sleep(0.3)
-    assert len(lines_of(file)) >= 2
-    assert lines_of(file)[-1].startswith("throws: 10/40 0:00:00 left 0:00:0")
-
-
 @pytest.mark.parametrize(
     ("done", "is_coloured", "lines"),
     [
@@ -41,17 +29,6 @@ def test_the_end_of_a_stage_is_a_line_and_so_is_silence_after_it(done, is_colour
         assert lines_of(console.file) == lines[: done // 40]
         time.sleep(0.2)
     assert lines_of(console.file)[: len(lines)] == lines
-
-
-def test_on_a_terminal_there_are_bars():
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    file = Terminal()
-    with open_stages(Console(file=file, width=200, force_terminal=True)) as stages:
-        stages("throws", 1, 2)
-    assert "throws" in file.getvalue() and "━" in file.getvalue()
 
 
 @pytest.mark.train

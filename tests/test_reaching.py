@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 import yaml
@@ -8,19 +6,14 @@ from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
 from drake_safety.control.mirror import Mirror
-from drake_safety.control.observation import stance_state
-from drake_safety.diagrams.reaching.sampling import PostureSampling
 from drake_safety.learning.segments import RECORDED, Episode
-from drake_safety.models import load_robot
-from drake_safety.plants.obstacles import Obstacle
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
 from drake_safety.simulation.rollouts import episode_rng, run_to_goal
-from legged_robots import edited, write_biped, write_hexapod
+from legged_robots import edited
 from reaching_loops import (
     EASY,
     LOOPS,
-    SCENES,
     atlas,
     easy_episode,
     evaluated,
@@ -52,25 +45,6 @@ def first_row(loop, context):
     names = ("state", "true_state", "output", "desired_output", "desired_preview", "features")
     rows = {name: evaluated(loop, context, name)[None].copy() for name in (*names, "margins")}
     return Episode(index=0, time_s=np.zeros(1), is_safe=True, cause="", **rows)
-
-
-def test_ports_have_values_of_the_plants_state(make_loop):
-    loop = make_loop()
-    simulator = Simulator(loop, started(loop))
-    simulator.AdvanceTo(0.3)
-    context = simulator.get_context()
-    q, v = plant_state(loop, context)
-    for name, expected in {
-        "true_state": stance_state(loop.kinematics, q, v),
-        "state": stance_state(loop.kinematics, q, v),
-        "output": loop.kinematics.reaching_position(q, loop.robot.reaching_frame(loop.hand)),
-        "safe": [1.0],
-        "solver_status": [0.0],
-    }.items():
-        np.testing.assert_array_equal(evaluated(loop, context, name), expected)
-    # Margins are held for a monitor's period.
-    margins = loop.safe_set.margins(q, v)
-    np.testing.assert_allclose(evaluated(loop, context, "margins"), margins, atol=0.02)
 
 
 @pytest.mark.parametrize("variation", ["nominal", "noisy"])
@@ -113,20 +87,6 @@ def test_starts_stand_safely_and_targets_are_within_the_ranges_of_the_scenario(m
     assert (np.ptp(goals, axis=0) > 0.6 * (highest - lowest)).all()
 
 
-def test_a_posture_has_the_least_clearance_and_distance_to_stops():
-    safe_set = porter().safe_set
-    v = np.zeros(safe_set.kinematics.num_velocities)
-    columns = [safe_set.names.index(name) for name in ("collision", "joint_limits")]
-
-    def least(**options):
-        sampling = PostureSampling(base_lowering_m=0.04, joint_offset_rad=0.3, **options)
-        postures = [sampling.sample(safe_set, np.random.default_rng(seed)) for seed in range(15)]
-        return np.array([safe_set.margins(q, v) for q in postures])[:, columns].min(axis=0)
-
-    assert np.all(least(clearance_m=0.05, joint_margin_rad=0.1) >= [0.05, 0.1])
-    assert np.any(least(clearance_m=0.0) < [0.05, 0.1])
-
-
 def test_a_goal_takes_the_place_of_the_drawn_target_alone():
     loop = porter("noisy")
     drawn, given = started(loop, 2), started(loop, 2, EASY)
@@ -134,13 +94,6 @@ def test_a_goal_takes_the_place_of_the_drawn_target_alone():
     assert not np.allclose(goal_of(loop, drawn), EASY, atol=1e-3)
     for name in ("plant_state", "state", "output"):
         np.testing.assert_array_equal(evaluated(loop, given, name), evaluated(loop, drawn, name))
-
-
-@pytest.mark.parametrize("goal", [[0.3, np.nan, 0.6], [0.3, 0.2]])
-def test_a_goal_that_is_not_three_finite_numbers_is_refused(goal):
-    loop = porter()
-    with pytest.raises(ValueError, match="reaching: a target is three finite numbers"):
-        loop.reset_standing(loop.CreateDefaultContext(), goal)
 
 
 def test_a_standing_start_is_the_posture_without_noise_and_repeats():
@@ -203,14 +156,6 @@ def test_evaluation_is_of_straight_plans_without_pushes(tmp_path):
     assert training.reset(training.CreateDefaultContext(), np.random.default_rng(0), EASY) == 0
 
 
-def test_a_push_is_over_when_the_rows_of_training_begin(tmp_path):
-    loop = exploring(tmp_path)
-    episodes = [run_episode(loop, i) for i in range(6)]
-    pushed = [e for e in episodes if e.first_step > 0]
-    assert 0 < len(pushed) < len(episodes)
-    assert all(e.time_s[e.first_step] >= 0.1 + 0.2 for e in pushed if e.is_safe)
-
-
 def test_the_other_hands_loop_is_the_trained_ones_mirror_image(make_loop):
     left, right = make_loop(), make_loop(hand="right")
     assert left.mirror is None and left.view.mirrored() == right.view
@@ -242,14 +187,6 @@ def test_the_other_hands_loop_is_the_trained_ones_mirror_image(make_loop):
     assert compared >= 2
 
 
-def test_the_mirror_image_moves_as_the_mirrored_robot():
-    left, right = easy_episode(), easy_episode(hand="right")
-    assert (left.cause, left.num_steps) == (right.cause, right.num_steps)
-    np.testing.assert_allclose(right.state, left.state, atol=1e-3)
-    np.testing.assert_allclose(right.features, left.features, atol=1e-3)
-    np.testing.assert_allclose(right.output, left.output * [1, -1, 1], atol=1e-3)
-
-
 @pytest.mark.train
 def test_one_assessment_serves_both_hands():
     scenario = load_scenario(porter_path())
@@ -275,32 +212,8 @@ def test_the_scenario_names_the_trained_hand_and_the_other_is_its_image(tmp_path
     assert (right.hand, left.hand) == ("right", "left")
     assert right.mirror is None and left.mirror is not None
     np.testing.assert_array_equal(right.target_box, scenario.parameters.target.box)
-    with pytest.raises(ValueError, match=r"has no reaching frame 'tail'; it has \['head', 'left'"):
-        scenario.make_loop(hand="tail")
     with pytest.raises(ValueError, match="are 'right' of robot 'porter' and its mirror image 'l"):
         scenario.make_loop(hand="head")
-    edited(tmp_path / "robot.yaml", mirror={})
-    with pytest.raises(ValueError, match=r"mirror pairs joint .* which is not its reflection"):
-        load_scenario(path).make_loop(hand="left")
-
-
-@pytest.mark.parametrize(
-    ("write", "message"),
-    [
-        (write_hexapod, "robot 'hexapod' has no reaching frames, so it cannot reach"),
-        (write_biped, "'biped': no body moved by joints of its reaching frames"),
-    ],
-)
-def test_a_robot_that_cannot_reach_is_refused(tmp_path, write, message):
-    with pytest.raises(ValueError, match=message):
-        load_scenario(porting(tmp_path, write)).make_loop()
-
-
-def test_a_decoration_with_collision_geometry_is_refused():
-    scenario = load_scenario(porter_path())
-    scenario.parameters.decorations = [Obstacle(model=f"{SCENES}/bookshelf.urdf")]
-    with pytest.raises(ValueError, match=r"decorations .*bookshelf.urdf'\] have collision geo"):
-        scenario.make_loop()
 
 
 def test_a_robot_of_ones_own_reaches_from_yaml_alone():
@@ -310,7 +223,7 @@ def test_a_robot_of_ones_own_reaches_from_yaml_alone():
     assert np.linalg.norm(episode.output - episode.desired_output, axis=1).max() < 0.05
 
 
-@pytest.mark.parametrize("variation", ["heavy", "rough", "noisy"])
+@pytest.mark.parametrize("variation", ["rough", "noisy"])
 def test_other_plants_nearly_reach_the_goal(variation):
     episode = easy_episode(variation)
     assert episode.cause == ""
@@ -358,14 +271,6 @@ def test_an_unsolved_program_is_in_the_solver_status():
     assert evaluated(loop, context, "num_controller_failures")[0] > 0
 
 
-def test_an_episode_that_begins_outside_the_safe_set_ends_at_once(monkeypatch):
-    q = porter().kinematics.standing_positions()
-    q[6] += 0.5
-    monkeypatch.setattr(PostureSampling, "sample", lambda *arguments: q)
-    episode = run_episode(porter(), 0)
-    assert episode.cause == "support_polygon" and len(episode.time_s) == 1
-
-
 def test_feet_that_begin_loaded_stay_flat_from_the_first_step():
     loop = atlas()
     fastest = []
@@ -399,32 +304,6 @@ def test_the_hash_depends_on_obstacles_and_their_files_and_on_no_online_paramete
         )
         hashes.add(scenario.simulation_hash())
     assert len(hashes) == 4
-
-
-@pytest.mark.parametrize("name", ["blue_box", "red_can"])
-def test_a_named_target_is_where_the_hand_touches_the_thing_on_its_board(name):
-    loop = atlas()
-    plant, context = loop.plant, loop.CreateDefaultContext()
-    query = plant.get_geometry_query_input_port().Eval(plant.GetMyContextFromRoot(context))
-    inspector = query.inspector()
-    (body,) = plant.GetBodyIndices(plant.GetModelInstanceByName(name))
-    corners = []
-    for geometry in inspector.GetGeometries(plant.GetBodyFrameIdOrThrow(body), Role.kIllustration):
-        box = inspector.GetObbInGeometryFrame(geometry)
-        X_WB = query.GetPoseInWorld(geometry) @ box.pose()
-        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1)
-        corners.append(X_WB.multiply(signs * np.reshape(box.half_width(), (3, 1))))
-    low, high = np.hstack(corners).min(axis=1), np.hstack(corners).max(axis=1)
-    foot = np.append(0.5 * (low + high)[:2], low[2])
-    clearance = loop.safe_set.clearance
-    under, over = clearance.of_points(np.array([foot - [0, 0, 0.025], foot + [0, 0, 0.01]]))
-    # Half a board's height under it is the middle of a board; a centimetre over its foot is air.
-    assert (under, over) == (pytest.approx(-0.025, abs=1e-6), pytest.approx(0.01, abs=1e-6))
-    target = np.array(loop.named_targets[name])
-    radius_m = load_robot("atlas").reaching_frame(loop.hand).radius_m
-    assert abs(np.linalg.norm(target - np.clip(target, low, high)) - radius_m) < 0.01
-    assert clearance.of_points(target[None], radius_m)[0] > 0.01
-    assert np.all((target >= loop.target_box[0]) & (target <= loop.target_box[1]))
 
 
 @pytest.mark.parametrize("is_watched", [False, True])
@@ -472,11 +351,3 @@ def test_a_motion_that_leaves_the_safe_set_goes_on_until_the_robot_falls(actual)
     assert motion["margins"][:row].min() >= 0
     assert actual.constraint_names[int(np.argmin(motion["margins"][row]))] == motion.cause
     assert motion["margins"][-1, actual.constraint_names.index(actual.fall_name)] < 0
-
-
-@pytest.mark.slow
-def test_the_safe_named_target_is_reached_inside_the_safe_set():
-    goal = np.array(atlas().named_targets["blue_box"])
-    motion = run_to_goal(load_scenario("atlas_reaching").make_loop(), goal, duration_s=3.5)
-    assert not motion.has_left and math.isinf(motion.leave_time_s)
-    assert np.linalg.norm(motion["output"][-1] - goal) < 0.02

@@ -4,17 +4,15 @@ import math
 
 import numpy as np
 import pytest
-import yaml
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
-from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_pose
+from drake_safety.control.kinematics import fit_stance, planar_pose
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.whole_body_model import WholeBodyModel
 from drake_safety.diagrams.reaching.safe_set import ReachingLimits, ReachingSafeSet
 from drake_safety.plants.obstacles import Clearance, Obstacle
-from drake_safety.robots.robot_model import load_robot_file
-from legged_robots import edited, robot_kinematics, robot_model, write_porter
+from legged_robots import robot_kinematics, robot_model
 
 SHELF_MODEL = "package://drake_safety_models/scenes/bookshelf.urdf"
 SHELF = Obstacle(model=SHELF_MODEL, position=[0.9, 0.0, 0.0])
@@ -232,31 +230,3 @@ def test_features_of_an_argument_that_is_not_finite_are_nan(where):
     arguments = {"q": q, "v": v, "preview": held_still(of, q)}
     arguments[where].flat[4] = np.inf
     assert np.isnan(of.features(**arguments)).all()
-
-
-def test_a_hand_has_the_radius_of_its_own_frame(tmp_path):
-    path = write_porter(tmp_path)
-    hands = yaml.safe_load(path.read_text())["reaching_frames"]
-    hands = {"fingertip": hands["left"] | {"radius_m": 0.01}, **hands}
-    kinematics = RobotKinematics(load_robot_file(edited(path, reaching_frames=hands)))
-    clearance = Clearance(kinematics.robot, [SHELF], range_m=RANGE_M)
-    q = kinematics.standing_positions()
-    path = in_stance(kinematics, q, straight([0.3, 0.2, 1.0], [0.66, 0.2, 0.925]))
-    clearances = {}
-    for hand in ("fingertip", "left"):
-        of = ReachingSafeSet(WholeBodyModel(kinematics, hand), clearance, ReachingLimits())
-        clearances[hand] = features(of, q, path)["goal_clearance"]
-    difference = clearances["fingertip"] - clearances["left"]
-    assert difference == pytest.approx(hands["left"]["radius_m"] - 0.01)
-
-
-@pytest.mark.parametrize(
-    ("name", "hand", "message"),
-    [
-        ("porter", None, r"'porter': the model must have a hand, one of \['left'"),
-        ("biped", "head", "'biped', reaching frame 'head': joints must be those of"),
-    ],
-)
-def test_a_model_without_a_hand_or_arm_is_refused(name, hand, message):
-    with pytest.raises(ValueError, match=message):
-        safe_set(name, hand)

@@ -1,4 +1,3 @@
-import math
 import re
 
 import numpy as np
@@ -13,7 +12,6 @@ from drake_safety.learning.segments import DIVERGED, EpisodeError
 from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.motion import advance_to
 from drake_safety.simulation.scenario_check import check_scenario
-from drake_safety.simulation.worker_processes import map_items
 from gliding_task import SCENARIO, Mass, gliding
 from shuttle_task import shuttling
 
@@ -59,18 +57,6 @@ def test_an_episode_until_a_fall_goes_on_outside_the_safe_set_and_only_a_fall_is
         run_episode(gliding().make_loop(), until_fall=True)
 
 
-def test_seeds_and_variations_are_kept_in_the_info():
-    sets = [run_episodes(gliding(), 2, variation="actual", seed=s, num_workers=1) for s in (7, 8)]
-    info = sets[0].info
-    assert (info.variation, info.seed) == ("actual", 7)
-    assert info.scenario_hash == gliding().simulation_hash("actual")
-    assert info.constraint_names == ["right", "left"]
-    assert len({episode.state[0, 0] for episodes in sets for episode in episodes}) == 4
-    # An episode depends on its seed and number alone, in any order.
-    loop = gliding().make_loop("actual")
-    assert_identical([run_episode(loop, i, seed=7) for i in (1, 0)][::-1], sets[0])
-
-
 @pytest.mark.parametrize("num_workers", [1, 2])
 def test_an_error_in_somebodys_code_is_not_a_diverged_simulation(num_workers):
     message = r"episode (\d+) of 'gliding' \(seed 3\): RuntimeError: operands"
@@ -101,7 +87,7 @@ def test_a_row_is_read_before_the_step_that_begins_at_it_whatever_the_rounding()
         assert simulator.get_context().get_discrete_state_vector()[0] == 40 * row
 
 
-@pytest.mark.parametrize("failure", ["raise", "nan", "1e13"])
+@pytest.mark.parametrize("failure", ["raise", "1e13"])
 def test_a_diverged_simulation_is_recorded_as_such_and_the_run_goes_on(failure):
     episodes = run_episodes(gliding(failure=failure), 20, num_workers=1)
     sound = run_episodes(gliding(), 20, num_workers=1)
@@ -168,14 +154,6 @@ def test_episodes_of_a_robot_are_the_same_to_the_bit_with_one_and_two_workers():
     assert alone.num_diverged == 0
 
 
-@pytest.mark.parametrize("num_workers", [1, 2])
-def test_every_item_is_called_once_and_a_failure_is_that_of_its_item(num_workers):
-    results = map_items(math.sqrt, range(9), num_workers=num_workers)
-    assert sorted(results) == [math.sqrt(i) for i in range(9)]
-    with pytest.raises(ValueError, match=r"domain|nonnegative"):
-        list(map_items(math.sqrt, [1, -1, 2], num_workers=num_workers, batch_size=1))
-
-
 @pytest.mark.train
 def test_an_episode_counts_the_failures_of_its_controller(tmp_path):
     loop = shuttling().make_loop()
@@ -238,5 +216,5 @@ def test_state_outside_the_context_is_found_in_many_episodes_and_by_check(
         assert len(run_episodes(load_scenario(file), 64, num_workers=1)) == 64
         return
     assert "keeps state outside its Context" in repeated.message
-    with pytest.raises(ValueError, match="episode 0 of 'mine', .* keeps state outside"):
+    with pytest.raises(ValueError, match=r"episode 0 of 'mine', .* keeps state outside"):
         run_episodes(load_scenario(file), 64, num_workers=1)

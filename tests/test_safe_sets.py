@@ -122,16 +122,6 @@ def test_features_and_margins_do_not_depend_on_the_place_and_each_feature_has_a_
     np.testing.assert_allclose(moved, unmoved, atol=1e-9)
 
 
-def test_directional_margins_are_distances_to_the_sides_the_robot_would_tip_over():
-    kinematics, safe_set = safe_set_of("laikago")
-    values = features(safe_set, *state(kinematics), np.zeros((3, 3)))
-    feet, base = kinematics.nominal_contacts, kinematics.nominal_base_offset
-    assert values["base_margin_0deg"] == pytest.approx(feet[:, 0].max() - base[0])
-    assert values["base_margin_270deg"] == pytest.approx(base[1] - feet[:, 1].min())
-    # The goal is the preview's last point: the stance frame's origin.
-    assert values["goal_margin_90deg"] == pytest.approx(feet[:, 1].max())
-
-
 def test_a_velocity_moves_the_capture_point_by_the_pendulums_time_constant():
     kinematics, safe_set = safe_set_of("laikago")
     q, v = state(kinematics)

@@ -3,7 +3,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -12,21 +11,13 @@ import drake_safety
 import gliding_task
 from command_line import invoked
 from drake_safety import load_scenario
-from drake_safety.cli.training_folder import check_fresh
-from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.rollouts import episodes_info
-from drake_safety.simulation.scenario import (
-    parse_scenario,
-    read_scenario,
-    scenario_names,
-    task_names,
-)
+from drake_safety.simulation.scenario import parse_scenario, read_scenario, scenario_names
 from drake_safety.simulation.scenario_check import check_scenario
 from gliding_task import SCENARIO, gliding
 from legged_robots import write_hexapod
 
 BALANCING = "task: drake_safety.diagrams.balancing:Balancing\nrobot: laikago\n"
-NOBODY = BALANCING.replace("laikago", "nobody") + "variations: {nominal: {}}"
 
 
 def parsed(text, name="mine", folder=Path()):
@@ -43,15 +34,6 @@ def task(name):
 
 def laikago():
     return load_scenario("laikago_balancing")
-
-
-def test_a_file_holds_only_what_differs_from_the_defaults():
-    scenario = parsed(with_parameters("{speed_m_s: 0.5}"))
-    assert scenario.parameters.speed_m_s == 0.5
-    assert scenario.parameters.failure == ""
-    assert scenario.control_period_s == 0.01
-    assert scenario.variation("nominal").mass_scale == 1.0
-    assert scenario.variation("actual").mass_scale == 1.2
 
 
 def test_values_of_a_file_are_replaced_by_their_keys():
@@ -142,48 +124,18 @@ def test_a_task_of_a_name_that_is_taken_is_refused_with_both_files(beside, tmp_p
         load_scenario(changed(beside, "beside_task:", "yaml:"))
 
 
-def test_a_task_beside_its_scenario_is_not_imported_where_its_code_is_not_to_run(beside):
-    findings = list(check_scenario(beside, is_imported=False))
-    assert findings[0].is_ok and "was not imported" in findings[1].message
-    assert "beside_task" not in sys.modules
-    # A text, as that of a run's report, says nothing of a folder either.
-    with pytest.raises(ValueError, match="no module 'beside_task'"):
-        parse_scenario(beside.read_text(), name="beside", folder=beside.parent)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("task: [", "scenario 'mine' is not YAML"),
-        ("robot: none", "must be a mapping with the key 'task'"),
-        (SCENARIO + "bogus: 1", "unknown key 'bogus'; keys there are .*episode_duration_s"),
         (BALANCING + "parameters: {push: {sharee: 1}}", "push.sharee' .* keys there are .*'share'"),
-        (BALANCING + "step_s: fast", "'mine': 'step_s' must be a valid number; got 'fast'"),
-        (with_parameters("{failure: sneeze}"), "gliding: unknown failure 'sneeze'"),
-        (task("nowhere:X"), r"no module 'nowhere'.*drake_safety\.diagrams\.balancing"),
+        (task("nowhere:X"), "no module 'nowhere'"),
         (task("drake_safety.diagrams.balancing:Throw"), r"no task 'Throw'; it has \['Balancing'\]"),
-        (task("gliding_task"), "task must be 'package.module:Class'; got 'gliding_task'"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused_with_what_would(text, message):
     with pytest.raises(ValueError, match=message):
         parsed(text)
-
-
-@pytest.mark.parametrize(
-    ("ask", "message"),
-    [
-        (lambda: load_scenario("nobody"), r"'nobody' does not exist; scenarios are \[.*'laikago_"),
-        (lambda: load_scenario(Path("gone.yaml")), r"scenario file '.*gone\.yaml' does not exist"),
-        (lambda: parsed(SCENARIO).make_loop("dream"), r"'dream'; it has \['nominal', 'actual'\]"),
-        (lambda: parsed(SCENARIO).make_loop(ball=1), r"'Gliding' has no .*\['ball'\]; it has \[\]"),
-        (lambda: laikago().make_loop(target=3), r"no options \['target'\]; it has .*'ball'\]"),
-        (lambda: parsed(NOBODY).make_loop(), "robot 'nobody' does not exist; robots are"),
-    ],
-)
-def test_a_name_that_does_not_exist_is_answered_with_those_that_do(ask, message):
-    with pytest.raises(ValueError, match=message):
-        ask()
 
 
 def test_a_module_that_a_task_lacks_is_not_taken_for_the_task(tmp_path, monkeypatch):
@@ -193,17 +145,9 @@ def test_a_module_that_a_task_lacks_is_not_taken_for_the_task(tmp_path, monkeypa
         parsed("task: hungry_task:X\nrobot: laikago\n")
 
 
-def test_a_horizon_as_long_as_the_episode_is_allowed_in_spite_of_rounding():
-    assert parsed(SCENARIO).num_steps == 20
-    # 3 × 0.1 > 0.3 in floating point.
-    text = BALANCING + "episode_duration_s: 0.3\nstep_s: 0.1\nassessment: {horizon: 3}"
-    assert parsed(text).num_steps == 3
-
-
 @pytest.mark.parametrize("name", scenario_names())
 def test_every_scenario_loads_and_is_read_again_from_its_canonical_text(name):
     scenario = load_scenario(name)
-    assert scenario.task.partition(":")[0] in task_names()
     assert scenario.name == name
     assert "nominal" in scenario.variations
     assert isinstance(scenario.parameters, scenario.task_class().Parameters)
@@ -219,7 +163,7 @@ def test_every_scenario_loads_and_is_read_again_from_its_canonical_text(name):
         (with_parameters("{speed_m_s: 2.0}"), True),  # The default.
         (SCENARIO + "assessment: {epochs: 3, mode: paper}", True),
         (SCENARIO + "assessment: {horizon: 11}", False),
-        (SCENARIO.replace("step_s: 0.04", "step_s: 0.02"), False),
+        (SCENARIO.replace("actual: {", "payload: {}, actual: {"), True),
         (SCENARIO.replace("nominal: {}", "nominal: {mass_scale: 1.2}"), False),
         (with_parameters("{speed_m_s: 3.0}"), False),
     ],
@@ -241,27 +185,6 @@ def test_a_copy_is_the_scenario_that_was_learned_from_only_if_it_simulates_the_s
     assert copy.adopt(learned) == is_same
     assert (copy.simulation_hash() == learned.scenario_hash) == is_same
     assert copy.name == "copied"
-
-
-def test_an_assessment_of_a_changed_scenario_names_both_and_their_robots(tmp_path):
-    write_hexapod(tmp_path)
-    scenario = parsed(SCENARIO.replace("robot: none", "robot: robot.yaml"), folder=tmp_path)
-    learned = replace(episodes_info(scenario.make_loop(), seed=0), robot="ours")
-    scenario.step_s = 0.08
-    with pytest.raises(
-        ValueError, match=r"of robot 'ours' with hash .* of robot 'hexapod' now has"
-    ):
-        check_fresh(SimpleNamespace(info_=learned), scenario)
-
-
-def test_another_plant_does_not_change_the_hash_of_this_one():
-    scenario = parsed(SCENARIO)
-    before = scenario.simulation_hash()
-    scenario.variations["payload"] = PlantVariation(mass_scale=1.4)
-    assert scenario.simulation_hash() == before
-    assert scenario.simulation_hash("payload") != before
-    with pytest.raises(ValueError, match=r"no variation 'lighter'.*'payload'"):
-        scenario.simulation_hash("lighter")
 
 
 def test_a_robots_files_change_the_hash_and_their_folder_does_not(tmp_path):
@@ -335,9 +258,6 @@ def test_a_strangers_scenario_is_checked_without_running_its_code(tmp_path, monk
     assert (scenario.task, scenario.parameters) == ("stranger:Task", {})
     with pytest.raises(SystemExit, match="code was run"):
         load_scenario(file)
-    code = next(f for f in check_scenario("pendulum", num_episodes=0) if f.item == "code")
-    assert "drake_safety.diagrams.pendulum:Pendulum" in code.message
-    assert code.message.endswith("pendulum/task.py")
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from pydrake.geometry import Box, Role
+from pydrake.geometry import Box
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety.plants.physics import add_ground
-from package_models import MODELS, Scene, package_parser
+from package_models import package_parser
 
 # Source: junhyeokahn/PyPnC, robot_model/bookcase/bookshelf.urdf.
 BOARD_SIZE = (0.3, 2.0, 0.05)
@@ -26,24 +26,6 @@ def scene_of(name, is_welded=False):
     return plant, scene_graph, bodies
 
 
-def test_the_ball_is_a_solid_sphere_of_two_kilograms():
-    _, _, (ball,) = scene_of("ball.sdf")
-    inertia = ball.default_spatial_inertia()
-    assert inertia.get_mass() == 2.0
-    np.testing.assert_array_equal(inertia.get_com(), np.zeros(3))
-    rotational = inertia.CalcRotationalInertia().CopyToFullMatrix3()
-    np.testing.assert_allclose(rotational, 0.4 * 2.0 * 0.08**2 * np.eye(3), rtol=0.0, atol=1e-15)
-
-
-@pytest.mark.parametrize("scene", ["ground.urdf", "blue_box.sdf", "red_can.sdf"])
-def test_ground_and_decorations_are_visual_only_and_the_ground_does_not_move(scene):
-    plant, scene_graph, _ = scene_of(scene)
-    inspector = scene_graph.model_inspector()
-    assert inspector.NumGeometriesWithRole(Role.kProximity) == 0
-    assert inspector.NumGeometriesWithRole(Role.kIllustration) > 0
-    assert (plant.num_velocities() == 0) == (scene == "ground.urdf")
-
-
 def test_the_bookshelf_can_be_touched_at_its_visible_boards():
     plant, scene_graph, (shelf,) = scene_of("bookshelf.urdf", is_welded=True)
     inspector = scene_graph.model_inspector()
@@ -58,15 +40,6 @@ def test_the_bookshelf_can_be_touched_at_its_visible_boards():
         heights.append(X_BG.translation()[2])
         assert any(X.IsExactlyEqualTo(X_BG) and tuple(size) == BOARD_SIZE for X, size in visible)
     assert sorted(heights) == list(BOARD_HEIGHTS)
-
-
-@pytest.mark.parametrize("name", ["laikago", "atlas"])
-def test_no_body_of_a_robot_shares_its_name_with_a_scene(name):
-    files = [path.name for path in (MODELS / "scenes").iterdir() if path.suffix != ".md"]
-    scene = Scene(name, *(file for file in files if file != "ground.urdf"))
-    for body in scene.bodies:
-        # By name alone, which fails where two models have one of that name.
-        assert scene.plant.GetBodyByName(body).model_instance() == scene.instance
 
 
 def test_the_ground_is_a_level_half_space_with_the_given_friction():

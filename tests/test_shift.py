@@ -8,7 +8,6 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import load_scenario
-from drake_safety.evaluation.shifts import plant_shifts
 from drake_safety.models import load_robot
 from drake_safety.robots.shift import Fault, JointShift, Shift
 from drake_safety.simulation.rollouts import run_episode
@@ -142,6 +141,7 @@ def test_a_faulty_input_does_not_change_the_motion(fault, seen):
     assert not seen(plain.state, plain.true_state)
 
 
+<<<<<<< HEAD
 def test_the_delays_of_the_catalogue_fit_every_period():
     scenario = load_scenario(SCENARIO)
     loop = scenario.make_loop()
@@ -150,6 +150,15 @@ def test_the_delays_of_the_catalogue_fit_every_period():
     assert shifts["late_command"].variation.shift.command_delay_s == pytest.approx(0.152)
     (stale,) = shifts["stale"].variation.shift.sensor_faults
     assert stale.value == pytest.approx(0.21)
+=======
+def test_noise_of_a_fault_follows_from_the_episode():
+    loop = loop_with(Shift(sensor_faults=[Fault(kind="noise", entries=["FR_.*_w"], value=3.0)]))
+    first, again, other = (run_episode(loop, index, seed=5) for index in (0, 0, 1))
+    np.testing.assert_array_equal(first.state, again.state)
+    errors = [(one.state - one.true_state)[:20, 24:27] for one in (first, other)]
+    assert np.std(errors[0]) == pytest.approx(3.0, rel=0.3)
+    assert not np.allclose(*errors, atol=0.5)
+>>>>>>> 82a1a1c (Tests of simulation and tasks: a law is tested once)
 
 
 def test_a_plant_without_shift_has_the_hash_from_before_there_were_any():
@@ -160,26 +169,11 @@ def test_a_plant_without_shift_has_the_hash_from_before_there_were_any():
     assert scenario.simulation_hash("nominal") != before
 
 
-def test_a_scenario_file_can_state_a_shift(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_text(
-        "task: drake_safety.diagrams.balancing:Balancing\nrobot: laikago\nvariations:\n"
-        "  nominal: {}\n  icy: {shift: {slope_rad: 0.1, joints: {.*_calf_joint: {effort_scale: "
-        "0.5}}, sensor_faults: [{kind: delay, value: 0.1}]}}\n",
-        encoding="utf-8",
-    )
-    shift = load_scenario(path).variation("icy").shift
-    assert shift.slope_rad == 0.1
-    assert shift.joints[".*_calf_joint"].effort_scale == 0.5
-    assert shift.sensor_faults == [Fault(kind="delay", value=0.1)]
-
-
 @pytest.mark.parametrize(
     ("shift", "message"),
     [
         (Shift(joints={"elbow": JointShift(is_locked=True)}), "no joint for shift 'elbow'; it has"),
         (Shift(sensor_faults=[Fault(kind="zero", entries=["elbow_q"])]), "no entry 'elbow_q'"),
-        (Shift(command_delay_s=0.004), "a delay must be a multiple of the period 0.0025 s"),
     ],
 )
 def test_a_shift_of_a_part_that_does_not_exist_is_refused(shift, message):

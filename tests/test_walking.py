@@ -10,7 +10,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety import load_assessment, load_scenario
 from drake_safety.control.observation import heading_velocity, walking_state
-from drake_safety.diagrams.walking.parameters import CommandSampling, WalkingRecovery, profile
+from drake_safety.diagrams.walking.parameters import WalkingRecovery
 from drake_safety.learning.beliefs import empty
 from drake_safety.simulation.contract import check_contract
 from drake_safety.simulation.rollouts import episode_rng
@@ -78,19 +78,6 @@ def test_state_and_output_do_not_depend_on_place_and_heading(loop):
     states = [walking_state(loop.kinematics, *one) for one in ((q, v), moved)]
     np.testing.assert_allclose(*states, atol=1e-9)
     np.testing.assert_allclose(heading_velocity(q, v), heading_velocity(*moved), atol=1e-9)
-
-
-def test_profiles_go_from_one_command_to_the_next_within_their_ranges(loop):
-    plan = profile([np.zeros(3), np.ones(3)], [1.0], 4.0)
-    for time_s, expected in ((0.9, 0.0), (1.2, 1.0), (4.0, 1.0)):
-        np.testing.assert_allclose(plan.value(time_s).ravel(), expected)
-    sampling, limits = CommandSampling(reach=2.0), loop.policy.parameters.command
-    rng = np.random.default_rng(0)
-    values = np.concatenate(
-        [sampling.sample(limits, rng, 4.0).vector_values([0.0, 2.0, 4.0]).T for _ in range(200)]
-    )
-    assert np.all(values <= 2.0 * np.array(limits.highest) + 1e-9)
-    assert np.any(np.abs(values) > np.array(limits.highest) + 0.2)
 
 
 def test_a_start_has_the_controllers_memory_so_that_the_motion_continues(loop):
@@ -162,18 +149,6 @@ def test_recovery_switches_to_the_branch_that_the_scenario_names(branch, slowest
     assert speeds[0] > 0.4
     assert loop.GetOutputPort("margins").Eval(context)[loop.constraint_names.index("tilt")] > 0.4
     assert slowest < speeds[1] / speeds[0] < fastest
-
-
-def test_a_missing_part_is_named():
-    scenario = load_scenario("go2_walking")
-    with pytest.raises(ValueError, match="guard=True needs an assessment"):
-        scenario.make_loop(guard=True)
-    loop = scenario.make_loop()
-    with pytest.raises(ValueError, match="built without a guard"):
-        loop.set_guarded(loop.CreateDefaultContext(), True)
-    scenario.parameters.safe_set.clearance_m["wing"] = 0.1
-    with pytest.raises(ValueError, match=r"no bodies \['wing'\] for clearance_m; it has"):
-        scenario.make_loop()
 
 
 def passed_on(assessment, command, state=0.0, is_acting=True):

@@ -13,6 +13,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.files.schema import Bounds, Positive, schema
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.planned_loop import PlannedLoop
@@ -192,7 +193,12 @@ class Pendulum(PlannedLoop):
         meshcat: Meshcat | None = None,
     ):
         super().__init__(scenario, variation, assessment)
-        self._check_variation("mass_scale", "joint_damping")
+        varied = self._plant_variation
+        plain = PlantVariation(mass_scale=varied.mass_scale, joint_damping=varied.joint_damping)
+        if varied != plain:
+            raise ValueError(
+                f"pendulum: variation '{variation}' may set mass_scale and joint_damping alone"
+            )
         parameters, period_s = scenario.parameters, scenario.control_period_s
         outlook_s = scenario.episode_duration_s
         builder = DiagramBuilder()

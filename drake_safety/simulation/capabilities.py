@@ -1,7 +1,6 @@
 """Protocols of optional features of a task, queried by ``isinstance`` or :func:`require`.
 
-Throughout, ``context`` is the diagram's root Context, which a reset overwrites, ``rng`` a random
-generator, and ``episode`` an episode of the loop.
+Throughout, ``context`` is the diagram's root Context, which a reset overwrites.
 """
 
 from __future__ import annotations
@@ -26,15 +25,11 @@ _Capability = TypeVar("_Capability")
 
 @runtime_checkable
 class HasGoals(Protocol):
-    """Plans lead to a goal: three numbers, a point in the world [m] or what `goal_words` says.
-
-    Attributes:
-        named_targets: Named goals, (3,) each.
-        hand: The reaching frame that moves to the goal; None for another part of the robot.
-    """
+    """Plans lead to a goal: three numbers, a point in the world [m] or what `goal_words` says."""
 
     named_targets: Mapping[str, list[float]]
     hand: str | None
+    """The reaching frame that moves to the goal; None for another part of the robot."""
 
     @property
     def target_box(self) -> np.ndarray:
@@ -83,16 +78,12 @@ class GoalWords:
 
 @runtime_checkable
 class CanFall(Protocol):
-    """The robot can fall, which ends a motion.
-
-    Attributes:
-        fall_name: The constraint whose violation is a fall.
-        watched_features: Features that a conventional monitor thresholds, by quantity; larger
-            values are safer.
-    """
+    """The robot can fall, which ends a motion."""
 
     fall_name: str
+    """The constraint whose violation is a fall."""
     watched_features: Mapping[str, str]
+    """Features that a conventional monitor thresholds, by quantity; larger values are safer."""
 
 
 @runtime_checkable

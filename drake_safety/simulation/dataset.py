@@ -1,10 +1,8 @@
 """Episodes on disk: a folder with an ``info.json`` and Parquet shards, written as they finish.
 
 ``info.json`` holds what all episodes share. Each ``episodes-NNNNN.parquet`` has one row per
-(episode, step); arrays are columns of fixed-size lists of float64 in SI units. A file is written
-under a temporary name, which starts with a dot, and renamed: a file with its final name is
-complete, and an interrupted run loses at most the episodes that were not flushed. pandas reads the
-rows by ``pandas.read_parquet(sorted(folder.glob("episodes-*.parquet")))``.
+(episode, step); arrays are columns of fixed-size lists of float64 in SI units. A file is renamed
+when it is complete: an interrupted run loses at most the episodes that were not flushed.
 """
 
 from __future__ import annotations
@@ -48,11 +46,8 @@ class EpisodeWriter:
 
     Leaving the ``with`` block writes the pending episodes, after an exception or Ctrl-C too. A
     folder that holds episodes is continued: ``completed(path)`` gives their indices. The folder is
-    locked until the writer is closed or its process ends.
-
-    Args:
-        extra: Further content of ``info.json``, as JSON types (the command, the scenario's text,
-            ...). In a folder that is continued, it replaces entries of the same names.
+    locked until the writer is closed or its process ends. ``extra`` is further content of
+    ``info.json``, as JSON types.
     """
 
     def __init__(
@@ -163,24 +158,18 @@ def completed(path: str | os.PathLike[str]) -> set[int]:
 
 
 def load_episodes(path: str | os.PathLike[str]) -> Episodes:
-    """Loads all episodes of a folder, sorted by index, bit for bit as they were appended.
-
-    An episode in two shards is loaded once if both copies are identical.
-    """
+    """Loads all episodes of a folder, sorted by index, bit for bit as they were appended."""
     info, _ = read_info(path)
-    episodes: dict[int, tuple[Episode, Path]] = {}
+    episodes: dict[int, Episode] = {}
     for shard in _shards_in(Path(path)):
         with reading(shard):
             read = _episodes_of(_read_shard(shard), info, shard)
             Episodes(info, read)  # Checks them.
         for episode in read:
-            known, where = episodes.setdefault(episode.index, (episode, shard))
-            if known is not episode and not is_same(known, episode):
-                raise ValueError(
-                    f"episode {episode.index} of {where} differs from that of {shard.name}; remove "
-                    "one of the shards"
-                )
-    return Episodes(info, [episodes[index][0] for index in sorted(episodes)])
+            if episode.index in episodes:
+                raise ValueError(f"episode {episode.index} of {shard} is in another shard, too")
+            episodes[episode.index] = episode
+    return Episodes(info, [episodes[index] for index in sorted(episodes)])
 
 
 def _open_folder(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> None:
@@ -208,11 +197,7 @@ def _open_folder(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> No
     if extra == known:
         return
     content = {"schema_version": _SCHEMA_VERSION, "info": dataclasses.asdict(info), "extra": extra}
-    try:
-        text = json.dumps(content, indent=2, ensure_ascii=False)
-    except TypeError as error:
-        raise ValueError(f"{path}: info and extra must be made of JSON types: {error}") from error
-    write_file(path / _INFO_NAME, text + "\n")
+    write_file(path / _INFO_NAME, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
 
 
 def is_same(a: Episode, b: Episode) -> bool:

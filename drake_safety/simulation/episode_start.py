@@ -16,16 +16,13 @@ _DRIFT, _ROUNDING = 0.2, 1e-6  # Of a quaternion's norm.
 class EpisodeStart:
     """A plant state and a plan, from which an episode or its nominal twin starts.
 
-    The orders of ``q`` and ``v`` are those of a robot; a task with another plant has its own.
-
     Attributes:
         q: Positions in Drake's order: base quaternion (w, x, y, z), base position, joints, (n_q,).
         v: Velocities: of the base in the world, angular first, then of the joints, (n_v,).
         plan: Desired output over time since the start, in the stance frame, (n_z, 1) [m].
-        foot_positions: Positions of the feet as the controller assumes them: centres of the contact
-            spheres, (n_c, 3) [m]. By default those of ``q``, put on the ground.
-        controller_state: Memory of the controller, such as the phase of a gait, as the task defines
-            it; that of a controller which has done nothing by default.
+        foot_positions: Centres of the contact spheres as the controller assumes them, (n_c, 3)
+            [m]; by default those of ``q``, put on the ground.
+        controller_state: Memory of the controller, such as the phase of a gait.
     """
 
     q: np.ndarray
@@ -51,10 +48,7 @@ class EpisodeStart:
                 raise ValueError(f"{who}: {name} must be {size} finite numbers; got {value}")
 
     def of_robot(self, kinematics: RobotKinematics) -> EpisodeStart:
-        """Checks that the start fits a robot, and returns it with a quaternion of unit norm.
-
-        The quaternion of a simulated plant drifts: its norm changes by up to 1e-4 a second.
-        """
+        """Checks that the start fits a robot, and returns it with a quaternion of unit norm."""
         who = f"start of robot '{kinematics.robot.name}'"
         self.check(who, kinematics.num_positions, kinematics.num_velocities)
         norm = float(np.linalg.norm(self.q[:4]))

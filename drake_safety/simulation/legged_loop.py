@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -26,15 +26,13 @@ from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.assessor_inputs import AssessorInputs
 from drake_safety.systems.push_source import PushSource
-from drake_safety.systems.safety_monitor import FeaturedSafeSet
 
 UPDATE_TICK = 0.25
 """Time between two systems that update one after the other, as a share of the plant's step.
 
-Drake has no order for events of one kind at one time: all discrete updates see the state before any
-of them. (Unrestricted ones come before, and publishing after; two kinds are too few.) So a system
-whose input is another's new state updates a tick later. Assessor, trigger, step planner and
-controller are the longest chain, done within the plant's step in which it began.
+Drake's discrete updates at one time see the state before any of them. So a system whose input is
+another's new state updates a tick later. Assessor, trigger, step planner and controller are the
+longest chain, done within the plant's step in which it began.
 """
 
 
@@ -59,25 +57,15 @@ class View:
         return View(azimuth_rad=-self.azimuth_rad, elevation_rad=self.elevation_rad, room=self.room)
 
 
-class LeggedSafeSet(FeaturedSafeSet, Protocol):
-    """A safe set of a robot that can fall."""
-
-    fall_name: str
-    watched_features: Mapping[str, str]
-
-
 class LeggedLoop(PlannedLoop):
     """A legged robot that follows a plan and is observed with noise.
 
     A subclass calls in this order: :meth:`_add_robot`, :meth:`_add_observers`,
     :meth:`_add_planner`, adds its controller, :meth:`_assess`, and ``builder.BuildInto(self)``. It
-    extends :meth:`_set_state` by the controller's initial state, and implements
-    :meth:`_output_of`, the output that its plans specify.
+    extends :meth:`_set_state` by the controller's initial state.
 
     Attributes:
         plant: A MultibodyPlant with the robot, to be read only, whatever engine simulates it.
-        watched_features: Features that a conventional monitor thresholds, by quantity; larger
-            values are safer.
         memory_features: Features that depend on what the controller did before, which a log of the
             plant lacks.
         memory_period_s: Time between two updates of a controller with a memory [s].
@@ -159,7 +147,7 @@ class LeggedLoop(PlannedLoop):
     def _assess(
         self,
         builder: DiagramBuilder,
-        safe_set: LeggedSafeSet,
+        safe_set: Any,
         ports: Mapping[str, OutputPort],
         *,
         period_s: float,
@@ -172,10 +160,10 @@ class LeggedLoop(PlannedLoop):
     ) -> None:
         """Adds monitor, assessor's inputs and assessor, connects them, and exports all ports.
 
-        ``ports`` are exported but ``desired_outlook``, which the features are of. ``command``,
-        desired joint states (2 n_j,), adds features of the servos' loads, ``memory`` a port with
-        the names of its entries. ``recovery`` reads the assessor, or without one an input port of
-        the diagram; ``guard`` reads the assessor's inputs and what it has learned.
+        ``ports`` are exported but ``desired_outlook``. ``command``, desired joint states (2 n_j,),
+        adds features of the servos' loads, ``memory`` a port with the names of its entries.
+        ``recovery`` reads the assessor, or without one an input port of the diagram; ``guard``
+        reads the assessor's inputs and what it has learned.
         """
         self.fall_name = safe_set.fall_name
         self.watched_features = safe_set.watched_features
@@ -277,7 +265,6 @@ class LeggedLoop(PlannedLoop):
         *,
         is_silent: bool = False,
     ) -> None:
-        """Begins at a start with noise of a generator, initially none if it is silent."""
         self._enter(context, start)
         self._observers.reseed(context, rng)
         if is_silent:

@@ -31,47 +31,41 @@ _LOGGER = logging.getLogger("drake_safety")
 
 @dataclass(frozen=True, kw_only=True)
 class End:
-    """When a simulated motion ends, whatever comes first.
-
-    Attributes:
-        duration_s: Time since the start [s].
-        after_leaving_s: Time outside the safe set [s]; by default it does not end a motion.
-        after_fall_s: Time after a fall, a violation of the diagram's ``fall_name`` [s].
-        until: Constraint whose violation ends the motion.
-        until_first_row: Whether it ends at the first row whose future is undisturbed.
-    """
+    """When a simulated motion ends, whatever comes first."""
 
     duration_s: float
+    """Time since the start [s]."""
     after_leaving_s: float = math.inf
+    """Time outside the safe set [s]; by default it does not end a motion."""
     after_fall_s: float = 0.0
+    """Time after a fall, a violation of the diagram's ``fall_name`` [s]."""
     until: str = ""
+    """Constraint whose violation ends the motion."""
     until_first_row: bool = False
+    """Whether it ends at the first row whose future is undisturbed."""
 
 
 @dataclass(kw_only=True, eq=False)
 class Motion:
-    """Log of a simulated motion; ``motion[name]`` is a logged port.
-
-    Attributes:
-        time_s: Times of the rows since the start [s], (N,).
-        ports: The logged output ports by name, (N, size) each.
-        leave_time_s: Time at which it left the safe set [s]; infinite if it did not.
-        cause: The constraint that was violated then; "" for none.
-        fall_time_s: Time of the fall [s]; infinite without one.
-        failure: Why the simulation ended early; "" if it did not.
-        first_row: First row with an undisturbed future.
-        push_time_s: Start of a push, or impact of the first ball [s]; infinite without one.
-    """
+    """Log of a simulated motion; ``motion[name]`` is a logged port."""
 
     time_s: np.ndarray
+    """Times of the rows since the start [s], (N,)."""
     ports: dict[str, np.ndarray]
+    """The logged output ports by name, (N, size) each."""
     leave_time_s: float = math.inf
+    """Time at which it left the safe set [s]; infinite if it did not."""
     cause: str = ""
+    """The constraint that was violated then; "" for none."""
     fall_time_s: float = math.inf
+    """Time of the fall [s]; infinite without one."""
     failure: str = ""
+    """Why the simulation ended early; "" if it did not."""
     first_row: int = 0
+    """First row with an undisturbed future."""
     index: int = 0
     push_time_s: float = math.inf
+    """Start of a push, or impact of the first ball [s]; infinite without one."""
 
     def __getitem__(self, port: str) -> np.ndarray:
         return self.ports[port]
@@ -98,10 +92,9 @@ class Motion:
         return [*zip(self.time_s[begins].tolist(), self.time_s[ends].tolist(), strict=True)]
 
     def episode(self, num_features: int = 0) -> Episode:
-        """The motion as an episode: ``diverged`` if the simulation failed.
+        """The motion as an episode, with the defaults of `record_episodes` for what was not logged.
 
-        What was not logged has its default: ``true_state`` is ``state``, ``desired_output`` the
-        first sample of the preview, and the ``num_features`` features are zero.
+        It is ``diverged`` if the simulation failed.
         """
         num_rows, cause = len(self.time_s), DIVERGED if self.failure else self.cause
         rows = {
@@ -183,18 +176,15 @@ def simulate(
         start: Sets state, plan and perhaps time of the default root Context. It may return the
             first row whose future is undisturbed, if that is not 0.
         ports: Ports to log; a mapping from logged names to those of ports renames them, also
-            ``margins`` and ``safe``, which is below 1 outside the safe set; without a port
-            ``safe`` that is where a margin is negative.
+            ``margins`` and ``safe``. Without a port ``safe`` a negative margin is unsafe.
         step_s: Time between two rows [s].
-        watch_period_s: Sampling period of the safe set, counted from each row [s]; by default it
-            is sampled at rows.
+        watch_period_s: Sampling period of the safe set [s]; by default it is sampled at rows.
         events: Times [s] and what is done then with the Context.
         each_row: Called with the Context after each row.
         monitor: Called with the Context after each step of the simulator; it may end it.
         constraint_names: Names of the margins; by default the diagram's.
         may_fail: Whether a failure of the simulation is a result, ``Motion.failure``, with the rows
             that are finite; otherwise it raises ``EpisodeError``, as an error of a system does.
-        who: What is simulated, for messages.
     """
     times = {"step_s": step_s, "watch_period_s": min(watch_period_s, step_s)}
     check_times(who, or_zero=["duration_s"], duration_s=end.duration_s, **times)
@@ -299,11 +289,8 @@ def _failed(system: System | None, message: str) -> None:
 
 
 def advance_to(simulator: Simulator, time_s: float) -> bool:
-    """Advances a simulation to a time, before its updates; returns whether a system has ended it.
-
-    The update that is due at a time already computes the next state of a discrete plant, so a row
-    recorded after it would not belong to its time.
-    """
+    """Advances a simulation to a time, before its updates; returns whether a system has ended it."""
+    # The update due at a time computes the next state: a row after it would not belong to its time.
     # Both this time and Drake's time of an update are products, rounded in the last bit or two.
     before_s = time_s - 4.0 * math.ulp(time_s)
     is_later = before_s > simulator.get_context().get_time()

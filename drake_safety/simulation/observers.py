@@ -37,10 +37,7 @@ class Observers:
     def add(
         self, name: str, noise: ObservationNoise, faults: Sequence[Fault] = ()
     ) -> StateObserver:
-        """Returns the observer of a noise level, and adds it if there is none yet.
-
-        One whose measurement has faults is always added.
-        """
+        """Returns the observer of a noise level; adds it if there is none yet, or with faults."""
         if faults:
             measured = self.add(f"{name}_measurement", noise).GetOutputPort("measured_plant_state")
             names = self._kinematics.plant.GetStateNames(add_model_instance_prefix=False)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from functools import cached_property
 
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.systems.monitored_assessor import MonitoredSafetyAssessor
@@ -24,16 +22,6 @@ class PlannedLoop(ClosedLoop):
     A subclass calls :meth:`_add_planner`, adds its plant and controller, calls :meth:`_finish`, and
     implements :meth:`_set_state`, which sets the plant's state.
     """
-
-    def _check_variation(self, *varied: str) -> None:
-        """Checks that a variation of a task's own plant changes only the entries ``varied``."""
-        variation, plain = self._plant_variation, PlantVariation()
-        for name in (entry.name for entry in fields(PlantVariation)):
-            if name not in varied and getattr(variation, name) != getattr(plain, name):
-                raise ValueError(
-                    f"{type(self).__name__.lower()}: variation '{self.variation}' sets "
-                    f"{name}; entries of this plant are {list(varied)}"
-                )
 
     def _add_planner(
         self, builder: DiagramBuilder, *, outlook_s: float, num_outlook: int
@@ -72,7 +60,7 @@ class PlannedLoop(ClosedLoop):
         """Adds the monitor of the true state, exports all ports, and adds an assessor.
 
         ``ports`` has ``plant_state``, of ``sizes`` n_q and n_v, ``state``, ``output`` and
-        ``features``; of the others the planner's and the monitor's are exported by default.
+        ``features``; those of planner and monitor are exported by default.
         """
         self.plant_state_sizes = sizes
         monitor = builder.AddNamedSystem("safety_monitor", SafetyMonitor(safe_set, *sizes))
@@ -108,11 +96,7 @@ class PlannedLoop(ClosedLoop):
         return EpisodeStart(q=q, v=v, plan=plan)
 
     def set_plan(self, context: Context, plan: PiecewisePolynomial) -> None:
-        """Sets the plan and keeps the state.
-
-        Args:
-            plan: Desired output over simulation time, in the stance frame, (n_z, 1) [m].
-        """
+        """Sets the plan over simulation time, in the stance frame, (n_z, 1) [m]."""
         self._planner.set_plan(self._planner.GetMyMutableContextFromRoot(context), plan)
 
     def _plan_of(self, context: Context) -> PiecewisePolynomial:

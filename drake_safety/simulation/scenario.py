@@ -139,8 +139,7 @@ class Scenario:
     ) -> ClosedLoop:
         """Builds the task's diagram, with options of the task, such as ``recovery=False``.
 
-        An assessment adds an assessor and, for example, recovery. A task whose constructor does not
-        take Meshcat draws nothing.
+        A task whose constructor does not take Meshcat draws nothing.
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
         known = inspect.signature(task).parameters
@@ -176,7 +175,7 @@ class Scenario:
     def adopt(self, info: EpisodesInfo) -> bool:
         """Takes over the identity of what an assessment was learned from, if it simulates the same.
 
-        Returns whether it does; its hashes are then those of the scenario that was learned from.
+        Returns whether it does.
         """
         is_same = self.simulation_hash(info.variation, name=info.scenario) == info.scenario_hash
         if is_same:
@@ -186,13 +185,10 @@ class Scenario:
     def simulation_hash(self, variation: str = "nominal", *, name: str = "") -> str:
         """SHA-256 of all parameters that determine a rollout, and of the robot's files.
 
-        Defaults are included, so that episodes from before and after a change of one do not mix,
-        and the nominal plant, because it is the controllers' model. The assessment's parameters
-        except those of the preview, the task's online parameters and the other variations are left
-        out: episodes stay valid when only these change. Source code is not covered.
-
-        Args:
-            name: File name to hash instead of the current one.
+        Defaults are included, and the nominal plant, because it is the controllers' model. The
+        assessment's parameters except those of the preview, the task's online parameters and the
+        other variations are left out: episodes stay valid when only these change. Source code is
+        not covered. A ``name`` replaces that of the file.
         """
         if variation != "nominal":
             self.variation(variation)
@@ -283,7 +279,7 @@ def _import_task(task: str, scenario_name: str, folder: str) -> type[ClosedLoop]
             raise
         raise ValueError(
             f"{who}: no module '{module_name}' for task '{task}', installed or beside the "
-            f"scenario's file; tasks of the package are {task_names()}"
+            "scenario's file"
         ) from error
     except ValueError as error:
         raise ValueError(f"{who}: {error}") from error
@@ -311,19 +307,12 @@ def scenario_names() -> list[str]:
     return sorted(path.stem for path in _scenario_folder().glob("*.yaml"))
 
 
-def task_names() -> list[str]:
-    """Import paths of the modules of the package's tasks."""
-    texts = (path.read_text(encoding="utf-8") for path in _scenario_folder().glob("*.yaml"))
-    return sorted({yaml.safe_load(text)["task"].partition(":")[0] for text in texts})
-
-
 def load_scenario(name: str | Path, changes: Mapping[str, Any] | None = None) -> Scenario:
     """Loads a scenario by name, or by the path of a YAML file, and imports its task.
 
-    Importing runs the task's code, wherever the file says that it is; :func:`read_scenario` does
-    not. The task's module may stand in the scenario file's folder, where modules are searched last.
-    A relative ``robot`` path is relative to that folder. ``changes`` replace values of the file by
-    key, such as ``parameters.policy``.
+    Importing runs the task's code; :func:`read_scenario` does not. The task's module may stand in
+    the scenario file's folder, where modules are searched last. A relative ``robot`` path is
+    relative to that folder. ``changes`` replace values by key, such as ``parameters.policy``.
     """
     path = _scenario_file(name)
     with reading(path, errors=ValueError):
@@ -340,10 +329,7 @@ def load_scenario(name: str | Path, changes: Mapping[str, Any] | None = None) ->
 
 
 def read_scenario(name: str | Path) -> Scenario:
-    """Reads a scenario's file without importing its task, so that no code of a stranger runs.
-
-    Its parameters are those that stand in the file, unchecked; errors are as of `load_scenario`.
-    """
+    """Reads a scenario's file without importing its task, which leaves its parameters unchecked."""
     path = _scenario_file(name)
     with reading(path):
         return _parsed(path.read_text(encoding="utf-8"), path.stem, path.resolve().parent)

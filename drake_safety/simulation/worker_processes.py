@@ -35,13 +35,9 @@ Progress = Callable[[int, int], None]
 
 
 class MadeOnce(Generic[_Made]):
-    """A diagram that each process makes once, when it is first called.
+    """A diagram that each process makes once; only that of the last key is kept.
 
-    It is sent to workers with all that ``make`` uses. pydrake never frees a system in Python: a
-    loop made for every call would cost 2.4 MB each. Only the last one is kept.
-
-    Args:
-        key: Tells diagrams apart.
+    pydrake never frees a system in Python: a loop made for every call would cost 2.4 MB each.
     """
 
     _made: ClassVar[dict[Hashable, Any]] = {}
@@ -70,10 +66,9 @@ def map_items(
 ) -> Generator[_Result, None, None]:
     """Calls a function of each item in worker processes; yields results as batches finish.
 
-    Within ``joblib.parallel_config`` of another backend than loky, or :func:`cluster.connected`,
-    that backend's workers are used. Every call has one BLAS thread, so that results do not depend
-    on the number of workers. On Ctrl-C or any error the workers end; when this process is killed
-    they end within a second or two.
+    Within ``joblib.parallel_config`` of another backend than loky that backend's workers are used.
+    Every call has one BLAS thread, so that results do not depend on the number of workers. The
+    workers end on Ctrl-C, an error, or soon after this process.
 
     Args:
         make: If given, the function is called with the worker's diagram and an item.
@@ -90,8 +85,7 @@ def map_items(
     is_local = backend in ("LokyBackend", "SequentialBackend")
     if not is_local and num_workers is not None:
         raise ValueError(
-            f"joblib's {backend} has its own number of workers; got {num_workers}: leave out "
-            "num_workers, on the command line --workers"
+            f"joblib's {backend} has its own number of workers: leave out num_workers (--workers)"
         )
     num_workers = num_workers or joblib.cpu_count()
     pending = list(items)
@@ -133,9 +127,8 @@ def map_items(
                 results.close()
             if is_killed:
                 raise ChildProcessError(
-                    "a worker process was killed, by the system if memory ran out; what had "
-                    "finished is kept: run the same again to continue (train: with --resume), with "
-                    "fewer workers if memory is short"
+                    "a worker process was killed, by the system if memory ran out; run the same "
+                    "again to continue (train: with --resume), perhaps with fewer workers"
                 ) from None
             raise
 
@@ -167,11 +160,7 @@ def _versions() -> dict[str, str]:
 
 
 def end_with_parent(parent: int) -> None:
-    """Ends this worker soon after its parent, however that ends; at once if it has.
-
-    A worker whose parent is killed while it starts would else wait for minutes, or for ever, when
-    it sends a result that nobody reads.
-    """
+    """Ends this worker soon after its parent, however that ends; at once if it has."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -186,9 +175,8 @@ def end_with_parent(parent: int) -> None:
 class CloudPickled:
     """A user's function, which reaches workers from a notebook or a script too.
 
-    It is pickled with all that it uses, as joblib pickles such functions. For that Drake lacks two
-    things: a module of its bound functions, such as StabilizingLQRController, and one of the
-    metaclass of its systems.
+    It is pickled with all that it uses. For that Drake lacks two things: a module of its bound
+    functions, such as StabilizingLQRController, and one of the metaclass of its systems.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
