@@ -29,8 +29,7 @@ class RecoveryParameters:
     threshold: float = 0.6
     """Γ_thre, of the probability. The default is the paper's value, which it has for b_safe."""
     persistence_s: NotNegative = 0.02
-    """Time for which "don't know" must have lasted to trigger [s]: two assessments. A known
-    probability triggers at once. The paper has neither."""
+    """Time for which "don't know" must have lasted to trigger [s]. The paper has none."""
     assessment_period_s: Positive = 0.02
     """Time between two assessments [s]."""
     step: RecoveryStepParameters = field(default_factory=RecoveryStepParameters)

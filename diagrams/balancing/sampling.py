@@ -113,10 +113,7 @@ def calm_start(
 ) -> EpisodeStart:
     """Samples a start on a plan near the standing posture, without tracking error.
 
-    Args:
-        half_widths_m: Half-widths of the plan's start and goal, about the stance, (2,) [m].
-        plan_duration_s: Shortest and longest duration of the plan [s].
-        elapsed_s: Time since the plan began [s].
+    ``half_widths_m`` (2,) are of the plan's ends about the stance; it began ``elapsed_s`` ago.
     """
     half = np.array([*half_widths_m, 0.0])
     nominal = np.array([*kinematics.nominal_base_offset, kinematics.standing_height])
@@ -171,11 +168,7 @@ def _contacts(kinematics: RobotKinematics, rng: np.random.Generator, offset_m: f
 def resting_feet(
     kinematics: RobotKinematics, X_WB: RigidTransform, joints: np.ndarray, V_WB: np.ndarray
 ) -> np.ndarray:
-    """Velocities (n_v,) with a moving base and the feet at rest: 0 = J_b V_WB + J_j dq.
-
-    V_WB is the base's spatial velocity, angular first, (6,) [rad/s, m/s]. Joints that move no foot
-    are at rest.
-    """
+    """Velocities (n_v,) with a moving base and the feet at rest: 0 = J_b V_WB + J_j dq."""
     J = kinematics.contact_jacobian(kinematics.positions_at(X_WB, joints))
     J_base, J_joints = np.split(J, [NUM_BASE_VELOCITIES], axis=1)
     rates, *_ = np.linalg.lstsq(J_joints, -J_base @ V_WB, rcond=1e-6)

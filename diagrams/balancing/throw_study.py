@@ -31,13 +31,11 @@ class TriggerRule:
 
 
 def log_probability(log: Motion, scorer: Scorer, persistence_s: float = 0.0) -> np.ndarray:
-    """Safety probability of a scorer at every row of a log as a `RecoveryTrigger` takes it, (N,).
-
-    Where nothing is known, the highest within ``persistence_s`` counts; before it has passed, 1.
-    """
+    """Safety probability of a scorer at every row as a `RecoveryTrigger` takes it, (N,)."""
     probability = scorer.probability(*(log[name] for name in SEEN))
     if len(probability) < 2 or not persistence_s:
         return probability
+    # Where nothing is known, the highest within the persistence counts; before it has passed, 1.
     num_waited = math.ceil(persistence_s / (log.time_s[1] - log.time_s[0]) - 1e-6)
     padded = np.concatenate([np.ones(num_waited), np.nan_to_num(probability, nan=0.0)])
     highest = np.lib.stride_tricks.sliding_window_view(padded, num_waited + 1).max(axis=1)
@@ -56,8 +54,7 @@ def evaluate_throws(
 ) -> tuple[dict[Key, Estimate], list[Motion]]:
     """Throws balls at the actual plant and compares the triggers of rules and their outcomes.
 
-    "Don't know" triggers when it has lasted ``persistence_s``. Returns the estimates by dotted key,
-    and the throws without recovery.
+    Returns the estimates by key, and the throws without recovery.
     """
     throw = partial(run_throws, scenario, seed=seed, num_workers=num_workers)
     logs = throw(range(num_throws), progress=partial(progress, "throws, balancing alone"))
@@ -77,14 +74,8 @@ def evaluate_throws(
         progress=partial(progress, "throws, with recovery"),
     )
     simulated = dict(zip(wanted, recoveries, strict=True))
-    leave_s = np.array([log.leave_time_s - log.push_time_s for log in logs if log.has_left])
-    fall_s = np.array([log.fall_time_s - log.push_time_s for log in logs if log.has_fallen])
-    estimates = {
-        ("throws", "", "falls_without_recovery"): proportion(len(fall_s), len(logs)),
-        ("throws", "", "leaves_safe_set_without_recovery"): proportion(len(leave_s), len(logs)),
-        ("throws", "", "impact_to_leaving_s"): median(leave_s),
-        ("throws", "", "impact_to_fall_s"): median(fall_s),
-    }
+    num_falls = sum(log.has_fallen for log in logs)
+    estimates = {("throws", "", "falls_without_recovery"): proportion(num_falls, len(logs))}
     for rule in rules:
         times = triggers[rule.scorer.name]
         recovered = {i: simulated[i, t] for i, t in enumerate(times) if not math.isnan(t)}
@@ -101,11 +92,10 @@ def _rule_estimates(
     times = np.where(np.isnan(times), np.inf, times)
     impact = np.array([log.push_time_s for log in logs])
     fall = np.array([log.fall_time_s for log in logs])
-    falls, is_early = np.isfinite(fall), times < impact - 1e-9
+    falls = np.isfinite(fall)
     in_time = falls & (times < fall)
-    after_impact = in_time & ~is_early
+    after_impact = in_time & ~(times < impact - 1e-9)
     stays = np.array([not log.has_left for log in logs])
-    false = stays & np.isfinite(times)
     fallen = [recovered.get(i, log).has_fallen for i, log in enumerate(logs)]
     successes = [log for log in recovered.values() if not log.has_fallen]
 
@@ -114,15 +104,10 @@ def _rule_estimates(
 
     estimates = {
         "falls_with_recovery": proportion(sum(fallen), len(logs)),
-        "false_triggers": share(false, stays),
-        "triggers_before_impact": proportion(int(is_early.sum()), len(logs)),
+        "false_triggers": share(stays & np.isfinite(times), stays),
         "falls_missed": share(falls & ~in_time, falls),
         "trigger_after_impact_s": median(times[after_impact] - impact[after_impact]),
         "trigger_before_fall_s": median(fall[in_time] - times[in_time]),
-        "false_triggers_that_fall": share(false & fallen, false),
-        "settled": proportion(
-            sum(log["recovery_active"][-1, 0] == 0 for log in successes), len(successes)
-        ),
     }
     for kind in sorted(VIOLATIONS) if recovered else ():
         column = VIOLATIONS.index(kind)

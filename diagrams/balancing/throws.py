@@ -1,8 +1,8 @@
 """Throws: balls thrown at a balancing robot, and logs of them.
 
-The motion before a recovery does not depend on the trigger. A throw is therefore logged once
-without recovery, every Γ or baseline is evaluated on the log, and only the recovery is simulated
-again, from the same seed, with the trigger at the time found.
+The motion before a recovery does not depend on the trigger. So a throw is logged once without
+recovery, every Γ or baseline is evaluated on the log, and the recovery is simulated from the same
+seed with the trigger at the time found.
 """
 
 from __future__ import annotations
@@ -64,10 +64,7 @@ class Violations:
     def __init__(self, loop: LeggedLoop):
         engine = loop.scenario.variation(loop.variation).engine
         if engine != "drake":
-            raise ValueError(
-                "throws: contacts and efforts are read from Drake's plant; variation "
-                f"'{loop.variation}' is simulated by engine '{engine}'"
-            )
+            raise ValueError(f"throws need a variation of Drake's engine; got '{engine}'")
         self._plant, self._instance = plant, instance = loop.plant, loop.robot_instance
         self._kinematics = loop.kinematics
         self._bodies = set(plant.GetBodyIndices(instance))
@@ -76,7 +73,7 @@ class Violations:
         for actuator in actuators:
             limits[actuator.joint().name()] += actuator.effort_limit()
         # The plant reports the net actuation of the joint for each of its actuators.
-        self._effort_limits = np.array([limits[one.joint().name()] for one in actuators])
+        self._effort_limits = np.array([limits[each.joint().name()] for each in actuators])
 
     def __call__(self, context: Context) -> list[bool]:
         """Whether the state of a root Context has each violation."""
@@ -120,12 +117,10 @@ def run_throw(
         loop: A closed loop with a ball. If it has an input port ``safety_probability`` (recovery
             without an assessment), recovery is triggered at ``trigger_time_s``; otherwise by Γ.
         index: Number of the throw; it and the seed determine start, plan and ball.
-        duration_s: End time [s]; by default 5 s after the first impact, or the latest possible
-            one where nothing is thrown.
+        duration_s: End time [s]; by default 5 s after the first impact.
         ports: Ports to log besides the assessor's inputs, ``margins``, ``plant_state``,
-            ``recovery_active`` if there is one, and ``violations``, (N, 4), whether the state has
-            each of `VIOLATIONS`.
-        **options: Those of :func:`~drake_safety.simulation.motion.simulate`.
+            ``recovery_active`` if there is one, and ``violations``, (N, 4), of `VIOLATIONS`.
+        **options: As for :func:`~drake_safety.simulation.motion.simulate`.
     """
     thrown = require(loop, HasBall)
     if throws is None:
@@ -181,11 +176,7 @@ def run_throws(
     num_workers: int | None = None,
     progress: Progress | bool | None = None,
 ) -> list[Motion]:
-    """Throws a set of balls at the actual plant, in worker processes.
-
-    Args:
-        trigger_times_s: Times of the triggers [s]; by default there is no recovery.
-    """
+    """Throws a set of balls at the actual plant; without times of triggers [s] none recovers."""
     times = [math.nan] * len(indices) if trigger_times_s is None else trigger_times_s
     make = worker_loop(scenario, "actual", ball=True, recovery=trigger_times_s is not None)
 
@@ -204,10 +195,6 @@ def run_throws(
 
 
 def trigger_time(log: Motion, probability: np.ndarray, threshold: float) -> float:
-    """Time at which a probability first falls below a threshold [s]; NaN if it never does.
-
-    Args:
-        probability: Safety probability of every row, (N,); NaN counts as below.
-    """
+    """Time at which a probability (N,), or NaN, is first below a threshold [s]; NaN for never."""
     below = ~(probability >= threshold)
     return float(log.time_s[int(np.argmax(below))]) if below.any() else math.nan

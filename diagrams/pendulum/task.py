@@ -113,8 +113,7 @@ class PendulumObserver(LeafSystem):
         output_ports: [plant_state, output, features]
 
     ``pendulum_state`` is Drake's, from hanging; ``plant_state`` is [φ, φ̇] from upright [rad,
-    rad/s], and ``output`` the bob's position relative to the hinge, (3,) [m]. The safe set's
-    features are of the plan's points from now to its end.
+    rad/s], and ``output`` the bob's position relative to the hinge, (3,) [m].
     """
 
     def __init__(self, length_m: float, safe_set: PendulumSafeSet):

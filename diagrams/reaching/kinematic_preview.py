@@ -30,8 +30,7 @@ class KinematicPreview:
 
         Σ w_i |e_i(q)|² + w_posture |q_j - q_posture|²  with fixed feet.
 
-    These are computed by Gauss-Newton steps: one per sample, more while the hand is off the plan,
-    and a few at the last sample.
+    These are computed by Gauss-Newton steps, more of them while the hand is off the plan.
     """
 
     def __init__(self, model: WholeBodyModel):

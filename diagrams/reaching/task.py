@@ -36,12 +36,11 @@ class Reaching(LeggedLoop):
     """The diagram of the reaching task, for any robot.yaml with feet and reaching frames.
 
     For the other hand, ``state``, ``desired_preview`` and ``features`` are those of the mirror
-    image, so that one assessment applies to both hands. All other ports are not mirrored.
+    image, so that one assessment applies to both hands.
 
     Args:
         hand: The hand that reaches; the scenario's by default.
-        exploring: Whether episodes with random goals have the scenario's random detours and pushes;
-            otherwise every plan is straight and undisturbed.
+        exploring: Whether episodes with random goals have the scenario's detours and pushes.
     """
 
     Parameters = ReachingParameters
@@ -93,7 +92,7 @@ class Reaching(LeggedLoop):
         )
         self._connect_controller(builder, controller, measured)
         actuators = map(self.plant.get_joint_actuator, self.plant.GetJointActuatorIndices())
-        names = [one.name() for one in actuators if one.model_instance() == self.robot_instance]
+        names = [each.name() for each in actuators if each.model_instance() == self.robot_instance]
         torques = self._as_received(builder, controller.GetOutputPort("actuation"), names)
         physics.connect_torques(builder, torques)
         self._add_push_source(builder)
@@ -198,10 +197,7 @@ class Reaching(LeggedLoop):
     def reset_undisturbed(
         self, context: Context, rng: np.random.Generator, duration_s: float
     ) -> None:
-        """Samples straight motions of the hand towards targets and back, one after another.
-
-        They end before half of the way, so that most of them are safe.
-        """
+        """Samples straight motions of the hand, up to half of the way to targets, and back."""
         piece_s = self.scenario.parameters.plan_duration_s
         q = self.scenario.parameters.start.sample(self.safe_set, rng, self.mirror)
         self._set(context, q, self._output_of(q))

@@ -25,21 +25,17 @@ class CommandGuard(LeafSystem):
         output_ports: [desired_output: n_z, desired_preview: H n_z, desired_outlook: M n_z,
           is_changed: 1, safety_probability: 1]
 
-    Every ``period_s`` the asked command, held from now on, is assessed. It is accepted, and passed
-    on, if its probability reaches the threshold. Otherwise ``desired_output`` is the accepted
-    command nearest to it, measured in the policy's ranges, among commands whose entries are shares
-    of the asked ones; if none is accepted, the one with the largest probability.
-    ``safety_probability`` is that of the asked command. All outputs are discrete states, and
-    preview and outlook hold the command. ``learned``, that of a
-    :class:`~drake_safety.systems.safety_assessor.SafetyAssessor`, replaces the beliefs of the
-    assessment. Whether the guard acts is a parameter of the Context; one that does not passes on
-    everything.
+    Every ``period_s`` the asked command, held from now on, is assessed. It is passed on if its
+    probability reaches the threshold. Otherwise ``desired_output`` is the accepted command nearest
+    to it, measured in the policy's ranges, among commands whose entries are shares of the asked
+    ones; if none is accepted, the one with the largest probability. ``safety_probability`` is that
+    of the asked command. ``learned`` of a
+    :class:`~drake_safety.systems.safety_assessor.SafetyAssessor` replaces the beliefs of the
+    assessment. Whether the guard acts is a parameter of the Context.
 
     Args:
         with_commands: Maps features (n_f,) and commands (C, 3) to the features (C, n_f) of these
-            commands, such as `WalkingSafeSet.with_commands`.
-        threshold: Lowest probability of an accepted command.
-        period_s: Time between two decisions [s].
+            commands.
         num_outlook: M, samples of the outlook.
     """
 

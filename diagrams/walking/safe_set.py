@@ -37,13 +37,10 @@ class WalkingLimits:
     def __post_init__(self) -> None:
         if not 0 < self.fall_height_share <= self.height_share < 1:
             raise ValueError(
-                "0 < fall_height_share <= height_share < 1; got "
-                f"{self.fall_height_share}, {self.height_share}"
+                "heights must be 0 < fall_height_share <= height_share < 1"
             )
         if not self.tilt_rad <= self.fall_tilt_rad:
-            raise ValueError(
-                f"tilt_rad must not exceed fall_tilt_rad; got {self.tilt_rad}, {self.fall_tilt_rad}"
-            )
+            raise ValueError("tilt_rad must not exceed fall_tilt_rad")
 
 
 class WalkingSafeSet:
@@ -71,14 +68,9 @@ class WalkingSafeSet:
         self.kinematics = kinematics
         self.limits = limits
         plant = kinematics.plant
-        known = [
-            plant.get_body(i).name()
-            for i in plant.GetBodyIndices(plant.GetModelInstanceByName(kinematics.robot.name))
-        ]
-        if unknown := [name for name in limits.clearance_m if name not in known]:
+        if unknown := [name for name in limits.clearance_m if not plant.HasBodyNamed(name)]:
             raise ValueError(
-                f"robot '{kinematics.robot.name}' has no bodies {unknown} for clearance_m; it has "
-                f"{known}"
+                f"robot '{kinematics.robot.name}' has no bodies {unknown} for clearance_m"
             )
         self._clear = [(plant.GetBodyByName(n), h) for n, h in limits.clearance_m.items()]
         self._lowest_m = limits.height_share * kinematics.standing_height

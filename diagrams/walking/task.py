@@ -53,13 +53,13 @@ class Walking(LeggedLoop):
 
     Args:
         disturbed: Whether some episodes begin with an offset of the state.
-        command_s: Duration of a goal's command [s], after which the command is zero; that of the
-            episode by default.
+        command_s: Duration of a goal's command [s], after which it is zero; by default the
+            episode's.
         guard: Whether a :class:`CommandGuard` passes on commands; requires an assessment.
         recovery: Whether to recover when Γ falls below a threshold. Without an assessment the
             diagram then has an input port ``safety_probability``.
-        starts_of: The scenario whose policy walks before the start, within whose commands plans are
-            drawn, and whose standing height the safe set refers to; by default this one.
+        starts_of: The scenario whose policy walks before the start, and whose commands and standing
+            height count; by default this one.
     """
 
     Parameters = WalkingParameters
@@ -219,10 +219,7 @@ class Walking(LeggedLoop):
         """The plan of a constant command (3,) [m/s, rad/s]."""
         command = np.asarray(command, dtype=float)
         if command.shape != (3,) or not np.isfinite(command).all():
-            raise ValueError(
-                "walking: a command is three finite numbers, v_x v_y [m/s] and ω_z [rad/s]; got "
-                f"{command}"
-            )
+            raise ValueError(f"walking: a command is three finite numbers; got {command}")
         duration_s = self.scenario.episode_duration_s
         if self._command_s is None or self._command_s >= duration_s:
             return profile([command], [], duration_s)
@@ -306,17 +303,15 @@ class Walking(LeggedLoop):
             self._controller.set_state(own_context, start.controller_state)
 
     def rehearse(self, command: np.ndarray, duration_s: float) -> EpisodeStart:
-        """Walks undisturbed from the standing posture, by the nominal robot.
+        """Walks by a command (3,) from the standing posture, undisturbed, by the nominal robot.
 
-        The command is (v_x, v_y, ω_z) (3,) [m/s, rad/s]. The duration is rounded to the policy's
-        period, so that the controller's next update is due.
+        The duration is rounded to the policy's period, so that the controller's next update is due.
         """
         other, period_s = self._rehearsing(), self.policy.parameters.period_s
         if _remembered(other.policy) != _remembered(self.policy):
             raise ValueError(
                 "walking: a policy cannot take over in mid-stride from one with other observations "
-                "or joints, nor a recurrent one: begin all episodes at rest, "
-                "parameters.start.standing_share: 1"
+                "or joints, nor a recurrent one: set parameters.start.standing_share: 1"
             )
         simulator = Simulator(other)
         context = simulator.get_mutable_context()

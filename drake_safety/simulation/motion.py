@@ -289,7 +289,7 @@ def _failed(system: System | None, message: str) -> None:
 
 
 def advance_to(simulator: Simulator, time_s: float) -> bool:
-    """Advances a simulation to a time, before its updates; returns whether a system has ended it."""
+    """Advances to a time, before its updates; returns whether a system has ended the simulation."""
     # The update due at a time computes the next state: a row after it would not belong to its time.
     # Both this time and Drake's time of an update are products, rounded in the last bit or two.
     before_s = time_s - 4.0 * math.ulp(time_s)
