@@ -1,6 +1,7 @@
 """Live sessions: clicks and sliders, as a browser sends them, and what comes of them."""
 
 import dataclasses
+import math
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,14 +11,12 @@ import numpy as np
 import pytest
 from pydrake.geometry import Meshcat
 
-from cart_pole_task import SCENARIO as CART_POLE
 from drake_safety import AddSafetyAssessor, load_scenario
 from drake_safety.cli.console import open_viewer
 from drake_safety.live import session as live
 from drake_safety.live.session import GO, PUSH, START, STOP, TICK_S, LiveSession
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
-from drake_safety.simulation.scenario import parse_scenario
 from gliding_task import Gliding, gliding
 from live_scenarios import learned, quick
 from reaching_targets import FAR, NEAR, SCENARIO, learned_targets
@@ -74,8 +73,8 @@ def commands_loop(meshcat):
 
 
 @pytest.fixture(scope="module")
-def cart_loop(meshcat):
-    scenario = parse_scenario(CART_POLE, name="cart_pole", folder=Path())
+def pendulum_loop(meshcat):
+    scenario = load_scenario("pendulum")
     return scenario.make_loop(assessment=learned(scenario, 200), meshcat=meshcat)
 
 
@@ -95,8 +94,8 @@ def commands(commands_loop, meshcat):
 
 
 @pytest.fixture
-def cart(cart_loop, meshcat):
-    return LiveSession(cart_loop, meshcat, threshold=0.5)
+def pendulum(pendulum_loop, meshcat):
+    return LiveSession(pendulum_loop, meshcat, threshold=0.5)
 
 
 def value_of(session, port):
@@ -108,9 +107,10 @@ def move(session, goal):
         session.panel.set_value(name, value)
 
 
-def set_cart(session, *state):
-    cart = session.loop.cart
-    cart.SetPositionsAndVelocities(cart.GetMyMutableContextFromRoot(session.context), state)
+def set_pendulum(session, angle_rad, rate_rad_s):
+    plant = session.loop.GetSubsystemByName("pendulum")
+    plant_context = plant.GetMyMutableContextFromRoot(session.context)
+    plant_context.SetContinuousState([math.pi + angle_rad, rate_rad_s])
 
 
 def ticks(session, *clicks, num=1):
@@ -241,53 +241,53 @@ def test_a_push_moves_the_robot(commands):
 
 
 @train
-def test_the_verdict_is_that_of_the_probability(cart):
+def test_the_verdict_is_that_of_the_probability(pendulum):
     states = set()
     for tick in range(150):
         if tick % 50 == 20:
-            set_cart(cart, 0.6, 0.0, 1.5, 0.0)  # On its way to the end of the rail.
-        assert cart.tick()
-        assert cart.panel.probability == value_of(cart, "safety_probability")[0]
-        last = pytest.approx(cart.panel.probability, abs=0.001)
-        assert cart.panel.curve()[-1] == (0.0, last)
-        status = cart.panel.status
-        if not cart.cause:
-            is_known = cart.panel.belief[2] <= 0.65  # Half of it is from empty cells.
+            set_pendulum(pendulum, 0.4, 0.8)  # Beyond what the motor holds.
+        assert pendulum.tick()
+        assert pendulum.panel.probability == value_of(pendulum, "safety_probability")[0]
+        last = pytest.approx(pendulum.panel.probability, abs=0.001)
+        assert pendulum.panel.curve()[-1] == (0.0, last)
+        status = pendulum.panel.status
+        if not pendulum.cause:
+            is_known = pendulum.panel.belief[2] <= 0.65  # Half of it is from empty cells.
             refused = "unsafe" if is_known else "don't know"
-            assert status.state == ("safe" if cart.panel.probability >= 0.5 else refused)
+            assert status.state == ("safe" if pendulum.panel.probability >= 0.5 else refused)
             assert status.tone == (status.state if is_known else "plain")
             states.add(status.state)
     assert {"safe", "unsafe"} <= states
 
 
 @train
-def test_an_alarm_of_the_monitor_is_shown_with_its_cause(cart):
-    ticks(cart, num=10)
-    assert "monitor" not in cart.panel.status.note
-    monitor = cart.loop.GetSubsystemByName("safety_assessor").monitor
-    always = dataclasses.replace(cart.assessment.detector_, alarm_level=-1.0)
-    monitor_context = monitor.GetMyMutableContextFromRoot(cart.context)
+def test_an_alarm_of_the_monitor_is_shown_with_its_cause(pendulum):
+    ticks(pendulum, num=10)
+    assert "monitor" not in pendulum.panel.status.note
+    monitor = pendulum.loop.GetSubsystemByName("safety_assessor").monitor
+    always = dataclasses.replace(pendulum.assessment.detector_, alarm_level=-1.0)
+    monitor_context = monitor.GetMyMutableContextFromRoot(pendulum.context)
     monitor.adopt(monitor_context, SimpleNamespace(detector_=always))
-    ticks(cart, num=10)
-    cause = cart.loop.GetOutputPort("alarm_cause").Eval(cart.context)
+    ticks(pendulum, num=10)
+    cause = pendulum.loop.GetOutputPort("alarm_cause").Eval(pendulum.context)
     assert cause
-    assert cart.panel.status.note == f"monitor: {cause}"
+    assert pendulum.panel.status.note == f"monitor: {cause}"
 
 
 @train
 @pytest.mark.parametrize(
     ("state", "shown_after_s", "cause"),
-    [((0.0, 0.0, 0.0, 0.0), 2.0, ""), ((0.95, 0.0, 10.0, 0.0), TICK_S, "rail")],
+    [((0.0, 0.0), 2.0, ""), ((0.95, 0.0, 10.0, 0.0), TICK_S, "rail")],
 )
-def test_the_end_of_an_episode_is_shown_until_the_next_start(cart, state, shown_after_s, cause):
-    set_cart(cart, *state)
-    ticks(cart, num=round(shown_after_s / TICK_S))
+def test_the_end_of_an_episode_is_shown_until_the_next_start(pendulum, state, shown_after_s, cause):
+    set_pendulum(pendulum, *state)
+    ticks(pendulum, num=round(shown_after_s / TICK_S))
     for _ in range(round(SHOWN_S / TICK_S) - 1):
-        assert cart.cause == cause
-        cart.tick()
-    ticks(cart, num=3)
-    assert cart.context.get_time() < 4 * TICK_S
-    assert not cart.cause
+        assert pendulum.cause == cause
+        pendulum.tick()
+    ticks(pendulum, num=3)
+    assert pendulum.context.get_time() < 4 * TICK_S
+    assert not pendulum.cause
 
 
 @train
