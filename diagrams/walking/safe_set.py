@@ -36,9 +36,7 @@ class WalkingLimits:
 
     def __post_init__(self) -> None:
         if not 0 < self.fall_height_share <= self.height_share < 1:
-            raise ValueError(
-                "heights must be 0 < fall_height_share <= height_share < 1"
-            )
+            raise ValueError("heights must be 0 < fall_height_share <= height_share < 1")
         if not self.tilt_rad <= self.fall_tilt_rad:
             raise ValueError("tilt_rad must not exceed fall_tilt_rad")
 

@@ -134,10 +134,7 @@ def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any
     content = content if isinstance(content, dict) else {}
     version, fields, extra = (content.get(name) for name in ("schema_version", "info", "extra"))
     if version != _SCHEMA_VERSION or not isinstance(fields, dict) or not isinstance(extra, dict):
-        raise ValueError(
-            f"{who}: expected schema version {_SCHEMA_VERSION}, info and extra; its version is "
-            f"{version!r}"
-        )
+        raise ValueError(f"{who}: expected schema version {_SCHEMA_VERSION}, info and extra")
     # Fields that older folders lack have defaults that mean "unknown"; others mean nothing now.
     known = {field.name for field in dataclasses.fields(EpisodesInfo)} & fields.keys()
     return load_typed(EpisodesInfo, {name: fields[name] for name in known}, who), extra
@@ -147,10 +144,7 @@ def completed(path: str | os.PathLike[str]) -> set[int]:
     """Indices of the episodes on disk; empty if nothing was written yet."""
     shards = _shards_in(Path(path))
     if shards and not (Path(path) / _INFO_NAME).exists():
-        raise ValueError(
-            f"{path} holds {len(shards)} shards but no {_INFO_NAME}, so the set that they belong "
-            "to is unknown"
-        )
+        raise ValueError(f"{path} holds {len(shards)} shards but no {_INFO_NAME}")
     indices: set[int] = set()
     for shard in shards:
         indices.update(_read_shard(shard, ["episode"]).column("episode").unique().to_pylist())
@@ -185,14 +179,11 @@ def _open_folder(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> No
             for name in there
             if there[name] != here[name] and (name != "robot" or there[name])
         }
-        versions = differences.pop("versions", None)
-        if differences:
-            raise ValueError(
-                f"{path} holds episodes of another set and cannot be continued "
-                f"({'; '.join(differences.values())})"
-            )
-        if versions:
+        if versions := differences.pop("versions", None):
             _LOGGER.warning("%s was begun with other package versions (%s)", path, versions)
+        if differences:
+            text = "; ".join(differences.values())
+            raise ValueError(f"{path} holds episodes of another set ({text})")
         info, extra = stored, {**known, **extra}
     if extra == known:
         return
@@ -244,10 +235,7 @@ def _episodes_of(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episo
     older = schema.remove(schema.get_field_index(_FAILURES))
     is_full = num_rows and not any(column.null_count for column in table.columns)
     if not is_full or not (table.schema.equals(schema) or table.schema.equals(older)):
-        raise ValueError(
-            f"{shard} holds no episodes of this set: expected full columns\n{schema}\nbut it has "
-            f"{num_rows} rows of\n{table.schema}"
-        )
+        raise ValueError(f"{shard} holds no episodes of this set: expected columns\n{schema}")
     arrays = {name: np.empty((num_rows, 0)) for name in widths} | {_FAILURES: np.zeros(num_rows)}
     for name in table.column_names:
         column, width = table.column(name), widths.get(name)
@@ -307,8 +295,7 @@ def _read_shard(shard: Path, columns: list[str] | None = None) -> pa.Table:
             table = file.read(columns=columns)
     except (pa.ArrowException, OSError) as error:
         raise ValueError(
-            f"shard {shard} is truncated or damaged ({error}); remove it and resume: its episodes "
-            "will be run again"
+            f"shard {shard} is truncated or damaged; remove it and resume: {error}"
         ) from error
     if columns is not None and table.column_names != columns:
         raise ValueError(f"{shard} holds no episodes: expected columns {columns}")

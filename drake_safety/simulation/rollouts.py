@@ -404,16 +404,15 @@ def collect_episodes(
                 if writer is not None:
                     writer.append(episode)
     collected = Episodes(info, sorted(episodes, key=lambda episode: episode.index))
-    for problem, which in {
-        "diverged and have no safety label": lambda e: e.cause == DIVERGED,
-        "held the last action, where the controller found none": (
-            lambda e: e.num_controller_failures
-        ),
+    diverged = [episode.index for episode in collected if episode.cause == DIVERGED]
+    failed = [episode.index for episode in collected if episode.num_controller_failures]
+    for problem, numbers in {
+        "diverged and have no safety label": diverged,
+        "held the last action, where the controller found none": failed,
     }.items():
-        if numbers := [str(episode.index) for episode in filter(which, collected)]:
-            first = ", ".join(numbers[:10]) + (", ..." if len(numbers) > 10 else "")
+        if numbers:
             counts = (len(numbers), len(indices), info.scenario)
-            _LOGGER.warning("%d of %d simulations of '%s' %s: episodes %s", *counts, problem, first)
+            _LOGGER.warning("%d of %d simulations of '%s' %s: %s", *counts, problem, numbers[:10])
     return collected
 
 
@@ -432,7 +431,6 @@ def check_kept(path: Path, kept: Sequence[Episode], run: Callable[[int], Episode
     if not is_same(chosen, again):
         raise ValueError(
             f"{path} holds {len(kept)} episodes of this set that are not the same any more: "
-            f"episode {chosen.index}, simulated again, differs. The diagram, the code, a package "
-            "or the kind of machine has changed; choose another folder, or remove this one "
-            "(`load_episodes` reads it as it is)"
+            f"episode {chosen.index}, simulated again, differs, as diagram, code, a package "
+            "or the machine has changed; choose another folder"
         )
