@@ -52,6 +52,16 @@ def test_a_reaching_start_gives_the_same_episode_again_whichever_hand_reaches():
             )
 
 
+def test_without_a_generator_the_first_instant_is_seen_as_it_is(balancing):
+    start = start_at(balancing, 0)
+    context = balancing.CreateDefaultContext()
+    balancing.reset_to(context, None, start)
+    true_state = evaluated(balancing, context, "true_state")
+    np.testing.assert_array_equal(evaluated(balancing, context, "state"), true_state)
+    balancing.reset_to(context, np.random.default_rng(0), start)
+    assert not np.array_equal(evaluated(balancing, context, "state"), true_state)
+
+
 def test_inputs_of_a_hypothetical_start_are_those_of_its_first_row(balancing):
     start = balancing.standing_start()
     # Feet that are not named stand on the ground below where they are.

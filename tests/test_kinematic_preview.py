@@ -8,7 +8,7 @@ from scipy.linalg import null_space
 
 from drake_safety.control.whole_body_model import PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import task_errors
-from drake_safety.diagrams.reaching.kinematic_preview import KinematicPreview, chain_joints
+from drake_safety.diagrams.reaching.kinematic_preview import KinematicPreview
 from legged_robots import robot_kinematics
 
 
@@ -61,18 +61,3 @@ def test_the_hand_arrives_with_fixed_feet_where_the_cost_is_minimal(name, hand):
         slope, one_centimetre = gradient(preview, reference, longer[-1])
         assert slope < 1e-4 * one_centimetre
     np.testing.assert_array_equal(q, before)
-
-
-def test_the_chain_has_the_joints_that_move_the_hand():
-    model = preview_of("porter", "left").model
-    kinematics, body = model.kinematics, model.hand.body
-
-    def pose(q):
-        kinematics.set_positions(q)
-        return body.EvalPoseInWorld(kinematics.context).GetAsMatrix4()
-
-    q = kinematics.standing_positions()
-    q[7:] += np.random.default_rng(0).uniform(-0.1, 0.1, kinematics.num_joints)
-    shifts = 0.1 * np.eye(len(q))[7:]
-    moving = [i for i, dq in enumerate(shifts) if np.abs(pose(q + dq) - pose(q)).max() > 1e-9]
-    assert chain_joints(kinematics, model.hand) == moving

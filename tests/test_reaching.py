@@ -96,26 +96,6 @@ def test_a_goal_takes_the_place_of_the_drawn_target_alone():
         np.testing.assert_array_equal(evaluated(loop, given, name), evaluated(loop, drawn, name))
 
 
-def test_a_standing_start_is_the_posture_without_noise_and_repeats():
-    loop = porter("noisy")
-    rows = []
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    for _ in range(2):
-        loop.reset_standing(context, EASY)
-        standing = loop.kinematics.standing_positions()
-        np.testing.assert_array_equal(positions(loop, context), standing)
-        state, true_state = (evaluated(loop, context, name) for name in ("state", "true_state"))
-        np.testing.assert_array_equal(state, true_state)
-        simulator.Initialize()
-        simulator.AdvanceTo(0.05)
-        rows.append(evaluated(loop, context, "state").copy())
-        loop.reset(context, np.random.default_rng(0))  # Another episode in between.
-        simulator.Initialize()
-        simulator.AdvanceTo(0.02)
-    np.testing.assert_array_equal(rows[0], rows[1])
-
-
 def exploring(tmp_path, **options):
     """The porter, half of whose plans make detours and half of whose episodes are pushed."""
     changes = {
