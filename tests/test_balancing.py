@@ -9,9 +9,7 @@ from balancing_loops import PACKAGED, packaged_loop, standing_loop, started
 from drake_safety import load_assessment, load_scenario, run_episode
 from drake_safety.control.safe_sets import BalanceSafeSet
 from drake_safety.diagrams.balancing.sampling import (
-    StartSampling,
     calm_start,
-    undisturbed_start,
 )
 from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.plants.balls import Throw
@@ -24,12 +22,6 @@ MASS_KG = 25.433
 @functools.cache
 def episode_of(robot=PACKAGED, variation="nominal"):
     return run_episode(standing_loop(robot, variation))
-
-
-def sampling_for(kinematics, **options):
-    """The default ranges, about the robot's own height."""
-    band = [0.9 * kinematics.standing_height, kinematics.standing_height]
-    return StartSampling(base_height_m=band, target_height_m=band, **options)
 
 
 def contact_velocities(kinematics, start):
@@ -142,24 +134,6 @@ def test_a_calm_start_is_a_point_of_its_motion_with_the_motions_velocity(elapsed
     np.testing.assert_allclose(contact_velocities(kinematics, start), 0.0, atol=1e-6)
     is_moving = np.linalg.norm(start.v[3:6]) > 1e-3
     assert is_moving == (0.0 < elapsed_s < 1.0)
-
-
-def test_undisturbed_motions_follow_each_other_with_rests_in_half_of_the_ranges():
-    kinematics = robot_kinematics(PACKAGED)
-    sampling = sampling_for(kinematics, foot_offset_m=0.01)
-    start = undisturbed_start(kinematics, np.random.default_rng(1), sampling, 30.0)
-    assert not start.v.any() and start.plan.start_time() == 0.0 and start.plan.end_time() >= 30.0
-    values = start.plan.vector_values(np.arange(0.0, 30.0, 0.02)).T
-    half = 0.5 * np.array(sampling.target_offset_m)
-    assert np.all(np.abs(values[:, :2] - kinematics.nominal_base_offset) <= half + 1e-9)
-    rest = np.all(np.diff(values, axis=0) == 0.0, axis=1)
-    # It moves most of the time, without jumps, and rests between two motions.
-    assert 0.1 < rest.mean() < 0.7
-    assert np.count_nonzero(np.diff(rest.astype(int)) == 1) >= 5
-    assert np.abs(np.diff(values, axis=0)).max() < 0.02
-    low, high = np.quantile(sampling.target_height_m, [0.25, 0.75])
-    later = values[300:, 2]  # After the motion from standing.
-    assert low - 1e-9 <= later.min() < later.max() <= high + 1e-9
 
 
 def test_a_low_probability_makes_the_robot_step_and_balance_again():

@@ -52,28 +52,3 @@ def test_a_copied_context_goes_on_as_its_original(name, variation, options, copi
     for copy in copies:
         copy.AdvanceTo(context.get_time())
         assert_equal(outputs(loop, copy.get_context()), expected)
-
-
-def test_a_context_whose_time_jumps_back_begins_anew():
-    loop = load_scenario("laikago_balancing").make_loop()
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset(context, np.random.default_rng(3))
-    simulator.Initialize()
-    command = loop.GetSubsystemByName("inverse_kinematics_controller").GetOutputPort(
-        "desired_joint_state"
-    )
-    own_context = command.get_system().GetMyContextFromRoot(context)
-    first = command.Eval(own_context).copy()
-    simulator.AdvanceTo(0.3)
-    assert not np.array_equal(command.Eval(own_context), first)
-    default = Simulator(loop).get_mutable_context()
-    loop.reset(default, np.random.default_rng(3))
-    plant = loop.plant.GetMyContextFromRoot(default)
-    loop.plant.SetPositionsAndVelocities(
-        loop.plant.GetMyMutableContextFromRoot(context),
-        loop.plant.GetPositionsAndVelocities(plant),
-    )
-    context.SetTime(0.0)
-    simulator.Initialize()
-    np.testing.assert_array_equal(command.Eval(own_context), first)

@@ -9,7 +9,6 @@ from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.diagrams.pendulum.task import (
     PendulumController,
     PendulumParameters,
-    PendulumSafeSet,
     bob_position,
 )
 from drake_safety.simulation.episode_start import EpisodeStart
@@ -116,22 +115,3 @@ def test_the_torque_is_of_both_errors_less_the_weights_within_its_limit(
     bench.fix(desired_output=bob_position(angle, LENGTH_M), desired_output_rate=velocity)
     bench.advance(0.1 * PERIOD_S)
     assert bench.get("torque")[0] == pytest.approx(expected, abs=1e-12)
-
-
-def test_features_of_a_plan_that_holds_still_are_worked_by_hand():
-    safe_set = PendulumSafeSet(PendulumParameters(), 0.05)
-    preview = np.tile(bob_position(0.1, LENGTH_M), (5, 1))
-    values = safe_set.features(np.array([0.02]), np.array([0.3]), preview)
-    hold, capture = math.asin(0.35), 0.02 + 0.3 * math.sqrt(0.5 / 9.81)
-    reserves = {  # To the front and to the back.
-        "now_margin": (0.58, 0.62),
-        "capture_reserve": (hold - capture, hold + capture),
-        "goal_reserve": (hold - 0.1, hold + 0.1),
-        "plan_reserve": (hold - 0.1, hold + 0.1),
-        "plan_capture_reserve": (hold - 0.1, hold + 0.1),
-        "plan_effort_reserve": (0.35 - math.sin(0.1), 0.35 + math.sin(0.1)),
-    }
-    expected = {f"{name}_front": front for name, (front, _) in reserves.items()}
-    expected |= {f"{name}_back": back for name, (_, back) in reserves.items()}
-    expected |= {"tracking_error": 0.08, "goal_from_capture": 0.1 - capture}
-    assert dict(zip(safe_set.feature_names, values, strict=True)) == pytest.approx(expected)

@@ -100,16 +100,6 @@ class Hidden(torch.nn.Module):
         return self.sums[0] * x[:, :2]
 
 
-class Grows(torch.nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.register_buffer("seen", torch.zeros(0, N_IN))
-
-    def forward(self, x):
-        self.seen = torch.cat([self.seen, x])
-        return self.seen.sum(0, keepdim=True)[:, :2]
-
-
 class Draws(torch.nn.Module):
     def forward(self, x):
         return torch.randn_like(x[:, :2])
@@ -119,7 +109,6 @@ class Draws(torch.nn.Module):
     ("network", "message"),
     [
         (Hidden, "a memory that is no buffer of a fixed"),
-        (Grows, "memory of 0 buffers was set back"),
         (Draws, "it draws random numbers"),
         (onnx(memory=[("state", "next")]), r"inputs .*'state \[1, 1, 4\].* pairs .* as h_in and"),
     ],
@@ -207,11 +196,3 @@ def test_a_twin_of_a_window_begins_in_mid_stride_with_the_memory_that_the_policy
     with mock.patch("drake_safety.simulation.feedback.run_episode", side_effect=AssertionError):
         with pytest.raises(ValueError, match="entries of the controller's memory, expected"):
             pair_windows(walking, recorder, [pieces[0], bad])
-
-
-def test_rows_that_are_not_when_the_policy_acts_are_refused(walking):
-    builder = DiagramBuilder()
-    loop = builder.AddSystem(walking.make_loop())
-    loop.memory_period_s = 0.03
-    with pytest.raises(ValueError, match=r"a row every 0\.1 s is not when .* every 0\.03 s"):
-        AddFeedbackRecorder(builder, loop)

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 import yaml
-from pydrake.geometry import Meshcat, Role
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
@@ -120,22 +119,6 @@ def test_the_goal_of_a_plan_with_a_detour_is_where_it_ends(hand, tmp_path):
     assert min(detours) < 1e-6 and max(detours) > 0.01
 
 
-def test_evaluation_is_of_straight_plans_without_pushes(tmp_path):
-    training, judging = exploring(tmp_path), exploring(tmp_path, exploring=False)
-    for purpose in ("evaluation", "paper"):
-        assert judging.scenario.options_for(purpose) == {"exploring": False}
-    first_steps = {training: set(), judging: set()}
-    for seed in range(8):
-        for loop, steps in first_steps.items():
-            steps.add(loop.reset(loop.CreateDefaultContext(), np.random.default_rng(seed)))
-        a, b = (first_row(loop, started(loop, seed)) for loop in (training, judging))
-        np.testing.assert_array_equal(a.true_state, b.true_state)
-        np.testing.assert_allclose(training.goal_of(a), judging.goal_of(b), atol=1e-9)
-    assert first_steps[judging] == {0} and len(first_steps[training]) > 1
-    # A given goal is reached straight, too.
-    assert training.reset(training.CreateDefaultContext(), np.random.default_rng(0), EASY) == 0
-
-
 def test_the_other_hands_loop_is_the_trained_ones_mirror_image(make_loop):
     left, right = make_loop(), make_loop(hand="right")
     assert left.mirror is None and left.view.mirrored() == right.view
@@ -249,55 +232,6 @@ def test_an_unsolved_program_is_in_the_solver_status():
     simulator.AdvanceTo(0.024)
     assert evaluated(loop, context, "solver_status")[0] != 0
     assert evaluated(loop, context, "num_controller_failures")[0] > 0
-
-
-def test_feet_that_begin_loaded_stay_flat_from_the_first_step():
-    loop = atlas()
-    fastest = []
-    for sink_m in (0.0, loop.scenario.parameters.start.sink_m):
-        context = started(loop, 1)
-        plant_context = loop.plant.GetMyMutableContextFromRoot(context)
-        q = positions(loop, context).copy()
-        q[6] += loop.scenario.parameters.start.sink_m - sink_m
-        loop.plant.SetPositions(plant_context, loop.robot_instance, q)
-        Simulator(loop, context).AdvanceTo(0.002)
-        fastest.append(np.abs(loop.plant.GetVelocities(plant_context, loop.robot_instance)).max())
-    assert fastest[0] > 10.0  # rad/s, of an ankle.
-    assert fastest[1] < 2.0
-
-
-def test_the_hash_depends_on_obstacles_and_their_files_and_on_no_online_parameter(tmp_path):
-    scenario = load_scenario(porter_path())
-    before = scenario.simulation_hash()
-    parameters = scenario.parameters
-    parameters.named_targets, parameters.decorations = {"here": [0.0, 0.0, 1.0]}, []
-    parameters.assessment_period_s, parameters.view.room = 0.5, 3.0
-    assert scenario.simulation_hash() == before
-    hashes, shelf = {before}, tmp_path / "shelf.urdf"
-    parameters.obstacles[0].position[2] += 0.01
-    hashes.add(scenario.simulation_hash())
-    parameters.obstacles[0].model = str(shelf)
-    for size in ("0.1", "0.2"):
-        shelf.write_text(
-            f'<robot name="s"><link name="s"><collision><geometry><box size="{size} 1 1"/>'
-            "</geometry></collision></link></robot>"
-        )
-        hashes.add(scenario.simulation_hash())
-    assert len(hashes) == 4
-
-
-@pytest.mark.parametrize("is_watched", [False, True])
-def test_visual_shapes_are_simulated_only_with_a_visualiser(is_watched):
-    loop = load_scenario("atlas_reaching").make_loop(meshcat=Meshcat()) if is_watched else atlas()
-    context = loop.CreateDefaultContext()
-    loop.prepare(context)
-    scene_graph = loop.scene_graph
-    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
-    model, simulated = scene_graph.model_inspector(), query.inspector()
-    assert simulated.GetCollisionCandidates() == model.GetCollisionCandidates()
-    num_visual = model.NumGeometriesWithRole(Role.kIllustration)
-    assert num_visual > 100
-    assert simulated.NumGeometriesWithRole(Role.kIllustration) == is_watched * num_visual
 
 
 @pytest.fixture(scope="module")

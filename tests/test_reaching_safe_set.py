@@ -177,21 +177,6 @@ def test_features_of_motion_are_velocities_and_the_margins_that_they_lead_to():
     assert values["capture_point_support"] != at_rest["capture_point_support"]
 
 
-def test_a_goal_in_an_obstacle_has_a_plan_that_is_not_clear():
-    of = safe_set("atlas", obstacles=[SHELF])
-    q, board_m = of.kinematics.standing_positions(), 0.925
-    hand, radius = (
-        of.model.reaching_position(q),
-        of.kinematics.robot.reaching_frame("left").radius_m,
-    )
-    values = features(of, q, in_stance(of.kinematics, q, straight(hand, [0.9, 0.2, board_m])))
-    assert values["plan_clearance"] == values["goal_clearance"]
-    assert values["goal_clearance"] == pytest.approx(-0.025 - radius, abs=1e-9)
-    # A goal as far as no hand reaches has features too.
-    values = features(of, q, in_stance(of.kinematics, q, straight(hand, [1e6, 0.0, board_m])))
-    assert np.isfinite([*values.values()]).all() and values["preview_last_miss"] > 5e5
-
-
 def test_features_do_not_depend_on_where_in_the_world_the_robot_stands():
     of = safe_set()
     q = leaning(of.kinematics, [0.01, 0.02, -0.05], [0.02, 0.0, 0.03])

@@ -116,19 +116,6 @@ def test_a_goal_is_a_command_which_may_end_before_the_episode(scenario):
         loop.reset_standing(context, np.array([0.5, np.nan, 0.0]))
 
 
-def test_evaluation_starts_without_an_offset(scenario, loop):
-    assert scenario.options_for("evaluation") == {"disturbed": False}
-    fastest = []
-    for made in (scenario.make_loop(disturbed=False), loop):
-        context, speeds = made.CreateDefaultContext(), []
-        for index in range(8):
-            made.reset(context, episode_rng(5, index))
-            v = made.GetOutputPort("plant_state").Eval(context)[made.kinematics.num_positions :]
-            speeds.append(np.linalg.norm(v[3:5]))
-        fastest.append(max(speeds))
-    assert fastest[0] < 1.6 < fastest[1]
-
-
 @pytest.mark.parametrize(
     ("branch", "slowest", "fastest"), [("stop", -0.15, 0.15), ("slower", 0.1, 0.8)]
 )
