@@ -123,7 +123,7 @@ def test_feet_that_do_not_fit_are_a_problem(own):
 def test_a_scenario_that_does_not_scale_is_read_before_its_robot(own):
     edited(own / "balancing.yaml", parameters={})
     edited(own / "robot.yaml", base="trunk")
-    assert "has no body 'trunk'" in problems(own / "balancing.yaml")["bodies and joints"].message
+    assert "has no body 'trunk'" in problems(own / "balancing.yaml")["robot.yaml"].message
     result = invoked("check", own / "balancing.yaml", "--quick")
     assert result.exit_code == 1
     assert "fix: correct what the message names" in result.output

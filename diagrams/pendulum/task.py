@@ -41,13 +41,6 @@ class PendulumParameters:
     plan_angle_rad: Positive = 0.3  # Half-width of the angles at which plans begin and end.
     plan_duration_s: Bounds[Positive] = field(default_factory=lambda: [0.5, 1.5])  # Of motions.
 
-    def __post_init__(self) -> None:
-        if self.start_angle_rad > self.largest_angle_rad:
-            raise ValueError(
-                f"start_angle_rad must not exceed largest_angle_rad {self.largest_angle_rad}, or "
-                f"episodes begin unsafe; got {self.start_angle_rad}"
-            )
-
     @property
     def hold_angle_rad(self) -> float:
         """The largest angle that the motor can hold."""

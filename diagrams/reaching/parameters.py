@@ -50,14 +50,6 @@ class ReachingParameters:
     pushes: dict[str, Push] = field(default_factory=dict)
     """Named pushes for single runs."""
     assessment_period_s: Positive = 0.1
-    """Time between two evaluations of Γ [s]. The features of a plan cost some 4 ms, and episodes
-    have a row every 0.1 s."""
+    """Time between two evaluations of Γ [s]; the features of a plan cost some 4 ms."""
     view: View = field(default_factory=View)
     """The camera's pose when the trained hand reaches."""
-
-    def __post_init__(self) -> None:
-        if not self.start.clearance_m <= self.clearance_range_m:
-            raise ValueError(
-                f"start.clearance_m must not exceed clearance_range_m, "
-                f"{self.clearance_range_m}; got {self.start.clearance_m}"
-            )

@@ -31,17 +31,12 @@ class PostureSampling:
     joint_margin_rad: NotNegative = 0.0
     """Least distance of every joint to the end of its safe range."""
     sink_m: NotNegative = 0.0
-    """Initial penetration of the contact points into the compliant ground, as at rest. Without it
-    there is no contact force in the plant's first step, and the torques press the feet into the
-    ground."""
+    """Initial penetration of the contact points into the compliant ground, as at rest."""
 
     def sample(
         self, safe_set: ReachingSafeSet, rng: np.random.Generator, mirror: Mirror | None = None
     ) -> np.ndarray:
-        """Samples positions (n_q,) in the safe set with the feet of the standing posture.
-
-        With ``mirror`` the posture is mirrored: that of the other hand's episode.
-        """
+        """Samples positions (n_q,), perhaps mirrored, in the safe set with standing feet."""
         kinematics = safe_set.kinematics
         legs = {name for foot in kinematics.robot.feet.values() for name in foot.joints}
         is_free = np.array([name not in legs for name in kinematics.joint_names])
@@ -69,8 +64,7 @@ class PostureSampling:
                 return q
         raise RuntimeError(
             f"reaching: none of {_MAX_TRIES} random postures of robot '{kinematics.robot.name}' is "
-            f"in the safe set with a clearance of {self.clearance_m} m and "
-            f"{self.joint_margin_rad} rad off the joints' stops: narrow 'start'"
+            "in the safe set: narrow 'start'"
         )
 
 
@@ -90,22 +84,12 @@ class TargetSampling:
 
 @schema(kw_only=True)
 class Detours:
-    """Random detours of the plans of training episodes.
-
-    A detour is the offset of the plan's middle from that of the straight line, in the stance frame
-    of the trained hand [m]: x forwards, y to the left, z up.
-    """
+    """Random offsets of the middle of training plans, in the trained hand's stance frame [m]."""
 
     share: ShareBelowOne = 0.0
     """Share of the training episodes with a detour."""
     lowest_m: Triple = field(default_factory=lambda: [-0.3, -0.2, -0.1])
     highest_m: Triple = field(default_factory=lambda: [0.0, 0.2, 0.3])
-
-    def __post_init__(self) -> None:
-        if not np.less_equal(self.lowest_m, self.highest_m).all():
-            raise ValueError(
-                f"lowest_m must not exceed highest_m; got {self.lowest_m}, {self.highest_m}"
-            )
 
     def sample(self, rng: np.random.Generator) -> np.ndarray | None:
         """Samples the detour of an episode, (3,) [m]; None for the straight line."""
