@@ -141,26 +141,6 @@ def test_a_faulty_input_does_not_change_the_motion(fault, seen):
     assert not seen(plain.state, plain.true_state)
 
 
-<<<<<<< HEAD
-def test_the_delays_of_the_catalogue_fit_every_period():
-    scenario = load_scenario(SCENARIO)
-    loop = scenario.make_loop()
-    scenario.time_step_s, scenario.control_period_s = 0.004, 0.03
-    shifts = plant_shifts(scenario, loop)
-    assert shifts["late_command"].variation.shift.command_delay_s == pytest.approx(0.152)
-    (stale,) = shifts["stale"].variation.shift.sensor_faults
-    assert stale.value == pytest.approx(0.21)
-=======
-def test_noise_of_a_fault_follows_from_the_episode():
-    loop = loop_with(Shift(sensor_faults=[Fault(kind="noise", entries=["FR_.*_w"], value=3.0)]))
-    first, again, other = (run_episode(loop, index, seed=5) for index in (0, 0, 1))
-    np.testing.assert_array_equal(first.state, again.state)
-    errors = [(one.state - one.true_state)[:20, 24:27] for one in (first, other)]
-    assert np.std(errors[0]) == pytest.approx(3.0, rel=0.3)
-    assert not np.allclose(*errors, atol=0.5)
->>>>>>> 82a1a1c (Tests of simulation and tasks: a law is tested once)
-
-
 def test_a_plant_without_shift_has_the_hash_from_before_there_were_any():
     scenario = load_scenario(SCENARIO)
     assert "shift" not in scenario.to_yaml()
