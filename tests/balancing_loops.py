@@ -37,7 +37,6 @@ def scenario_of(robot, **changes):
             "nominal": {},
             "light": {"mass_scale": 0.8},
             "slippery": {"foot_friction": 0.123},
-            "rough": {"joint_friction_nm": 1.5},
             "noisy": {"observation_noise": {"position": 0.004, "velocity": 0.016}},
             "blurred": {"input_noise": {"position": 0.004, "velocity": 0.016}},
         },

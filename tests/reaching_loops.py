@@ -27,10 +27,8 @@ PORTING = {
     "control_period_s": 0.004,
     "variations": {
         "nominal": {},
-        "heavy": {"mass_scale": 1.1},
         "rough": {"joint_friction_nm": 0.4},
         "noisy": {"observation_noise": NOISE},
-        "blurred": {"input_noise": NOISE},
     },
     "assessment": {
         "horizon": 8,

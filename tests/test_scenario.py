@@ -130,7 +130,7 @@ def test_a_task_of_a_name_that_is_taken_is_refused_with_both_files(beside, tmp_p
         ("task: [", "scenario 'mine' is not YAML"),
         (BALANCING + "parameters: {push: {sharee: 1}}", "push.sharee' .* keys there are .*'share'"),
         (task("nowhere:X"), "no module 'nowhere'"),
-        (task("drake_safety.diagrams.balancing:Throw"), r"no task 'Throw'; it has \['Balancing'\]"),
+        (task("drake_safety.diagrams.balancing:Throw"), "no task 'Throw'"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused_with_what_would(text, message):

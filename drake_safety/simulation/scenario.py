@@ -273,7 +273,7 @@ def _import_task(task: str, scenario_name: str, folder: str) -> type[ClosedLoop]
     if not (module_name and class_name):
         raise ValueError(f"{who}: task must be 'package.module:Class'; got '{task}'")
     try:
-        members = vars(_imported(module_name, folder))
+        module = _imported(module_name, folder)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise
@@ -281,21 +281,12 @@ def _import_task(task: str, scenario_name: str, folder: str) -> type[ClosedLoop]
             f"{who}: no module '{module_name}' for task '{task}', installed or beside the "
             "scenario's file"
         ) from error
-    except ValueError as error:
-        raise ValueError(f"{who}: {error}") from error
+    task_class: Any = getattr(module, class_name, None)
+    is_task = isinstance(task_class, type) and issubclass(task_class, ClosedLoop)
     # A class without parameters is a base class of tasks.
-    known = {
-        name: member
-        for name, member in members.items()
-        if isinstance(member, type)
-        and issubclass(member, ClosedLoop)
-        and hasattr(member, "Parameters")
-    }
-    if class_name not in known:
-        raise ValueError(
-            f"{who}: module '{module_name}' has no task '{class_name}'; it has {list(known)}"
-        )
-    return known[class_name]
+    if not (is_task and hasattr(task_class, "Parameters")):
+        raise ValueError(f"{who}: module '{module_name}' has no task '{class_name}'")
+    return task_class
 
 
 def _scenario_folder() -> Path:
