@@ -18,7 +18,6 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import RATE
 from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.rollouts import (
-    Execution,
     collect_episodes,
     episodes_info,
     run_episode,
@@ -79,11 +78,9 @@ def estimate_failure_rate(
             indices,
             make,
             partial(run_episode, seed=seed, **simulated),
-            Execution(
-                num_workers=num_workers,
-                path=None if path is None else Path(path) / f"{info.scenario_hash[:12]}-{seed}",
-                progress=None if progress is None else partial(progress, stage),
-            ),
+            num_workers=num_workers,
+            path=None if path is None else Path(path) / f"{info.scenario_hash[:12]}-{seed}",
+            progress=None if progress is None else partial(progress, stage),
         )
 
     starts = collected("starts", range(num_starts), until_first_row=True)

@@ -24,7 +24,6 @@ from drake_safety.learning.segments import (
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, port_sizes
 from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.rollouts import (
-    Execution,
     collect_episodes,
     episode_rng,
     seed_random_sources,
@@ -80,7 +79,7 @@ def record_episodes(
         state_names: Names of the n_s entries of ``state``; numbered by default.
         name: Name of the set; that of ``make_diagram`` by default.
         monitor_period_s: Sampling period of ``safe`` [s]; a tenth of ``step_s`` by default.
-        num_workers, path, progress: See `Execution`.
+        num_workers, path, progress: As of `run_episodes`.
 
     Returns:
         The episodes, for ``SafetyAssessment.fit``. Those whose simulation failed have the cause
@@ -140,8 +139,8 @@ def record_episodes(
             who=who,
         ).episode()
 
-    execution = Execution(num_workers=num_workers, path=path, progress=progress)
-    episodes = collect_episodes(info, range(num_episodes), make, run, execution, is_repeated=True)
+    options: dict[str, Any] = {"num_workers": num_workers, "path": path, "progress": progress}
+    episodes = collect_episodes(info, range(num_episodes), make, run, is_repeated=True, **options)
     episodes.warn()
     if ended := [e.index for e in episodes if e.is_safe and e.num_steps < num_steps]:
         _LOGGER.warning(

@@ -7,7 +7,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -55,24 +55,6 @@ HIDDEN_STATE = (
     "differs: the diagram, or its reset, keeps state outside its Context, such as a memory, a "
     "random generator or a cache in an attribute of a system; declare it as state"
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Execution:
-    """How a set of episodes is simulated; no episode depends on it.
-
-    Attributes:
-        num_workers: Number of processes; that of cores by default. 1 runs in this process.
-        path: Folder for the episodes. Those that it holds are kept, if one of them, simulated
-            again, is the same to the last bit.
-        progress: Called with the number done and in all; True shows it.
-        extra: Further content of the folder's ``info.json``.
-    """
-
-    num_workers: int | None = None
-    path: str | PathLike[str] | None = None
-    progress: Progress | bool | None = None
-    extra: dict[str, Any] | None = None
 
 
 def worker_loop(
@@ -270,7 +252,10 @@ def run_motions(
         range(math.ceil(duration_s / piece_s - 1e-6)),
         make,
         partial(run_motion, seed=seed, is_episode=are_episodes),
-        Execution(num_workers=num_workers, path=path, progress=progress, extra=extra),
+        num_workers=num_workers,
+        path=path,
+        progress=progress,
+        extra=extra,
         batch_size=1 if piece_s > scenario.episode_duration_s else BATCH_SIZE,
     )
 
@@ -339,7 +324,11 @@ def run_episodes(
     more, is refused.
 
     Args:
-        num_workers, path, progress, extra: See :class:`Execution`.
+        num_workers: Number of processes; that of cores by default. 1 runs in this process.
+        path: Folder for the episodes. Those that it holds are kept, if one of them, simulated
+            again, is the same to the last bit.
+        progress: Called with the number done and in all; True shows it.
+        extra: Further content of the folder's ``info.json``.
         until_fall: As of `run_episode`.
         **loop_options: Options of the task; part of the set's hash.
     """
@@ -352,7 +341,10 @@ def run_episodes(
         range(num_episodes),
         make,
         partial(run_episode, seed=seed, until_fall=until_fall),
-        Execution(num_workers=num_workers, path=path, progress=progress, extra=extra),
+        num_workers=num_workers,
+        path=path,
+        progress=progress,
+        extra=extra,
         is_repeated=num_episodes >= _MANY,
     )
 
@@ -362,8 +354,11 @@ def collect_episodes(
     indices: Sequence[int],
     make: MadeOnce[Any],
     run: Callable[..., Episode],
-    execution: Execution,
     *,
+    num_workers: int | None = None,
+    path: str | PathLike[str] | None = None,
+    progress: Progress | bool | None = None,
+    extra: dict[str, Any] | None = None,
     batch_size: int = BATCH_SIZE,
     is_repeated: bool = False,
 ) -> Episodes:
@@ -372,8 +367,8 @@ def collect_episodes(
     ``run`` returns the episode of a diagram and an index. If ``is_repeated``, the first episode,
     simulated again after the next by a new diagram, must be the same.
     """
-    path, wanted = execution.path, set(indices)
-    with nullcontext() if path is None else EpisodeWriter(path, info, execution.extra) as writer:
+    wanted = set(indices)
+    with nullcontext() if path is None else EpisodeWriter(path, info, extra) as writer:
         episodes: list[Episode] = []
         if writer is not None:
             episodes += (e for e in load_episodes(writer.path) if e.index in wanted)
@@ -388,8 +383,8 @@ def collect_episodes(
             run,
             pending,
             make=make,
-            num_workers=execution.num_workers,
-            progress=execution.progress,
+            num_workers=num_workers,
+            progress=progress,
             num_done=len(known),
             stage=f"episodes of '{info.scenario}'",
             batch_size=batch_size,
