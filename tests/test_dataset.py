@@ -141,19 +141,6 @@ def test_other_package_versions_are_a_warning_and_the_first_ones_are_kept(tmp_pa
     assert read_info(tmp_path)[0].versions == {"numpy": "2.4.6"}
 
 
-def test_folders_of_earlier_versions_are_read(tmp_path):
-    write(tmp_path, [0, 1])
-    file, shard = tmp_path / "info.json", tmp_path / "episodes-00000.parquet"
-    content = json.loads(file.read_text())
-    content["info"]["code"] = "ab" * 32  # A field that is not known any more.
-    file.write_text(json.dumps(content))
-    # Failures were not counted yet.
-    pq.write_table(pq.read_table(shard).drop_columns(["num_controller_failures"]), shard)
-    write(tmp_path, [2])
-    assert load_episodes(tmp_path).info == make_info()
-    assert [episode.num_controller_failures for episode in load_episodes(tmp_path)] == [0, 0, 2]
-
-
 def flip_a_bit(content):
     middle = len(content) // 3
     return content[:middle] + bytes([content[middle] ^ 0x10]) + content[middle + 1 :]

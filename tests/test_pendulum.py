@@ -3,7 +3,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
 
 from drake_safety import SafetyAssessment, load_scenario, run_episodes
 from drake_safety.diagrams.pendulum.task import (
@@ -47,17 +46,6 @@ def test_beyond_the_angle_that_the_motor_holds_there_is_no_way_back(scenario, lo
     lost = run_episode(loop, start=start(loop, hold + 0.02, 0.0))
     assert (lost.is_safe, lost.cause) == (False, "front")
     assert run_episode(loop, start=start(loop, -hold - 0.02, 0.0)).cause == "back"
-
-
-def test_at_rest_and_upright_gravity_accelerates_what_leans(loop):
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    # The motor's torque is at its limit, m g l share: φ̈ = (sin φ - share) g / l.
-    loop.reset_to(context, None, start(loop, 0.5, 0.0))
-    simulator.AdvanceTo(0.04)
-    acceleration = (math.sin(0.5) - loop.scenario.parameters.effort_share) * 9.81 / LENGTH_M
-    rate = loop.GetOutputPort("state").Eval(context)[1]
-    assert rate == pytest.approx(0.04 * acceleration, rel=0.03)
 
 
 def test_what_a_plan_asks_of_the_motor_is_that_of_its_minimum_jerk(loop):

@@ -231,12 +231,10 @@ def _table_of(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:
 def _episodes_of(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode]:
     """The episodes of a shard's rows; ValueError if they are damaged or of another set."""
     schema, widths, num_rows = _schema_of(info), info.widths, table.num_rows
-    # Older shards have no count of failures; nothing is learned from it.
-    older = schema.remove(schema.get_field_index(_FAILURES))
     is_full = num_rows and not any(column.null_count for column in table.columns)
-    if not is_full or not (table.schema.equals(schema) or table.schema.equals(older)):
+    if not is_full or not table.schema.equals(schema):
         raise ValueError(f"{shard} holds no episodes of this set: expected columns\n{schema}")
-    arrays = {name: np.empty((num_rows, 0)) for name in widths} | {_FAILURES: np.zeros(num_rows)}
+    arrays = {name: np.empty((num_rows, 0)) for name in widths}
     for name in table.column_names:
         column, width = table.column(name), widths.get(name)
         if width:
