@@ -1,6 +1,5 @@
 """`ask` answers before anything moves, and `run --target` obeys, unless it is forced."""
 
-import json
 import re
 import shutil
 import subprocess
@@ -14,12 +13,11 @@ import command_line
 from drake_safety.cli import join_targets
 from drake_safety.cli.ask import parse_target
 from drake_safety.cli.run import alarm_times
-from drake_safety.cli.training_folder import DEFAULT_THRESHOLD, assessment_file
+from drake_safety.cli.training_folder import assessment_file
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import Calibration
-from drake_safety.planning.goal_verdict import assess_goal
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import load_scenario
 from reaching_targets import CAUSE, FAR, NEAR, SCENARIO, learned_targets
@@ -98,19 +96,6 @@ def test_a_refused_target_is_printed_with_its_cause_and_the_nearest_accepted_one
     assert ask("--target", *nearest.split())[0] == 0
     assert float(nearest.split()[0]) < FAR[0]
     assert float(re.search(r"cm away, probability (\S+)", printed)[1]) >= 0.5 + 0.8 * 0.5
-
-
-@pytest.mark.parametrize("target", [NEAR, FAR])
-def test_the_answer_as_json_is_the_library_s_own(ask, folder, trained, loop, target, monkeypatch):
-    verdict = assess_goal(loop, trained[1], np.array(target), threshold=DEFAULT_THRESHOLD)
-    monkeypatch.setattr("drake_safety.cli.ask.nearest_accepted_goal", lambda *_, **options: verdict)
-    code, printed = ask("--target", *target, "--json")
-    answer = json.loads(printed)
-    assert (answer.pop("hand"), answer.pop("assessment")) == ("left", str(folder))
-    assert "promises nothing" in answer.pop("threshold_origin")
-    assert answer.pop("nearest_accepted") == (None if verdict.is_accepted else list(target))
-    assert answer == json.loads(json.dumps(verdict.to_json()))
-    assert code == (0 if verdict.is_accepted else 1)
 
 
 def test_outside_the_region_the_answer_is_the_region_and_ends_with_one(ask, folder):

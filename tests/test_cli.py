@@ -27,7 +27,6 @@ def test_a_mistake_in_a_task_names_its_episode_and_debug_shows_where(tmp_path, m
     assert call(monkeypatch, *command, "--out", tmp_path / "a") == 2
     told = capsys.readouterr().out
     assert "of 'gliding' (seed 0): RuntimeError: operands could not be broadcast" in told
-    assert "--debug in the command line shows where" in told
     arguments = ["drake-safety", *map(str, command), "--debug", "--out", str(tmp_path / "b")]
     monkeypatch.setattr(sys, "argv", arguments)
     with pytest.raises(EpisodeError) as caught:
@@ -88,22 +87,6 @@ def stopped(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("drake_safety.simulation.rollouts.collect_episodes", stop)
-
-
-@pytest.mark.train
-def test_a_training_that_is_stopped_says_what_continues_it(monkeypatch, capsys, stopped, tmp_path):
-    out = tmp_path / "my run"
-    assert call(monkeypatch, "train", "pendulum", "--out", out, "--mode", "paper") == 130
-    line = f"continue with: drake-safety train pendulum --out '{out}' --mode paper --resume"
-    assert capsys.readouterr().out.splitlines() == ["stopped; finished episodes are kept", line]
-    # The option is not added twice.
-    assert call(monkeypatch, "train", "pendulum", "--out", out, "--resume") == 130
-    assert capsys.readouterr().out.splitlines()[1].endswith(f"--out '{out}' --resume")
-    # What keeps its episodes anyway is continued by the same command.
-    monkeypatch.chdir(tmp_path)
-    assert call(monkeypatch, "calibrate", "laikago_balancing", "--episodes", 7) == 130
-    line = "continue with: drake-safety calibrate laikago_balancing --episodes 7"
-    assert capsys.readouterr().out.splitlines()[-1] == line
 
 
 def test_a_shell_completes_commands_without_drake():

@@ -278,7 +278,6 @@ def test_a_scenario_file_is_a_candidate_and_ctrl_c_tells_what_is_known_so_far(
     assert call(monkeypatch, *command) == 130
     printed = capsys.readouterr().out
     assert "undecided" in printed
-    assert "continue with: drake-safety gate pendulum" in printed
     (name,) = Results.read(tmp_path / "gate.json").entries["candidates"]
     assert name == "mine"
 

@@ -167,10 +167,9 @@ def test_targets_are_asked_for_in_the_light_install_and_answered_at_once(light_e
         return spent.ru_utime + spent.ru_stime
 
     started = cpu_s()
-    ask = ["ask", "atlas_reaching", "--target", "0.7", "0.3", "1.0", "--json"]
-    answer = json.loads(run(light_environment / "bin" / "drake-safety", *ask, cwd="/"))
-    assert answer["verdict"] == "safe"
-    assert Path(answer["assessment"]).is_relative_to(light_environment)
+    ask = ["ask", "atlas_reaching", "--target", "0.7", "0.3", "1.0"]
+    answer = run(light_environment / "bin" / "drake-safety", *ask, cwd="/")
+    assert "safe: probability" in answer and str(light_environment) in answer
     # Of the processor, as other tests may run beside; on an idle machine the clock shows no more.
     assert cpu_s() - started < 5.0
 

@@ -9,7 +9,6 @@ import pytest
 from cart_episodes import make_episode, make_info
 from drake_safety import load_assessment, load_scenario
 from drake_safety.evaluation import shift_study
-from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.shift_study import (
@@ -18,7 +17,6 @@ from drake_safety.evaluation.shift_study import (
     monitored,
     run_monitored,
     shift_estimates,
-    shifts_figure,
     shifts_tables,
 )
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
@@ -189,4 +187,3 @@ def test_a_variation_may_have_any_name(tmp_path):
     (table,) = shifts_tables(read)
     assert [row.label for row in table.rows] == [f"variation {n}".replace("_", " ") for n in NAMES]
     assert all(None not in row.estimates for row in table.rows)
-    save(shifts_figure(found), tmp_path / "shifts")

@@ -51,9 +51,6 @@ COMMANDS = {
     "report": ("report", "report", "Write RUN/report.html, a self-contained page of a run."),
 }
 """In the order of the help: module, the extra that it needs, and a line of help."""
-_KEEPING = ("calibrate", "evaluate", "gate", "rate", "adapt")
-_RESUMED = {"train": "--resume"} | dict.fromkeys(_KEEPING, "")
-"""Commands that the same line continues after Ctrl-C, and the option that does so."""
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.
 _ERRORS = {"gate": 3}  # Exit codes of errors where 1 and 2 are results.
@@ -142,7 +139,7 @@ def run_app(commands: Callable[..., Any], program: str) -> None:
 
     SIGTERM stops it as Ctrl-C does.
     """
-    # What reads a pipe, such as the JSON of `ask`, gets results alone.
+    # What reads a pipe gets results alone.
     log = console.console if console.console.is_terminal else Console(stderr=True)
     handler = RichHandler(console=log, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)
@@ -157,14 +154,10 @@ def run_app(commands: Callable[..., Any], program: str) -> None:
             raise KeyboardInterrupt
     except (typer.Abort, KeyboardInterrupt):
         console.say("stopped; finished episodes are kept")
-        if name in _RESUMED:
-            console.say("continue with:", console.command_line(program, _RESUMED[name]))
         sys.exit(_STOPPED)
     except (Exception, SystemExit) as error:
         if isinstance(error, (ValueError, OSError, EpisodeError)) and _DEBUG not in sys.argv:
             console.say("error", error, style="red")
-            if isinstance(error, EpisodeError):
-                console.say(f"{_DEBUG} in the command line shows where")
         elif hasattr(error, "show"):  # Typer's own errors: unknown options, wrong types.
             error.show()
         elif name in _ERRORS:

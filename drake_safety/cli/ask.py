@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated, Any
 
 import numpy as np
@@ -32,15 +31,12 @@ def ask(
         ),
     ] = None,
     mode: console.ModeOption = MODES[0],
-    as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print the verdict on a target, or on a command of a walking robot; nothing moves.
 
     Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
     """
-    loaded, folder, gamma = folders.open_assessment(
-        scenario, assessment, mode, is_printed=not as_json
-    )
+    loaded, _, gamma = folders.open_assessment(scenario, assessment, mode)
     loop = loaded.make_loop(assessment=gamma, **console.given(hand=hand, command_s=duration))
     if not isinstance(loop, HasGoals):
         raise ValueError(
@@ -51,16 +47,7 @@ def ask(
         raise ValueError("ask: pass --target, or for a walking robot --command")
     goal, rule = parse_target(loop, target), folders.goal_threshold(gamma)
     verdict, nearest = judge_target(loop, goal, rule)
-    if as_json:
-        answer = verdict.to_json() | {
-            "assessment": str(folder.path),
-            "hand": loop.hand,
-            "nearest_accepted": None if nearest is None else nearest.goal.tolist(),
-            "threshold_origin": rule.origin,
-        }
-        console.say(json.dumps(answer))
-    else:
-        print_verdict(loop, verdict, nearest, rule.origin)
+    print_verdict(loop, verdict, nearest, rule.origin)
     if not verdict.is_accepted:
         raise Exit(1)
 

@@ -261,6 +261,6 @@ def _add_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> N
     estimates = {
         (f"shifts.{name}", *key): one for name, each in judged.items() for key, one in each.items()
     }
-    evaluation.add(estimates, shifts=shift_study.shifts_figure(estimates))
+    evaluation.add(estimates)
     kinds = {name: shift.kind for name, shift in shifts.items()}
     evaluation.entries["kinds"] = {"nominal": "nominal"} | kinds

@@ -98,21 +98,18 @@ def assessment_file(folder: Path, mode: str) -> Path:
 
 
 def open_assessment(
-    scenario: str, given: Path | None, mode: str = MODES[0], *, is_printed: bool = True
+    scenario: str, given: Path | None, mode: str = MODES[0]
 ) -> tuple[Scenario, AssessmentFolder, SafetyAssessment]:
     """Loads a scenario, and the assessment of a mode from the given or the shipped folder."""
     loaded = load_scenario(scenario)
-    folder = assessment_folder(loaded, given, is_printed=is_printed)
+    folder = assessment_folder(loaded, given)
     assessment = load_assessment(folder.path, mode)
     check_fresh(assessment, loaded)
-    if is_printed:
-        console.say(assessment.detector_.describe())
+    console.say(assessment.detector_.describe())
     return loaded, folder, assessment
 
 
-def assessment_folder(
-    scenario: Scenario, given: Path | None, *, is_printed: bool = True
-) -> AssessmentFolder:
+def assessment_folder(scenario: Scenario, given: Path | None) -> AssessmentFolder:
     """The given folder, or by default that of the shipped assessments of what is simulated."""
     if given is not None:
         return AssessmentFolder(given, given)
@@ -127,8 +124,7 @@ def assessment_folder(
             f"the package has no assessment of what scenario '{scenario.name}' simulates, only of "
             f"{names}: pass --assessment with a folder of `drake-safety train`"
         )
-    if is_printed:
-        console.say("assessment        comes with the package,", shipped)
+    console.say("assessment        comes with the package,", shipped)
     # A separate folder, so that no training is overwritten.
     return AssessmentFolder(shipped, Path("runs") / f"{scenario.name}-shipped")
 

@@ -13,10 +13,8 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from drake_safety.evaluation.figure_style import spoken
-from drake_safety.evaluation.interval_figure import interval_figure
 from drake_safety.evaluation.metrics import (
     Bootstrap,
     Estimate,
@@ -26,7 +24,7 @@ from drake_safety.evaluation.metrics import (
     quantile,
     rate_per_hour,
 )
-from drake_safety.evaluation.results import Key, Results
+from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.evaluation.tables import Column, Row, Table
 from drake_safety.learning.assessment import SafetyAssessment
@@ -236,15 +234,3 @@ def shifts_tables(results: Results) -> list[Table]:
         corner="shift", columns=columns, rows=rows, title="Γ under shifts", meaning=meaning
     )
     return [table] if rows else []
-
-
-def shifts_figure(estimates: Mapping[Key, Estimate]) -> Figure:
-    """Plots shares of "don't know" and of rows sure and wrong, and the AUC, of all shifts."""
-    return interval_figure(
-        {
-            (method, set.removeprefix("shifts."), metric): estimates[set, method, metric]
-            for shown in ("unknown", "confident_error", "auc", "confident_error_60s")
-            for set, method, metric in estimates
-            if metric == shown
-        }
-    )

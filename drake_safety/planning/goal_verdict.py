@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -73,21 +72,6 @@ class GoalVerdict:
         """What the cause is to the motion, and text of its margin; see the function."""
         is_known = self.verdict != UNKNOWN
         return cause_words(self.cause, self.cause_margin, angular_constraints, is_known=is_known)
-
-    def to_json(self) -> dict[str, Any]:
-        """Returns the verdict as JSON types; unknown values are None."""
-        masses = dict(zip(self.constraint_names, self.cause_probability.tolist(), strict=True))
-        return {
-            "goal": [_finite(value) for value in self.goal.tolist()],
-            "verdict": self.verdict,
-            "reason": self.reason,
-            "belief": dict(zip(("safe", "unsafe", "unknown"), self.belief.tolist(), strict=True)),
-            "probability": _finite(self.probability),
-            "threshold": self.threshold,
-            "cause": self.cause or None,
-            "cause_probability": masses,
-            "cause_margin": _finite(self.cause_margin),
-        }
 
 
 def assess_goal(
@@ -208,7 +192,3 @@ def checked_goal(goal: np.ndarray) -> np.ndarray:
     if goal.shape != (3,):
         raise ValueError(f"a goal is three numbers; got {goal.tolist()}")
     return goal
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
