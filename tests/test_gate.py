@@ -1,6 +1,5 @@
 """Two closed loops in the same episodes: verdicts, refusals, and the command."""
 
-import re
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -287,41 +286,6 @@ def test_a_scenario_file_is_a_candidate_and_ctrl_c_tells_what_is_known_so_far(
 )
 def test_an_error_has_an_exit_code_of_its_own(monkeypatch, tmp_path, arguments):
     assert call(monkeypatch, *GATE, *arguments, "--out", tmp_path) == 3
-
-
-BROKEN = """
-from drake_safety.diagrams.pendulum.task import Pendulum
-
-
-class Aborted(Pendulum):
-    def __init__(self, *arguments, **options):
-        raise SystemExit("Failure at plant.cc: condition failed")
-
-"""
-
-
-@pytest.fixture
-def broken(tmp_path):
-    """Makes a scenario of a broken task."""
-    module = tmp_path.name  # Of its own in each test.
-    (tmp_path / f"{module}.py").write_text(BROKEN)
-    text = (Path(__file__).resolve().parents[1] / "diagrams/pendulum.yaml").read_text()
-
-    def make(name):
-        file = tmp_path / f"{name}.yaml"
-        file.write_text(re.sub(r"(?m)^task:.*$", f"task: {module}:{name}", text))
-        return file
-
-    return make
-
-
-def test_every_candidate_is_tried_before_anything_is_simulated(
-    monkeypatch, capsys, tmp_path, broken
-):
-    monkeypatch.setattr(gate, "compare_loops", None)
-    sound = ("--candidate", "parameters.damping=0.0501")
-    assert call(monkeypatch, *GATE, *sound, broken("Aborted"), "--out", tmp_path) == 3
-    assert "condition failed" in capsys.readouterr().err
 
 
 def test_what_nobody_expects_is_an_error_too_with_its_traceback(monkeypatch, capsys):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from pydrake.geometry import Meshcat, Rgba
+from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
@@ -14,11 +14,10 @@ from drake_safety.simulation.legged_loop import LeggedLoop
 WORLD = "/drake"
 """Path of the world in Meshcat's scene."""
 
-_OWN = ("/Grid", "/Axes")  # Meshcat's own, which are hidden.
-_GROUND, _GRID = f"{WORLD}/visualizer/ground", f"{WORLD}/grid"
+_GROUND = f"{WORLD}/visualizer/ground"
 _DISTANCE = 1.55  # From the camera to the robot, by the robot's size.
 _TICK_S, _FOLLOWED = 0.04, 0.2  # The camera goes this share of the way to the robot in a tick.
-_CELL_M, _NUM_CELLS = 0.5, 7  # Of the grid: size, and number from its middle.
+_CELL_M = 0.5  # Of Meshcat's grid.
 
 
 class FollowingCamera:
@@ -36,9 +35,7 @@ class FollowingCamera:
         contacts = loop.kinematics.contact_positions(q)
         self.size_m = float(max(2 * q[6], *np.ptp(contacts, axis=0)))
         self._height_m = 0.7 * float(q[6])
-        for path in _OWN:
-            meshcat.SetProperty(path, "visible", False)
-        self._draw_grid()
+        meshcat.SetProperty("/Axes", "visible", False)
         meshcat.SetCameraPose(_DISTANCE * self.size_m * loop.view.direction(), np.zeros(3))
 
     def follow(self, context: Context) -> None:
@@ -47,25 +44,12 @@ class FollowingCamera:
         share = 1.0 - (1.0 - _FOLLOWED) ** (elapsed_s / _TICK_S) if elapsed_s >= 0 else 1.0
         base = self._state_port.Eval(context)[4:6]
         self._target = self._target + share * (base - self._target)
-        # The ground has no end: its disc and whole cells of its grid stay below the robot.
-        cells = _CELL_M * np.round(self._target / _CELL_M)
-        poses = {WORLD: [*-self._target, -self._height_m]}
-        poses |= {_GROUND: [*self._target, 0.0], _GRID: [*cells, 0.0]}
+        # The ground has no end: its disc and whole cells of Meshcat's grid stay below the robot.
+        cells = _CELL_M * np.round(self._target / _CELL_M) - self._target
+        poses = {WORLD: [*-self._target, -self._height_m], _GROUND: [*self._target, 0.0]}
+        poses["/Grid"] = [*cells, 0.004 - self._height_m]
         for path, place in poses.items():
             self.meshcat.SetTransform(path, RigidTransform(place), self._time_s)
-
-    def _draw_grid(self) -> None:
-        """Draws a round grid a little above the ground, by which one sees the robot move."""
-        # In pieces: some browsers do not draw a line that begins behind the camera.
-        n = _NUM_CELLS
-        x, y = (part.ravel() for part in np.mgrid[-n : n + 1.0, -n : n + 0.0])
-        is_near = np.hypot(x, np.maximum(np.abs(y), np.abs(y + 1.0))) <= n
-        x, y, z = x[is_near], y[is_near], np.full(is_near.sum(), 0.004 / _CELL_M)
-        starts = np.hstack([[x, y, z], [y, x, z]])
-        ends = np.hstack([[x, y + 1.0, z], [y + 1.0, x, z]])
-        self.meshcat.SetLineSegments(
-            _GRID, _CELL_M * starts, _CELL_M * ends, 1.0, Rgba(0.65, 0.67, 0.7)
-        )
 
 
 def follow(loop: object, meshcat: Meshcat) -> Callable[[Context], None] | None:
