@@ -115,7 +115,8 @@ def walked(speed_m_s=0.4, turn_rad_s=0.3, duration_s=2.0, rate_hz=200):
             lift = [0.0, 0.0, 0.06 * np.sin(np.pi * swing)]
             targets.append(last + (3 - 2 * swing) * swing**2 * (after - last) + lift)
         for _ in range(6):
-            p_WC, J = kinematics.contact_positions_and_jacobian(q)
+            kinematics.set_positions(q)
+            p_WC, J = kinematics.present_contacts()
             q[7:] += np.linalg.solve(J[:, 6:], (np.array(targets) - p_WC).ravel())
         joints = q[7:].copy()
         rows.append(q)

@@ -1,6 +1,5 @@
 """The package's robots as plants on flat ground, for the tests of models."""
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +9,10 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from atlas_figures import ATLAS
+from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.models import load_robot
-from laikago_figures import LAIKAGO
 
 MODELS = Path(__file__).resolve().parent.parent / "models"
-PUBLISHED = {"laikago": LAIKAGO, "atlas": ATLAS}
 
 
 def package_parser(plant: MultibodyPlant) -> Parser:
@@ -27,7 +24,7 @@ def package_parser(plant: MultibodyPlant) -> Parser:
 
 
 class Scene:
-    """A robot of the package in its published standing posture on a flat ground.
+    """A robot of the package in its standing posture on a flat ground.
 
     Args:
         name: The robot.
@@ -35,8 +32,8 @@ class Scene:
     """
 
     def __init__(self, name: str, *scenes: str, time_step: float = 0.001) -> None:
-        self.published = PUBLISHED[name]
         self.robot = load_robot(name)
+        self.kinematics = RobotKinematics(self.robot)
         builder = DiagramBuilder()
         self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, time_step)
         parser = package_parser(self.plant)
@@ -52,26 +49,18 @@ class Scene:
         self.diagram = builder.Build()
         self.root = self.diagram.CreateDefaultContext()
         self.context = self.plant.GetMyMutableContextFromRoot(self.root)
-        self.base = self.plant.GetBodyByName(self.published.base, self.instance)
+        self.base = self.plant.GetBodyByName(self.robot.base, self.instance)
         self.bodies = {
             self.plant.get_body(index).name(): self.plant.get_body(index)
             for index in self.plant.GetBodyIndices(self.instance)
         }
         self.stand()
 
-    def stand(self) -> None:
-        self.set_base(RigidTransform([0.0, 0.0, self.published.standing_height]))
-        self.set_joints(dict.fromkeys(self.published.movable, 0.0) | dict(self.published.posture))
-
-    def set_base(self, X_WB: RigidTransform) -> None:
-        self.plant.SetFreeBodyPose(self.context, self.base, X_WB)
-
-    def set_joints(self, positions: Mapping[str, float]) -> None:
-        for name, position in positions.items():
-            self.plant.GetJointByName(name, self.instance).set_angle(self.context, position)
-
-    def pose(self, frame: str) -> RigidTransform:
-        return self.plant.GetFrameByName(frame, self.instance).CalcPoseInWorld(self.context)
+    def stand(self, sunk_m: float = 0.0) -> None:
+        height = self.kinematics.standing_height - sunk_m
+        self.plant.SetFreeBodyPose(self.context, self.base, RigidTransform([0.0, 0.0, height]))
+        for name, q in zip(self.kinematics.joint_names, self.kinematics.posture, strict=True):
+            self.plant.GetJointByName(name, self.instance).set_angle(self.context, q)
 
     def query(self) -> QueryObject:
         context = self.scene_graph.GetMyContextFromRoot(self.root)

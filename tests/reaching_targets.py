@@ -32,7 +32,6 @@ def made_up_episodes(loop):
         is_safe = bool(goal[0] < BOUNDARY_M)
         column = loop.constraint_names.index(CAUSE)
         margins[:, column] = np.linspace(0.05, 0.05 if is_safe else -0.02, len(margins))
-
         episodes.append(
             Episode(
                 index=index,

@@ -1,7 +1,6 @@
 """`ask` answers before anything moves, and `run --target` obeys, unless it is forced."""
 
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 import command_line
-from drake_safety.cli import join_targets
 from drake_safety.cli.ask import parse_target
 from drake_safety.cli.run import alarm_times
 from drake_safety.cli.training_folder import assessment_file
@@ -108,32 +106,6 @@ def test_outside_the_region_the_answer_is_the_region_and_ends_with_one(ask, fold
     assert ask("--target", NEAR[0], -NEAR[1], NEAR[2], "--hand", "right")[0] == 0
 
 
-@pytest.fixture
-def shipped(trained, monkeypatch, tmp_path):
-    """The package seems to come with that assessment; the working folder is an empty one."""
-    package = tmp_path / "package"
-    (package / SCENARIO).mkdir(parents=True)
-    file = assessment_file(package / SCENARIO, "sharpened")
-    shutil.copyfile(assessment_file(trained[0], "sharpened"), file)
-    monkeypatch.setattr("drake_safety.assessments._FOLDER", package)
-    (tmp_path / "work").mkdir()
-    monkeypatch.chdir(tmp_path / "work")
-    return package / SCENARIO
-
-
-def test_without_a_training_the_shipped_assessment_answers_and_is_named(call, ask, shipped, folder):
-    code, printed = call("ask", SCENARIO, "--target", *NEAR)
-    assert code == 0
-    first, *answer = printed.splitlines()
-    assert first.split() == ["assessment", *"comes with the package,".split(), str(shipped)]
-    # It is the same assessment as that of the folder, which is not announced when it is asked for.
-    answer = [line.replace(str(shipped), str(folder)) for line in answer]
-    assert answer == ask("--target", *NEAR)[1].splitlines()
-    code, printed = call("ask", "talos_reaching", "--target", *NEAR)
-    assert code == 2
-    assert f"only of ['{SCENARIO}']: pass --assessment" in printed
-
-
 def test_an_answer_takes_none_of_the_packages_that_training_takes(folder):
     code = (
         "import sys\n"
@@ -153,13 +125,6 @@ def test_an_answer_takes_none_of_the_packages_that_training_takes(folder):
     assert loaded & heavy == set()
 
 
-def test_for_a_task_without_targets_the_answer_is_the_command_to_use_instead(call):
-    code, printed = call("ask", "laikago_balancing", "--target", "1", "0", "0")
-    assert code == 2
-    assert "task 'Balancing' has no targets or commands to ask about" in printed
-    assert "`drake-safety run laikago_balancing`" in printed
-
-
 def test_a_named_target_is_the_point_of_that_name(loop):
     for name, point in loop.named_targets.items():
         np.testing.assert_array_equal(parse_target(loop, name), point)
@@ -169,9 +134,7 @@ def test_a_named_target_is_the_point_of_that_name(loop):
     ("arguments", "message"),
     [
         (["--target", "green_ball"], r"'green_ball': give x y z, .*['blue_box', 'red_can']"),
-        (["--target", "0.7 0.3"], "'0.7 0.3': give x y z"),
         (["--target", "blue_box", "--hand", "third"], "no reaching frame 'third'; it has ['left'"),
-        (["--target", "blue_box", "--mode", "paper"], "holds no 'paper' assessment"),
     ],
 )
 def test_what_does_not_exist_is_answered_with_what_does(call, folder, arguments, message):
@@ -219,29 +182,6 @@ def test_a_run_goes_where_it_is_let(call, folder, monkeypatch):
     assert shown.motion.time_s[-1] == pytest.approx(0.1)
     assert np.ptp(shown.motion["output"], axis=0).max() > 0.0
     assert shown.events[0][0] == 0.0 and shown.events[-1][0] == pytest.approx(0.1)
-
-
-@pytest.mark.slow
-def test_a_run_that_is_forced_leaves_recording_and_timeline(call, folder, nothing_near):
-    calibrate(folder, 1.0 + 1e-6)
-    options = ("--assessment", folder, "--target", "blue_box", "--duration", 0.2)
-    code, printed = call("run", SCENARIO, *options, "--force")
-    assert code == 0
-    written = {path.name for path in (folder / "run").iterdir()}
-    assert written == {"recording.html", "run.json", "timeline.png", "timeline.svg"}
-    assert ", inside the safe set throughout" in printed
-
-
-@pytest.mark.parametrize(
-    ("words", "joined"),
-    [
-        (["--target", "1", "-2", "3e-1", "b"], ["--target", "1 -2 3e-1", "b"]),
-        (["a", "--command", "fast", "b"], ["a", "--command", "fast", "b"]),
-        (["--target=1 2 3"], ["--target=1 2 3"]),
-    ],
-)
-def test_the_numbers_of_a_target_become_one_word(words, joined):
-    assert join_targets(words) == joined
 
 
 @pytest.mark.parametrize(

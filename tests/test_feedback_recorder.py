@@ -148,8 +148,3 @@ def test_contexts_do_not_share_what_they_record():
     np.testing.assert_array_equal(window.episode.true_state, window.episode.state)
     other = running.recorder.GetMyContextFromRoot(clone)
     assert len(running.recorder.recording(other).rows) == 3
-
-
-def test_windows_that_are_too_short_are_refused():
-    with pytest.raises(ValueError, match="horizon of 3"):
-        Running(0.0, 0.0, num_steps=2)

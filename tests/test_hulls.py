@@ -1,6 +1,5 @@
 """`new` replaces collision meshes that Drake does not read by hulls; the robot stands with them."""
 
-import shutil
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -11,10 +10,9 @@ import urdf_files
 from drake_safety.evaluation.stills import StillCamera
 from drake_safety.importing.robot_template import write_robot
 from drake_safety.importing.urdf_survey import Survey
-from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.scenario_check import check_scenario
-from legged_robots import edited, write_hexapod
+from legged_robots import write_hexapod
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -119,25 +117,3 @@ def test_new_gives_normals_to_meshes_of_visuals_and_of_links_without_one(tmp_pat
     StillCamera(loop, loop.plant.GetPositions(loop.plant.CreateDefaultContext()))
     assert not caplog.records
     assert {one.name for one in (folder / "meshes").iterdir()} >= {"femur_0.gltf", "femur_1.gltf"}
-
-
-def test_mujoco_takes_the_hulls_too(spider, tmp_path):
-    pytest.importorskip("mujoco")
-    file = shutil.copytree(spider.folder, tmp_path / "own") / "balancing.yaml"
-    edited(file, variations={"nominal": {}, "in_mujoco": {"engine": "mujoco"}})
-    loop = load_scenario(file).make_loop("in_mujoco", ball=False)
-    assert np.isfinite(run_episode(loop, 0, seed=0).margins).all()
-
-
-def test_a_picture_is_without_a_mesh_that_has_no_normals(spider, tmp_path, caplog):
-    own = shutil.copytree(spider.folder, tmp_path / "own")
-    (own / "bare.obj").write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\n")
-    urdf, bare = own / "spider.urdf", urdf_files.mesh("visual", "bare.obj")
-    urdf.write_text(urdf_files.with_shape(urdf.read_text(), "femur_3", bare))
-    loop = load_scenario(own / "balancing.yaml").make_loop()
-    context = loop.plant.CreateDefaultContext()
-    camera = StillCamera(loop, loop.plant.GetPositions(context), width=96, height=72)
-    (note,) = [record.getMessage() for record in caplog.records]
-    assert note.startswith("the picture is without a mesh: OBJ has no normals:")
-    assert "bare.obj" in note
-    assert np.ptp(camera.render(loop.plant.GetPositions(context))) > 100

@@ -30,7 +30,7 @@ def easy_paths(preview, num=5, seed=0):
 def gradient(preview, reference, q):
     """Of half the cost in the motions that leave the feet still, and the hand's share of it."""
     model, kinematics = preview.model, preview.model.kinematics
-    _, J_feet = kinematics.contact_positions_and_jacobian(q)
+    J_feet = kinematics.contact_jacobian(q)
     J, error = task_errors(model, reference)
     slope = (model.task_weights * J).T @ error
     slope[6:] += model.parameters.posture.weight * (reference.posture - q[7:])

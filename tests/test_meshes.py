@@ -5,21 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from drake_safety.robots.meshes import (
-    cache_folder,
-    convex_hull,
-    is_shown,
-    mesh_points,
-    shown_mesh,
-)
+from drake_safety.robots.meshes import cache_folder, convex_hull, is_shown, mesh_points, shown_mesh
 
 trimesh = pytest.importorskip("trimesh")
-
-NOTHING = """<?xml version="1.0"?>
-<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset><unit meter="1"/><up_axis>Z_UP</up_axis></asset>
-<library_visual_scenes><visual_scene id="s"/></library_visual_scenes>
-<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
 
 
 @pytest.fixture
@@ -72,18 +60,12 @@ def test_a_collada_mesh_is_upright_and_in_metres(tmp_path, asset, extents):
 
 @pytest.mark.parametrize(
     ("materials", "shown"),
-    [
-        (None, True),
-        ("newmtl a\nKd 1 0 0\n", True),
-        ("newmtl a\nTr 1.0\nnewmtl b\nTr 0.5\n", True),
-        ("newmtl a\nKd 1 0 0\nTr 1.000000\n", False),
-    ],
+    [("newmtl a\nTr 1.0\nnewmtl b\nTr 0.5\n", True), ("newmtl a\nKd 1 0 0\nTr 1.000000\n", False)],
 )
 def test_an_obj_whose_materials_are_all_transparent_is_converted(cache, tmp_path, materials, shown):
     path = tmp_path / "hip.obj"
     trimesh.creation.box(extents=[1.0, 2.0, 4.0]).export(path, include_normals=True)
-    if materials is not None:
-        path.with_suffix(".mtl").write_text(materials)
+    path.with_suffix(".mtl").write_text(materials)
     assert is_shown(path) == shown
     found = shown_mesh(path, "0.2 0.4 0.6 1")
     assert (found == path) == shown == (not cache.exists())
@@ -100,7 +82,6 @@ NORMAL = "vn 0 0 1\n"
     [
         (NORMAL + "f 1//1 2//1 3//1\nf 1//1 2//1 4//1\n", True),
         ("f 1 2 3\nf 1 2 4\n", False),
-        (NORMAL + "f 1//1 2//1 3//1\nf 1 2 4\n", False),
         ("  f\t1 2 3 4 \r\n", False),
     ],
 )
@@ -130,20 +111,6 @@ def test_a_mesh_is_converted_once_until_it_or_its_colour_changes(cache, tower):
     assert [path for path in first.parent.iterdir() if path.suffix != ".gltf"] == []
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        ("text.dae", "no mesh", r"text\.dae' cannot be read"),
-        ("nothing.dae", NOTHING, r"nothing\.dae' is empty, or has no surface"),
-    ],
-)
-def test_a_mesh_that_is_none_is_refused(cache, tmp_path, name, text, message):
-    (tmp_path / name).write_text(text)
-    with pytest.raises(ValueError, match=message):
-        shown_mesh(tmp_path / name)
-    assert list(cache.rglob("*.gltf")) == []
-
-
 def test_a_hull_has_few_vertices_which_are_the_meshs_and_reaches_as_far_along_the_axes():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1).vertices
     points = np.vstack([ball, [[0.0, 0.0, 0.5]], [[0.3, 0.0, 0.0]]])
@@ -156,14 +123,8 @@ def test_a_hull_has_few_vertices_which_are_the_meshs_and_reaches_as_far_along_th
     assert hull.volume > 0.8 * trimesh.convex.convex_hull(points).volume
 
 
-@pytest.mark.parametrize(
-    ("points", "edges"),
-    [
-        ([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.0, 0.1, 1.0]], [0.2, 0.1, 1e-3]),
-        ([[0.5, 0.5, 0.5]], [1e-3, 1e-3, 1e-3]),
-    ],
-)
-def test_a_flat_mesh_becomes_the_box_around_it(points, edges):
+def test_a_flat_mesh_becomes_the_box_around_it():
+    points, edges = [[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.0, 0.1, 1.0]], [0.2, 0.1, 1e-3]
     hull = convex_hull(np.array(points))
     assert hull.extents == pytest.approx(edges)
     assert hull.volume == pytest.approx(np.prod(edges))

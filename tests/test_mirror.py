@@ -10,7 +10,7 @@ from drake_safety.control.kinematics import RobotKinematics, fit_stance, planar_
 from drake_safety.control.mirror import Mirror
 from drake_safety.control.observation import stance_state
 from drake_safety.robots.robot_model import load_robot_file
-from legged_robots import edited, robot_kinematics, write_biped, write_hexapod
+from legged_robots import edited, robot_kinematics, write_hexapod
 
 
 def law(test):
@@ -98,11 +98,3 @@ def test_joints_that_are_not_each_others_reflection_are_refused(tmp_path):
     robot = load_robot_file(edited(write_hexapod(tmp_path), mirror={"(.*)_0": r"\1_1"}))
     with pytest.raises(ValueError, match="joint 'swing_0' with 'swing_1', which is not its"):
         Mirror(RobotKinematics(robot))
-
-
-def test_a_hand_without_a_partner_is_answered_with_the_hands_there_are(tmp_path):
-    frames = {"left": {"body": "left_shin", "joints": ["left_knee"]}}
-    path = edited(write_biped(tmp_path), reaching_frames=frames)
-    mirror = Mirror(RobotKinematics(load_robot_file(path)))
-    with pytest.raises(ValueError, match=r"joints \['right_knee'\] opposite hand 'left'; there"):
-        mirror.hand("left")

@@ -7,13 +7,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_safety import (
-    AddSafetyAssessor,
-    AssessmentParameters,
-    MonitoredSafetyAssessor,
-    SafetyAssessment,
-    load_assessment,
-)
+from drake_safety import AddSafetyAssessor, AssessmentParameters, SafetyAssessment
 from gliding_task import evaluated
 from lip_assessments import QUICK, worse
 from lip_episodes import STEP_S, make_episodes
@@ -93,8 +87,6 @@ def test_less_is_said_by_an_argument(assessment, inputs):
     assert not without.HasInputPort("margins")
     simulator.AdvanceTo(STEP_S)
     assert evaluated(without, context, "belief")[2] < 1.0
-    with pytest.raises(ValueError, match=r"on_alarm is 'stop', expected one of .* or None"):
-        MonitoredSafetyAssessor(assessment, on_alarm="stop")
 
 
 def test_a_port_that_is_needed_is_not_left_out_by_mistake(assessment, inputs):
@@ -104,13 +96,6 @@ def test_a_port_that_is_needed_is_not_left_out_by_mistake(assessment, inputs):
         added(assessment, {name: inputs[name] for name in INPUTS if name != "features"})
     with pytest.raises(ValueError, match=r"port 'y0' for state has size 1; .* fitted with 6"):
         added(assessment, {**inputs, "state": np.zeros(1)})
-    # In the paper's mode Γ reads no features, but its monitor may.
-    paper = load_assessment("laikago_balancing", "paper")
-    sizes = len(paper.info_.state_names), 3 * paper.info_.horizon
-    given = {"state": np.zeros(sizes[0]), "desired_preview": np.zeros(sizes[1]), "margins": None}
-    with pytest.raises(ValueError, match="was fitted with features"):
-        added(paper, given)
-    assert added(paper, given, on_alarm=None)[0].monitor is None
 
 
 def test_it_adopts_what_an_adapted_assessment_has_learned_and_the_alarm_ends(assessment, inputs):

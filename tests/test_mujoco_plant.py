@@ -1,29 +1,20 @@
 """MuJoCo behind the contract: the same robots, tasks and ports, another plant."""
 
 import functools
-import logging
 
 import mujoco
 import numpy as np
 import pytest
-from pydrake.geometry import Mesh
-from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
-from pydrake.multibody.plant import (
-    AddMultibodyPlantSceneGraph,
-    CoulombFriction,
-    ExternallyAppliedSpatialForce,
-)
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ExternallyAppliedSpatialForce
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 import legged_robots
 import reaching_loops
 from drake_safety import load_scenario, run_episode
-from drake_safety.diagrams.balancing.throws import Violations
 from drake_safety.plants.mujoco_plant import MujocoPlant
 from drake_safety.plants.physics import add_ground
-from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot import Payload, PlantVariation, add_robot, apply_masses
 
 MUJOCO = PlantVariation(engine="mujoco")
@@ -143,21 +134,14 @@ def test_friction_stops_and_effort_limits_are_drakes(bench):
     model, system = bench.model, bench.system
     ground = model.geom_bodyid == model.body("WorldModelInstance::world").id
     assert model.geom_friction[ground, 0] == pytest.approx(bench.robot.foot_friction)
-    for foot in bench.robot.feet.values():
-        of_foot = model.geom_bodyid == model.body(foot.body).id
-        is_contact = of_foot & np.isclose(model.geom_size[:, 0], foot.radius_m)
-        assert is_contact.sum() == len(foot.contact_points)
-        np.testing.assert_allclose(model.geom_friction[is_contact, 0], bench.robot.foot_friction)
     assert system.joint_names == bench.kinematics.joint_names
     joints = [model.joint(name) for name in system.joint_names]
     ranges = np.array([joint.range for joint in joints])
     np.testing.assert_allclose(ranges, bench.kinematics.position_limits, atol=1e-12)
-    limits = {
-        actuator.joint().name(): actuator.effort_limit()
-        for actuator in map(bench.plant.get_joint_actuator, bench.plant.GetJointActuatorIndices())
-    }
-    for joint in joints:
-        assert model.jnt_actfrcrange[joint.id, 1] == limits[joint.name]
+    for index in bench.plant.GetJointActuatorIndices():
+        actuator = bench.plant.get_joint_actuator(index)
+        joint = model.joint(actuator.joint().name())
+        assert model.jnt_actfrcrange[joint.id, 1] == actuator.effort_limit()
 
 
 def test_a_variation_changes_mass_friction_and_damping():
@@ -221,7 +205,7 @@ def test_a_force_on_the_base_adds_its_momentum():
     np.testing.assert_allclose(gained, [30.0 * STEP_S, 0.0, 0.0], atol=5e-3 * 30 * STEP_S)
 
 
-def test_a_step_from_nan_or_into_instability_is_an_error(caplog, monkeypatch, tmp_path):
+def test_a_step_from_nan_or_into_instability_is_an_error(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     bench = Bench("hexapod")
     good = bench.system.state_from(bench.random_state(np.random.default_rng(3)))
@@ -231,40 +215,10 @@ def test_a_step_from_nan_or_into_instability_is_an_error(caplog, monkeypatch, tm
     with pytest.raises(RuntimeError, match="cannot step from NaN"):
         bench.system.step(bad, command)
     before = bench.system.step(good, command)
-    with caplog.at_level(logging.DEBUG), pytest.raises(RuntimeError, match="unstable"):
+    with pytest.raises(RuntimeError, match="unstable"):
         bench.system.step(fast, command)
     np.testing.assert_array_equal(bench.system.step(good, command), before)
     assert not list(tmp_path.iterdir()), "MuJoCo wrote its log to the working directory"
-
-
-def test_a_model_that_mujoco_cannot_read_is_refused_by_name(tmp_path):
-    robot = legged_robots.load_robot_file(legged_robots.write_hexapod(tmp_path))
-    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), STEP_S)
-    add_robot(plant, robot)
-    mesh = tmp_path / "mesh.obj"
-    mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n")
-    body, friction = plant.GetBodyByName("tibia_0"), CoulombFriction(0.5, 0.5)
-    plant.RegisterCollisionGeometry(body, RigidTransform(), Mesh(str(mesh)), "mesh", friction)
-    plant.Finalize()
-    options = {"time_step_s": STEP_S, "servos": False}
-    with pytest.raises(ValueError, match=r"body 'tibia_0'.*no collision shape Mesh.*'Sphere'"):
-        MujocoPlant(robot, plant, scene_graph, PlantVariation(), **options)
-    robot.urdf = "hexapod.sdf"
-    with pytest.raises(ValueError, match=r"robot 'hexapod'.*reads models from URDF files"):
-        MujocoPlant(robot, plant, scene_graph, PlantVariation(), **options)
-
-
-def test_both_engines_start_alike_and_export_the_same_ports_and_names():
-    loops = [loop_of("laikago_balancing", v, ball=False) for v in ("nominal", "mujoco")]
-    ports = [
-        {p.get_name(): p.size() for p in map(loop.get_output_port, range(loop.num_output_ports()))}
-        for loop in loops
-    ]
-    assert ports[0] == ports[1]
-    assert loops[0].feature_names == loops[1].feature_names
-    assert not loops[1].GetSubsystemByName("plant").HasAnyDirectFeedthrough()
-    for port in ("plant_state", "desired_preview"):
-        np.testing.assert_allclose(*(read(one, started(one), port) for one in loops), atol=1e-12)
 
 
 def test_two_contexts_of_one_diagram_do_not_disturb_each_other():
@@ -282,25 +236,6 @@ def test_two_contexts_of_one_diagram_do_not_disturb_each_other():
     context = simulators[0].get_context()
     clone, original = context.Clone(), context.Clone()
     np.testing.assert_array_equal(advanced(loop, clone, 0.05), advanced(loop, original, 0.05))
-
-
-def test_a_push_moves_the_robot_as_far_as_in_drake():
-    push = Push(body="utorso", force_n=[0.0, 300.0, 0.0], time_s=0.0, duration_s=0.04)
-    moved = []
-    for variation in ("nominal", "mujoco"):
-        loop = loop_of("atlas_reaching", variation)
-        context = loop.CreateDefaultContext()
-        loop.reset_standing(context, [0.6, 0.3, 1.0])
-        loop.set_push(context, push)
-        state = advanced(loop, context, 0.04)
-        plant = loop.kinematics.plant
-        robot_context = plant.CreateDefaultContext()
-        plant.SetPositionsAndVelocities(robot_context, state)
-        moved.append(plant.CalcCenterOfMassTranslationalVelocityInWorld(robot_context)[1])
-    # The push gives at most F t / m; the ground takes some of it back.
-    assert 0.3 * 300.0 * 0.04 / 175.1 < moved[0] < 300.0 * 0.04 / 175.1
-    # MuJoCo's contacts are softer: the feet take less of it.
-    assert moved[1] == pytest.approx(moved[0], rel=0.3)
 
 
 def test_obstacles_stand_where_the_monitor_has_them_and_stop_an_arm():
@@ -327,8 +262,6 @@ def test_a_ball_is_refused_by_default_too_where_pushes_are_sampled():
     scenario = load_scenario("laikago_balancing")
     with pytest.raises(ValueError, match=r"engine 'mujoco' has no ball.*pass ball=False"):
         scenario.make_loop("mujoco")
-    with pytest.raises(ValueError, match=r"read from Drake's plant; variation 'mujoco'"):
-        Violations(laikago())
 
 
 def test_a_robot_of_ones_own_reaches_in_mujoco():

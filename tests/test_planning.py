@@ -143,28 +143,12 @@ def test_the_search_finds_a_goal_nearly_as_near_as_the_boundary(signed_distance,
         np.testing.assert_array_equal(typed, nearest.goal)
 
 
-def test_a_small_region_far_away_is_found_too():
-    centre = np.array([0.9, -0.9, 1.9])
-    nearest = search(step(lambda goals: 0.2 - np.linalg.norm(goals - centre, axis=1)), BOX[0])
-    assert np.linalg.norm(nearest.goal - centre) <= 0.2
-
-
-@pytest.mark.parametrize(("reserve", "x_m"), [(0.0, 0.5), (0.8, 0.1)])
-def test_a_suggested_goal_exceeds_the_threshold_by_the_reserve(reserve, x_m):
-    # Γ = 1 - x: the threshold 0.5 is met at x = 0.5, 0.5 + 0.5 reserve further down.
-    nearest = search(lambda goals: 1.0 - goals[:, 0], np.array([0.9, 0.0, 1.0]), reserve=reserve)
-    assert nearest.probability >= 0.5 + 0.5 * reserve
-    assert x_m - 0.05 <= nearest.goal[0] <= x_m + 1e-9
+def test_a_suggested_goal_exceeds_the_threshold_by_the_reserve():
+    # Γ = 1 - x: the threshold 0.5 is met at x = 0.5, the reserve of 0.8 at x = 0.1.
+    nearest = search(lambda goals: 1.0 - goals[:, 0], np.array([0.9, 0.0, 1.0]))
+    assert nearest.probability >= 0.9
+    assert 0.05 <= nearest.goal[0] <= 0.1 + 1e-9
     assert nearest.threshold == 0.5 and nearest.is_accepted
-
-
-@pytest.mark.parametrize(
-    ("goal", "nearest"),
-    [(INSIDE, INSIDE), (np.array([0.5, 3.0, 1.0]), [0.5, 1.0, 1.0])],
-    ids=["accepted", "outside the region"],
-)
-def test_an_accepted_goal_is_its_own_nearest_and_one_outside_is_moved_in(goal, nearest):
-    np.testing.assert_array_equal(search(constant(1.0), goal).goal, nearest)
 
 
 def test_without_a_goal_accepted_with_reserve_nothing_is_suggested():
@@ -184,8 +168,6 @@ def test_the_reserve_of_the_papers_mode_ends_at_its_largest_probability():
 def test_arguments_out_of_range_are_refused():
     with pytest.raises(ValueError, match=r"three numbers; got \[0.5, 0.0\]"):
         ask(constant(1.0), INSIDE[:2])
-    with pytest.raises(ValueError, match=r"reserve is -0\.1"):
-        search(constant(1.0), INSIDE, reserve=-0.1)
     loop = ClosedLoop(shuttling(), "nominal", None)
     with pytest.raises(ValueError, match="'ClosedLoop' has no plans with a goal"):
         assess_goal(loop, FieldAssessment(constant(1.0)), INSIDE, threshold=0.5)
@@ -220,11 +202,6 @@ def test_with_a_gradient_a_suggestion_is_as_near_with_fewer_goals_judged():
     assert distances[0] <= distances[1] + 0.002
     assert nearest.probability >= 0.9 and nearest.threshold == 0.5
     assert led.num_resets < 0.6 * whole.num_resets
-
-
-def test_a_flat_logit_leads_nowhere_and_the_search_goes_on_alone():
-    searched = suggest(FieldAssessment(PlaneAssessment()._gamma))
-    np.testing.assert_array_equal(suggest(PlaneAssessment(steepness=0.0)).goal, searched.goal)
 
 
 def test_a_nearer_goal_than_the_gradient_leads_to_is_found():

@@ -73,9 +73,3 @@ def test_contexts_of_one_source_are_pushed_each_by_its_own_and_a_cleared_push_ne
     assert np.abs(loop.velocity(pushed.get_context())).max() > 0.1
     for simulator in (cleared, left_alone):
         np.testing.assert_array_equal(loop.velocity(simulator.get_context()), np.zeros(6))
-
-
-def test_a_body_that_the_robot_does_not_have_is_answered_with_those_it_has():
-    loop = FloatingBox()
-    with pytest.raises(ValueError, match=r"'box' has no body 'head'; its bodies are \['trunk'\]"):
-        loop.set_push(loop.CreateDefaultContext(), "head")

@@ -10,8 +10,6 @@ from legged_robots import robot_kinematics
 from system_doubles import Bench
 
 PERIOD_S = 0.01
-HORIZON = 4
-NUM_OUTLOOK = 3
 
 
 class Stepping(Bench):
@@ -22,7 +20,7 @@ class Stepping(Bench):
     ):
         self.kinematics = k = robot_kinematics(name)
         self.parameters = RecoveryStepParameters(**numbers)
-        options = {"period_s": PERIOD_S, "horizon": HORIZON, "num_outlook": NUM_OUTLOOK}
+        options = {"period_s": PERIOD_S, "horizon": 4, "num_outlook": 3}
         super().__init__(RecoveryStepPlanner(k, self.parameters, **options))
         self.stance_pose, self.speed = np.array(stance_pose), np.array([*speed, 0.0])
         self.feet = to_world(self.stance_pose, np.c_[k.nominal_contacts, k.foot_radii])
@@ -52,9 +50,8 @@ class Stepping(Bench):
         return gait_groups(np.array([contacts[rows].mean(axis=0) for rows in slices]))
 
 
-@pytest.mark.parametrize("name", ["laikago", "hexapod"])
-def test_at_rest_the_feet_stay_where_they_were_seen_first(name):
-    bench = Stepping(name, stance_pose=(1.0, 2.0, 0.5), active=0.0)
+def test_at_rest_the_feet_stay_where_they_were_seen_first():
+    bench = Stepping(stance_pose=(1.0, 2.0, 0.5), active=0.0)
     bench.advance(0.3)
     np.testing.assert_allclose(bench.feet_now(), bench.feet, atol=1e-12)
     np.testing.assert_allclose(bench.get("stance_pose"), [1.0, 2.0, 0.5], atol=1e-12)
@@ -76,33 +73,13 @@ def test_one_group_swings_at_a_time_and_the_groups_alternate(name):
     assert sorted(swung[0] + swung[1]) == list(range(len(bench.kinematics.foot_names)))
 
 
-@pytest.mark.parametrize("speed", [(0.6, 0.0), (0.0, 0.6), (-0.4, 0.4)])
-def test_feet_step_in_the_direction_of_the_fall(speed):
+def test_feet_step_in_the_direction_of_the_fall():
+    speed = (-0.4, 0.4)
     bench = Stepping(speed=speed)
     bench.advance(0.9 * bench.parameters.step_duration_s)
     moved = (bench.feet_now() - bench.feet)[:, :2]
     swung = np.concatenate([np.r_[bench.kinematics.foot_slices[i]] for i in bench.lifted()])
     assert np.all(moved[swung] @ np.array(speed) > 0)
-
-
-def test_the_base_set_point_follows_the_measured_base_at_the_standing_height():
-    bench = Stepping(speed=(0.5, 0.0))
-    bench.advance(2 * PERIOD_S)
-    bench.see(bench.base + [0.05, -0.02, -0.03])
-    bench.advance(2 * PERIOD_S)
-    expected = [*(bench.base[:2] + [0.05, -0.02]), bench.kinematics.standing_height]
-    np.testing.assert_allclose(bench.get("desired_output"), expected, atol=1e-9)
-
-
-def test_the_preview_is_the_set_point_held_in_the_stance_frame():
-    bench = Stepping(stance_pose=(2.0, -1.0, 1.2), speed=(0.5, 0.0))
-    bench.advance(5 * PERIOD_S)
-    preview = bench.get("desired_preview").reshape(HORIZON, 3)
-    assert np.all(preview == preview[0])
-    outlook = bench.get("desired_outlook").reshape(NUM_OUTLOOK, 3)
-    np.testing.assert_array_equal(outlook, preview[:NUM_OUTLOOK])
-    world = to_world(bench.get("stance_pose"), preview[0])
-    np.testing.assert_allclose(world, bench.get("desired_output"), atol=1e-9)
 
 
 @pytest.mark.parametrize(("heading", "turned"), [(0.5, 0.1), (3.1, 0.1), (-3.1, -0.2)])
@@ -130,6 +107,14 @@ def test_a_turning_base_is_told_a_yaw_against_it(damping_s, twist, turned, rate,
     bench.see(bench.base, turned=turned, yaw_rate=rate)
     bench.advance(2 * PERIOD_S)
     assert bench.get("desired_yaw")[0] == pytest.approx(yaw, abs=1e-9 if twist else 0.1)
+
+
+def test_a_robot_that_holds_no_heading_stops_wherever_it_has_turned_to():
+    bench = Stepping(max_twist_rad=0.0)
+    bench.see(bench.base, turned=1.5)
+    settled(bench)
+    assert bench.get("recovery_done")[0] == 1
+    assert bench.get("stance_pose")[2] == pytest.approx(1.5, abs=0.05)
 
 
 def test_a_robot_far_from_its_heading_steps_on():
@@ -171,11 +156,9 @@ def settled(bench):
     return bench
 
 
-@pytest.mark.parametrize("name", ["laikago", "hexapod"])
-def test_the_stance_pose_becomes_that_of_the_new_footholds(name):
-    bench = Stepping(
-        name, stance_pose=(0.5, 0.0, 0.3), min_steps=2, settle_margin_m=0.01, resume_margin_m=0.0
-    )
+def test_the_stance_pose_becomes_that_of_the_new_footholds():
+    margins = {"settle_margin_m": 0.01, "resume_margin_m": 0.0}
+    bench = Stepping(stance_pose=(0.5, 0.0, 0.3), min_steps=2, **margins)
     bench.advance(PERIOD_S)
     bench.see(bench.base + [0.04, 0.02, 0.0])  # Feet and all: the posture has not changed.
     settled(bench)
@@ -183,18 +166,6 @@ def test_the_stance_pose_becomes_that_of_the_new_footholds(name):
     np.testing.assert_allclose(stance, [0.54, 0.02, 0.3], atol=5e-3)
     fitted = fit_stance(bench.feet_now(), bench.kinematics.nominal_contacts)
     np.testing.assert_allclose(stance, fitted, atol=1e-9)
-
-
-def test_done_lasts_until_the_trigger_lets_go_and_then_it_can_step_again():
-    bench = settled(Stepping())
-    assert bench.get("recovery_done")[0] == 1
-    bench.fix(recovery_active=0.0)
-    bench.advance(2 * PERIOD_S)
-    assert bench.get("recovery_done")[0] == 0
-    assert not bench.lifted()
-    bench.fix(recovery_active=1.0)
-    bench.advance(0.5 * bench.parameters.step_duration_s)
-    assert bench.lifted()
 
 
 def test_the_base_returns_to_the_nominal_set_point_without_a_jump_and_the_feet_stand():
@@ -212,13 +183,3 @@ def test_the_base_returns_to_the_nominal_set_point_without_a_jump_and_the_feet_s
     assert largest <= 1.05 * bound
     np.testing.assert_allclose(settled(bench).get("desired_output"), goal, atol=1e-9)
     np.testing.assert_allclose(bench.feet_now()[:, 2], bench.kinematics.foot_radii, atol=1e-9)
-
-
-def test_setting_the_stance_puts_it_to_rest():
-    bench = Stepping(speed=(1.0, 0.0))
-    bench.advance(0.5 * bench.parameters.step_duration_s)
-    bench.fix(recovery_active=0.0)
-    bench.system.set_stance(bench.context, bench.feet, bench.stance_pose)
-    bench.advance(0.2)
-    assert not bench.lifted()
-    np.testing.assert_array_equal(bench.feet_now(), bench.feet)

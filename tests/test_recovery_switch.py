@@ -42,16 +42,6 @@ class Standing(Bench):
         return steps + self.parameters.return_duration_s + 0.2
 
 
-def test_while_safe_the_nominal_plan_passes_through_at_once():
-    bench = Standing()
-    bench.advance(0.1)
-    bench.assert_nominal()
-    np.testing.assert_allclose(bench.get("desired_foot_positions"), bench.feet.ravel(), atol=1e-12)
-    np.testing.assert_allclose(bench.get("stance_pose"), np.zeros(3), atol=1e-12)
-    bench.fix(nominal_desired_output=bench.nominal + 1.0)
-    np.testing.assert_array_equal(bench.get("desired_output"), bench.nominal + 1.0)
-
-
 def test_the_step_planner_ticks_behind_the_trigger_in_the_same_period():
     bench = Standing()
     bench.advance(0.1 + 0.5 * PERIOD_S)

@@ -62,16 +62,3 @@ def test_it_latches_until_recovery_is_done_and_may_fire_again():
     assert bench.after(**DANGER, recovery_done=0.0)
     # Done means nothing before it fired.
     assert Triggered(0.1, recovery_done=1.0).after()
-
-
-def test_it_reads_its_inputs_only_at_its_own_times():
-    bench = Triggered(0.1, {"offset_s": 0.005})
-    for time_s, fires in ((0.004, 0.0), (0.006, 1.0)):
-        bench.simulator.AdvanceTo(time_s)
-        assert bench.get("recovery_active")[0] == fires
-
-
-@pytest.mark.parametrize("threshold", [-0.1, math.nan])
-def test_a_threshold_outside_zero_and_one_is_refused(threshold):
-    with pytest.raises(ValueError, match=r"must be in \[0, 1\]; got"):
-        RecoveryTrigger(period_s=PERIOD_S, threshold=threshold)

@@ -96,11 +96,6 @@ def test_a_stated_speed_limit_holds_and_what_is_welded_to_a_neighbour_does_not_t
     assert plant.GetJointByName("hip").velocity_lower_limit() == -7.0
 
 
-def test_shapes_of_no_body_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"no body for shapes 'lid'"):
-        built(write(tmp_path, shapes={"lid": [{"radius_m": 0.1}]}))
-
-
 def test_a_package_that_an_extra_would_bring_is_asked_for_by_the_extras_name(monkeypatch):
     monkeypatch.setattr(model_files, "_installed_folder", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"pip install 'drake_safety\[robots\]'"):

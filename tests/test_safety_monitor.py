@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 
 from drake_safety.systems.safety_monitor import SafetyMonitor
 from system_doubles import Bench
@@ -27,12 +26,3 @@ def test_it_is_safe_exactly_while_no_margin_of_the_present_state_is_negative():
         bench.fix(plant_state=state)
         assert bench.get("safe") == safe
         np.testing.assert_allclose(bench.get("margins"), margins)
-
-
-@pytest.mark.parametrize("margin", [np.nan, np.inf, -np.inf])
-def test_a_margin_that_is_not_finite_is_not_safe(margin):
-    class Broken(BoxSafeSet):
-        def margins(self, q, v):
-            return np.array([margin, 1.0])
-
-    assert Bench(SafetyMonitor(Broken(), 1, 1), plant_state=[0.0, 0.0]).get("safe") == 0

@@ -32,7 +32,7 @@ from drake_safety.systems.whole_body_controller import WholeBodyController
 from legged_robots import robot_kinematics
 from system_doubles import INFO, AssessmentDouble, Bench, SlowIsSafe, controller, guard
 
-ROBOT = robot_kinematics("laikago")
+ROBOT, BIPED = robot_kinematics("laikago"), robot_kinematics("biped")  # Of the same sizes.
 STANDING = np.append(ROBOT.standing_positions(), np.zeros(18))
 SAFE_SET = BalanceSafeSet(ROBOT, BalanceLimits())
 STEPS = RecoveryStepParameters(min_steps=1, max_steps=1)
@@ -79,22 +79,14 @@ CASES = {
         RECORDED,
         ["* num_finished"],
     ),
-    type(controller()): (
-        controller,
-        {"n_q": 9, "n_v": 8, "n_j": 2, "n_m": 10, "n": 28},
-        [],
-    ),
+    type(controller()): (controller, {"n_q": 9, "n_v": 8, "n_j": 2, "n_m": 10, "n": 28}, []),
     StateObserver: (
         lambda: StateObserver(ROBOT),
         LAIKAGO,
         ["* measured_plant_state", "* state", "* output"],
     ),
-    InverseKinematicsController: (
-        lambda: InverseKinematicsController(ROBOT, **LATE),
-        LAIKAGO,
-        [],
-    ),
-    WholeBodyController: (lambda: WholeBodyController(ROBOT, **LATE), LAIKAGO, []),
+    InverseKinematicsController: (lambda: InverseKinematicsController(ROBOT, **LATE), LAIKAGO, []),
+    WholeBodyController: (lambda: WholeBodyController(BIPED, hand="head", **LATE), LAIKAGO, []),
     RecoveryStepPlanner: (lambda: RecoveryStepPlanner(ROBOT, STEPS, **ROWS), LAIKAGO, []),
     RecoverySwitch: (
         lambda: RecoverySwitch(ROBOT, STEPS, threshold=0.6, offset_s=0.0005, **ROWS),
@@ -133,6 +125,8 @@ class Given(Bench):
 
     def value(self, kind, port):
         size = self.inputs[port]
+        if kind is WholeBodyController and port == "plant_state":
+            return np.append(BIPED.standing_positions(), np.zeros(18))
         known = {
             "safe": [1.0],
             "recovery_active": [float(kind is RecoveryStepPlanner)],

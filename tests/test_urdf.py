@@ -10,11 +10,6 @@ from drake_safety.robots.urdf import drake_urdf, read_urdf
 from urdf_files import GOOD, LINK, mesh, stl, written
 
 
-def test_a_file_that_needs_no_change_is_taken_as_it_is(tmp_path):
-    path = written(tmp_path, LINK.format("seat", GOOD, mesh("visual", "seat.obj")))
-    assert drake_urdf(path, with_collisions=False, with_visuals=True) is None
-
-
 def test_a_mesh_in_the_cache_has_its_colour_and_hides_no_other_beside_the_urdf(
     tmp_path, monkeypatch
 ):

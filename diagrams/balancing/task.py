@@ -183,7 +183,8 @@ class Balancing(LeggedLoop):
         if self._recovery_switch is not None:
             planner = self._recovery_switch.step_planner
             own_context = planner.GetMyMutableContextFromRoot(context)
-            planner.set_stance(own_context, p_WC, self._stance_of(start))
+            discrete_state = own_context.get_mutable_discrete_state()
+            planner.set_stance(discrete_state, p_WC, self._stance_of(start))
 
     def throw_ball(self, context: Context, throw: Throw, lead_s: float) -> None:
         """Sets the ball in flight, which hits the base after ``lead_s`` [s]; the monitor waits."""

@@ -34,11 +34,6 @@ class KinematicPreview:
     """
 
     def __init__(self, model: WholeBodyModel):
-        if model.hand is None:
-            raise ValueError(
-                f"kinematic preview of robot '{model.kinematics.robot.name}': the model must have "
-                f"a hand, one of {list(model.kinematics.robot.reaching_frames)}"
-            )
         self.model = model
         self.hand = model.hand
 

@@ -14,18 +14,14 @@ from drake_safety.control.kinematics import (
 
 _TOLERANCE_M = 1e-4  # Tolerance of a contact point's coordinates.
 _DAMPING = 1e-8  # [m²/rad²]: limits the step of a stretched leg.
+_MAX_ITERATIONS = 20
 _MAX_STEP_RAD = 0.5  # Per iteration.
 # The error after a Newton step is of second order: about 1e-5 m for a leg of 1 m.
 _LAST_STEP_RAD = 0.004
 
 
 def solve_inverse_kinematics(
-    kinematics: RobotKinematics,
-    X_WB: RigidTransform,
-    p_WC: np.ndarray,
-    guess: np.ndarray,
-    *,
-    max_iterations: int = 20,
+    kinematics: RobotKinematics, X_WB: RigidTransform, p_WC: np.ndarray, guess: np.ndarray
 ) -> np.ndarray:
     """Returns joint positions (n_j,) [rad] with desired contact points at a given base pose.
 
@@ -34,11 +30,11 @@ def solve_inverse_kinematics(
     limits. ``p_WC`` has the desired centres of the contact spheres, (n_c, 3) [m].
     """
     q = kinematics.positions_at(X_WB, guess)
-    return solve_from(kinematics, q, p_WC, max_iterations=max_iterations)[0]
+    return solve_from(kinematics, q, p_WC)[0]
 
 
 def solve_from(
-    kinematics: RobotKinematics, q: np.ndarray, p_WC: np.ndarray, *, max_iterations: int = 20
+    kinematics: RobotKinematics, q: np.ndarray, p_WC: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """As :func:`solve_inverse_kinematics` from ``q`` (n_q,), whose joints are overwritten.
 
@@ -47,7 +43,7 @@ def solve_from(
     lowest, highest = kinematics.position_limits.T
     joints = np.minimum(np.maximum(q[NUM_BASE_POSITIONS:], lowest), highest)
     J = np.empty((3 * kinematics.num_contacts, kinematics.num_velocities))
-    for _ in range(max_iterations):
+    for _ in range(_MAX_ITERATIONS):
         q[NUM_BASE_POSITIONS:] = joints
         kinematics.set_positions(q)
         reached, J = kinematics.present_contacts()

@@ -80,12 +80,10 @@ class RobotKinematics:
         self.num_velocities = self.plant.num_velocities()
         self.num_states = self.plant.num_multibody_states()
         self.num_joints = self.num_velocities - NUM_BASE_VELOCITIES
-        instance = self.plant.GetModelInstanceByName(robot.name)
         self.joint_names = servo_joints(self.plant, robot)
-        joints = [self.plant.GetJointByName(name, instance) for name in self.joint_names]
-        self.position_limits = np.array(
-            [[j.position_lower_limit(), j.position_upper_limit()] for j in joints]
-        ).reshape(-1, 2)
+        joints = [self.plant.GetJointByName(name) for name in self.joint_names]
+        limits = [[j.position_lower_limit(), j.position_upper_limit()] for j in joints]
+        self.position_limits = np.array(limits).reshape(-1, 2)
         self.velocity_limits = np.array([j.velocity_upper_limit() for j in joints])
         self.base = base
         self.world_frame = self.plant.world_frame()
@@ -96,9 +94,7 @@ class RobotKinematics:
         self._feet = list(zip(frames, self.foot_points, strict=True))
         sizes = [len(foot.contact_points) for foot in feet]
         stops = np.cumsum(sizes).tolist()
-        self.foot_slices = [
-            slice(stop - size, stop) for stop, size in zip(stops, sizes, strict=True)
-        ]
+        self.foot_slices = [slice(end - size, end) for end, size in zip(stops, sizes, strict=True)]
         self.foot_radii = np.repeat([foot.radius_m for foot in feet], sizes)
         self.num_contacts = len(self.foot_radii)
         posture = posture_positions(self.plant, robot)
@@ -107,12 +103,10 @@ class RobotKinematics:
         q = self.positions_at(RigidTransform(), self.posture)
         p_WC = self.contact_positions(q)
         self.standing_height = -float(np.min(p_WC[:, 2] - self.foot_radii))
-        """Height of the base in the standing posture [m]."""
         centroid = p_WC.mean(axis=0)
+        # Contact points (n_c, 2) and base (2,) of the standing posture from the points' centroid.
         self.nominal_contacts = p_WC[:, :2] - centroid[:2]
-        """Contact points of the standing posture relative to their centroid, (n_c, 2) [m]."""
         self.nominal_base_offset = -centroid[:2]
-        """Base relative to the contact points' centroid in the standing posture, (2,) [m]."""
 
     @property
     def context(self) -> Context:
@@ -229,8 +223,7 @@ def yaw_of(R_WB: RotationMatrix) -> float:
 def fit_stance(p_WC: np.ndarray, nominal_contacts: np.ndarray) -> np.ndarray:
     """The pose ``[x, y, yaw]`` of the stance frame S at contact points (n_c, 3) [m] in the world.
 
-    The least-squares fit of the standing posture's points, ``nominal_contacts`` (n_c, 2) relative
-    to their centroid, in closed form (planar Procrustes).
+    The least-squares fit (planar Procrustes) of the standing posture's ``nominal_contacts``.
     """
     # Floats are several times faster than arrays for a few points.
     points, nominal = p_WC[:, :2].tolist(), nominal_contacts.tolist()

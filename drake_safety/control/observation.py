@@ -44,11 +44,8 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
 
     S lies on the ground at the centroid of the contact points, with the yaw of their planar fit.
     Departure: the paper's s_k has configurations only; without velocities a pushed robot cannot be
-    distinguished from one at rest.
-
-    Returns:
-        (12 + 2 n_j,) [m, rad, m/s, rad/s], in the order of :func:`state_names`; NaN without a
-        finite state with an orientation.
+    distinguished from one at rest. The (12 + 2 n_j,) entries [m, rad, m/s, rad/s] have the order of
+    :func:`state_names`; they are NaN without a finite state with an orientation.
     """
     if not is_state(q, v):
         return np.full(12 + 2 * kinematics.num_joints, np.nan)
@@ -72,11 +69,8 @@ def walking_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> 
     """Returns the state s_k of a walking robot, which does not depend on its place and heading.
 
     Departure: feet that swing define no stance frame. Height is over the ground z = 0, and the
-    direction of gravity and the velocities are in the base's frame.
-
-    Returns:
-        (10 + 2 n_j,) [m, rad/s, m/s, rad], in the order of :func:`walking_state_names`; NaN without
-        a finite state with an orientation.
+    direction of gravity and the velocities are in the base's frame. The (10 + 2 n_j,) entries have
+    the order of :func:`walking_state_names`; they are NaN as those of :func:`stance_state`.
     """
     if not is_state(q, v):
         return np.full(10 + 2 * kinematics.num_joints, np.nan)

@@ -15,7 +15,6 @@ class RecoveryStepParameters:
     step_duration_s: Positive = 0.09
     """Duration of a swing [s]."""
     lift_m: Positive = 0.06
-    """Height of the swing trajectory [m]."""
     velocity_gain_s: float = 0.05
     """Raibert's gain: distance beyond the neutral point per speed [s]."""
     velocity_gain_growth: NotNegative = 0.1
@@ -23,15 +22,14 @@ class RecoveryStepParameters:
     max_reach_m: Positive = 0.18
     """Largest distance of a foothold from its hip's ground projection [m]."""
     min_lateral_m: float = 0.11
-    """Smallest distance of a foothold from the base's midline, on its own side [m]."""
+    """Smallest distance of a foothold from the base's midline [m]."""
     max_twist_rad: NotNegative = 0.3
     """Largest difference of desired and measured base yaw; with 0 no heading is held [rad]."""
     yaw_damping_s: float = 0.1
     """Offset of the desired base yaw from the heading against the yaw rate, per yaw rate [s]."""
     min_steps: Count = 2
-    """Least number of swings."""
     max_steps: int = 100
-    """Largest number of swings. A robot that stops before it can stand falls."""
+    """Least and largest number of swings. A robot that stops before it can stand falls."""
     settle_heading_rad: float = 0.35
     """Largest angle between the base's yaw and the heading for stopping [rad]."""
     settle_margin_m: float = 0.08
@@ -50,10 +48,7 @@ class RecoveryStepParameters:
 
 
 def gait_groups(foot_positions: np.ndarray) -> list[list[int]]:
-    """Two groups of feet that swing together: every second foot around the body.
-
-    ``foot_positions`` (n_feet, 2) [m] are relative to their centroid.
-    """
+    """Two groups of feet (n_feet, 2) [m] that swing together: every second one around the body."""
     around = np.argsort(np.arctan2(foot_positions[:, 1], foot_positions[:, 0]), kind="stable")
     return [sorted(around[0::2].tolist()), sorted(around[1::2].tolist())]
 
@@ -64,10 +59,7 @@ def capture_point(p_WB: np.ndarray, v_WB: np.ndarray) -> np.ndarray:
 
 
 def come_to_rest(p_WB: np.ndarray, v_WB: np.ndarray, elapsed_s: float) -> np.ndarray:
-    """Position (3,) [m] of a linear inverted pendulum with its support at the capture point.
-
-    Its height is constant, its velocity ``v_WB`` horizontal.
-    """
+    """Position (3,) [m] of a linear inverted pendulum with its support at the capture point."""
     time_constant_s = math.sqrt(p_WB[2] / GRAVITY_M_S2)
     return p_WB - v_WB * time_constant_s * math.expm1(-elapsed_s / time_constant_s)
 
@@ -106,7 +98,6 @@ def foothold(
     is within reach of the hip at touchdown, and on its own side of the base.
 
     Args:
-        yaw: Yaw of the heading frame [rad].
         hip_offset: The foot's position in the standing posture, in the heading frame, (2,) [m].
         remaining_s: Time to touchdown [s].
         num_steps: Number of swings before this one.

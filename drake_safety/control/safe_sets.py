@@ -67,11 +67,7 @@ def signed_distance_to_polygon(
 
 
 def support_margin(kinematics: RobotKinematics, q: np.ndarray, clearance_m: float) -> float:
-    """Signed distance of the base's ground projection to the support polygon [m].
-
-    Contact points below ``clearance_m`` are on the ground. In the air it is the negative distance
-    to the centroid of the feet.
-    """
+    """Signed distance of the base's ground projection to the contacts below ``clearance_m`` [m]."""
     p_WC = kinematics.contact_positions(q)
     points = zip(p_WC.tolist(), kinematics.foot_radii.tolist(), strict=True)
     if support := [(x, y) for (x, y, z), radius in points if z - radius < clearance_m]:
@@ -83,11 +79,7 @@ def support_margin(kinematics: RobotKinematics, q: np.ndarray, clearance_m: floa
 def fall_margin(
     kinematics: RobotKinematics, q: np.ndarray, lowest_height_m: float, cos_fall_tilt: float
 ) -> float:
-    """The smaller of the margins of height and tilt before a fall [m].
-
-    The margin of tilt is the height that a rigid pendulum of the standing height loses before the
-    largest angle between the base's z axis and the vertical.
-    """
+    """The smaller of height over ``lowest_height_m`` and height that the largest tilt loses [m]."""
     # Floats are faster than short arrays.
     w, x, y, z, _, _, height = q[:7].tolist()
     cos_tilt = 1.0 - 2.0 * (x * x + y * y) / (w * w + x * x + y * y + z * z)
@@ -103,15 +95,13 @@ class BalanceLimits:
     height_m: Interval = field(default_factory=lambda: [0.3, 0.5])
     """Lowest and highest safe height of the base [m]."""
     fall_height_m: float = 0.2
-    """Height of the base below which the robot has fallen [m]."""
     fall_tilt_rad: float = 0.8
     """Angle between the base's z axis and the vertical beyond which it has fallen [rad]."""
 
     def __post_init__(self) -> None:
         if not self.fall_height_m <= self.height_m[0]:
             raise ValueError(
-                f"fall_height_m must not exceed the lowest safe height "
-                f"{self.height_m[0]}; got {self.fall_height_m}"
+                f"fall_height_m must not exceed {self.height_m[0]}; got {self.fall_height_m}"
             )
 
 
@@ -159,11 +149,10 @@ class BalanceSafeSet:
         )
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
-        """Returns the margins in eight directions, now, at the capture point and at the goal.
+        """Returns the features (n_f,), from the desired base positions in the stance frame (M, 3).
 
         A directional margin is positive if the support polygon extends beyond the point in that
-        direction. ``preview`` has the desired base positions from now to the goal, in the stance
-        frame, (M, 3) [m]. NaN without a finite state with an orientation.
+        direction. All are NaN without a finite state with an orientation.
         """
         if not is_state(q, v, preview):
             return np.full(len(self.feature_names), np.nan)

@@ -39,15 +39,14 @@ class WholeBodyReference:
     """R_WB of every body with an orientation task, in the order of ``model.body_names``."""
     posture: np.ndarray
     """Joint positions (n_j,) [rad]."""
-    reaching: PointReference | None = None
-    """Reference of the hand; required by models with a hand."""
+    reaching: PointReference
+    """Reference of the hand."""
 
 
 class Hand:
     """A reaching point, its collision sphere and the joints of its arm."""
 
-    def __init__(self, name: str, body: RigidBody, reaching_frame: ReachingFrame):
-        self.name = name
+    def __init__(self, body: RigidBody, reaching_frame: ReachingFrame):
         self.body = body
         self.frame: Frame = body.body_frame()
         self.point = np.array(reaching_frame.point, dtype=float)
@@ -56,7 +55,6 @@ class Hand:
 
     def present_position(self, kinematics: RobotKinematics) -> np.ndarray:
         """Returns the reaching point in the world at the scratch Context's positions, (3,) [m]."""
-        # A third quicker than RigidTransform's product, which is wrapped in Python.
         p_WH: np.ndarray = kinematics.plant.CalcPointsPositions(
             kinematics.context, self.frame, self.point, kinematics.world_frame
         )
@@ -85,9 +83,9 @@ class StandingFoot:
 
 
 class WholeBodyModel:
-    """Frames, gains and limits of a robot's whole-body program; no reaching without a hand."""
+    """Frames, gains and limits of a robot's whole-body program for reaching with a hand."""
 
-    def __init__(self, kinematics: RobotKinematics, hand: str | None = None):
+    def __init__(self, kinematics: RobotKinematics, hand: str):
         robot, plant = kinematics.robot, kinematics.plant
         self.kinematics = kinematics
         self.parameters = parameters = robot.whole_body
@@ -97,10 +95,8 @@ class WholeBodyModel:
         self.weight_W = self.mass * plant.gravity_field().gravity_vector()
         # The cost of forces divided by this is their squared norm.
         self.force_scale = self.mass / math.sqrt(parameters.force_regularization)
-        self.hand: Hand | None = None
-        if hand is not None:
-            frame = robot.reaching_frame(hand)
-            self.hand = Hand(hand, plant.GetBodyByName(frame.body), frame)
+        frame = robot.reaching_frame(hand)
+        self.hand = Hand(plant.GetBodyByName(frame.body), frame)
         self.body_names = list(parameters.orientation)
         self.bodies = [plant.GetBodyByName(name) for name in self.body_names]
         # After the three of the centre of mass.
@@ -109,9 +105,7 @@ class WholeBodyModel:
             StandingFoot(plant.GetBodyByName(foot.body), points)
             for foot, points in zip(robot.feet.values(), kinematics.foot_points, strict=True)
         ]
-        tasks = [parameters.center_of_mass, *parameters.orientation.values()]
-        if hand is not None:
-            tasks.append(parameters.reaching)
+        tasks = [parameters.center_of_mass, *parameters.orientation.values(), parameters.reaching]
         # Three rows per task: the centre of mass, the bodies in order, the hand.
         self.num_task_rows = 3 * len(tasks)
         gains = np.array([[task.weight, task.stiffness, task.damping] for task in tasks])
@@ -162,9 +156,8 @@ class WholeBodyModel:
             center_of_mass=PointReference(position=np.array([x, y, height])),
             orientations=[],
             posture=np.array(kinematics.posture, dtype=float),
+            reaching=PointReference(position=self.reaching_position(q)),
         )
-        if self.hand is not None:
-            reference.reaching = PointReference(position=self.reaching_position(q))
         kinematics.set_positions(kinematics.standing_positions())
         R_WS = RotationMatrix.MakeZRotation(yaw)
         for body in self.bodies:
@@ -174,26 +167,21 @@ class WholeBodyModel:
 
     def check_reference(self, reference: WholeBodyReference) -> None:
         """Checks that a reference is complete and finite, and of the right sizes."""
-        points: list[PointReference | None] = [reference.center_of_mass]
-        if self.hand is not None:
-            points.append(reference.reaching)
-        vectors = [x for p in points if p is not None for x in (p.position, p.rate)]
+        points = reference.center_of_mass, reference.reaching
+        vectors = [vector for point in points for vector in (point.position, point.rate)]
         is_sized = (
-            len(vectors) == 2 * len(points)
-            and all(np.shape(vector) == (3,) for vector in vectors)
+            all(np.shape(vector) == (3,) for vector in vectors)
             and len(reference.orientations) == len(self.bodies)
             and len(reference.posture) == self.num_joints
         )
         if not (is_sized and np.isfinite(np.concatenate([*vectors, reference.posture])).all()):
             raise ValueError(
                 f"robot '{self.kinematics.robot.name}': the whole-body reference needs finite "
-                f"points (3,), orientations of {self.body_names}, a posture of {self.num_joints} "
-                f"joints and reaching for a hand; got {reference}"
+                f"points (3,), orientations of {self.body_names} and a posture of "
+                f"{self.num_joints} joints; got {reference}"
             )
 
     def reaching_position(self, q: np.ndarray) -> np.ndarray:
         """Returns the reaching point in the world, (3,) [m]."""
-        if self.hand is None:
-            raise ValueError(f"robot '{self.kinematics.robot.name}': the model has no hand")
         self.kinematics.set_positions(q)
         return self.hand.present_position(self.kinematics)

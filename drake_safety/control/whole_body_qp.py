@@ -42,9 +42,7 @@ class WholeBodyQP:
     """
 
     H: np.ndarray
-    """(n_v, n_v)."""
     g: np.ndarray
-    """(n_v,)."""
     A: np.ndarray
     num_vdot_rows: int
     """Number of the first rows of A, in which v̇ has nonzero entries."""
@@ -68,11 +66,9 @@ class WholeBodySolution:
     """A solution of the program, valid if its status is ``SOLVED``."""
 
     vdot: np.ndarray
-    """(n_v,)."""
     forces: np.ndarray
-    """Forces at the stance feet's contact points in the world, (n_points, 3) [N]."""
+    """Forces at the contact points in the world, (n_points, 3) [N]."""
     torques: np.ndarray
-    """(n_j,) [N·m]."""
     status: int
 
 
@@ -102,9 +98,7 @@ def build_qp(
     error[_FIRST] = reference.center_of_mass.position - p_com
     _set_body_rows(model, reference, J, error)
     _set_body_biases(model, Jdot_v)
-    rate[_FIRST] = reference.center_of_mass.rate
-    if model.hand is not None and reference.reaching is not None:
-        rate[_LAST] = reference.reaching.rate
+    rate[_FIRST], rate[_LAST] = reference.center_of_mass.rate, reference.reaching.rate
     wanted = model.stiffness * error + model.damping * (rate - J @ v) - Jdot_v
     _check_size(wanted.dot(wanted))
     weighted = model.task_weights * J
@@ -202,10 +196,9 @@ def _set_body_rows(
         R_WB = body.EvalPoseInWorld(context).rotation()
         # R_WBd R_WBᵀ. Drake's product of rotations is wrapped in Python, and twice as slow.
         error[rows] = rotation_vector(R_WBd.inverse().InvertAndCompose(R_WB.inverse()))
-    if model.hand is not None and reference.reaching is not None:
-        frame, p = model.hand.frame, model.hand.point
-        J[_LAST] = plant.CalcJacobianTranslationalVelocity(context, kv, frame, p, world, world)
-        error[_LAST] = reference.reaching.position - model.hand.present_position(kinematics)
+    frame, p = model.hand.frame, model.hand.point
+    J[_LAST] = plant.CalcJacobianTranslationalVelocity(context, kv, frame, p, world, world)
+    error[_LAST] = reference.reaching.position - model.hand.present_position(kinematics)
 
 
 def _set_body_biases(model: WholeBodyModel, Jdot_v: np.ndarray) -> None:
@@ -218,10 +211,9 @@ def _set_body_biases(model: WholeBodyModel, Jdot_v: np.ndarray) -> None:
                 context, kv, body.body_frame(), _ORIGIN, world, world
             )
             Jdot_v[rows] = acceleration.rotational()
-    if model.hand is not None:
-        frame, p = model.hand.frame, model.hand.point
-        acceleration = plant.CalcBiasTranslationalAcceleration(context, kv, frame, p, world, world)
-        Jdot_v[_LAST] = acceleration[:, 0]
+    frame, p = model.hand.frame, model.hand.point
+    acceleration = plant.CalcBiasTranslationalAcceleration(context, kv, frame, p, world, world)
+    Jdot_v[_LAST] = acceleration[:, 0]
 
 
 @one_blas_thread

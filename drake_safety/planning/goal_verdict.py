@@ -20,28 +20,24 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GoalVerdict:
-    """The verdict of an assessment on a goal, before the robot moves.
-
-    Attributes:
-        goal: The goal in the world, (3,) [m].
-        belief: (safe, unsafe, don't know), (3,); its first entry is the paper's Γ.
-        probability: The probability of staying safe; NaN outside the region sampled in training.
-        threshold: Lowest probability of a safe goal.
-        predicted_margins: Smallest margin predicted for each constraint [m, rad], (n_c,); NaN
-            where none is predicted.
-        margin_unit: Scale by which margins are compared [m, rad].
-        reason: Why the verdict is "don't know"; "" otherwise.
-    """
+    """The verdict of an assessment on a goal, before the robot moves."""
 
     goal: np.ndarray
+    """In the world, (3,) [m]."""
     belief: np.ndarray
+    """(safe, unsafe, don't know), (3,); its first entry is the paper's Γ."""
     probability: float
+    """The probability of staying safe; NaN outside the region sampled in training."""
     threshold: float
+    """Lowest probability of a safe goal."""
     constraint_names: tuple[str, ...]
     cause_probability: np.ndarray
     predicted_margins: np.ndarray
+    """Smallest margin predicted for each constraint [m, rad], (n_c,), or NaN."""
     margin_unit: float = 1.0
+    """Scale by which margins are compared [m, rad]."""
     reason: str = ""
+    """Why the verdict is "don't know"; "" otherwise."""
 
     @property
     def verdict(self) -> str:
@@ -82,15 +78,10 @@ def assess_goal(
     threshold: float,
     unsafe_below: float | None = None,
 ) -> GoalVerdict:
-    """Assesses the motion from the standing posture to a goal.
+    """Assesses the motion from standing to a goal, (3,) [m], by state and plan at its start.
 
-    Nothing is simulated: Γ is evaluated on state, plan and features of the first instant.
-
-    Args:
-        goal: In the world, (3,) [m]; "don't know" outside the region sampled in training.
-        threshold: Lowest probability of a safe goal.
-        unsafe_below: A probability below this is unsafe, from there to the threshold "don't know";
-            the threshold by default.
+    A goal outside the region sampled in training is "don't know". So is a probability from
+    ``unsafe_below``, the threshold by default, to the threshold.
     """
     goal = checked_goal(goal)
     with_goals = require(loop, HasGoals)
@@ -124,11 +115,7 @@ def assess_goals(
     threshold: float,
     unsafe_below: float | None = None,
 ) -> list[GoalVerdict]:
-    """Assesses goals (N, 3) inside the region sampled in training, as `assess_goal` does.
-
-    The verdict is "don't know" where the input is novel, or half of the belief or more comes from
-    cells without training data.
-    """
+    """Assesses goals (N, 3) inside the region sampled in training, as `assess_goal` does."""
     if len(goals) == 0:
         return []
     unsafe_below = threshold if unsafe_below is None else unsafe_below
@@ -172,11 +159,7 @@ def assess_goals(
 
 
 def goal_inputs(loop: ClosedLoop, goals: np.ndarray) -> list[np.ndarray]:
-    """The assessment's inputs at the first instant of motions from standing to goals (N, 3) [m].
-
-    Returns:
-        State (N, n_s), desired preview (N, H n_z) and features (N, n_f).
-    """
+    """State, preview and features (N, ...) at the start of motions from standing to goals."""
     with_goals, context = require(loop, HasGoals), loop.CreateDefaultContext()
     ports = [loop.GetOutputPort(name) for name in ("state", "desired_preview", "features")]
     rows = []

@@ -175,10 +175,6 @@ def _add_geometries(
             mujoco_body = spec.body(body.name())
         else:
             name = f"{plant.GetModelInstanceName(body.model_instance())}::{body.name()}"
-            if not plant.IsAnchored(body):
-                raise ValueError(
-                    f"engine 'mujoco' simulates no moving body but the robot; got '{name}'"
-                )
             X_WB = plant.EvalBodyPoseInWorld(context, body)
             mujoco_body = spec.worldbody.add_body(
                 name=name, pos=X_WB.translation(), quat=X_WB.rotation().ToQuaternion().wxyz()
@@ -187,10 +183,7 @@ def _add_geometries(
         for geometry in geometries:
             shape = inspector.GetShape(geometry)
             if type(shape) not in _SHAPES:
-                raise ValueError(
-                    f"body '{mujoco_body.name}': engine 'mujoco' has no collision shape "
-                    f"{type(shape).__name__}; it has {[kind.__name__ for kind in _SHAPES]}"
-                )
+                raise ValueError(f"engine 'mujoco' has no collision shape {type(shape).__name__}")
             kind, size = _SHAPES[type(shape)]
             X_BG = inspector.GetPoseInFrame(geometry)
             geom = mujoco_body.add_geom(

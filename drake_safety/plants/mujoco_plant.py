@@ -84,7 +84,6 @@ class MujocoPlant(LeafSystem):
             )
 
     def _parts(self, state: np.ndarray) -> list[np.ndarray]:
-        """The parts qpos, qvel and qacc_warmstart of MuJoCo's state."""
         return np.split(state, [self.model.nq, self.model.nq + self.model.nv])
 
     def state_from(self, plant_state: np.ndarray) -> np.ndarray:

@@ -6,12 +6,7 @@ from dataclasses import field
 
 import numpy as np
 from pydantic import FiniteFloat
-from pydrake.geometry import (
-    CollisionFilterDeclaration,
-    GeometryId,
-    GeometrySet,
-    SceneGraph,
-)
+from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
@@ -49,7 +44,10 @@ def _add_obstacle(plant: MultibodyPlant, parser: Parser, obstacle: Obstacle) -> 
             f"{who}: model must be a package:// URL or the absolute path of an existing file"
         )
     check_meshes(path)
-    instance, *others = parser.AddModels(str(path))
+    try:
+        instance, *others = parser.AddModels(str(path))
+    except RuntimeError as error:
+        raise ValueError(f"{who}: {error}") from error
     joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
     held = {joint.child_body().index() for joint in joints}
     roots = [i for i in plant.GetBodyIndices(instance) if i not in held]

@@ -59,13 +59,7 @@ class Scene:
 
 
 class DrakePhysics:
-    """Physics by a MultibodyPlant; :func:`add_physics` makes it.
-
-    Attributes:
-        ball: The ball, or None.
-        state: Output port of the robot's ``[q; v]``.
-        ball_state: Output port of the ball's ``[q; v]``, or None.
-    """
+    """Physics by a MultibodyPlant; ``state`` and ``ball_state`` are ports of ``[q; v]``."""
 
     def __init__(
         self,
@@ -99,10 +93,7 @@ class DrakePhysics:
     def connect_servos(
         self, builder: DiagramBuilder, joint_names: list[str], desired_joint_state: OutputPort
     ) -> None:
-        """Connects joint positions and velocities (2 n_j,) to a robot with servos.
-
-        Actuators that model dry friction get a desired velocity of zero.
-        """
+        """Connects joint positions and velocities (2 n_j,) to a robot with servos."""
         D = np.kron(np.eye(2), self.actuation_matrix(joint_names))
         servos = builder.AddNamedSystem("servo_map", MatrixGain(D=D))
         builder.Connect(desired_joint_state, servos.get_input_port())
@@ -111,7 +102,7 @@ class DrakePhysics:
 
     @contextmanager
     def edited(self, context: Context) -> Iterator[Context]:
-        """Context manager for writing the plant's part of a root Context, masses set."""
+        """Context manager for writing the plant's part of a root Context, with its masses."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         apply_masses(self.plant, plant_context, self._robot, self._variation)
         yield plant_context
@@ -141,7 +132,7 @@ class MujocoPhysics:
         self.applied_spatial_force: InputPort = system.GetInputPort("applied_spatial_force")
 
     def actuation_matrix(self, joint_names: list[str]) -> np.ndarray:
-        """Returns the identity, as :meth:`connect_torques` has the order of the joints."""
+        """Returns the identity: :meth:`connect_torques` has the order of the joints."""
         return np.eye(len(joint_names))
 
     def connect_torques(self, builder: DiagramBuilder, torques: OutputPort) -> None:
@@ -180,11 +171,7 @@ def add_physics(
     time_step_s: float,
     servos: bool,
 ) -> Physics:
-    """Adds a robot on level ground to a diagram, simulated by the variation's engine.
-
-    The joints have robot.yaml's position servos, or else torque inputs. The variation's masses are
-    set in a Context by ``edited``.
-    """
+    """Adds a robot, with servos or torque inputs, on level ground to a diagram."""
     if variation.engine == "drake":
         config = MultibodyPlantConfig(
             time_step=time_step_s,
@@ -197,8 +184,7 @@ def add_physics(
         return DrakePhysics(plant, scene_graph, instance, robot, variation, ball)
     if scene.has_ball:
         raise ValueError(
-            "engine 'mujoco' has no ball to throw: pass ball=False, for both sides of a "
-            "comparison, or set the share of pushes to 0"
+            "engine 'mujoco' has no ball to throw: pass ball=False, or set the share of pushes to 0"
         )
     if variation.shift is not None:
         raise ValueError("engine 'mujoco' has no shifts; simulate them by engine 'drake'")
@@ -216,13 +202,8 @@ def add_ground(plant: MultibodyPlant, friction: float) -> None:
     """Adds level ground at z = 0, with a friction coefficient, to a plant not yet finalised."""
     # The URDF is the visual; the collision shape is an infinite half space.
     package_parser(plant).AddModels(url="package://drake_safety_models/scenes/ground.urdf")
-    plant.RegisterCollisionGeometry(
-        plant.world_body(),
-        RigidTransform(),
-        HalfSpace(),
-        "ground",
-        CoulombFriction(friction, friction),
-    )
+    world, material = plant.world_body(), CoulombFriction(friction, friction)
+    plant.RegisterCollisionGeometry(world, RigidTransform(), HalfSpace(), "ground", material)
 
 
 def _add_holes(
@@ -238,17 +219,12 @@ def _add_holes(
         raise ValueError(
             f"robot '{robot.name}' has no foot '{unknown[0]}' for a hole; it has {list(robot.feet)}"
         )
-    material = CoulombFriction(friction, friction)
-    holes = {
-        robot.feet[name].body: plant.RegisterCollisionGeometry(
-            plant.world_body(),
-            RigidTransform([0.0, 0.0, -depth_m]),
-            HalfSpace(),
-            f"hole_{name}",
-            material,
+    world, material, holes = plant.world_body(), CoulombFriction(friction, friction), {}
+    for name, depth_m in depths_m.items():
+        X_WH = RigidTransform([0.0, 0.0, -depth_m])
+        holes[robot.feet[name].body] = plant.RegisterCollisionGeometry(
+            world, X_WH, HalfSpace(), f"hole_{name}", material
         )
-        for name, depth_m in depths_m.items()
-    }
     # After the registrations, which invalidate earlier lists of identifiers.
     everything = plant.GetCollisionGeometriesForBody(plant.world_body())
     ground = [geometry for geometry in everything if geometry not in holes.values()]
@@ -299,8 +275,7 @@ def _add_robot_and_scene(
         if collision_geometries(plant, [model])
     ]:
         raise ValueError(
-            f"decorations {touchable} have collision geometry, which no margin covers; list them "
-            "under 'obstacles'"
+            f"decorations {touchable} have collision geometry; list them under 'obstacles'"
         )
     if scene.obstacles is not None:
         filter_collisions(plant, scene_graph, robot, obstacles)

@@ -9,16 +9,13 @@ from drake_safety.files.schema import Bounds, NotNegative, Positive, ShareBelowO
 
 @schema(kw_only=True)
 class Push:
-    """A push on a body."""
+    """A push on a body at its centre of mass."""
 
     body: str = ""
-    """The robot's body; the force acts at its centre of mass."""
     force_n: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
     """The force in the world, (3,) [N]."""
     time_s: NotNegative = 1.0
-    """Start [s]."""
     duration_s: Positive = 0.1
-    """Duration [s]."""
 
     @property
     def strength_n(self) -> float:
@@ -39,7 +36,6 @@ class RandomPushes:
     time_s: Bounds[NotNegative] = field(default_factory=lambda: [0.1, 1.5])
     """Earliest and latest start [s]."""
     duration_s: Positive = 0.2
-    """Duration [s]."""
 
     def sample(self, rng: np.random.Generator, body: str) -> Push | None:
         """Draws the push of an episode, on this body by default; None in ``1 - share`` of them."""

@@ -104,10 +104,7 @@ _FAULTS = {".obj": _obj_fault, ".gltf": _gltf_fault, ".vtk": _vtk_fault}
 
 @lru_cache(maxsize=1024)
 def is_shown(path: Path) -> bool:
-    """Whether Drake renders a mesh without conversion.
-
-    OBJ files by MeshLab may declare opaque materials fully transparent, and Drake renders them so.
-    """
+    """Whether Drake renders a mesh as it is; MeshLab may declare opaque OBJ files transparent."""
     materials = path.with_suffix(".mtl")
     if path.suffix.lower() != ".obj" or not materials.is_file():
         return path.suffix.lower() in SHOWN_FORMATS
@@ -116,11 +113,7 @@ def is_shown(path: Path) -> bool:
 
 
 def shown_mesh(path: Path, rgba: str = "") -> Path:
-    """The file itself if Drake renders it, or else a glTF file in the cache.
-
-    An OBJ without normals gets them, if trimesh is installed. ``rgba`` ("r g b a") colours a mesh
-    without materials.
-    """
+    """The file itself if Drake renders it, else a glTF file in the cache, coloured "r g b a"."""
     is_bare = path.suffix.lower() == ".obj" and find_spec("trimesh") is not None
     if is_shown(path) and not (is_bare and _BARE_FACE.search(path.read_text("utf-8", "replace"))):
         return path
@@ -145,10 +138,7 @@ def mesh_points(path: Path) -> np.ndarray:
 
 
 def convex_hull(points: np.ndarray) -> trimesh.Trimesh:
-    """Returns the convex hull of the points (n, 3) [m] that are extreme in 42 directions.
-
-    Points in a plane get the box around them, at least 1 mm thick.
-    """
+    """Returns a hull of points (n, 3) [m], of those extreme in 42 directions; a box if flat."""
     from trimesh import convex, creation
 
     if np.linalg.matrix_rank(points - points.mean(axis=0), tol=_FLAT_M) < 3:

@@ -30,10 +30,7 @@ def add_to_package_map(package_map: PackageMap, url: str = "") -> None:
 
 
 def package_parser(plant: MultibodyPlant, url: str = "") -> Parser:
-    """Returns a parser with the packages of :func:`add_to_package_map`.
-
-    The parser renames models whose name the plant already has.
-    """
+    """Returns a parser with the packages of :func:`add_to_package_map`, which renames models."""
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
     add_to_package_map(parser.package_map(), url)
@@ -59,8 +56,7 @@ def _installed_folder(name: str) -> Path | None:
 def model_file(url: str, folder: str = "", requires: str = "") -> Path:
     """Returns the file of a ``package://…`` URL, or of a path relative to ``folder``.
 
-    ``file://`` may precede a path. Packages are this one's (``drake_safety_models``), Drake's, and
-    those installed by pip.
+    Packages are this one's (``drake_safety_models``), Drake's, and those installed by pip.
     ``requires`` is what pip installs without its dependencies; empty for packages of an extra.
     """
     parts = urlparse(url)

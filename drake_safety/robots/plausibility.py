@@ -13,7 +13,6 @@ from drake_safety.robots.robot_size import GRAVITY_M_S2
 _MATTERS = 1e-4  # Moment of inertia that matters, by the robot's mass times extent squared.
 _POINT = 0.005  # Least radius of gyration, by the robot's extent.
 _MOST_TORQUE, _MOST_FORCE = 1.5, 8.0  # Of motors, by weight times extent (known: 0.4); by weight.
-_MOST_SPEED = 25.0  # Of joints, by √(g / extent); known robots have 5 to 20.
 _AIR_KG_M3, _LEAD_KG_M3 = 1.2, 11_300.0  # Density of the cube that is as large as the robot.
 _NUM_LISTED = 4
 
@@ -36,12 +35,7 @@ def listed(reasons: Mapping[str, str]) -> str:
 
 
 def odd_inertias(plant: MultibodyPlant, context: Context, instance: ModelInstanceIndex) -> str:
-    """Names links with masses that no body of a robot of this size has; "" if there is none.
-
-    The radius of gyration √(I/m) or the distance of the centre of mass is beyond the robot's
-    extent, a heavy link's radius is below 1/200 of it, or the robot is lighter than air or heavier
-    than lead.
-    """
+    """Names links with masses or inertias that no body of a robot of this size has; "" if none."""
     size, total = extent(plant, context, instance), plant.CalcTotalMass(context, [instance])
     odd, remarks = [], []
     for body in map(plant.get_body, plant.GetBodyIndices(instance)):
@@ -77,28 +71,17 @@ def odd_limits(
     instance: ModelInstanceIndex,
     efforts: Mapping[str, float],
 ) -> tuple[set[str], str]:
-    """Returns joints with efforts that no motor of a robot of this size has, and words; "" if none.
-
-    A torque is beyond 1.5 times weight times extent, a force beyond 8 times the weight. Words also
-    name speeds beyond 25 √(g / extent) of hinges and 25 √(g · extent) of sliders.
-    """
+    """Returns joints with efforts that no motor of such a robot has, and words; "" if none."""
     size, mass = extent(plant, context, instance), plant.CalcTotalMass(context, [instance])
-    strong, odd = set[str](), dict[str, str]()
+    odd = dict[str, str]()
     for joint in map(plant.get_joint, plant.GetJointIndices(instance)):
         if joint.num_velocities() != 1:
             continue
         name, unit = joint.name(), effort_unit(joint)
-        most, fastest = _MOST_TORQUE * size, _MOST_SPEED * math.sqrt(GRAVITY_M_S2 / size)
-        if unit == "N":
-            most, fastest = _MOST_FORCE, fastest * size
-        effort, speed = efforts.get(name, math.inf), joint.velocity_upper_limits()[0]
-        if fastest < speed < math.inf:
-            rate = "m/s" if unit == "N" else "rad/s"
-            odd[name] = f"{speed:g} {rate}, at most {fastest:.3g} expected"
-        most *= GRAVITY_M_S2 * mass
+        most = (_MOST_FORCE if unit == "N" else _MOST_TORQUE * size) * GRAVITY_M_S2 * mass
+        effort = efforts.get(name, math.inf)
         if most < effort < math.inf:
             odd[name] = f"{effort:g} {unit}, at most {most:.3g} expected"
-            strong.add(name)
     few = listed(dict([*odd.items()][:_NUM_LISTED])) + " ..." * (len(odd) > _NUM_LISTED)
     what = f"limits that no motor of a robot of {mass:.3g} kg and {size:.2g} m has (placeholders?)"
-    return strong, f"{len(odd)} joints have {what}: {few}" if odd else ""
+    return set(odd), f"{len(odd)} joints have {what}: {few}" if odd else ""

@@ -1,14 +1,13 @@
 """Adds a robot to a MultibodyPlant, with plant variations that model a reality gap."""
 
 import logging
-import operator
 import re
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import field
 from itertools import chain
-from typing import Any, Generic, Literal, TypeVar
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
 from pydrake.geometry import (
@@ -55,13 +54,12 @@ class ObservationNoise:
 
 @schema(kw_only=True)
 class Payload:
-    """A small mass fixed to a body of the robot."""
+    """A small mass fixed to a body of the robot, by default to its base."""
 
     mass_kg: Positive = 1.0
     position_m: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Its centre in the body's frame, (3,)."""
     body: str = ""
-    """The body it is fixed to; the robot's base by default."""
 
 
 @schema(kw_only=True)
@@ -69,7 +67,6 @@ class PlantVariation:
     """Differences of a plant from the published robot."""
 
     engine: Literal["drake", "mujoco"] = "drake"
-    """Physics engine: ``drake`` or ``mujoco``."""
     mass_scale: Positive = 1.0
     """Factor on every body's spatial inertia."""
     joint_friction_nm: NotNegative = 0.0
@@ -96,23 +93,15 @@ _FRICTION_SUFFIX = "_friction"  # Suffix of actuators that model dry friction.
 _FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
 
 
-def _require(
-    robot: RobotModel,
-    what: str,
-    names: Iterable[str],
-    known: list[str],
-    fits: Callable[[str, str], Any] = operator.eq,
-) -> None:
+def _require(robot: RobotModel, what: str, names: Iterable[str], known: list[str]) -> None:
+    """Checks that names, or patterns, are of what a robot has."""
     for name in names:
-        if not any(fits(name, other) for other in known):
+        if name not in known and not any(re.fullmatch(name, other) for other in known):
             raise ValueError(f"robot '{robot.name}' has no {what} '{name}'; it has {known}")
 
 
 def servo_joints(plant: MultibodyPlant, robot: RobotModel) -> list[str]:
-    """Returns the names of the robot's one-degree-of-freedom joints.
-
-    For a finalised plant they are in the order of its positions and of its velocities.
-    """
+    """Returns the robot's one-degree-of-freedom joints, in the order of a finalised plant."""
     instance = plant.GetModelInstanceByName(robot.name)
     joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
     joints = [joint for joint in joints if joint.num_velocities() == 1]
@@ -156,13 +145,10 @@ def _add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceI
         with _quiet_about(robot):
             if text is not None:
                 (instance,) = parser.AddModelsFromString(text, "urdf")
-            elif robot.urdf.startswith("package://"):
-                (instance,) = parser.AddModels(url=robot.urdf)
             else:
                 (instance,) = parser.AddModels(str(path))
     except SystemExit as error:  # pydrake raises it where a condition of Drake's C++ fails.
-        is_urdf = path.suffix == ".urdf"
-        shapes = [words for _, _, words in empty_shapes(read_urdf(path))] if is_urdf else []
+        shapes = [x for *_, x in empty_shapes(read_urdf(path))] if path.suffix == ".urdf" else []
         what = "; ".join([f"Drake cannot build '{path}'", *shapes, str(error)])
         raise ValueError(what) from error
     plant.RenameModelInstance(instance, robot.name)
@@ -189,7 +175,7 @@ def _add_stated_shapes(
 ) -> None:
     """Adds the collision geometry of robot.yaml: contact points and shapes."""
     names = [plant.get_body(index).name() for index in plant.GetBodyIndices(instance)]
-    _require(robot, "body for shapes", robot.shapes, names, re.fullmatch)
+    _require(robot, "body for shapes", robot.shapes, names)
 
     def add(body: str, name: str, X_BG: RigidTransform, shape: Shape, mu: float) -> None:
         plant.RegisterCollisionGeometry(
@@ -242,21 +228,18 @@ def add_robot(
 ) -> ModelInstanceIndex:
     """Adds a robot to a plant that is not finalised: model, servos, friction.
 
-    The variation's masses are parameters of the Context: see :func:`apply_masses`.
-    Dry joint friction is a second actuator on the joint that holds velocity zero with at most
-    the friction torque, solved implicitly with the contact.
+    The variation's masses are parameters of the Context: see :func:`apply_masses`. Dry joint
+    friction is a second actuator on the joint that holds velocity zero with at most the friction
+    torque, solved implicitly with the contact.
 
     Args:
-        plant: A plant before ``Finalize``.
-        scene_graph: Assigns the feet's friction here; None keeps the model file's friction.
-        servos: Whether the joints get robot.yaml's position servos. Torque control needs False: in
-            Drake 1.51 an actuator with gains whose desired state is not connected ignores its
-            torque input.
+        scene_graph: Gets the feet's friction; None keeps the model file's friction.
+        servos: Whether the joints get robot.yaml's position servos; False for torque control.
     """
     variation = variation or PlantVariation()
     instance = _add_description(plant, robot)
     shifts, joint_names = variation.shift or Shift(), servo_joints(plant, robot)
-    _require(robot, "joint for shift", shifts.joints, joint_names, re.fullmatch)
+    _require(robot, "joint for shift", shifts.joints, joint_names)
     if force_n := np.linalg.norm(shifts.base_force_n):
         # A spring so long that motion hardly changes its force or direction.
         far = _SPRING_LENGTH_M * np.array(shifts.base_force_n) / force_n
@@ -319,11 +302,7 @@ def add_robot(
 
 
 def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
-    """Checks that every joint of legs and arms has a motor.
-
-    Drake adds one for a transmission with an effort limit in the model file, and :func:`add_robot`
-    for a joint in ``effort_limits``.
-    """
+    """Checks that every joint of legs and arms has a motor."""
     instance = plant.GetModelInstanceByName(robot.name)
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices(instance))
     driven = {actuator.joint().name() for actuator in actuators}
@@ -331,28 +310,22 @@ def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
     # Limbs may leave out their joints; then all joints are checked.
     if without := [name for name in names or servo_joints(plant, robot) if name not in driven]:
         raise ValueError(
-            f"robot '{robot.name}': joints {without} have no motor: '{robot.urdf}' has no "
-            "transmission with an effort limit for them, and effort_limits in robot.yaml is "
-            f"{robot.effort_limits}; add the largest torque of each [N·m], such as "
-            f"effort_limits: {{{without[0]}: 40.0}}"
+            f"robot '{robot.name}': joints {without} have no motor: add a transmission to "
+            f"'{robot.urdf}', or their largest torques [N·m] to effort_limits in robot.yaml"
         )
 
 
 def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, float]:
     """Returns the standing position [rad] of every servo joint; zero if robot.yaml has none."""
     names = servo_joints(plant, robot)
-    _require(robot, "joint for posture pattern", robot.posture, names, re.fullmatch)
+    _require(robot, "joint for posture pattern", robot.posture, names)
     return {name: by_pattern(robot.posture, name, "posture", robot.name) or 0.0 for name in names}
 
 
 def actuation_matrix(
     plant: MultibodyPlant, robot: RobotModel, joint_names: list[str]
 ) -> np.ndarray:
-    """The map (n_u, n_j) from joint values to the robot's actuators; friction actuators get zero.
-
-    A plant with dry joint friction needs a connected desired state, zero for a robot without
-    servos: friction is modelled by a servo, which is inactive otherwise.
-    """
+    """The map (n_u, n_j) from joint values to actuators; those of friction get zero."""
     instance = plant.GetModelInstanceByName(robot.name)
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]
     matrix = np.zeros((len(actuators), len(joint_names)))
@@ -390,11 +363,7 @@ def apply_masses(
 
 
 class Scratch(threading.local, Generic[_T]):
-    """A value that a calculation overwrites, one for each thread.
-
-    Systems of one diagram share a robot's model, and Drake's users expect that a diagram can be
-    simulated in several threads, each with a Context of its own.
-    """
+    """A value that a calculation overwrites, one for each thread."""
 
     def __init__(self, make: Callable[[], _T]):
         # A subclass of threading.local is initialised anew in each thread.

@@ -26,11 +26,9 @@ class Foot:
     """A foot: its contact points with the ground, and the joints of its leg."""
 
     body: str = ""
-    """Body that carries the contact points."""
     contact_points: Annotated[list[Triple], Field(min_length=1)]
     """Centres of the contact spheres in the body's frame, each (3,) [m]."""
     radius_m: float = 0.0
-    """Radius of the contact spheres [m]."""
     joints: list[str] = field(default_factory=list)
     """Joints of the leg, from the base to the foot."""
 
@@ -40,9 +38,9 @@ class JointGains:
     """Gains of a joint's position servo."""
 
     stiffness: float = 0.0
-    """Proportional gain [N·m/rad]."""
+    """[N·m/rad]"""
     damping: float = 0.0
-    """Derivative gain [N·m·s/rad]."""
+    """[N·m·s/rad]"""
 
 
 @schema(kw_only=True)
@@ -62,11 +60,9 @@ class ReachingFrame:
     """A hand: its reaching point, its collision sphere and the joints of its arm."""
 
     body: str = ""
-    """Body of the point."""
     point: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Reaching point and centre of the collision sphere in the body's frame, (3,) [m]."""
     radius_m: NotNegative = 0.0
-    """Radius of the hand's collision sphere [m]."""
     joints: list[str] = field(default_factory=list)
     """Joints of the arm, from the torso to the hand."""
 
@@ -85,20 +81,10 @@ class WholeBody:
     regularization: Positive = 1e-4
     """Weight of squared accelerations, including the base's."""
     force_regularization: Positive = 1e-2
-    """Weight of squared contact forces over the robot's mass, (f/m)² [m²/s⁴]: it distributes the
-    load evenly and makes the solution unique; too large a weight lets the robot sag."""
+    """Weight of squared contact forces over the robot's mass, (f/m)² [m²/s⁴]; too large a weight
+    lets the robot sag."""
     friction: Positive = 0.5
     """Friction coefficient of the planned contact forces, below the ground's own."""
-
-    def tasks(self) -> dict[str, TaskGains]:
-        """Returns all tasks by name, ``orientation.BODY`` for the bodies."""
-        bodies = {f"orientation.{body}": gains for body, gains in self.orientation.items()}
-        return {
-            "center_of_mass": self.center_of_mass,
-            **bodies,
-            "reaching": self.reaching,
-            "posture": self.posture,
-        }
 
 
 @schema(kw_only=True)
@@ -117,10 +103,7 @@ class CollisionShape:
     def __post_init__(self) -> None:
         is_box, is_end = self.box_m is not None, self.to_m == self.position_m
         if is_box != (self.radius_m == 0) or (self.to_m and (is_box or is_end)):
-            raise ValueError(
-                "either box_m or a positive radius_m, with to_m away from position_m for a "
-                f"capsule; got {vars(self)}"
-            )
+            raise ValueError(f"expected box_m, or radius_m (with to_m); got {vars(self)}")
 
 
 @schema(kw_only=True)
@@ -132,8 +115,7 @@ class RobotModel:
     """``package://…`` (ours, Drake's or a pip package's) or a path relative to the YAML file; any
     format that Drake's Parser reads."""
     requires: Requirement = ""
-    """Requirement by which pip installs the package of ``urdf`` without its dependencies, if no
-    extra does."""
+    """What pip installs for ``urdf`` without dependencies, if no extra does."""
     base: str = ""
     """Floating base body."""
     posture: dict[Pattern, float] = field(default_factory=dict)
@@ -147,20 +129,17 @@ class RobotModel:
     joint_gains: dict[Pattern, JointGains] = field(default_factory=dict)
     """Position servo gains, by regular expression over joint names."""
     effort_limits: dict[Pattern, float] = field(default_factory=dict)
-    """Effort limits [N·m] of actuators that the model file lacks or leaves unlimited, by regular
-    expression."""
+    """Effort limits [N·m] that the model file lacks, by regular expression."""
     velocity_limits: dict[Pattern, float] = field(default_factory=dict)
     """Joint speed limits [rad/s] that replace the model file's, by regular expression."""
     rotor_inertia: dict[Pattern, float] = field(default_factory=dict)
     """Inertia of the motors' rotors as the joints feel it [kg·m²], by regular expression."""
     collision: Literal["model_file", "stated"] = "model_file"
-    """``model_file``: the model file's collision geometry. ``stated``: only the contact points of
-    the feet and ``shapes``, for files with meshes or without shapes (URDF only)."""
+    """``stated``: only the feet's contact points and ``shapes`` (URDF only)."""
     shapes: dict[Pattern, list[CollisionShape]] = field(default_factory=dict)
     """Shapes for ``stated`` collisions, by regular expression over body names."""
     without_collision: list[str] = field(default_factory=list)
-    """Links that lost the collision meshes of their source when ``new`` wrote the model file, and
-    have no other shape; ``check`` warns of them."""
+    """Links that lost their collision meshes to ``new`` and have no shape; ``check`` warns."""
     foot_friction: Positive = 0.8
     """Coulomb friction coefficient of the contact points."""
     source_dir: str = ""
@@ -188,24 +167,18 @@ class RobotModel:
         return self.reaching_frames[hand]
 
     def mirror_partners(self, joint_names: Iterable[str]) -> dict[str, str]:
-        """Returns each joint's mirrored joint; joints without a pattern map to themselves.
-
-        Patterns hold in both directions, so one side's names suffice.
-        """
+        """Returns each joint's mirrored joint; joints without a pattern map to themselves."""
         names, partners = list(joint_names), dict[str, str]()
         for pattern, template in self.mirror.items():
             matches = [match for name in names if (match := re.fullmatch(pattern, name))]
             try:
                 pairs = {match.string: match.expand(template) for match in matches}
-            except (re.error, IndexError) as error:
-                raise ValueError(
-                    f"robot '{self.name}': mirror pattern '{pattern}' cannot be replaced by "
-                    f"'{template}': {error}"
-                ) from error
+            except (re.error, IndexError):
+                pairs = {}
             if not pairs or not {*pairs.values()} <= {*names}:
                 raise ValueError(
-                    f"robot '{self.name}': mirror pattern '{pattern}' pairs joints {pairs}; it has "
-                    f"{names}"
+                    f"robot '{self.name}': mirror pattern '{pattern}: {template}' pairs joints "
+                    f"{pairs}; it has {names}"
                 )
             for joint, other in (*pairs.items(), *((other, one) for one, other in pairs.items())):
                 if partners.setdefault(joint, other) != other:

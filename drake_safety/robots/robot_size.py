@@ -60,11 +60,7 @@ BALANCING_REFERENCE = RobotSize(
 def scaled_defaults(
     defaults: Any, quantities: Mapping[str, Any], factors: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Scales the defaults of nested dataclasses, and returns the scaled fields, nested alike.
-
-    A field's quantity is a name, a list of names for the entries of a list, or a mapping for a
-    dataclass.
-    """
+    """Scales the defaults of nested dataclasses by quantities nested alike."""
     scaled: dict[str, Any] = {}
     for name, quantity in quantities.items():
         value = getattr(defaults, name)

@@ -26,19 +26,7 @@ class JointShift:
 
 @schema(kw_only=True)
 class Fault:
-    """A fault of some entries of a vector signal; see `SensorFaults`.
-
-    ========== =================================================================================
-    kind       the entries
-    ========== =================================================================================
-    ``bias``   have ``value`` added
-    ``drift``  have ``value`` times the elapsed time [s] added
-    ``zero``   are 0
-    ``scale``  are multiplied by ``value``
-    ``delay``  are those of ``value`` [s] ago, a multiple of the sampling period
-    ``freeze`` repeat the last sample before the fault
-    ========== =================================================================================
-    """
+    """A fault of some entries of a vector signal; ``docs/shifts.md`` lists the kinds."""
 
     kind: Literal[*FAULTS] = "zero"  # type: ignore[valid-type]
     entries: list[str] = field(default_factory=lambda: [".*"])

@@ -79,11 +79,7 @@ def _faults(root: ET.Element) -> Iterator[str]:
 
 
 def drake_urdf(path: Path, *, with_collisions: bool, with_visuals: bool) -> str | None:
-    """Returns a URDF's text as Drake can build and render it; None if that is the file itself.
-
-    Couplings of fixed joints go, and visual meshes that Drake does not render become glTF files in
-    the user's cache.
-    """
+    """Returns a URDF's text as Drake can build and render it; None if that is the file itself."""
     root = read_urdf(path)
     as_read = ET.tostring(root, encoding="unicode")
     remove_fixed_mimics(root)
@@ -114,10 +110,7 @@ def remove_fixed_mimics(root: ET.Element) -> None:
 
 
 def replace_visual_meshes(root: ET.Element, shown: Callable[[str, str], str]) -> None:
-    """Replaces visual meshes by ``shown(url, rgba)``, or removes them where that is "".
-
-    The material of a converted mesh is removed: the mesh has its own, and Drake warns of two.
-    """
+    """Replaces visual meshes by ``shown(url, rgba)``, or removes them where that is ""."""
     shared = {material.get("name"): _colour(material) for material in root.findall("material")}
     for link, visual, mesh in shape_meshes(root, "visual"):
         material, url = visual.find("material"), mesh.get("filename", "")
@@ -125,7 +118,7 @@ def replace_visual_meshes(root: ET.Element, shown: Callable[[str, str], str]) ->
         mesh.set("filename", shown(url, _colour(material) or shared.get(name, "")))
         if not mesh.get("filename"):
             link.remove(visual)
-        elif Path(mesh.get("filename", "")).suffix != Path(url).suffix:
+        elif Path(mesh.get("filename", "")).suffix != Path(url).suffix:  # It has its own material.
             remove(visual, "material")
 
 

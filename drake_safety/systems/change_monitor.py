@@ -83,10 +83,7 @@ class ChangeMonitor(LeafSystem):
             context.SetDiscreteState(self._groups[name], value)
 
     def expect_disturbance(self, context: Context, begin_s: float, end_s: float) -> None:
-        """Lets the charts wait in an interval of time [s], and until its effect has settled.
-
-        An interval that begins before the last one has settled extends it, else it replaces it.
-        """
+        """Lets the charts wait in an interval [s]; one before the last has settled extends it."""
         begin, end = self._value(context, "expected_s")
         if context.get_time() < end + SETTLING_S:
             begin_s, end_s = min(begin_s, begin), max(end_s, end)

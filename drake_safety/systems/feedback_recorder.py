@@ -77,11 +77,6 @@ class FeedbackRecorder(LeafSystem):
     ):
         super().__init__()
         check_times("feedback recorder", watch_period_s=watch_period_s, step_s=info.step_s)
-        if num_steps < info.horizon * info.preview_stride:
-            raise ValueError(
-                f"feedback recorder: num_steps is {num_steps}, expected at least the horizon of "
-                f"{info.horizon * info.preview_stride} steps"
-            )
         self.info = info
         self._num_steps = num_steps
         num_outputs, num_margins = len(info.output_names), len(info.constraint_names)

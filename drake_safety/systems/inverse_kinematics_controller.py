@@ -55,8 +55,8 @@ class InverseKinematicsController(LeafSystem):
         stiffness = np.asarray(stiffness, dtype=float)
         if stiffness.shape != (n_j,) or not np.all(stiffness > 0):
             raise ValueError(
-                f"inverse kinematics controller: stiffness must be {n_j} positive numbers, in the "
-                f"order of {kinematics.joint_names}; got {stiffness}"
+                f"inverse kinematics controller: stiffness of {kinematics.joint_names} must be "
+                f"positive; got {stiffness}"
             )
         self._kinematics = kinematics
         self._stiffness = stiffness

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Iterator
-from typing import Literal, get_args
+from typing import Literal
 
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
@@ -36,9 +36,6 @@ class MonitoredSafetyAssessor(Diagram):
         period_s: Time between two evaluations [s]; the step of the training episodes by default.
         checks_margins: Whether a state outside the safe set is always unsafe.
         on_alarm: Effect of the monitor's alarm, an `OnAlarm`; None for no monitor.
-
-    Attributes:
-        assessor, monitor: Its two systems.
     """
 
     def __init__(
@@ -50,11 +47,8 @@ class MonitoredSafetyAssessor(Diagram):
         on_alarm: str | None = "unknown",
     ):
         super().__init__()
-        if on_alarm not in (*get_args(OnAlarm), None):
-            raise ValueError(
-                f"safety assessor: on_alarm is {on_alarm!r}, expected one of "
-                f"{list(get_args(OnAlarm))} or None for no monitor"
-            )
+        if on_alarm not in ("unknown", "report", None):
+            raise ValueError(f"on_alarm must be 'unknown', 'report' or None; got {on_alarm!r}")
         builder = DiagramBuilder()
         self.assessor = builder.AddNamedSystem(
             "safety_assessor",
@@ -85,7 +79,7 @@ class MonitoredSafetyAssessor(Diagram):
 
     @property
     def reads_features(self) -> bool:
-        """Whether one of its systems reads the features."""
+        """Whether assessor or monitor reads the features."""
         return any(system.reads_features for system in (self.assessor, self.monitor) if system)
 
     def connect_recovery(self, builder: DiagramBuilder, recovery: System) -> None:
@@ -121,11 +115,8 @@ def AddSafetyAssessor(
     monitor that never alarms.
 
     Args:
-        state, desired_preview: Ports of the state and the desired preview, as in training.
         margins: Port of the measured state's margins; None if nothing checks them.
-        features: Port of the features; not needed if the assessment reads none.
         hold: Port that is 1 while a known disturbance acts: the monitor waits then.
-        period_s, on_alarm: See :class:`MonitoredSafetyAssessor`.
     """
     assessor = MonitoredSafetyAssessor(
         assessment, period_s=period_s, checks_margins=margins is not None, on_alarm=on_alarm
@@ -169,8 +160,7 @@ def warn_of_sampled_ports(who: str, systems: Iterable[System]) -> None:
     for system in leaf_systems(systems):
         if isinstance(system, MultibodyPlant) and system.has_sampled_output_ports():
             _LOGGER.warning(
-                "%s: plant '%s' steps before what updates at the same time, so that "
-                "Γ sees a later state than in its episodes; make it by AddMultibodyPlant with "
+                "%s: plant '%s' shows a later state than in episodes; make it with "
                 "MultibodyPlantConfig(use_sampled_output_ports=False)",
                 who,
                 system.get_name(),

@@ -31,7 +31,6 @@ class PushSource(LeafSystem):
 
     def __init__(self, plant: MultibodyPlant, instance: ModelInstanceIndex, *, period_s: float):
         super().__init__()
-        self._robot_name = plant.GetModelInstanceName(instance)
         bodies = map(plant.get_body, plant.GetBodyIndices(instance))
         self._bodies = {body.name(): body for body in bodies}
         self._parameter = self.DeclareNumericParameter(BasicVector(np.zeros(_SIZE)))
@@ -47,14 +46,10 @@ class PushSource(LeafSystem):
     def set_push(self, context: Context, push: Push) -> None:
         """Sets the push; it replaces an earlier one."""
         if push.body not in self._bodies:
-            raise ValueError(
-                f"push: robot '{self._robot_name}' has no body '{push.body}'; its bodies are "
-                f"{list(self._bodies)}"
-            )
+            raise ValueError(f"push: no body '{push.body}'; there are {list(self._bodies)}")
         values = [self._bodies[push.body].index(), *push.force_n, push.time_s, push.duration_s]
-        context.get_mutable_numeric_parameter(self._parameter).SetFromVector(
-            np.array(values, dtype=float)
-        )
+        parameter = context.get_mutable_numeric_parameter(self._parameter)
+        parameter.SetFromVector(np.array(values, dtype=float))
 
     def push(self, context: Context) -> np.ndarray:
         """Index of the body, force [N], start and duration [s] of the push, (6,)."""

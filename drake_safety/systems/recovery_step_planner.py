@@ -37,12 +37,11 @@ class RecoveryStepPlanner(LeafSystem):
         output_ports: [desired_output: n_z, desired_foot_positions: 3 n_p, desired_yaw: 1,
           desired_preview: H n_z, desired_outlook: M n_z, stance_pose: 3, recovery_done: 1]
 
-    While idle, the feet keep the positions of the first state that the planner sees when a
-    simulation is initialised, put on level ground, or those of :meth:`set_stance`. When
-    ``recovery_active`` rises, groups of feet swing by turns to Raibert footholds, which follow the
-    base at every update. The base set point follows the measured base at the standing height, so
-    that the stance legs carry the weight without pulling the base back, and they twist the base
-    towards the heading of the initial stance.
+    While idle, the feet keep the positions of the first state that the planner sees, put on level
+    ground, or those of :meth:`set_stance`. When ``recovery_active`` rises, groups of feet swing by
+    turns to Raibert footholds. The base set point follows the measured base at the standing height,
+    so that the stance legs do not pull the base back, and the legs twist the base towards the
+    heading of the initial stance.
 
     Groups alternate until the capture point is well inside the support polygon and the heading
     error is small. The base then comes to rest like an inverted pendulum over its capture point,
@@ -50,8 +49,7 @@ class RecoveryStepPlanner(LeafSystem):
     point comes near the polygon's edge meanwhile, the robot steps again. After that
     ``recovery_done`` is 1 until ``recovery_active`` has fallen.
 
-    Preview (H, ``horizon`` samples) and outlook (M, ``num_outlook``) are the base set point, held
-    constant, in the stance frame. No output has direct feedthrough.
+    Preview and outlook are the base set point, held constant, in the stance frame.
     """
 
     def __init__(
@@ -104,13 +102,10 @@ class RecoveryStepPlanner(LeafSystem):
             )
         self.DeclareVectorOutputPort("recovery_done", 1, self._calc_done, ticket)
 
-    def set_stance(self, context: Context, p_WC: np.ndarray, stance_pose: np.ndarray) -> None:
-        """Sets contact positions (n_c, 3) [m] and stance pose (3,) [m, rad]; the planner idles."""
-        self._set_stance(context.get_mutable_discrete_state(), p_WC, stance_pose)
-
-    def _set_stance(
+    def set_stance(
         self, discrete_state: DiscreteValues, p_WC: np.ndarray, stance_pose: np.ndarray
     ) -> None:
+        """Sets contact positions (n_c, 3) [m] and stance pose (3,) [m, rad]; the planner idles."""
         now = self._values(discrete_state)
         now.mode, now.stance_pose, now.desired_yaw = [_IDLE], stance_pose, stance_pose[2:]
         now.desired_foot_positions = now.planted = np.ravel(p_WC)
@@ -132,7 +127,7 @@ class RecoveryStepPlanner(LeafSystem):
             q = self._state_port.Eval(context)[: self._kinematics.num_positions]
             p_WC = self._kinematics.planted_contacts(q)
             stance = fit_stance(p_WC, self._kinematics.nominal_contacts)
-            self._set_stance(discrete_state, p_WC, stance)
+            self.set_stance(discrete_state, p_WC, stance)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         now = self._values(discrete_state)

@@ -27,12 +27,8 @@ class RecoverySwitch(Diagram):
     footholds, ``desired_foot_positions`` and ``desired_yaw`` to the controller,
     ``desired_preview`` to the assessor, and ``desired_outlook`` to the features.
 
-    Args:
-        threshold, persistence_s, initial_uncertainty: See
-            :class:`~drake_safety.systems.recovery_trigger.RecoveryTrigger`.
-        period_s: Period of trigger and step planner [s].
-        offset_s: Delay of the trigger after the assessor, and of the step planner after the
-            trigger [s]: updates of one time see the state before all of them.
+    The trigger updates ``offset_s`` after the assessor, and the step planner as much after the
+    trigger: updates of one time would see the state before all of them.
     """
 
     def __init__(

@@ -29,7 +29,6 @@ class RecoveryTrigger(LeafSystem):
 
     Args:
         threshold: Γ_thre in [0, 1]; the paper's value is 0.6, of the belief's first entry.
-        persistence_s: Time that a belief of "don't know" must last to activate it [s].
         initial_uncertainty: μ_ini of the assessment, which says what is "don't know".
     """
 

@@ -29,7 +29,7 @@ class SafetyAssessor(LeafSystem):
           predicted_margins: n_c, novelty: 1, probability_without_alarm: 1, belief_without_alarm: 3,
           fall_probability: 1, learned: abstract]
 
-    Γ is evaluated every ``period_s`` and held, so no output but ``learned`` has direct feedthrough.
+    Γ is evaluated every ``period_s`` [s] and held, so only ``learned`` has direct feedthrough.
 
     - ``belief`` is (safe, unsafe, don't know); its first entry is the paper's Γ. It is (0, 0, 1)
       for inputs that are novel or not finite, before the first evaluation, and during an alarm.
@@ -45,10 +45,6 @@ class SafetyAssessor(LeafSystem):
     violated one. What feedback changes (beliefs, correction and novelty) are parameters of the
     Context, see :meth:`adopt`. The embedding is immutable.
 
-    Args:
-        period_s: Time between two evaluations [s].
-        checks_margins: Whether a state outside the safe set is always unsafe.
-        heeds_alarm: Whether every belief is unknown during an alarm.
     """
 
     def __init__(

@@ -23,10 +23,9 @@ class SensorFaults(LeafSystem):
         input_ports: [input: n]
         output_ports: [output: n]
 
-    :class:`~drake_safety.robots.shift.Fault` lists the kinds. Without faults, and before they
-    start, the output has the input's bits. Delays and ``freeze`` hold samples, taken at multiples
-    of the period: a delay's output is the input of ``value / period_s`` samples ago, or the first
-    sample until that is so old. All memory is discrete state.
+    Without faults, and before they start, the output has the input's bits. Delays and ``freeze``
+    hold samples, taken at multiples of the period: a delay's output is the input of ``value /
+    period_s`` samples ago, or the first sample until that is so old.
 
     Args:
         period_s: Sampling period of faults that hold samples [s].

@@ -24,8 +24,7 @@ def interpolate(
 ) -> PiecewisePolynomial:
     """The minimum-jerk motion from rest at ``start`` to rest at ``goal``, (n_z,) [m] each.
 
-    With s the minimum-jerk progress from 0 to 1, ``z*(s) = start + s (goal - start) + 4 s (1 - s)
-    detour``: at s = 0.5 the motion is offset from the straight line by the detour, (n_z,) [m].
+    With progress s, ``z*(s) = start + s (goal - start) + 4 s (1 - s) detour``.
     """
     check_times("plan", duration_s=duration_s)
     progress = np.array([0, 0, 0, 10 / duration_s**3, -15 / duration_s**4, 6 / duration_s**5])
@@ -41,10 +40,7 @@ def interpolate(
 
 
 def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndarray:
-    """Start, goal and detour, (3, n_z), of a plan of :func:`interpolate` from its samples [m].
-
-    The samples (M, n_z) [m] begin at the plan's start, ``step_s`` apart, and may end before it.
-    """
+    """Start, goal and detour, (3, n_z), of a plan of :func:`interpolate` from its first samples."""
     check_times("plan", step_s=step_s)
     times_s = step_s * np.arange(len(preview))
     motion = interpolate(np.zeros(1), np.ones(1), duration_s)
@@ -74,16 +70,9 @@ class TrajectoryPlanner(LeafSystem):
 
     The plan is a trajectory of 3-D positions in the stance frame S, and a parameter of the Context
     (:meth:`set_plan`). Before its start and after its end it is constant. ``desired_output`` and
-    its rate are in the world. ``desired_preview``, z*_{k:k+H}, is in S, row-major in time, and so
-    is ``desired_outlook``, M samples at equal intervals from now to ``outlook_s`` ahead. The stance
-    pose [x, y, yaw] is the input if it is connected, else a parameter.
-
-    Args:
-        horizon: H, samples of the preview.
-        step_s: Time between them [s].
-        outlook_s: Duration of the outlook [s]; that of the preview by default.
-        num_outlook: M, samples of the outlook.
-        plan: The plan of a default Context, (n_z, 1) [m].
+    its rate are in the world; ``desired_preview``, H samples ``step_s`` apart, and
+    ``desired_outlook``, M samples from now to ``outlook_s`` ahead, are in S, row-major in time. The
+    stance pose [x, y, yaw] is the input if it is connected, else a parameter.
     """
 
     def __init__(
@@ -117,12 +106,14 @@ class TrajectoryPlanner(LeafSystem):
                 name,
                 3 * len(offsets),
                 lambda context, output, offsets=offsets: output.SetFromVector(
-                    self.get_plan(context)
-                    .vector_values(context.get_time() + offsets)
-                    .ravel(order="F")
+                    self._samples(context, offsets)
                 ),
                 {self.time_ticket(), self.all_parameters_ticket()},
             )
+
+    def _samples(self, context: Context, offsets: np.ndarray) -> np.ndarray:
+        times = context.get_time() + offsets
+        return self.get_plan(context).vector_values(times).ravel(order="F")
 
     def set_plan(
         self, context: Context, plan: PiecewisePolynomial, stance_pose: np.ndarray | None = None

@@ -24,20 +24,19 @@ class WholeBodyController(LeafSystem):
     .. pydrake_system::
 
         name: WholeBodyController
-        input_ports: [plant_state: n_q + n_v, desired_output: n_z (optional),
-          desired_output_rate: n_z (optional)]
+        input_ports: [plant_state: n_q + n_v, desired_output: n_z,
+          desired_output_rate: n_z]
         output_ports: [actuation: n_j, solver_status: 1, num_failures: 1]
 
-    ``desired_output`` is the set point of the hand, or of the centre of mass for a controller
-    without a hand, in the world [m]. While it is not connected, the set point is that of
-    :meth:`set_reference`, at rest. The command is a discrete state.
+    ``desired_output`` is the set point of the hand in the world [m]; the other references are those
+    of :meth:`set_reference`. The command is a discrete state.
 
     ``solver_status`` is 0 if the last program was solved, negative if it was not (daqp's exit
     flag), and ``NOT_FINITE`` if its inputs were not finite. The last command is then held,
     initially zero torque. ``num_failures`` counts these updates since the initialisation.
 
     Args:
-        hand: Name of the reaching frame that follows ``desired_output``; None when none does.
+        hand: Name of the reaching frame that follows ``desired_output``.
         actuation_matrix: See :func:`~drake_safety.robots.robot.actuation_matrix`, (n_u, n_j); the
             identity by default.
         offset_s: Time of the first update, after those of its inputs [s].
@@ -47,7 +46,7 @@ class WholeBodyController(LeafSystem):
         self,
         kinematics: RobotKinematics,
         *,
-        hand: str | None = None,
+        hand: str,
         actuation_matrix: np.ndarray | None = None,
         period_s: float,
         offset_s: float = 0.0,
@@ -55,11 +54,6 @@ class WholeBodyController(LeafSystem):
         super().__init__()
         n_j = kinematics.num_joints
         matrix = np.eye(n_j) if actuation_matrix is None else np.array(actuation_matrix, float)
-        if matrix.ndim != 2 or matrix.shape[1] != n_j:
-            raise ValueError(
-                f"whole-body controller: actuation_matrix must have {n_j} columns, in the order "
-                f"of {kinematics.joint_names}; got shape {matrix.shape}"
-            )
         self.model = WholeBodyModel(kinematics, hand)
         self._kinematics = kinematics
         self._matrix = matrix
@@ -86,13 +80,8 @@ class WholeBodyController(LeafSystem):
 
     def _reference(self, context: Context) -> WholeBodyReference:
         reference = context.get_abstract_parameter(self._reference_index).get_value()
-        if not self._desired_port.HasValue(context):
-            return reference
-        point = PointReference(position=self._desired_port.Eval(context))
-        if self._rate_port.HasValue(context):
-            point.rate = self._rate_port.Eval(context)
-        name = "center_of_mass" if self.model.hand is None else "reaching"
-        return replace(reference, **{name: point})
+        position, rate = self._desired_port.Eval(context), self._rate_port.Eval(context)
+        return replace(reference, reaching=PointReference(position=position, rate=rate))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self._state_port.Eval(context)
