@@ -120,7 +120,7 @@ def test_an_answer_takes_none_of_the_packages_that_training_takes(folder):
     assert done.returncode == 0, done.stderr
     loaded = set(done.stdout.splitlines()[-1].split())
     assert "pydrake" in loaded
-    heavy = {"torch", "tslearn", "dtaidistance", "openTSNE", "sklearn", "matplotlib", "numba"}
+    heavy = {"torch", "dtaidistance", "openTSNE", "sklearn", "matplotlib", "numba"}
     heavy |= {"pandas", "pyarrow", "joblib", "tensorboard"}
     assert loaded & heavy == set()
 

@@ -153,7 +153,7 @@ assessment = SafetyAssessment.load({str(path)!r})
 parts = [np.zeros(size) for size in {sizes}]
 assessment.predict_one(*parts)
 assessment.predict(*[part[None] for part in parts])
-heavy = {{"torch", "openTSNE", "dtaidistance", "tslearn", "sklearn", "pydrake", "scipy", "numba"}}
+heavy = {{"torch", "openTSNE", "dtaidistance", "sklearn", "pydrake", "scipy", "numba"}}
 sys.exit(", ".join(heavy & set(sys.modules)) or 0)
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -109,22 +109,6 @@ def test_repr_of_a_set_has_scenario_plant_and_counts(episodes):
     assert [episode.index for episode in episodes[3:5]] == [3, 4]
 
 
-@pytest.mark.train
-def test_table_has_every_row_and_every_column_by_name(episodes):
-    table, info = episodes.to_frame(), episodes.info
-    assert table.num_rows == sum(len(episode.time_s) for episode in episodes)
-    assert table.num_columns == 6 + sum(info.widths.values())
-    rows = table["episode"].to_numpy() == episodes[3].index
-    for name, array in {
-        f"state.{info.state_names[1]}": episodes[3].state[:, 1],
-        f"desired_preview.z[{HORIZON - 1}]": episodes[3].desired_preview[:, -1],
-        "time_s": episodes[3].time_s,
-    }.items():
-        np.testing.assert_array_equal(table[name].to_numpy()[rows], array)
-    assert set(np.array(table["cause"].to_pylist())[rows]) == {episodes[3].cause}
-    assert episodes[:0].to_frame().column_names == table.column_names
-
-
 def changed(episodes, **changes):
     return Episodes(episodes.info, [dataclasses.replace(episodes[7], **changes)])
 

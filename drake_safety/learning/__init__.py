@@ -1,5 +1,5 @@
 """The mathematics of the safety assessment, from episodes to beliefs.
 
-Independent of any simulator. Evaluating an assessment needs numpy alone; torch, openTSNE,
-dtaidistance and tslearn are imported only by the functions that train.
+Independent of any simulator. Evaluating an assessment needs numpy alone; torch, openTSNE
+and dtaidistance are imported only by the functions that train.
 """

@@ -8,11 +8,6 @@ from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.segments import Episode, EpisodesInfo, Segments, floats
 
 
-def is_rate(name: str) -> bool:
-    """Whether the name of a state is that of a velocity."""
-    return name.endswith("_rate") or "velocity" in name
-
-
 def preview_names(info: EpisodesInfo) -> list[str]:
     """Returns the names of the preview's entries, (H*n_z,), counted from 0."""
     return [f"desired {name} [{k}]" for k in range(info.horizon) for name in info.output_names]

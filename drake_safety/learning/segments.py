@@ -7,16 +7,12 @@ import importlib.metadata
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from typing import Any, TypeVar, overload
 
 import numpy as np
 
-from drake_safety.extras import require_extra
 from drake_safety.learning.assessment_parameters import MOST_SAMPLES, AssessmentParameters
 from drake_safety.learning.mode_settings import mode_settings
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 RECORDED = (
     *("state", "true_state", "output", "desired_output"),
@@ -199,34 +195,6 @@ class Episodes(Sequence[Episode]):
             f"Episodes('{self.info.scenario}', variation '{self.info.variation}', seed "
             f"{self.info.seed}, {len(self)} episodes{': ' if words else ''}{words})"
         )
-
-    def to_frame(self) -> pa.Table:
-        """Returns all rows of all episodes as one table.
-
-        Columns are ``episode``, ``row`` and ``time_s``, those of the arrays (``state.NAME``,
-        ``margins.NAME``, ``desired_preview.NAME[k]``, ...), and of the row's episode ``is_safe``,
-        ``cause`` and ``first_step``. ``to_frame().to_pandas()`` is a pandas DataFrame.
-        """
-        require_extra("train", "Episodes.to_frame", "pyarrow")
-        import pyarrow as pa
-
-        episodes, info = self._episodes, self.info
-        counts = [len(episode.time_s) for episode in episodes]
-
-        def repeated(name: str) -> np.ndarray:
-            return np.repeat(np.array([getattr(e, name) for e in episodes]), counts)
-
-        columns = {
-            "episode": repeated("index"),
-            "row": np.concatenate([np.arange(0), *map(np.arange, counts)]),
-            "time_s": np.concatenate([np.empty(0), *(episode.time_s for episode in episodes)]),
-        }
-        for array, names in info.columns.items():
-            rows = (getattr(episode, array) for episode in episodes)
-            table = np.concatenate([np.empty((0, len(names))), *rows])
-            columns |= {f"{array}.{name}": table[:, i] for i, name in enumerate(names)}
-        columns |= {name: repeated(name) for name in ("is_safe", "cause", "first_step")}
-        return pa.table(columns)
 
     @overload
     def __getitem__(self, key: int) -> Episode: ...
