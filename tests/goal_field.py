@@ -43,7 +43,7 @@ class FieldAssessment:
 
     parameters = SimpleNamespace(initial_uncertainty=0.3, margin_unit=0.02)
     base_logit_ = object()
-    embedding_ = SimpleNamespace(has_safety_head=False)
+    embedding_ = SimpleNamespace(has_heads=False)
 
     def __init__(self, gamma, unknown=0.3):
         self._gamma = gamma

@@ -85,7 +85,7 @@ def prediction(assessment, x):
         hidden += z @ correction.hidden[k, :-1] + correction.hidden[k, -1]
         output = z @ w["output.weight"] + w["output.bias"]
         margins.append(output[2:])
-        if maps.has_safety_head:
+        if maps.has_heads:
             h = np.maximum(output[:2] @ w["safety.0.weight"] + w["safety.0.bias"], 0.0)
             said.append(np.clip(h @ w["safety.1.weight"] + w["safety.1.bias"], -8, 8).item())
         weights = cell_weights(grid, output[:2])
@@ -103,8 +103,8 @@ def prediction(assessment, x):
     belief = belief / maps.num_members if distance <= 1.0 else empty
     probability, fall = belief[0], np.nan
     if logit is not None:
-        smallest = np.clip(margins.min(), *logit.margin_range) if len(margins) else 0.0
-        heads = [np.mean(said) if said else 0.0, -smallest / logit.margin_unit]
+        smallest = np.clip(margins.min(), *logit.margin_range)
+        heads = [np.mean(said), -smallest / logit.margin_unit]
         if assessment.trees_ is not None:
             heads.append(np.clip(tree_sum(assessment.trees_.arrays, x), -8, 8))
         unsafe = np.clip(logit.offset + np.dot(heads, logit.slopes[: len(heads)]), -8, 8)

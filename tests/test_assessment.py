@@ -267,27 +267,6 @@ def test_saved_assessment_is_loaded_to_the_bit(assessment, held_out, tmp_path, p
     assert path.read_bytes() == (tmp_path / "again").read_bytes()
 
 
-def test_trees_change_the_probability_alone(assessment, held_out):
-    if not assessment.uses_features:
-        assert assessment.trees_ is None
-        return
-    without = SafetyAssessment(AssessmentParameters(**QUICK, trees=False)).fit(quick_episodes())
-    assert (without.trees_, without.base_logit_.trees_slope) == (None, 0.0)
-    assert without.training_.heads.shape[1] + 1 == assessment.training_.heads.shape[1] == 3
-    assert assessment.base_logit_.trees_slope > 0.1
-    with_trees, expected = (a.predict(*inputs(held_out)) for a in (assessment, without))
-    assert np.abs(with_trees.probability - expected.probability).max() > 0.05
-    # The rest of it is the maps'.
-    for name in ("belief", "cause_probability", "embedding", "predicted_margins", "novelty"):
-        np.testing.assert_array_equal(getattr(with_trees, name), getattr(expected, name))
-    gradients = (a.unsafe_logits(*inputs(held_out)) for a in (assessment, without))
-    np.testing.assert_array_equal(*(gradient for *_, gradient in gradients))
-    area, least = (
-        area_under_curve(-p.probability, held_out.is_unsafe) for p in (with_trees, expected)
-    )
-    assert area > least - 0.005
-
-
 def test_calibration_is_kept_with_the_assessment(assessment, tmp_path):
     path = tmp_path / "gamma.safetensors"
     for calibrations in ({"plan": calibration(confidence=0.9)}, {}):

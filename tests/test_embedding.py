@@ -20,8 +20,6 @@ SETTINGS = AssessmentParameters(
     epochs=30,
     batch_size=64,
     learning_rate=5e-3,
-    target_weight=1.0,
-    safety_weight=1.0,
 )
 
 
@@ -39,7 +37,7 @@ def data():
 @pytest.fixture(scope="module")
 def embedding(data):
     members = [train_map(data, SETTINGS, seed=seed) for seed in (0, 1)]
-    return stack_members(members, num_margins=1)
+    return stack_members(members)
 
 
 def test_tsne_puts_neighbours_near_each_other_the_same_for_a_seed():
@@ -96,7 +94,7 @@ def test_sample_weight_draws_the_map_towards_its_samples(data):
         sample_weight = np.where(contrary, weight, 1.0)
         changed = replace(data, x=x, is_unsafe=is_unsafe, sample_weight=sample_weight)
         trained = train_map(changed, replace(SETTINGS, epochs=4), seed=0)
-        logit = stack_members([trained], num_margins=1).evaluate(x[contrary]).unsafe_logit[0]
+        logit = stack_members([trained]).evaluate(x[contrary]).unsafe_logit[0]
         agreement.append(((logit > 0.0) == is_unsafe[contrary]).mean())
     assert agreement[1] > agreement[0]
 
@@ -133,7 +131,7 @@ def test_input_beyond_the_range_is_clipped_to_its_edge(embedding):
         (lambda e: e.weights["output.bias"].fill(0.0), "read-only"),
         (lambda e: e.evaluate(np.zeros((2, 3))), r"inputs have shape \(2, 3\), expected \(N, 4\)"),
         (lambda e: e.clipping(np.zeros((2, 3))), r"range of inputs has the shape \(2, 3\)"),
-        (lambda e: Embedding({}, num_margins=1), "the arrays are"),
+        (lambda e: Embedding({}), "the arrays are"),
     ],
 )
 def test_what_does_not_fit_the_maps_is_refused(embedding, ask, message):

@@ -29,7 +29,7 @@ def test_standardised_inputs_make_map_independent_of_units():
         points = []
         for inputs in (x, x * scale):
             member = train_map(map_data(inputs, target), parameters, seed=0)
-            points.append(stack_members([member], num_margins=0).embed(inputs))
+            points.append(stack_members([member]).embed(inputs))
         assert np.allclose(*points, atol=1e-3) == standardized
 
 

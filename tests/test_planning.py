@@ -62,8 +62,7 @@ class PlaneAssessment(FieldAssessment):
                 "safety.0.bias": np.full((1, 1), 10.0),
                 "safety.1.weight": np.full((1, 1, 1), steepness),
                 "safety.1.bias": np.full((1, 1), -steepness * (20.0 + OFFSET)),
-            },
-            num_margins=0,
+            }
         )
 
     unsafe_logits = SafetyAssessment.unsafe_logits
@@ -180,7 +179,7 @@ def test_the_logits_gradient_is_that_of_finite_differences():
     for name, (n, m) in (sizes | {"safety.0": (2, 5), "safety.1": (5, 1)}).items():
         weights[f"{name}.weight"] = rng.normal(size=(2, n, m))
         weights[f"{name}.bias"] = rng.normal(size=(2, m))
-    embedding = Embedding(weights, num_margins=0)
+    embedding = Embedding(weights)
     x = rng.normal(size=(4, 6))
     logit, gradient = embedding.logit_gradient(x)
     expected = embedding.evaluate(x).unsafe_logit.mean(axis=0)

@@ -230,8 +230,8 @@ class SafetyAssessment:
         """
         require_extra("train", "SafetyAssessment.fit_falls", "sklearn")
         model, names = self.model, self.columns_.names
-        if model.base_logit is None or not model.embedding.num_margins:
-            raise ValueError(f"{self._who}: the probability of a fall needs maps with margin heads")
+        if model.base_logit is None:
+            raise ValueError(f"{self._who}: the probability of a fall needs maps with heads")
         if unknown := sorted(set(features) - set(names)):
             raise ValueError(f"{self._who}: there are no features {unknown} among {names}")
         self.check_unused(episodes.info.seed, purpose="falls")

@@ -119,7 +119,6 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
         "info": asdict(learned["info_"]),
         "adaptation": json_values.pop("adaptation"),
         "numbers": {
-            "num_margins": embedding.num_margins,
             "novelty_limits": novelty.limits.tolist(),
             "novelty_counts": counts,
             **json_values,
@@ -241,10 +240,11 @@ def _learned(
         return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
     trees, widths, num_causes = group("trees."), info.widths, len(info.constraint_names)
+    has_heads = "embedding.safety.0.weight" in tensors
     sizes = {
         **{"1": 1, "2": 2, "6": 6, "r": parameters.resolution**2, "b": 3 + num_causes},
         **{"c": num_causes, "s": widths["state"], "x": len(columns.names)},
-        **{"g": 4 if trees else 3, "h": 3 if trees else 2, "m": 2 + numbers["num_margins"]},
+        **{"g": 4 if trees else 3, "h": 3 if trees else 2, "m": 2 + num_causes * has_heads},
         **{"l": 1 + len(trees.get("left", ())), "v": 2 * len(tensors["detector.columns"])},
         "y": sum(widths[name] for name in ("state", "desired_preview", "features")),
     }
@@ -258,13 +258,11 @@ def _learned(
     training = {k: v.astype(_TRAINING[k][1]) for k, v in group("training_").items()}
     nominal = Moments(count=counts[0], **group("novelty."))
     # Maps of the paper's mode extrapolate: they have no range.
-    shape: dict[str, Any] = {"num_margins": numbers["num_margins"]}
-    shape["input_range"] = tensors.get("input_range")
     learned: dict[str, Any] = {
         "info_": info,
         "grid_": Grid.of(parameters),
         "columns_": columns,
-        "embedding_": Embedding(group("embedding."), **shape),
+        "embedding_": Embedding(group("embedding."), tensors.get("input_range")),
         "trees_": Trees(**trees) if trees else None,
         "beliefs_": tensors["beliefs"],
         "correction_": correction,

@@ -32,8 +32,7 @@ class AdaptationParameters:
         least_uncertainty: mu_min of nominal beliefs without discrepancy (paper).
         decay_rate: alpha, rate at which feedback beliefs lose uncertainty (paper).
         first_uncertainty: beta, uncertainty of a feedback belief from one sample (paper).
-        update_interval: k_u, pairs of episodes between two updates: "The online adaptation process
-            is performed once every 40 feedback data".
+        update_interval: k_u, pairs of episodes between two updates.
         offset_std: Prior standard deviation of the change of the base logit's offset (sharpened).
         slope_std: The same for each of its slopes (sharpened).
         hidden_std: The same for the contribution of the maps' last hidden layer at the feedback's
@@ -61,8 +60,6 @@ class PaperReading:
         stride: Samples between the starts of segments; 0 means H, segments that do not overlap.
         standardized: Whether every column of x is scaled to mean 0 and standard deviation 1.
         hidden_sizes: Widths of the layers of Psi, "a deep neural network".
-        dropout: Dropout rate.
-        weight_decay: Weight decay of AdamW.
         epochs: Passes over the segments.
     """
 
@@ -70,7 +67,6 @@ class PaperReading:
     standardized: bool = False
     hidden_sizes: Widths = field(default_factory=lambda: [128, 128])
     dropout: ShareBelowOne = 0.3
-    weight_decay: NotNegative = 0.01
     epochs: Count = 60
 
 
@@ -79,10 +75,8 @@ class AssessmentParameters:
     """Parameters of a safety assessment.
 
     discount, horizon, score_weight, initial_uncertainty and min_count default to the paper's
-    Table I, resolution and cell_length to its text; the other defaults are our own.
-
-    The paper's mode has one plain map, described by `paper`; it ignores the attributes marked
-    "sharpened".
+    Table I, resolution and cell_length to its text. The paper's mode has one plain map, described
+    by `paper`; it ignores the attributes marked "sharpened".
 
     Attributes:
         mode: "sharpened" or "paper".
@@ -107,26 +101,20 @@ class AssessmentParameters:
         batch_size: Segments per training step.
         epochs: Passes over the segments (sharpened).
         ensemble_size: Number of maps K (sharpened).
-        held_out: Share of held-out episodes. The base logit is fitted to maps trained without
-            them; the final maps are trained on all episodes (sharpened).
+        held_out: Share of episodes on which the base logit is fitted; the final maps are trained
+            on all episodes (sharpened).
         hidden_sizes: Widths of a map's layers (sharpened).
         dropout: Dropout rate (sharpened).
-        target_weight: Weight of the distance to t-SNE's points (sharpened).
-        safety_weight: Weight of the safety head's loss (sharpened).
-        margin_weight: Weight of the margin head's loss (sharpened).
         margin_unit: Margin that counts as one in the Huber loss [m] (sharpened).
         margin_range: Range margins are clipped to, [lowest, highest] [m] (sharpened).
+        first_row_weight: Weight of an episode's first segment relative to the others, for verdicts
+            at planning time (sharpened).
+        shortest_segment: Least number of samples of a safe episode's segment, for episodes that end
+            at rest; 0 means the whole horizon (sharpened).
         raw_input_scale: Spread of state and preview as a map's inputs, where features have spread
             one (sharpened). A small scale prevents overfitting to them if the features suffice.
         feature_unit: Features enter a second time as asinh(f / feature_unit), which resolves
             margins near zero [unit of the features]; 0 disables it (sharpened).
-        shortest_segment: Least number of samples of a safe episode's segment, for episodes that end
-            at rest; 0 means the whole horizon (sharpened).
-        first_row_weight: Weight of an episode's first segment relative to the others, for verdicts
-            at planning time (sharpened).
-        trees: Whether the base logit has boosted trees as a third input (sharpened).
-        paper: Reading of the paper (paper).
-        adaptation: Parameters of the adaptation.
     """
 
     mode: Literal["sharpened", "paper"] = "sharpened"
@@ -151,16 +139,12 @@ class AssessmentParameters:
     held_out: ShareBelowOne = 0.3
     hidden_sizes: Widths = field(default_factory=lambda: [128, 128])
     dropout: ShareBelowOne = 0.2
-    target_weight: NotNegative = 0.1
-    safety_weight: NotNegative = 5.0
-    margin_weight: NotNegative = 1.0
     margin_unit: Positive = 0.02
     margin_range: Interval = field(default_factory=lambda: [-0.03, 0.10])
     first_row_weight: Positive = 6.0
     shortest_segment: Annotated[int, Field(ge=0)] = 0
     raw_input_scale: Positive = 1.0
     feature_unit: NotNegative = 0.0
-    trees: bool = True
     paper: PaperReading = field(default_factory=PaperReading)
     adaptation: AdaptationParameters = field(default_factory=AdaptationParameters)
 

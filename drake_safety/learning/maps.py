@@ -25,6 +25,8 @@ _CLIPPED_SHARE = 1e-3
 """Share of the training inputs that is clipped at either end of a column of x."""
 _SMALLEST_SPREAD = 1e-3
 _SAFETY_HIDDEN = 32
+_TARGET_WEIGHT, _SAFETY_WEIGHT = 0.1, 5.0
+"""Weights of the distance to t-SNE's points and of the safety head's loss, beside the margins'."""
 _Report = Callable[[float], object]
 
 
@@ -63,15 +65,12 @@ def learned_maps(
     parameters: AssessmentParameters,
     progress: _Report = ignore,
 ) -> tuple[Embedding, BaseLogit | None, Trees | None]:
-    """Trains the maps Psi to reproduce t-SNE's points and, when sharpened, to predict safety.
+    """Trains the maps Psi, the base logit and the trees; the last two are None in the paper's mode.
+
+    Trees are also None without episodes of both labels to learn from and to weigh them on.
 
     Departure ("sharpened" only): maps of rectifiers extrapolate linearly, off the grid or into
-    cells of others, so the 0.1 and 99.9 % quantiles of training clip every column of x; of a
-    clipped input a map knows at least the other columns, as a decision tree does.
-
-    Returns:
-        The maps, the base logit of their heads and of the trees, and the trees. Without heads, both
-        are None; trees are None without episodes of both labels to weigh them on and to learn from.
+    cells of others, so the 0.1 and 99.9 % quantiles of training clip every column of x.
     """
     settings, x = mode_settings(parameters), columns.of_rows(segments)
     is_raw = np.arange(x.shape[1]) < columns.plan.stop
@@ -87,7 +86,7 @@ def learned_maps(
         return _train(data, parameters, progress), None, None
     is_held_out = held_out_segments(segments, parameters)
     label = segments.is_unsafe[is_held_out]
-    tried_trees = trees = base_logit = None
+    tried_trees = trees = None
     if not 0 < label.sum() < len(label):
         # No held-out episodes of both labels.
         tried = embedding = _train(data, parameters, progress)
@@ -97,14 +96,12 @@ def learned_maps(
         # on the held-out episodes, and the final one is trained on all episodes.
         tried = _train(data.take(~is_held_out), parameters, lambda done: progress(0.5 * done))
         embedding = _train(data, parameters, lambda done: progress(0.5 * (1 + done)))
-        if settings.trees and embedding.has_heads:
-            tried_trees, trees = learned_trees(data, segments.episode, is_held_out, parameters.seed)
-    if embedding.has_heads:
-        judged = x[is_held_out]
-        trees_logit = None if tried_trees is None else tried_trees.evaluate(judged)
-        base_logit = fitted_base_logit(
-            tried.evaluate(judged), segments.take(is_held_out), parameters, trees_logit
-        )
+        tried_trees, trees = learned_trees(data, segments.episode, is_held_out, parameters.seed)
+    judged = x[is_held_out]
+    trees_logit = None if tried_trees is None else tried_trees.evaluate(judged)
+    base_logit = fitted_base_logit(
+        tried.evaluate(judged), segments.take(is_held_out), parameters, trees_logit
+    )
     known = np.quantile(x, [_CLIPPED_SHARE, 1.0 - _CLIPPED_SHARE], axis=0)
     return embedding.clipping(known), base_logit, trees
 
@@ -129,10 +126,7 @@ def learned_trees(
 
 
 def held_out_segments(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
-    """Returns which segments are held out for the base logit, (N,), by whole episodes.
-
-    It is a function of the ensemble's mean, so all maps hold out the same episodes.
-    """
+    """Returns which segments are held out for the base logit, (N,), by whole episodes."""
     settings, episodes = mode_settings(parameters), np.unique(segments.episode)
     seed = np.random.SeedSequence(parameters.seed, spawn_key=(settings.num_maps,))
     drawn = np.random.default_rng(seed).permutation(episodes)
@@ -154,22 +148,19 @@ def _train(data: MapData, parameters: AssessmentParameters, progress: _Report) -
 
         seed = int(np.random.SeedSequence(parameters.seed, spawn_key=(k,)).generate_state(1)[0])
         members.append(train_map(data, parameters, seed=seed, progress=report))
-    num_margins = data.margins.shape[1] if settings.margin_weight > 0.0 else 0
-    embedding = stack_members(members, num_margins=num_margins)
+    embedding = stack_members(members)
     if settings.is_paper:
         return embedding
-    # Departure: a small weight of the distance to t-SNE's points leaves the maps' scale open;
-    # outputs would fall outside the grid, or into few of its cells. They become as wide as the
-    # points.
+    # Departure: the small weight of the distance to t-SNE's points leaves the maps' scale open, so
+    # outputs are made as wide as the points.
     reach = np.abs(embedding.embed(data.x)).max(axis=2)
     extent = np.quantile(reach, _INSIDE_SHARE, axis=1)
     return embedding.scaled((np.abs(data.target).max() / extent).astype(np.float32))
 
 
-def stack_members(members: list[dict[str, np.ndarray]], *, num_margins: int) -> Embedding:
+def stack_members(members: list[dict[str, np.ndarray]]) -> Embedding:
     """Stacks members returned by `train_map` into one `Embedding`."""
-    weights = {name: np.stack([member[name] for member in members]) for name in members[0]}
-    return Embedding(weights, num_margins=num_margins)
+    return Embedding({name: np.stack([member[name] for member in members]) for name in members[0]})
 
 
 @contextmanager
@@ -191,29 +182,26 @@ def train_map(
 ) -> dict[str, np.ndarray]:
     """Trains one map Psi, the same for a seed and a machine; names its arrays as in `Embedding`.
 
-    Departure: the paper trains Psi on ||y - Psi(x)|| alone. With a safety head on y and a margin
-    head on the trunk, the map separates neighbours in t-SNE that end differently; held-out accuracy
-    on the robots rises to that of a direct classifier.
+    Departure ("sharpened" only): the paper trains Psi on ||y - Psi(x)|| alone. With a safety head
+    on y and a margin head on the trunk, it separates neighbours in t-SNE that end differently.
     """
     import torch
     from torch.nn import functional
 
     settings = mode_settings(parameters)
-    has_safety, has_margins = settings.safety_weight > 0.0, settings.margin_weight > 0.0
     mean = data.x.mean(axis=0)
     spread = np.ones(len(mean))
     if settings.standardized:
         # With a lower bound, so that nearly constant columns are not amplified.
         spread = np.maximum(data.x.std(axis=0), _SMALLEST_SPREAD) / data.input_scale
     target_scale = float(data.target.std())
-    num_margins = data.margins.shape[1] if has_margins else 0
 
     def single(values: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.asarray(values, dtype=np.float32))
 
     with one_torch_thread():
         torch.manual_seed(seed)
-        net = _network(data.x.shape[1], num_margins, has_safety, settings)
+        net = _network(data.x.shape[1], data.margins.shape[1], settings)
         x = single((data.x - mean) / spread)
         target = torch.zeros(len(x), 2)
         has_target = torch.from_numpy(np.asarray(data.has_target, dtype=bool))
@@ -242,16 +230,16 @@ def train_map(
                 y, w = output[:, :2], weight[batch]
                 distance = ((y - target[batch]) ** 2).sum(dim=1)
                 distance = (target_weight[batch] * distance).mean()
-                loss = settings.target_weight * distance / mean_target_weight
-                if has_safety:
-                    logit = net["safety"](y)[:, 0]
+                distance = distance / mean_target_weight
+                if settings.is_paper:
+                    loss = distance
+                else:
                     entropy = functional.binary_cross_entropy_with_logits(
-                        logit, is_unsafe[batch], weight=w
+                        net["safety"](y)[:, 0], is_unsafe[batch], weight=w
                     )
-                    loss = loss + settings.safety_weight * entropy
-                if has_margins:
                     huber = functional.huber_loss(output[:, 2:], margins[batch], reduction="none")
-                    loss = loss + settings.margin_weight * (w * huber.mean(dim=1)).mean()
+                    loss = _TARGET_WEIGHT * distance + _SAFETY_WEIGHT * entropy
+                    loss = loss + (w * huber.mean(dim=1)).mean()
                 optimiser.zero_grad(set_to_none=True)
                 loss.backward()
                 optimiser.step()
@@ -260,23 +248,21 @@ def train_map(
     return _folded_weights(net, mean, spread, target_scale, parameters.margin_unit)
 
 
-def _network(num_inputs: int, num_margins: int, has_safety: bool, settings: ModeSettings) -> Any:
+def _network(num_inputs: int, num_margins: int, settings: ModeSettings) -> Any:
     from torch import nn
 
-    trunk, width = [], num_inputs
+    trunk: list[nn.Module] = []
+    width = num_inputs
     for size in settings.hidden_sizes:
         trunk += [nn.Linear(width, size), nn.ReLU()]
         if settings.dropout > 0.0:
             trunk.append(nn.Dropout(settings.dropout))
         width = size
-    net = nn.ModuleDict(
-        {"trunk": nn.Sequential(*trunk), "output": nn.Linear(width, 2 + num_margins)}
-    )
-    if has_safety:
-        net["safety"] = nn.Sequential(
-            nn.Linear(2, _SAFETY_HIDDEN), nn.ReLU(), nn.Linear(_SAFETY_HIDDEN, 1)
-        )
-    return net
+    if settings.is_paper:
+        return nn.ModuleDict({"trunk": nn.Sequential(*trunk), "output": nn.Linear(width, 2)})
+    output = nn.Linear(width, 2 + num_margins)
+    safety = nn.Sequential(nn.Linear(2, _SAFETY_HIDDEN), nn.ReLU(), nn.Linear(_SAFETY_HIDDEN, 1))
+    return nn.ModuleDict({"trunk": nn.Sequential(*trunk), "output": output, "safety": safety})
 
 
 def _folded_weights(
@@ -308,15 +294,10 @@ def fitted_base_logit(
     parameters: AssessmentParameters,
     trees_logit: np.ndarray | None = None,
 ) -> BaseLogit:
-    """Fits the base logit to the ensemble's heads and the trees by logistic regression.
+    """Fits the base logit to heads and trees at held-out segments by logistic regression.
 
     Beside trees the slopes of both logits are scaled to a sum of at most one: what is surer than
     either holds for the nominal plant, as on a changed one both err together.
-
-    Args:
-        output: The maps' outputs for held-out segments; on training segments they are
-            overconfident.
-        trees_logit: The logit of the trees for these segments, (N,); None without trees.
     """
     low, high = parameters.margin_range
     logit = BaseLogit(margin_unit=parameters.margin_unit, margin_range=(low, high))

@@ -205,7 +205,7 @@ def _add_prediction(graph: _Graph, model: Model, ports: Iterable[str], feature_u
     is_small = x.Abs().Less(INPUT_LIMIT).double()
     is_usable = is_small.ReduceMin(axes=[1], keepdims=1).Greater(0.5)
     usable = is_usable.Where(x, 0.0)
-    y, logit, margins, activations = _maps(usable, embedding)
+    y, head, activations = _maps(usable, embedding)
     share = _novelty(x, model.novelty)
     is_known = is_usable.And(share.LessOrEqual(1.0))
     weights, inside = _cell_weights(y, model.grid)
@@ -216,13 +216,14 @@ def _add_prediction(graph: _Graph, model: Model, ports: Iterable[str], feature_u
     masses.part(0, 3, axis=1, output="belief")
     masses.part(3, 3 + num_causes, axis=1, output="cause_probability")
     nan = np.full(num_causes, np.nan)
-    is_usable.Where(nan if margins is None else margins, nan, output="predicted_margins")
+    margins = nan if head is None else head[1]
+    is_usable.Where(margins, nan, output="predicted_margins")
     share.Squeeze([1], output="novelty")
     is_usable.Where(y.Gather(np.array(0), axis=0), np.full(2, np.nan), output="embedding")
     safe, uncertainty = (masses.part(i, i + 1, axis=1) for i in (SAFE, UNCERTAINTY))
     probability, fall = safe, None
-    if base_logit is not None:
-        heads = _heads(logit, margins, base_logit)
+    if base_logit is not None and head is not None:
+        heads = _heads(*head, base_logit)
         if model.trees is not None:
             heads = heads.Concat(_trees(usable, model.trees), axis=1)
         slopes = np.array(base_logit.slopes[: 2 if model.trees is None else 3], dtype=float)
@@ -233,9 +234,9 @@ def _add_prediction(graph: _Graph, model: Model, ports: Iterable[str], feature_u
             guard = guard / inside.ReduceSum([0], keepdims=0).Max(1.0)
             unsafe_logit = unsafe_logit + _shift(heads, activations, guard, correction)
         probability = unsafe_logit.Neg().Sigmoid()
-        if model.fall_logit is not None and margins is not None:
+        if model.fall_logit is not None:
             columns = usable.Gather(np.array(model.fall_logit.columns, dtype=np.int64), axis=1)
-            fall_inputs = margins.Concat(unsafe_logit, columns, axis=1)
+            fall_inputs = head[1].Concat(unsafe_logit, columns, axis=1)
             fall = fall_inputs @ np.array(model.fall_logit.weights)[:, None]
             fall = (fall + model.fall_logit.offset).Sigmoid()
     is_known = uncertainty.LessOrEqual(unknown_above(model.initial_uncertainty))
@@ -257,8 +258,8 @@ def _inputs(graph: _Graph, ports: Iterable[str], feature_unit: float) -> _Value:
     return graph.node("Concat", *parts, axis=1, output="x")
 
 
-def _maps(x: _Value, embedding: Embedding) -> tuple[_Value, _Value | None, _Value | None, _Value]:
-    """y (K, N, 2), safety logits (K, N, 1), mean margins (N, n_c) and activations (K, N, n)."""
+def _maps(x: _Value, embedding: Embedding) -> tuple[_Value, tuple[_Value, _Value] | None, _Value]:
+    """y (K, N, 2), safety logits (K, N, 1) and mean margins (N, n_c), activations (K, N, n)."""
     weights = embedding.weights
 
     def layer(name: str, z: _Value) -> _Value:
@@ -274,13 +275,12 @@ def _maps(x: _Value, embedding: Embedding) -> tuple[_Value, _Value | None, _Valu
         z = layer(f"trunk.{i}", z).Relu()
     output = layer("output", z)
     y = output.part(0, 2, axis=2)
-    logit = margins = None
-    if embedding.has_safety_head:
+    heads = None
+    if embedding.has_heads:
         logit = layer("safety.1", layer("safety.0", y).Relu()).double()
-    if embedding.num_margins:
         margins = output.part(2, 2 + embedding.num_margins, axis=2).double()
-        margins = margins.ReduceMean(axes=[0], keepdims=0)
-    return y.double(), logit, margins, z
+        heads = logit, margins.ReduceMean(axes=[0], keepdims=0)
+    return y.double(), heads, z
 
 
 def _novelty(x: _Value, novelty: Novelty) -> _Value:
@@ -328,18 +328,11 @@ def _read_grid(weights: _Value, values: np.ndarray) -> _Value:
     return (second @ along).ReduceSum([0, 2], keepdims=0)
 
 
-def _heads(logit: _Value | None, margins: _Value | None, base_logit: BaseLogit) -> _Value:
-    """z and -m / margin_unit, (N, 2); zero for a missing head."""
-    columns = []
-    if logit is not None:
-        clipped = logit.Clip(-LOGIT_LIMIT, LOGIT_LIMIT)
-        columns.append(clipped.ReduceMean(axes=[0], keepdims=0))
-    if margins is not None:
-        smallest = margins.ReduceMin(axes=[1], keepdims=1).Clip(*base_logit.margin_range)
-        columns.append(smallest / -base_logit.margin_unit)
-    if len(columns) == 1:
-        columns.insert(0 if logit is None else 1, columns[0] * 0.0)
-    return columns[0].Concat(columns[1], axis=1)
+def _heads(logit: _Value, margins: _Value, base_logit: BaseLogit) -> _Value:
+    """z and -m / margin_unit, (N, 2)."""
+    z = logit.Clip(-LOGIT_LIMIT, LOGIT_LIMIT).ReduceMean(axes=[0], keepdims=0)
+    smallest = margins.ReduceMin(axes=[1], keepdims=1).Clip(*base_logit.margin_range)
+    return z.Concat(smallest / -base_logit.margin_unit, axis=1)
 
 
 def _trees(x: _Value, trees: Trees) -> _Value:

@@ -29,12 +29,12 @@ class Prediction:
 
     Attributes:
         belief: (b_safe, b_unsafe, mu), (N, 3); empty for novel inputs. b_safe is the paper's Γ.
-        probability: Probability of staying safe, (N,), from the corrected base logit; b_safe
-            without heads, as in the paper's mode. 0 where the belief is "don't know".
+        probability: Probability of staying safe, (N,), from the corrected base logit; b_safe in the
+            paper's mode. 0 where the belief is "don't know".
         cause_probability: b_unsafe split by the violated constraint, (N, n_c).
         embedding: y of the first map, (N, 2); NaN for inputs that are not finite.
         predicted_margins: Smallest margin of each constraint until the episode's end [unit of the
-            margins], (N, n_c); NaN for inputs that are not finite or without a margin head.
+            margins], (N, n_c); NaN for inputs that are not finite and in the paper's mode.
         novelty: Distance of x from the training inputs, (N,); novel above 1, infinite for inputs
             that are not finite.
         fall_probability: Probability of a fall until the episode's end or soon after it left the
@@ -80,16 +80,12 @@ class BaseLogit:
     """The base logit: a logit of an unsafe end from the maps' heads and the trees.
 
     ``offset + safety_slope z - margin_slope m / margin_unit + trees_slope t``, where z is the mean
-    logit of the safety heads, m the smallest predicted margin and t the logit of the trees; the
-    term of a missing head is zero.
+    logit of the safety heads, m the smallest predicted margin, clipped to `margin_range`, and t the
+    logit of the trees.
 
     Departure: the paper judges by the map alone. Boosted trees, taught by the ends of the motions,
-    and maps, taught by margins too, err on different inputs; the base logit of both ranks better
-    than either. Belief, cause and gradient are the maps'.
-
-    Attributes:
-        margin_unit: Unit of margins [unit of the margins].
-        margin_range: Range that margins are clipped to [unit of the margins].
+    and maps, taught by margins too, err on different inputs. Belief, cause and gradient are the
+    maps'.
     """
 
     margin_unit: Positive
@@ -109,15 +105,12 @@ class BaseLogit:
     ) -> np.ndarray:
         """Returns z, -m / margin_unit and, with trees, t of all inputs, (N, 2) or (N, 3).
 
-        A missing head of the maps gives zero. `margins` is the mean of the maps', (N, n_c).
+        `margins` is the mean of the maps', (N, n_c).
         """
-        heads = np.zeros((len(margins), 2 if trees_logit is None else 3))
-        logit = mean_of_maps(_clip(maps.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT))
-        if np.count_nonzero(np.isnan(logit)) < logit.size:
-            heads[:, 0] = logit
-        if maps.margins.shape[2]:
-            smallest = np.minimum.reduce(margins, axis=1)
-            heads[:, 1] = _clip(smallest, *self.margin_range) / -self.margin_unit
+        heads = np.empty((len(margins), 2 if trees_logit is None else 3))
+        heads[:, 0] = mean_of_maps(_clip(maps.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT))
+        smallest = np.minimum.reduce(margins, axis=1)
+        heads[:, 1] = _clip(smallest, *self.margin_range) / -self.margin_unit
         if trees_logit is not None:
             heads[:, 2] = _clip(trees_logit, -LOGIT_LIMIT, LOGIT_LIMIT)
         return heads
@@ -133,11 +126,10 @@ class Correction:
     """Correction of the base logit by feedback.
 
     Attributes:
-        change: Changes of the offset, safety slope, margin slope and, with trees, trees slope, (3,)
-            or (4,).
+        change: Changes of the offset and of the slopes of the heads, (3,), or (4,) with trees.
         hidden: Weights of the activations of the maps' last hidden layer, and a constant, (K,
             num_activations + 1).
-        hidden_range: Least and largest sum of the hidden layer's terms in feedback, to which it is
+        hidden_range: Range in feedback of the sum of the hidden layer's terms, to which it is
             clipped, (2,).
         guard: 1 in cells of each map where the base logit must not fall, else 0, (K, R*R).
     """
@@ -164,7 +156,7 @@ class Correction:
         return any(self.change.tolist()) or any(self.hidden_range.tolist())
 
     def residual(self, activations: np.ndarray) -> np.ndarray:
-        """Returns the hidden layer's contribution by its activations (K, N, n), (N,)."""
+        """Returns the hidden layer's contribution, (N,), by its activations (K, N, n)."""
         return _clip(hidden_sum(activations, self.hidden), *self.hidden_range)
 
     def shift(self, heads: np.ndarray, residual: np.ndarray, guard: np.ndarray) -> np.ndarray:
@@ -180,9 +172,9 @@ class Evaluation(NamedTuple):
 
     Attributes:
         maps: Outputs of the K maps.
-        margins: Mean of the maps' predicted margins, (N, n_c); NaN without a margin head.
-        heads: Inputs of the base logit, see `BaseLogit.heads`; None without a base logit.
-        logit: The base logit before its correction, (N,); None without one.
+        margins: Mean of the maps' predicted margins, (N, n_c); NaN without heads.
+        heads: Inputs of the base logit, see `BaseLogit.heads`; None without heads.
+        logit: The base logit before its correction, (N,); None without heads.
     """
 
     maps: EmbeddingOutput
@@ -218,19 +210,16 @@ class Model:
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
         """Shapes of the beliefs and of the correction's arrays."""
-        of = self.correction
-        arrays = (self.beliefs, of.change, of.hidden, of.hidden_range, of.guard)
+        change = self.correction
+        arrays = (self.beliefs, change.change, change.hidden, change.hidden_range, change.guard)
         return tuple(array.shape for array in arrays)
 
     def evaluate(self, x: np.ndarray) -> Evaluation:
         """Evaluates maps, trees and base logit at inputs (N, n_x)."""
         maps = self.embedding.evaluate(x)
-        if maps.margins.shape[2]:
-            margins = mean_of_maps(maps.margins)
-        else:
-            margins = np.full((len(x), self.num_causes), np.nan)
         if self.base_logit is None:
-            return Evaluation(maps, margins, None, None)
+            return Evaluation(maps, np.full((len(x), self.num_causes), np.nan), None, None)
+        margins = mean_of_maps(maps.margins)
         trees_logit = None if self.trees is None else self.trees.evaluate(x)
         heads = self.base_logit.heads(maps, margins, trees_logit)
         return Evaluation(maps, margins, heads, self.base_logit.of_heads(heads))
@@ -269,7 +258,7 @@ class Model:
                 residual[is_usable] = self.correction.residual(activations)
                 logit += self.correction.shift(heads, residual, guard)
             probability = 1.0 / (1.0 + np.exp(logit))
-            if self.fall_logit is not None and maps.margins.shape[2]:
+            if self.fall_logit is not None:
                 fall_probability = sigmoid(self.fall_logit.of(margins, logit, x))
                 fall_probability[np.isnan(maps.embedding[0, :, 0])] = 1.0
         probability[is_unknown(masses, self.initial_uncertainty)] = 0.0
@@ -285,7 +274,7 @@ class Model:
 
 
 def _weighted(heads: np.ndarray, slopes: Sequence[float], offset: float = 0.0) -> np.ndarray:
-    """The weighted sum of heads, (N,); a product of matrices would round by the number of rows."""
+    # A product of matrices would round by the number of rows.
     return np.add.reduce(heads * slopes, axis=1) + offset
 
 

@@ -26,9 +26,9 @@ class EmbeddingOutput(NamedTuple):
 
     Attributes:
         embedding: y, (K, N, 2).
-        unsafe_logit: Logit of an unsafe end, (K, N); NaN for maps without a safety head.
+        unsafe_logit: Logit of an unsafe end, (K, N); NaN for maps without heads.
         margins: Predicted smallest future margin of each constraint [unit of the margins], (K, N,
-            n_c); no columns for maps without a margin head.
+            n_c); no columns for maps without heads.
     """
 
     embedding: np.ndarray
@@ -41,33 +41,26 @@ class Embedding:
 
     The arrays `weights` are "trunk.i.weight" (K, in, out) and "trunk.i.bias" (K, out);
     "output.weight" (K, width, 2 + n_c) whose first two columns give y and the others the margins;
-    with a safety head also "safety.0.weight" (K, 2, hidden), "safety.0.bias", "safety.1.weight"
+    with heads also "safety.0.weight" (K, 2, hidden), "safety.0.bias", "safety.1.weight"
     (K, hidden, 1) and "safety.1.bias". Standardisation is folded into them.
 
     Attributes:
-        num_margins: n_c, the number of predicted margins.
+        num_margins: n_c, the number of predicted margins; 0 without heads.
         input_range: Range to which each column of inputs is clipped, (2, n_x); may be infinite.
         centre: What is subtracted from inputs before they are multiplied, (n_x,).
         centred_bias: Bias of the first layer for these inputs, (K, out).
     """
 
-    def __init__(
-        self,
-        weights: Mapping[str, np.ndarray],
-        *,
-        num_margins: int,
-        input_range: np.ndarray | None = None,
-    ):
+    def __init__(self, weights: Mapping[str, np.ndarray], input_range: np.ndarray | None = None):
         self.weights = {
             name: np.ascontiguousarray(w, dtype=np.float32) for name, w in weights.items()
         }
         for w in self.weights.values():
             w.setflags(write=False)
-        self.num_margins = num_margins
         self.num_layers = sum(name.startswith("trunk.") for name in self.weights) // 2
-        self.has_safety_head = any(name.startswith("safety.") for name in self.weights)
+        self.has_heads = any(name.startswith("safety.") for name in self.weights)
         names = [f"trunk.{i}" for i in range(self.num_layers)] + ["output"]
-        heads = ["safety.0", "safety.1"] if self.has_safety_head else []
+        heads = ["safety.0", "safety.1"] if self.has_heads else []
         expected = {f"{name}.{kind}" for name in names + heads for kind in ("weight", "bias")}
         if expected != self.weights.keys() or self.num_layers == 0:
             raise ValueError(
@@ -75,7 +68,8 @@ class Embedding:
             )
         self._layers = [self._layer(name) for name in names]
         self.num_members, self.num_inputs, _ = self._layers[0][0].shape
-        self.num_activations = self._layers[-1][0].shape[1]
+        _, self.num_activations, num_outputs = self._layers[-1][0].shape
+        self.num_margins = num_outputs - 2
         unlimited = np.tile([[-np.inf], [np.inf]], self.num_inputs)
         limits = unlimited if input_range is None else input_range
         self.input_range = np.array(limits, dtype=np.float32)
@@ -97,7 +91,7 @@ class Embedding:
         self.centred_bias = bias[:, 0]
         layers = [(w[:, None], b[:, None]) for w, b in ((weight, bias), *others)]
         *self._trunk, self._readout = layers
-        if self.has_safety_head:
+        if self.has_heads:
             # The safety head reads y, so its first layer is a part of the output layer.
             (weight, bias), (head, head_bias) = self._layers[-1], self._layer("safety.0")
             y = [part[..., :2].astype(float) for part in (weight, bias)]
@@ -111,38 +105,33 @@ class Embedding:
         """Weights (K, in, out) and biases (K, 1, out)."""
         return self.weights[f"{name}.weight"], self.weights[f"{name}.bias"][:, None, :]
 
-    @property
-    def has_heads(self) -> bool:
-        """Whether the maps have a safety head or a margin head."""
-        return self.has_safety_head or self.num_margins > 0
-
     def is_same(self, other: Embedding) -> bool:
         """Whether weights and input range are identical."""
-        return (
-            self.weights.keys() == other.weights.keys()
-            and all(np.array_equal(w, other.weights[name]) for name, w in self.weights.items())
-            and np.array_equal(self.input_range, other.input_range)
-        )
+        own, others = ({**maps.weights, "range": maps.input_range} for maps in (self, other))
+        return own.keys() == others.keys() and all(np.array_equal(own[k], others[k]) for k in own)
 
     def clipping(self, input_range: np.ndarray) -> Embedding:
         """Returns the same maps, with inputs clipped to a range of each column, (2, n_x)."""
-        return Embedding(self.weights, num_margins=self.num_margins, input_range=input_range)
+        return Embedding(self.weights, input_range)
 
     def scaled(self, factors: np.ndarray) -> Embedding:
         """Returns maps with y scaled by one factor each, (K,), and the same safety logits."""
         weights = {name: w.copy() for name, w in self.weights.items()}
-        for name in ("output.weight", "output.bias"):
-            weights[name][..., :2] *= factors.reshape(-1, *[1] * (weights[name].ndim - 1))
-        if self.has_safety_head:
+        weights["output.weight"][..., :2] *= factors[:, None, None]
+        weights["output.bias"][..., :2] *= factors[:, None]
+        if self.has_heads:
             weights["safety.0.weight"] /= factors[:, None, None]
-        return Embedding(weights, num_margins=self.num_margins, input_range=self.input_range)
+        return Embedding(weights, self.input_range)
 
     def evaluate(self, x: np.ndarray) -> EmbeddingOutput:
         """Evaluates all members at inputs (N, n_x); rows that are not finite give NaN.
 
         A row has the same bits whatever the others are.
         """
-        self._check(x)
+        if np.ndim(x) != 2 or np.shape(x)[1] != self.num_inputs:
+            raise ValueError(
+                f"Embedding: inputs have shape {np.shape(x)}, expected (N, {self.num_inputs})"
+            )
         if are_usable(x):
             return self._outputs(self._clipped(x))
         is_usable = (np.abs(x) < INPUT_LIMIT).all(axis=1)  # False for NaN.
@@ -161,7 +150,7 @@ class Embedding:
             z = self._hidden(x) @ weight
             z += bias
             width = 2 + self.num_margins
-            if self.has_safety_head:
+            if self.has_heads:
                 weight, bias = self._logit
                 logit = (np.maximum(z[..., width:], 0.0) @ weight)[..., 0, 0] + bias[:, 0, 0]
             else:
@@ -171,7 +160,6 @@ class Embedding:
 
     def activations(self, x: np.ndarray) -> np.ndarray:
         """Returns the last hidden layers at finite inputs (N, n_x), (K, N, num_activations)."""
-        self._check(x)
         with ONE_BLAS_THREAD:
             return self._hidden(self._clipped(x))[:, :, 0]
 
@@ -182,10 +170,8 @@ class Embedding:
     def logit_gradient(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the mean safety logit at x (N, n_x) and its gradient: (N,) and (N, n_x).
 
-        The gradient is zero along a column that is clipped.
+        The maps need heads. The gradient is zero along a column that is clipped.
         """
-        if not self.has_safety_head:
-            raise ValueError("Embedding.logit_gradient: the maps have no safety head")
         x = np.asarray(x, dtype=float)
         clipped = np.clip(x, *self.input_range)
         logit, gradient = np.zeros(len(x)), np.zeros(np.shape(x))
@@ -205,12 +191,6 @@ class Embedding:
                 back = (back * is_active[i]) @ w[f"trunk.{i}.weight"].T
             gradient += back * (clipped == x)
         return logit / self.num_members, gradient / self.num_members
-
-    def _check(self, x: np.ndarray) -> None:
-        if np.ndim(x) != 2 or np.shape(x)[1] != self.num_inputs:
-            raise ValueError(
-                f"Embedding: inputs have shape {np.shape(x)}, expected (N, {self.num_inputs})"
-            )
 
     def _clipped(self, x: np.ndarray) -> np.ndarray:
         """Inputs clipped to the range, from its centre, in single precision."""

@@ -45,9 +45,7 @@ class TrainingScores:
         heads = nearest = None
         if evaluation.heads is not None:
             heads = _single(evaluation.heads)
-            nearest = np.zeros(len(segments), dtype=np.int64)
-            if evaluation.maps.margins.shape[2]:
-                nearest = evaluation.margins.argmin(axis=1)
+            nearest = evaluation.margins.argmin(axis=1)
         return cls(
             points=evaluation.maps.embedding.astype(np.float32),
             score=_single(segments.score),

@@ -57,7 +57,7 @@ def nearest_accepted_goal(
         return None
     box = require(loop, HasGoals).target_box
     near = _Search(loop, assessment, goal, box, stricter)
-    best = near.descend() if assessment.embedding_.has_safety_head else None
+    best = near.descend() if assessment.embedding_.has_heads else None
     best = near.search(best, rng, num_candidates)
     return None if best is None else replace(best, threshold=threshold)
 
