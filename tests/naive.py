@@ -96,10 +96,9 @@ def prediction(assessment, x):
     known = known if novelty.feedback is None else known.joined(novelty.feedback)
     distances = whitened_distances(known, x[None], novelty.plan)[0]
     distance = max(distances / novelty.limits[:3])
-    if len(novelty.limits) > 3:
-        low, high = known.least, known.largest
-        offset = np.abs(x - (low + high) / 2) / np.maximum((high - low) / 2, 0.05)
-        distance = max(distance, offset.max() / novelty.limits[3])
+    low, high = known.least, known.largest
+    offset = np.abs(x - (low + high) / 2) / np.maximum((high - low) / 2, 0.05)
+    distance = max(distance, offset.max() / novelty.limits[3])
     belief = belief / maps.num_members if distance <= 1.0 else empty
     probability, fall = belief[0], np.nan
     if logit is not None:

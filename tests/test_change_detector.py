@@ -95,9 +95,8 @@ def test_too_little_motion_gives_levels_and_no_alarm():
     assert np.isinf(detector.alarm_level) and learned().alarm_level == 1.0
     levels, alarms = detector.watch([motion(5.0, 12, ALWAYS)])
     assert levels.max() > 1.0 and alarms == []
-    assert "never alarms; 3 min of" in detector.with_motions(rows).describe()
     assert "extrapolated to one false alarm in" in learned().describe()
-    with pytest.raises(ValueError, match="1 motions have three rows; two are needed"):
+    with pytest.raises(ValueError, match="1 motions have three rows"):
         ChangeDetector.fit(recorded([few[: 2 + i] for i, few in enumerate(rows[:2])]))
 
 
@@ -133,15 +132,10 @@ def test_little_motion_of_an_actual_robot_widens_no_limit(num_pieces):
     assert worst(motion(5.0, 10, ALWAYS, -0.4), adapted).max() > 1.0
 
 
-def test_adapted_detector_says_how_much_its_limits_were_widened():
+def test_adapted_detector_is_read_to_the_bit():
     adapted = learned().with_motions([wild(MOTION_S, seed) for seed in range(8)])
-    widening = adapted.widening()
-    assert widening.min() >= 1.0 and np.median(widening) > 1.0
     assert adapted.longest_repeat == 4 + 3  # As of a fitted one.
     text = adapted.describe()
-    assert f"widen limits, {np.median(widening):.2f} times in the median and " in text
-    assert "7 repeated inputs are no alarm" in text
-    # A detector that is read, and its adaptation, are the same to the bit.
     again = ChangeDetector.from_arrays(adapted.arrays())
     assert again.describe() == text and again.nominal.describe() == learned().describe()
     rows = [motion(MOTION_S, seed, ALWAYS, 0.1) for seed in range(8)]

@@ -100,15 +100,6 @@ def test_samples_and_steps_of_the_score_are_a_preview_stride_apart():
             assert segments.score[i] == pytest.approx(expected)
 
 
-def test_repr_of_a_set_has_scenario_plant_and_counts(episodes):
-    assert repr(episodes) == (
-        f"Episodes('lip', variation 'nominal', seed {episodes.info.seed}, 40 episodes: "
-        f"{episodes.num_safe} safe, {episodes.num_unsafe} unsafe)"
-    )
-    assert repr(episodes[:0]).endswith("0 episodes)")
-    assert [episode.index for episode in episodes[3:5]] == [3, 4]
-
-
 def changed(episodes, **changes):
     return Episodes(episodes.info, [dataclasses.replace(episodes[7], **changes)])
 

@@ -64,29 +64,26 @@ _OF_MODEL = (
 class SafetyAssessment:
     """Γ: maps the state and the desired preview to a belief about safety.
 
-    `fit` learns it from nominal episodes. Learned attributes end in an underscore:
-
-    - `info_`: the `EpisodesInfo` of the training episodes.
-    - `grid_`: the `Grid` of the embedding space.
-    - `columns_`: the `InputColumns` of x.
-    - `embedding_`: the maps Psi, an immutable `Embedding`.
-    - `detector_`: the `ChangeDetector`, which sees a changed plant or sensor, for a monitor.
-    - `beliefs_`: the beliefs of every map's cells, (K, R*R, 3 + n_c).
-    - `training_`: the `TrainingScores` of training segments, from which adaptation starts.
-    - `novelty_`: the `Novelty`, which says which inputs are unlike those of training.
-    - `base_logit_`: the `BaseLogit` of the maps' heads and the trees; None without heads.
-    - `trees_`: the `Trees` beside the maps; None where none are learned.
-    - `fall_logit_`: the `FallLogit`, of `fit_falls`; initially None.
-    - `correction_`: the `Correction` that feedback adds to the base logit; initially zero.
-    - `adaptation_`: the `Adaptation` to feedback; initially None.
-    - `used_`: the `UsedEpisodes` of training, calibration and adaptation; evaluation needs others.
-    - `calibrations_`: the `Calibration` by kind for these maps and `beliefs_`; initially empty.
+    `fit` learns it from nominal episodes. Learned attributes end in an underscore.
 
     Departure ("sharpened" only): x gains the safe set's signed margins along the plan (`features`),
     the maps learn safety and future margins beside t-SNE's points from every start row, Γ is
     interpolated bilinearly between cell centres, and it is the mean of an ensemble of maps, each
-    with its own grid. Read literally, the method is weak on the robots; the "paper" mode is that
-    reading, for comparison.
+    with its own grid. The "paper" mode is the literal reading, for comparison.
+
+    Attributes:
+        info_: Metadata of the training episodes.
+        columns_: The columns of x.
+        embedding_: The maps Psi.
+        detector_: A monitor's detector of a changed plant or sensor.
+        beliefs_: The beliefs of every map's cells, (K, R*R, 3 + n_c).
+        training_: Scores of training segments, from which adaptation starts.
+        base_logit_: The logit of the maps' heads and the trees; None in the paper's mode.
+        trees_: The trees beside the maps; None where none are learned.
+        fall_logit_: The logit of a fall, of `fit_falls`; None before.
+        correction_: What feedback adds to the base logit; initially zero.
+        used_: Episodes of training, calibration and adaptation; evaluation needs others.
+        calibrations_: Calibrations by kind for these maps and `beliefs_`; initially empty.
     """
 
     info_: EpisodesInfo
@@ -151,8 +148,7 @@ class SafetyAssessment:
         """Learns embedding and beliefs from nominal episodes.
 
         Args:
-            progress: Called with a stage ("distances", "t-SNE", "training", "beliefs", "monitor"),
-                the percentage done and 100; True shows it.
+            progress: Called with a stage, the percentage done and 100; True shows it.
             detector: A detector that has learned undisturbed motion.
             motions: Long undisturbed motions of the same diagram, from which else the detector is
                 learned; by default the episodes, whose motion rarely suffices for its limits.
@@ -224,8 +220,7 @@ class SafetyAssessment:
         """Fits the probability of a fall to episodes that go on after they leave the safe set.
 
         Args:
-            episodes: Episodes whose unsafe end is a fall, as those of `run_episodes` with
-                ``until_fall``, of seeds without other use.
+            episodes: Episodes of unused seeds whose unsafe end is a fall.
             features: Features that it reads beside predicted margins and base logit.
         """
         require_extra("train", "SafetyAssessment.fit_falls", "sklearn")
@@ -261,15 +256,12 @@ class SafetyAssessment:
         Every adaptation starts from the nominal episodes, as F is not associative: pass all
         feedback, not only the new pairs.
 
-        Departure ("recalibration"): see `recalibration.recalibrated`.
-
         Args:
             method: "recalibration" corrects the base logit and with it the training scores;
                 "paper" is the paper's update by a discrepancy function and feedback beliefs.
                 Default: "recalibration" for maps with heads, else "paper".
             motions: Motion of the actual robot that the monitor is to know as well, or its rows
-                (state, desired preview, features), (K, n) each, as far apart as in its training;
-                of motion with more rows those between are left out.
+                (state, desired preview, features), (K, n) each, as far apart as in its training.
         """
         require_extra("train", "SafetyAssessment.adapt", "sklearn")
         model, columns, parameters = self.model, self.columns_, self.parameters
@@ -278,8 +270,7 @@ class SafetyAssessment:
         method = method or methods[0]
         if method not in methods:
             raise ValueError(
-                f"{self._who}: cannot adapt by '{method}'; the methods are {list(methods)}, and "
-                "'recalibration' needs maps with heads"
+                f"{self._who}: cannot adapt by '{method}'; the methods are {list(methods)}"
             )
         check_feedback(feedback, self.info_)
         used = used_episodes(feedback)
@@ -330,10 +321,7 @@ class SafetyAssessment:
         self.used_ = [*(kept for kept in self.used_ if kept.purpose != purpose), *used]
 
     def check_unused(self, *seeds: int, purpose: str = "") -> None:
-        """Checks that seeds were not used for training, calibration or adaptation.
-
-        Earlier sets of the ``purpose``, such as "calibration", which these replace, are ignored.
-        """
+        """Checks that seeds are unused; sets of the `purpose`, which they replace, are ignored."""
         self._check_fitted()
         check_unused([used for used in self.used_ if used.purpose != purpose], seeds, self._who)
 
@@ -370,7 +358,9 @@ class SafetyAssessment:
         correction: Correction | None = None,
         novelty: Novelty | None = None,
     ) -> Prediction:
-        """Assesses N inputs.
+        """Assesses N inputs; novel ones and those that are not finite get the empty belief.
+
+        A row has the same bits whatever the others are.
 
         Args:
             state: Measured states, (N, n_s).
@@ -379,10 +369,6 @@ class SafetyAssessment:
             beliefs: Beliefs of the cells; `beliefs_` by default, (K, R*R, 3 + n_c).
             correction: Correction of the base logit; `correction_` by default.
             novelty: Says which inputs are novel; `novelty_` by default.
-
-        Returns:
-            The prediction. Novel inputs and those that are not finite get the empty belief, whose
-            probability is 0. A row has the same bits whatever the others are.
         """
         x = self._checked_inputs(2, state, desired_preview, features)
         return self._predict(x, beliefs=beliefs, correction=correction, novelty=novelty)
@@ -414,28 +400,22 @@ class SafetyAssessment:
         correction: Correction | None = None,
         novelty: Novelty | None = None,
     ) -> Prediction:
-        """Assesses one input; the arguments are those of `predict` without the axis N.
-
-        The result has the same bits as that of `predict` in a row.
-        """
+        """Assesses one input, with the same bits; arguments as of `predict` without the axis N."""
         x = self._checked_inputs(1, state, desired_preview, features)[None]
         return self._predict(x, beliefs=beliefs, correction=correction, novelty=novelty).one(0)
 
     def _checked_inputs(self, ndim: int, state: np.ndarray, *others: Any) -> np.ndarray:
         x = self.inputs_of(state, *others)
         if x.ndim != ndim:
-            raise ValueError(
-                f"{self._who}: state has the shape {np.shape(state)}, but predict takes (N, n_s) "
-                "and predict_one (n_s,)"
-            )
+            raise ValueError(f"{self._who}: state has {np.ndim(state)} axes, expected {ndim}")
         return x
 
     def strangest_input(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> tuple[str, float]:
-        """Returns the name of the entry of x that contradicts the others most, and by how much.
+        """Returns the entry of x that contradicts the others most, and by how much.
 
-        The difference from what the others say is in standard deviations of training.
+        The difference is in standard deviations of training.
         """
         difference = self.novelty_.contradictions(self.inputs_of(state, desired_preview, features))
         column = int(np.argmax(np.abs(difference)))
@@ -446,8 +426,7 @@ class SafetyAssessment:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns x, the maps' mean logit (N,) of an unsafe end and its gradient, (N, n_x) both.
 
-        The belief is constant where all corners of a cell agree; this logit, without the trees, has
-        a slope everywhere. The arguments are those of `predict`.
+        Unlike the belief, this logit has a slope everywhere.
         """
         x = self.inputs_of(state, desired_preview, features)
         return x, *self.embedding_.logit_gradient(x)

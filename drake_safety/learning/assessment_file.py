@@ -7,7 +7,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -16,11 +16,7 @@ import numpy as np
 from drake_safety.files.atomic import write_file
 from drake_safety.files.schema import load_typed
 from drake_safety.learning.adaptation import Adaptation
-from drake_safety.learning.assessment_parameters import (
-    AdaptationParameters,
-    AssessmentParameters,
-    PaperReading,
-)
+from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.calibration import Calibration
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.fall_logit import FallLogit
@@ -107,11 +103,10 @@ def write(path: Path, parameters: AssessmentParameters, learned: Mapping[str, An
     if np.isfinite(embedding.input_range).all():
         groups[""]["input_range"] = embedding.input_range
     counts = []
-    of_novelty = {"novelty.": novelty.training, "feedback_novelty.": novelty.feedback}
-    for prefix, moments in of_novelty.items():
-        known = {} if moments is None else vars(moments)
-        counts.append(known.get("count", 0))
-        groups[prefix] = {k: v for k, v in known.items() if k != "count" and v is not None}
+    for prefix, moments in ("", novelty.training), ("feedback_", novelty.feedback):
+        known = {"count": 0} if moments is None else dict(vars(moments))
+        counts.append(known.pop("count"))
+        groups[f"{prefix}novelty."] = known
     json_values = {name: _to_json(learned[f"{name}_"]) for name in _MADE_OF_JSON}
     entries = {
         "schema_version": SCHEMA_VERSION,
@@ -183,12 +178,16 @@ def digest(entries: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> str
 
 
 def _made(made: type[_T], entries: Mapping[str, Any]) -> _T:
-    """Makes a dataclass of JSON values, without those of fields that it does not have any more."""
+    """Makes a dataclass of JSON values."""
     return load_typed(made, _known(made, entries), made.__name__)
 
 
-def _known(made: type, entries: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in entries.items() if name in get_type_hints(made)}
+def _known(made: Any, value: Any) -> Any:
+    """The value without entries of fields that a dataclass does not have any more."""
+    if not is_dataclass(made):
+        return value
+    hints = get_type_hints(made)
+    return {name: _known(hints[name], value[name]) for name in value if name in hints}
 
 
 def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: dict[str, int]) -> None:
@@ -230,10 +229,8 @@ def _learned(
     stored = entries.pop("sha256")
     if stored != digest(entries, tensors):
         raise ValueError("its contents do not have the SHA-256 that it was written with")
-    own = dict(entries["parameters"])
-    own["paper"] = _known(PaperReading, own["paper"])
-    own["adaptation"] = _known(AdaptationParameters, own["adaptation"])
-    parameters, info = _made(AssessmentParameters, own), _made(EpisodesInfo, entries["info"])
+    parameters = _made(AssessmentParameters, entries["parameters"])
+    info = _made(EpisodesInfo, entries["info"])
     numbers, columns = entries["numbers"], InputColumns(info, parameters)
 
     def group(prefix: str) -> dict[str, Any]:
@@ -256,8 +253,11 @@ def _learned(
         raise ValueError(f"its novelty has the counts {counts} and limits {limits.tolist()}")
     feedback = Moments(count=counts[1], **group("feedback_novelty.")) if counts[1] else None
     training = {k: v.astype(_TRAINING[k][1]) for k, v in group("training_").items()}
-    nominal = Moments(count=counts[0], **group("novelty."))
-    # Maps of the paper's mode extrapolate: they have no range.
+    known = group("novelty.")
+    if len(limits) == 3:  # Without a range, which then has no limit.
+        known |= {"least": known["mean"], "largest": known["mean"]}
+        limits = np.append(limits, np.inf)
+    nominal = Moments(count=counts[0], **known)
     learned: dict[str, Any] = {
         "info_": info,
         "grid_": Grid.of(parameters),

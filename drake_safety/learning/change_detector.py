@@ -38,9 +38,9 @@ _LEAST_LIMIT = 0.3  # Of a chart, in standard deviations of its value for white 
 _MOST_ALARMS = 0.1  # Share of safe episodes, above which the monitor does not know their motion.
 _FREE_REPEATS = 3  # Beyond the longest run of repeated inputs in training.
 _SETTINGS = ("alarm_level", "longest_repeat", "step_s", "motion_s")
-_LINEAR = ("predictor.linear.weight", "predictor.linear.bias")
-_ADAPTED = ("deviation", "limits", "settings", *_LINEAR)
+_ADAPTED = ("deviation", "limits", "settings", "predictor.linear.weight", "predictor.linear.bias")
 """Arrays in which an adapted detector differs from the nominal one."""
+_SIDES = {"x": ("forward", "backward"), "y": ("to the left", "to the right"), "z": ("up", "down")}
 
 
 class Alarm(NamedTuple):
@@ -55,13 +55,12 @@ class Alarm(NamedTuple):
 class ChangeDetector:
     """Charts of the innovation, the error of predicting the next measured state.
 
-    A changed plant or sensor shows in the error of predicting the next state from the last two
-    inputs. Each state's innovation, in its standard deviations and clipped, has exponentially
-    weighted means of itself and of its square, with three memories. The largest of the six, each in
-    units of its limit, is the state's level; an alarm is a level above 1. The limits are from
-    motion that the predictor has not learned, extrapolated to a rate of false alarms by the
-    exponential tail of the maxima of blocks (peaks over threshold; Coles 2001, section 4), first of
-    each chart and then of the levels. Nothing is learned from failures.
+    Each state's innovation, in its standard deviations and clipped, has exponentially weighted
+    means of itself and of its square, with three memories. The largest of the six, each in units of
+    its limit, is the state's level; an alarm is a level above 1. The limits are from motion that
+    the predictor has not learned, extrapolated to a rate of false alarms by the exponential tail of
+    the maxima of blocks (peaks over threshold; Coles 2001, section 4), first of each chart and then
+    of the levels. Nothing is learned from failures.
 
     Attributes:
         columns: Entries of (state, desired preview, features) that are its inputs, (n_u,).
@@ -70,9 +69,7 @@ class ChangeDetector:
         limits: Of the charts, (6, n_w): of the means, then of the squares.
         alarm_level: 1, or infinite where there was too little motion for limits.
         longest_repeat: Longest known run of repeated inputs.
-        step_s: Time between two inputs [s].
-        motion_s: Duration of the motion for the limits, of an adapted detector of the actual
-            robot's motion [s].
+        motion_s: Duration of the motion for the limits, or of an adapted detector's motion [s].
         nominal: The detector before it was adapted to an actual robot; None if it was not.
     """
 
@@ -100,28 +97,14 @@ class ChangeDetector:
         nominal, needed = self.nominal or self, f"{LEAST_MOTION_S / 60.0:.0f} are needed"
         learned = f"monitor: {_minutes(nominal.motion_s)} of motion for its limits"
         promise = f"extrapolated to one false alarm in {1 / FALSE_ALARMS_PER_HOUR:.0f} h"
-        own = ""
-        if self.nominal is not None:
-            own = f"; {_minutes(self.motion_s)} of an actual robot's correct its prediction"
         if not math.isfinite(self.alarm_level):
-            return f"{learned}, {needed}: it reports levels and never alarms{own}"
+            return f"{learned}, {needed}: it reports levels and never alarms"
         if self.nominal is None:
             return f"{learned}, {promise}"
+        own = f"{learned}; {_minutes(self.motion_s)} of an actual robot's correct its prediction"
         if self.motion_s < LEAST_MOTION_S:
-            kept = f"{needed} to widen limits: no rate of false alarms is promised on it"
-            return f"{learned}{own}, {kept}"
-        wider = self.widening()
-        widened = f"widen limits, {np.median(wider):.2f} times in the median and {wider.max():.2f}"
-        kept = f"{self.longest_repeat} repeated inputs are no alarm"
-        return f"{learned}{own} and {widened} at most, {promise}; {kept}"
-
-    def widening(self) -> np.ndarray:
-        """Limits in units of the nominal ones, (6, n_w): of the error, or of its deviation."""
-        sizes = []
-        for detector in (self, self.nominal or self):
-            means, squares = np.split(detector.limits, 2)
-            sizes.append(detector.deviation * np.concatenate([means, np.sqrt(1.0 + squares)]))
-        return np.divide(*sizes)
+            return f"{own}, {needed} to widen limits: no rate of false alarms is promised on it"
+        return f"{own} and widen limits, {promise}"
 
     @classmethod
     def fit(
@@ -133,15 +116,13 @@ class ChangeDetector:
     ) -> ChangeDetector:
         """Learns a prediction from half of the motions, at most an hour; limits from the rest.
 
-        Limits from the errors of other predictions, as in cross-validation, do not see what this
-        one gets wrong: on a mass on a spring they gave 16 to 71 false alarms in four hours.
+        Limits from the errors of other predictions, as in cross-validation, would not see what this
+        one gets wrong.
 
         Args:
-            motions: Undisturbed motions, such as those of `run_motions`; those that leave the safe
-                set count until shortly before.
+            motions: Undisturbed motions, such as those of `run_motions`.
             progress: Called with the fraction done.
-            episodes: Nominal episodes with rows as far apart, which may be less calm. The safe ones
-                belong to the motions.
+            episodes: Nominal episodes, which may be less calm; the safe ones belong to the motions.
         """
         require_extra("train", "ChangeDetector.fit", "torch")
         info = motions.info
@@ -160,10 +141,7 @@ class ChangeDetector:
         every = [*usual_rows(motions), *safe_rows(episodes or [])]
         inputs, states = _split_rows(every, columns, watched)
         if len(inputs) < 2:
-            raise ValueError(
-                f"ChangeDetector: {len(inputs)} motions have three rows; two are needed, one for "
-                "the prediction and one for the limits"
-            )
+            raise ValueError(f"ChangeDetector: {len(inputs)} motions have three rows, not two")
         with threadpool_limits(1, user_api="blas"):
             # Motions alternate, so that both parts are alike.
             stride = max(2, math.ceil(info.step_s * sum(map(len, inputs)) / MOST_PREDICTOR_S))
@@ -266,9 +244,8 @@ class ChangeDetector:
     ) -> tuple[np.ndarray, list[Alarm]]:
         """Levels at each row of consecutive motions (K, n), (sum of K, n_w), and the alarms.
 
-        Between motions the charts keep their values, which the first two rows of a motion show. A
-        row that is not finite, and the two after it, are not judged, as in the diagram. Causes need
-        the names of the watched states.
+        Between motions the charts keep their values. A row that is not finite, and the two after
+        it, are not judged. Causes need the names of the watched states.
         """
         # Of no row, then of each judged one.
         errors, repeats = [np.zeros((0, len(self.watched)))], [np.zeros(1)]
@@ -313,8 +290,7 @@ class ChangeDetector:
     def with_motions(self, motions: Sequence[np.ndarray]) -> ChangeDetector:
         """Returns the nominal detector for which an actual robot's motions (K, n) are known too.
 
-        The prediction gets a linear correction. With `LEAST_MOTION_S` of motion limits widen to it,
-        and none becomes lower; with less they stay, as they would only say how little was seen.
+        The prediction gets a linear correction. With `LEAST_MOTION_S` of motion limits widen to it.
         """
         nominal = self.nominal or self
         inputs, states = _split_rows(motions, self.columns, self.watched)
@@ -336,12 +312,9 @@ class ChangeDetector:
     def cause(
         self, charts: np.ndarray, repeats: float, state_names: Sequence[str], judged: float = 1.0
     ) -> str:
-        """Says in which state an alarm shows, for how long, and of what kind it is.
+        """Says in which watched state an alarm with charts (6, n_w) shows, and of what kind it is.
 
-        Args:
-            charts: Their values at the alarm, (6, n_w).
-            state_names: Names of the watched states.
-            judged: Share of inputs that could be judged.
+        `judged` is the share of inputs that could be judged.
         """
         if judged < LEAST_JUDGED:
             return "blind: most inputs are not finite, or follow one that is not"
@@ -366,12 +339,13 @@ class ChangeDetector:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns all that `from_arrays` needs, by name."""
-        own = {f"predictor.{k}": v for k, v in self.predictor.arrays().items()} | {
+        own = {
             "deviation": self.deviation,
             "limits": self.limits,
             "columns": self.columns.astype(np.int32),
             "watched": self.watched.astype(np.int32),
             "settings": np.array([getattr(self, name) for name in _SETTINGS], dtype=float),
+            **{f"predictor.{k}": v for k, v in self.predictor.arrays().items()},
         }
         nominal = {} if self.nominal is None else self.nominal.arrays()
         return own | {f"nominal.{k}": nominal[k] for k in _ADAPTED if nominal}
@@ -380,16 +354,13 @@ class ChangeDetector:
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ChangeDetector:
         """Makes the detector of arrays written by `arrays`."""
         alarm_level, longest_repeat, step_s, motion_s = arrays["settings"].tolist()
-        groups: dict[str, dict[str, np.ndarray]] = {"predictor": {}, "nominal": {}}
-        for name, array in arrays.items():
-            group, _, rest = name.partition(".")
-            if rest:
-                groups[group][rest] = array
-        own = {name: array for name, array in arrays.items() if not name.startswith("nominal.")}
-        nominal = cls.from_arrays(own | groups["nominal"]) if groups["nominal"] else None
+        own = {k: v for k, v in arrays.items() if not k.startswith("nominal.")}
+        adapted = {k.removeprefix("nominal."): v for k, v in arrays.items() if k not in own}
+        nominal = cls.from_arrays(own | adapted) if adapted else None
+        predictor = {k.removeprefix("predictor."): v for k, v in own.items() if "predictor." in k}
         return cls(
             nominal=nominal,
-            predictor=StatePredictor.from_arrays(groups["predictor"]),
+            predictor=StatePredictor.from_arrays(predictor),
             columns=arrays["columns"].astype(int),
             watched=arrays["watched"].astype(int),
             deviation=arrays["deviation"].astype(float),
@@ -399,9 +370,6 @@ class ChangeDetector:
             step_s=step_s,
             motion_s=motion_s,
         )
-
-
-_SIDES = {"x": ("forward", "backward"), "y": ("to the left", "to the right"), "z": ("up", "down")}
 
 
 def _chosen(names: Sequence[str] | None, every: Sequence[str], what: str) -> np.ndarray:
@@ -492,4 +460,4 @@ def _free_repeats(inputs: Sequence[np.ndarray]) -> int:
 
 
 def _minutes(duration_s: float) -> str:
-    return f"{math.floor(duration_s / 60.0)} min"  # Rounded down: a little too little.
+    return f"{math.floor(duration_s / 60.0)} min"

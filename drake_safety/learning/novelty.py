@@ -22,18 +22,13 @@ _LEAST_HALF_WIDTH = 5e-2  # Of a column's range [unit of the column].
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Moments:
-    """Mean (n_x,), covariance (n_x, n_x) and range of inputs x.
-
-    Attributes:
-        least: Smallest value of each column, (n_x,); None where it is not known.
-        largest: Largest value, like `least`.
-    """
+    """Mean (n_x,), covariance (n_x, n_x) and range, `least` to `largest` (n_x,), of inputs x."""
 
     count: int
     mean: np.ndarray
     covariance: np.ndarray
-    least: np.ndarray | None = None
-    largest: np.ndarray | None = None
+    least: np.ndarray
+    largest: np.ndarray
 
     @classmethod
     def of(cls, x: np.ndarray) -> Moments:
@@ -53,16 +48,12 @@ class Moments:
         share, shift = other.count / count, other.mean - self.mean
         within = (1.0 - share) * self.covariance + share * other.covariance
         between = share * (1.0 - share) * np.outer(shift, shift)
-        least = largest = None
-        if self.least is not None and other.least is not None:
-            least = np.minimum(self.least, other.least)
-            largest = np.maximum(self.largest, other.largest)  # type: ignore[arg-type]
         return Moments(
             count=count,
             mean=self.mean + share * shift,
             covariance=within + between,
-            least=least,
-            largest=largest,
+            least=np.minimum(self.least, other.least),
+            largest=np.maximum(self.largest, other.largest),
         )
 
     @property
@@ -80,9 +71,8 @@ class Moments:
 class Distances:
     """Squared Mahalanobis distances whose variances have a lower bound along each axis.
 
-    Axes with less than the bound v share it, so their part of a distance is what the others leave
-    of the standardised offset z: Σ (aᵢ·z)²/max(vᵢ, v) = |z|²/v - Σ (aᵢ·z)² (1/v - 1/vᵢ) over the
-    axes with vᵢ > v. That takes a third of the products.
+    Axes with less than the bound v share it: Σ (aᵢ·z)²/max(vᵢ, v) = |z|²/v - Σ (aᵢ·z)² (1/v - 1/vᵢ)
+    over the axes with vᵢ > v, of a standardised offset z. That takes a third of the products.
 
     Attributes:
         mean: Mean of the known inputs, (n_x,).
@@ -139,21 +129,20 @@ def _above(variance: np.ndarray, axes: np.ndarray, least: float) -> np.ndarray:
 class Novelty:
     """Says which inputs are beyond those of training, by three Mahalanobis distances and the range.
 
-    The first is along all axes of the training inputs, with a tolerance: an input outside their
-    range is novel. The second is along their redundancies alone: an input that contradicts itself,
-    such as the features of another plan, is novel though every entry is within its range. (In
-    process monitoring they are T^2 and SPE.) The third is that of the plan alone. The range is that
-    of every column, in half widths from its centre: one entry far from all that training had is
-    novel even where the sum over many others hides it. The object is immutable.
+    The first is along all axes of the training inputs, with a tolerance. The second is along their
+    redundancies alone: an input that contradicts itself, such as the features of another plan, is
+    novel though every entry is within its range. (In process monitoring they are T^2 and SPE.) The
+    third is that of the plan alone. The range is that of every column, in half widths from its
+    centre: one entry far from all that training had is novel even where the sum over many others
+    hides it. The object is immutable.
 
     Attributes:
         centre: Centre of each column's range, (n_x,).
-        inverse_half_width: One over half of its width, with a lower bound, (n_x,); zero where the
-            range is not known.
+        inverse_half_width: One over half of its width, with a lower bound, (n_x,).
 
     Args:
         limits: Largest distances of a known input: of all of it, along redundancies, of the plan,
-            and from the centre of the range, (4,); (3,) where the range is not known.
+            and from the centre of the range, (4,).
         feedback: Moments of an actual robot's inputs, which are known as well; None before
             adaptation.
     """
@@ -165,11 +154,9 @@ class Novelty:
         self.plan = plan
         known = training if feedback is None else training.joined(feedback)
         self.quadratic = Distances(known, plan)
-        self.centre, self.inverse_half_width = known.mean, np.zeros(len(known.mean))
-        if known.least is not None and len(self.limits) > NUM_QUADRATIC:
-            half_width = 0.5 * (known.largest - known.least)
-            self.centre = known.least + half_width
-            self.inverse_half_width = 1.0 / np.maximum(half_width, _LEAST_HALF_WIDTH)
+        half_width = 0.5 * (known.largest - known.least)
+        self.centre = known.least + half_width
+        self.inverse_half_width = 1.0 / np.maximum(half_width, _LEAST_HALF_WIDTH)
         # Without other episodes to choose them from, the limits are infinite: nothing is novel that
         # is finite.
         self.inverse_limits = 1.0 / np.square(self.limits)
@@ -190,17 +177,12 @@ class Novelty:
         range_limit: float,
         plan: slice,
     ) -> Novelty:
-        """Computes the moments of training inputs and chooses the limits.
+        """Computes the moments of training inputs x (N, n_x) and chooses the limits.
 
-        Each limit is exceeded by at most a share of `rate` of the first inputs, which are as drawn,
-        and somewhere in at most that share of the safe episodes, each judged by the moments of
-        other episodes. The range of a column is as much wider than that of the inputs as one fold
-        of the episodes exceeds that of the others.
-
-        Args:
-            is_unsafe: Whether its episode ended unsafely, (N,).
-            rate: Share of episodes with a novel input, in (0, 1).
-            range_limit: Largest distance of a column from the centre of its range [half widths].
+        Each limit is exceeded by at most a share of `rate` of the episodes' first inputs, and
+        somewhere in at most that share of the safe episodes, each judged by the moments of other
+        episodes. The range of a column is as much wider than that of the inputs as one fold of the
+        episodes exceeds that of the others.
         """
         fold = np.unique(episode, return_inverse=True)[1] % _NUM_FOLDS
         distances, growth = np.full((len(x), NUM_QUADRATIC), np.inf), np.ones(x.shape[1])
@@ -241,7 +223,7 @@ class Novelty:
         )
 
     def distances(self, x: np.ndarray) -> np.ndarray:
-        """Returns the distances of inputs (N, n_x) in the order of `limits`, (N, 3) or (N, 4).
+        """Returns the distances of inputs (N, n_x) in the order of `limits`, (N, 4).
 
         An input that is not finite has infinite ones.
         """
@@ -249,8 +231,7 @@ class Novelty:
             # Rounding may make a small square negative.
             quadratic = np.sqrt(np.maximum(self.quadratic.squared(x, self.quadratic.terms), 0.0))
             every = np.column_stack([quadratic, self.offsets(x).max(axis=1)])
-            # `fmin` chooses the number beside NaN.
-            return np.fmin(every[:, : len(self.limits)], np.inf)
+            return np.fmin(every, np.inf)  # It chooses the number beside NaN.
 
     def offsets(self, x: np.ndarray) -> np.ndarray:
         """Returns how far inputs are from the centre of the range, in half widths, (N, n_x)."""
@@ -263,10 +244,9 @@ class Novelty:
         """
         with np.errstate(invalid="ignore", over="ignore"):
             largest = np.maximum.reduce(self.quadratic.squared(x, self._shares), axis=1)
-            if len(self.limits) > NUM_QUADRATIC:
-                offset = (x - self.centre) * self._range_share
-                offset *= offset
-                largest = np.maximum(largest, np.maximum.reduce(offset, axis=1))
+            offset = (x - self.centre) * self._range_share
+            offset *= offset
+            largest = np.maximum(largest, np.maximum.reduce(offset, axis=1))
             return np.fmin(np.sqrt(np.maximum(largest, 0.0)), np.inf)
 
     def contradictions(self, x: np.ndarray) -> np.ndarray:

@@ -289,9 +289,8 @@ def _novelty(x: _Value, novelty: Novelty) -> _Value:
     offset = x - quadratic.mean
     entries = offset.Concat(offset @ quadratic.axes, axis=1)
     shares = entries * entries @ (quadratic.terms * inverse[:NUM_QUADRATIC])
-    if len(inverse) > NUM_QUADRATIC:
-        scale = novelty.inverse_half_width * np.sqrt(inverse[-1])
-        outside = (x - novelty.centre) * scale
+    if inverse[-1] > 0.0:
+        outside = (x - novelty.centre) * (novelty.inverse_half_width * np.sqrt(inverse[-1]))
         shares = shares.Concat(outside * outside, axis=1)
     largest = shares.ReduceMax(axes=[1], keepdims=1)
     # Of inputs that are not finite, some entries are NaN.

@@ -51,7 +51,6 @@ class EpisodesInfo:
     Attributes:
         scenario_hash: SHA-256 of everything that determines a rollout, robot files included.
         variation: The simulated plant variation, e.g. "nominal" or "actual".
-        seed: Seed of the set, see `seeds`.
         step_s: Time between two rows of an episode [s].
         horizon: The safety assessment horizon H [samples of the preview].
         constraint_names: The n_c safety constraints: columns of `margins` and possible causes.
@@ -59,7 +58,6 @@ class EpisodesInfo:
         preview_stride: Rows between two of the H samples of a preview or a segment.
         monitored_states: States that a `ChangeDetector` predicts; None for all of them.
         monitored_features: Features by which it predicts them; None for all of them.
-        robot: Name of the robot; empty if it is unknown, or there is none.
         until: The only constraint whose violation ends an episode; empty for every one.
     """
 
@@ -82,13 +80,12 @@ class EpisodesInfo:
     until: str = ""
 
     def __post_init__(self) -> None:
-        who = f"episodes of '{self.scenario}'"
-        if not 1 <= self.horizon <= MOST_SAMPLES:
-            raise ValueError(f"{who}: horizon is {self.horizon}, expected 1..{MOST_SAMPLES}")
-        if not (self.step_s > 0.0 and self.preview_stride >= 1):
+        is_known = 1 <= self.horizon <= MOST_SAMPLES and self.preview_stride >= 1
+        if not (is_known and self.step_s > 0.0):
             raise ValueError(
-                f"{who}: step_s is {self.step_s} and preview_stride {self.preview_stride}, "
-                "expected > 0"
+                f"episodes of '{self.scenario}': horizon {self.horizon}, preview_stride "
+                f"{self.preview_stride} and step_s {self.step_s} must be positive, and the first "
+                f"at most {MOST_SAMPLES}"
             )
 
     @property
@@ -135,8 +132,7 @@ class Episode:
         true_state: State without observation noise, (K+1, n_s).
         output: Measured output z [m], (K+1, n_z).
         desired_output: Desired output z* [m], (K+1, n_z).
-        desired_preview: The next H desired outputs, row-major in time, in the frame of `state`,
-            (K+1, H*n_z).
+        desired_preview: The next H desired outputs, row-major in time, (K+1, H*n_z).
         features: Measured features, (K+1, n_f).
         margins: Signed distance to each safety constraint, negative where violated, (K+1, n_c).
         is_safe: Whether the whole rollout stayed in the safe set.
@@ -189,11 +185,10 @@ class Episodes(Sequence[Episode]):
         return len(self._episodes)
 
     def __repr__(self) -> str:
-        counts = {"safe": self.num_safe, "unsafe": self.num_unsafe, "diverged": self.num_diverged}
-        words = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
         return (
             f"Episodes('{self.info.scenario}', variation '{self.info.variation}', seed "
-            f"{self.info.seed}, {len(self)} episodes{': ' if words else ''}{words})"
+            f"{self.info.seed}, {len(self)} episodes: {self.num_safe} safe, {self.num_unsafe} "
+            f"unsafe, {self.num_diverged} diverged)"
         )
 
     @overload
@@ -272,7 +267,6 @@ class Segments:
             are those of that row.
         is_first: Whether the segment starts at its episode's `first_step`, (N,).
         remaining_steps: Rows until the episode ends, (N,).
-        is_unsafe: Whether the episode ended unsafely, (N,).
         score: Unsafety score lambda, (N,).
         cause: Column of the constraint that ended the episode, -1 when safe, (N,).
         future_margins: Smallest margins from the start to the episode's end, (N, n_c).
@@ -317,12 +311,11 @@ def joined(parts: Sequence[_Segments]) -> _Segments:
 def split(
     episodes: Episodes, *, stride: int, discount: float, shortest: int | None = None
 ) -> Segments:
-    """Splits episodes into segments of the assessment horizon H.
+    """Splits episodes into segments of H samples, ``preview_stride`` rows apart.
 
-    A segment's H samples are ``preview_stride`` rows apart, and so are the steps of R. Segments
-    start where at least ``shortest`` samples of a complete episode are left, for both labels, so
-    that a start row carries no information about the label. Segments that reach beyond the end are
-    cut short and keep the terminal sample. Diverged episodes are skipped.
+    Segments start where at least ``shortest`` samples of a complete episode are left, for both
+    labels, so that a start row carries no information about the label. Segments that reach beyond
+    the end are cut short and keep the terminal sample. Diverged episodes are skipped.
 
     Args:
         stride: Rows between two starts; `stride=H` is the paper's split.
@@ -382,7 +375,7 @@ def training_segments(episodes: Episodes, parameters: AssessmentParameters) -> S
         here, there = getattr(parameters, name), getattr(episodes.info, name)
         if here != there:
             raise ValueError(
-                f"SafetyAssessment: {name} is {here}, but that of the episodes of "
+                f"SafetyAssessment: {name} is {here}, of the episodes of "
                 f"'{episodes.info.scenario}' is {there}"
             )
     settings = mode_settings(parameters)
