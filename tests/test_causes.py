@@ -1,21 +1,23 @@
 import numpy as np
 import pytest
 
-from drake_safety.learning.causes import NO_CAUSE, cause_words, likely_causes
+from drake_safety.learning.causes import cause_words, likely_cause
+
+NAMES = ["fall", "shelf"]
 
 
 def test_smallest_relative_margin_outweighs_the_mass():
-    masses, margins = np.array([[0.6, 0.1]]), np.array([[-0.01, -0.02]])
-    np.testing.assert_array_equal(likely_causes(masses, margins), [1])
+    masses, margins = np.array([0.6, 0.1]), np.array([-0.01, -0.02])
+    assert likely_cause(NAMES, masses, margins) == "shelf"
     # One is a length and counts in centimetres, the other an angle and counts in tenths.
-    np.testing.assert_array_equal(likely_causes(masses, margins, np.array([0.01, 0.1])), [0])
+    assert likely_cause(NAMES, masses, margins, np.array([0.01, 0.1])) == "fall"
+    assert likely_cause(NAMES, masses, np.array([np.nan, 0.02])) == "shelf"
 
 
 def test_without_margins_the_mass_decides():
-    masses = np.array([[0.1, 0.3], [0.0, 0.0], [0.3, 0.1]])
-    margins = np.array([[np.nan, np.nan], [np.nan, np.nan], [np.nan, 0.02]])
-    np.testing.assert_array_equal(likely_causes(masses, margins), [1, NO_CAUSE, 1])
-    np.testing.assert_array_equal(likely_causes(np.zeros((2, 0)), np.zeros((2, 0))), [NO_CAUSE] * 2)
+    unknown = np.full(2, np.nan)
+    assert likely_cause(NAMES, np.array([0.1, 0.3]), unknown) == "shelf"
+    assert likely_cause(NAMES, np.zeros(2), unknown) == ""
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from drake_safety.cli.training_folder import MODES
 from drake_safety.files.progress import stage_of
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import ChangeDetector
-from drake_safety.learning.learning_curve import describe, learning_curve
 from drake_safety.learning.seeds import FALLS, TRAINING
 from drake_safety.learning.segments import Episodes, training_segments
 from drake_safety.simulation.capabilities import CanFall, require
@@ -55,7 +54,7 @@ def train(
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
 ) -> None:
-    """Simulate the nominal closed loop and train Γ; says whether more episodes would help.
+    """Simulate the nominal closed loop and train Γ.
 
     Episodes are kept as they finish: a stopped run continues with --resume.
     """
@@ -149,7 +148,6 @@ def train(
     if detector is not None:
         text, is_ok = detector.describe_alarms(fresh)
         console.say(text, style=None if is_ok else "yellow")
-    console.say(describe(learning_curve(load_episodes(next(iter(sets))), loaded.assessment)))
     for folder in sets:
         console.say("episodes  ", folder)
     for name in modes:

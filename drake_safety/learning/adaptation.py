@@ -20,14 +20,7 @@ _CHUNK = 2048
 
 @dataclass(frozen=True, kw_only=True)
 class Adaptation:
-    """Record of an adaptation.
-
-    Attributes:
-        method: "paper" or "recalibration".
-        variation: Plant variation of the actual episodes.
-        num_sets: Number of pairs of episodes.
-        num_differing: Number of those that ended differently.
-    """
+    """Record of an adaptation, by `num_sets` pairs, of which `num_differing` ended differently."""
 
     method: str
     variation: str
@@ -62,13 +55,8 @@ def paper_beliefs(
 class DiscrepancyFunction:
     """D(y), a Gaussian process regression of |lambda actual - lambda nominal| on Psi(x).
 
-    The kernel's amplitude is fixed at one: a fitted amplitude shrinks with the differences, which
-    makes sigma small everywhere, even without data. Length scale and noise are fitted on at most
-    250 points; the posterior is exact with all points.
-
-    Args:
-        points: Psi(x) of the feedback, (N, 2).
-        difference: |lambda actual - lambda nominal| there, (N,).
+    The kernel's amplitude is fixed at one: a fitted one makes sigma small even without data. Length
+    scale and noise are fitted on at most 250 points; the posterior is exact with all points.
     """
 
     def __init__(self, points: np.ndarray, difference: np.ndarray):
@@ -122,10 +110,6 @@ def feedback_beliefs(
 
     Departure: n_f is the number of segments in the cell. Read literally, as the number of all
     feedback, 40 leave an uncertainty of 5e-8, and one segment replaces its cell's prior.
-
-    Args:
-        certain: Beliefs of the feedback segments, mu = 0, (M, 3 + n_c).
-        cells: Cell of each, -1 for outside, (M,).
     """
     num_feedback = np.bincount(cells[cells >= 0], minlength=grid.num_cells)
     # mu_v = beta exp(-alpha (n_f - 1))

@@ -37,10 +37,9 @@ def from_scores(
     cause: np.ndarray | None = None,
     num_causes: int = 0,
 ) -> np.ndarray:
-    """Converts unsafety scores to beliefs, (N, 3 + n_c).
+    """Converts unsafety scores lambda (N,) to beliefs, (N, 3 + n_c).
 
     Args:
-        score: Unsafety scores lambda in [0, 1], (N,).
         uncertainty: mu in [0, 1], scalar or (N,).
         cause: Column of the constraint that each unsafe mass is assigned to, -1 for none, (N,).
     """
@@ -65,7 +64,7 @@ def from_scores(
 
 
 def fuse(beliefs: np.ndarray) -> np.ndarray:
-    """Applies F, the joint fusion of a set of beliefs.
+    """Applies F, the joint fusion of a set of beliefs (N, 3 + n_c), to one, (3 + n_c,).
 
     Certain beliefs (mu = 0) outweigh all others and are averaged; vacuous ones (mu = 1) have no
     weight. F accumulates no evidence (equal mu stays mu) and is not associative: fuse a set at
@@ -73,9 +72,6 @@ def fuse(beliefs: np.ndarray) -> np.ndarray:
 
     Departure: the printed products of uncertainties underflow from about 600 beliefs on. Divided
     by their common product they become the weights w = (1 - mu) / mu, which give the same value.
-
-    Returns:
-        The fused belief, (3 + n_c,); empty if the set is empty or all beliefs are vacuous.
     """
     beliefs = np.asarray(beliefs, dtype=float)
     return fuse_cells(beliefs, np.zeros(len(beliefs), dtype=int), num_cells=1, min_count=0)[0]
@@ -94,15 +90,9 @@ def fuse_cells(
     Args:
         beliefs: Beliefs, (N, 3 + n_c).
         cells: Cell of each belief, -1 for outside, (N,).
-        num_cells: Number of cells V.
         min_count: k_min, the number of beliefs below which a cell stays empty.
         multiplicity: Number of equal beliefs that each stands for, (N,); one by default.
     """
-    beliefs, cells = np.asarray(beliefs, dtype=float), np.asarray(cells)
-    if cells.shape != beliefs.shape[:1]:
-        raise ValueError(
-            f"fuse_cells: got {cells.shape} cells for beliefs of shape {beliefs.shape}"
-        )
     is_inside = cells >= 0
     times = np.ones(int(is_inside.sum())) if multiplicity is None else multiplicity[is_inside]
     beliefs, cells = beliefs[is_inside], cells[is_inside]
@@ -143,9 +133,6 @@ def average_cells(beliefs: np.ndarray, cells: np.ndarray, uncertainty: np.ndarra
         beliefs: Beliefs, mu = 0, (N, 3 + n_c).
         cells: Cell of each belief, -1 for outside, (N,).
         uncertainty: mu of each cell, (V,).
-
-    Returns:
-        Beliefs (V, 3 + n_c); cells without beliefs are empty.
     """
     num_cells, num_columns = len(uncertainty), beliefs.shape[1]
     is_inside = cells >= 0

@@ -43,7 +43,6 @@ class Calibration:
     `unsafe_below`, and "don't know" in between.
 
     Attributes:
-        kind: "plan" or "motion", the score of an episode.
         miss_rate: Promised share of unsafe episodes with the verdict "safe".
         false_alarm_rate: Promised share of safe episodes with the verdict "unsafe".
         confidence: Confidence of both rates for this calibration set; None for rates on average.
@@ -66,10 +65,7 @@ class Calibration:
 
     def __post_init__(self) -> None:
         if not self.unsafe_below <= self.threshold:
-            raise ValueError(
-                f"unsafe_below is {self.unsafe_below}, expected at most the threshold "
-                f"{self.threshold}"
-            )
+            raise ValueError(f"unsafe_below {self.unsafe_below} exceeds {self.threshold}")
 
     @property
     def promise(self) -> str:
@@ -118,9 +114,6 @@ def calibrate(
     Args:
         unsafe_score: 1 - probability of each episode, (N,); NaN counts as most unsafe.
         is_unsafe: Whether each episode ended unsafely, (N,).
-        miss_rate: Promised share of unsafe episodes with the verdict "safe", in (0, 1).
-        false_alarm_rate: Promised share of safe episodes with the verdict "unsafe", in (0, 1).
-        confidence: Confidence of both rates, in (0, 1); None for rates on average.
     """
     score, label = _checked(unsafe_score, is_unsafe)
     above = score_threshold(score, label, miss_rate, confidence=confidence)
@@ -152,11 +145,10 @@ def score_threshold(
     confidence: float | None = None,
     whose: str = "unsafe",
 ) -> float:
-    """Returns the highest score with the verdict "safe"; `calibrate` explains the arguments.
+    """Returns the highest score with the verdict "safe".
 
     It is the midpoint between the k-th lowest unsafe score and the next lower score of either
-    label; without a lower score, just below the k-th lowest. `whose` names the labelled class in
-    an error.
+    label; without a lower score, just below the k-th lowest.
     """
     score, label = _checked(unsafe_score, is_unsafe)
     if not np.isfinite(score).any():

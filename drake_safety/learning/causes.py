@@ -7,9 +7,6 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-NO_CAUSE = -1
-"""Column of a cause without evidence."""
-
 
 def is_on(flag: float) -> bool:
     """Whether an alarm is on: it is above 0.5, or not finite."""
@@ -27,44 +24,28 @@ def violated(margins: np.ndarray) -> int:
     return int(np.argmin(margins if is_finite.all() else is_finite))
 
 
-def likely_causes(
-    cause_probability: np.ndarray,
-    predicted_margins: np.ndarray,
-    margin_unit: float | np.ndarray = 1.0,
-) -> np.ndarray:
-    """Returns the constraint that is most likely to be violated first.
-
-    With predicted margins, it is the constraint with the smallest relative margin; otherwise, as in
-    the paper's mode, the one with the largest unsafe mass. Cells contain segments that end alike
-    for different reasons, so for a single motion the margins are more specific than the mass.
-
-    Args:
-        cause_probability: b_unsafe split by constraint, (N, n_c).
-        predicted_margins: Predicted margins [m, rad], (N, n_c); NaN where there are none.
-        margin_unit: Unit of the margins [m, rad], scalar or (n_c,).
-
-    Returns:
-        Columns of the constraints, (N,); `NO_CAUSE` without margins and mass.
-    """
-    probability = np.asarray(cause_probability, dtype=float)
-    relative = np.asarray(predicted_margins, dtype=float) / margin_unit
-    if probability.shape[1] == 0:
-        return np.full(len(probability), NO_CAUSE)
-    by_mass = np.where(probability.max(axis=1) > 0.0, probability.argmax(axis=1), NO_CAUSE)
-    has_margins = np.isfinite(relative).any(axis=1)
-    by_margin = np.where(np.isfinite(relative), relative, np.inf).argmin(axis=1)
-    return np.where(has_margins, by_margin, by_mass)
-
-
 def likely_cause(
     names: Sequence[str],
     cause_probability: np.ndarray,
     predicted_margins: np.ndarray,
     margin_unit: float | np.ndarray = 1.0,
 ) -> str:
-    """`likely_causes` of one input, (n_c,) each, as the constraint's name; "" without evidence."""
-    (column,) = likely_causes(cause_probability[None], predicted_margins[None], margin_unit)
-    return "" if column == NO_CAUSE else names[column]
+    """Returns the constraint that is most likely to be violated first; "" without evidence.
+
+    With predicted margins, it is the constraint with the smallest relative margin; otherwise, as in
+    the paper's mode, the one with the largest unsafe mass.
+
+    Args:
+        cause_probability: b_unsafe split by constraint, (n_c,).
+        predicted_margins: Predicted margins [m, rad], (n_c,); NaN where there are none.
+        margin_unit: Unit of the margins [m, rad], scalar or (n_c,).
+    """
+    relative = np.asarray(predicted_margins, dtype=float) / margin_unit
+    is_known = np.isfinite(relative)
+    if is_known.any():
+        return names[int(np.where(is_known, relative, np.inf).argmin())]
+    has_mass = np.max(cause_probability, initial=0.0) > 0.0
+    return names[int(np.argmax(cause_probability))] if has_mass else ""
 
 
 def cause_words(

@@ -1,14 +1,9 @@
 """The safety distance Omega between segments, as a graph of nearest neighbours.
 
 The paper names "the dynamic time warping operator" without a definition. Here it is the sum of
-squared distances along the warping path.
-
-The Euclidean distance of two error sequences, the shorter one held at its last value, is the cost
-of one admissible warping path and so bounds DTW from above. A tree finds the candidates with the
-smallest bounds; DTW is computed for these alone, so the cost grows as N log N with the number of
-segments. Segments that are close in the tree share their candidates: one call of dtaidistance's C
-implementation takes them together, and abandons a pair as soon as it exceeds the largest bound that
-matters.
+squared distances along the warping path. The Euclidean distance of two error sequences, the shorter
+one held at its last value, bounds DTW from above. A tree finds the candidates with the smallest
+bounds; DTW is computed for these alone, together for segments that are close in the tree.
 """
 
 from __future__ import annotations
@@ -56,15 +51,13 @@ def neighbour_graph(
     """Finds nearest neighbours under Omega = DTW / w_max + delta |lambda_i - lambda_j|.
 
     Args:
-        error: Error sequences z* - z [m], each held at its last value beyond its length, (N, H,
-            n_z).
+        error: Error sequences z* - z [m], (N, H, n_z).
         length: Number of valid samples of each sequence, (N,).
         score: Unsafety scores lambda, (N,).
         score_weight: delta, the weight of a score difference.
         num_neighbours: k, below N.
         num_candidates: Segments with the smallest bounds of Omega among which the neighbours of a
-            segment are sought, at least k; None for all others, with which they are exact and the
-            cost grows as N^2.
+            segment are sought, at least k; None for all others, with the cost N².
     """
     from scipy.spatial import cKDTree
 

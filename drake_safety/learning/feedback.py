@@ -35,13 +35,7 @@ _LOGGER = logging.getLogger("drake_safety")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodePair:
-    """An actual episode and its nominal twin, from the same state along the same plan.
-
-    Attributes:
-        info: Metadata of the actual episode.
-        nominal_hash: Scenario hash of the nominal plant.
-        twin_seed: Seed of the twin's set.
-    """
+    """An actual episode, with its metadata, and its nominal twin, from the same state and plan."""
 
     info: EpisodesInfo
     actual: Episode
@@ -65,10 +59,7 @@ def pair_episodes(
 ) -> list[EpisodePair]:
     """Pairs actual episodes with their nominal twins by index, without diverged pairs.
 
-    Args:
-        nominal: The twins; further episodes are ignored.
-        nominal_hash: Scenario hash of the nominal plant, if the twins' hash also covers the options
-            of the pairs; the twins' hash by default.
+    `nominal_hash` is the scenario hash of the nominal plant, if it is not that of the twins.
     """
     who = f"feedback of '{actual.info.scenario}'"
     _check_same(who, actual.info, nominal.info, _SAME_TASK)
@@ -76,15 +67,12 @@ def pair_episodes(
     pairs = []
     for episode in actual:
         if (twin := twins.get(episode.index)) is None:
-            raise ValueError(
-                f"{who}: episode {episode.index} of the variation '{actual.info.variation}' has no "
-                f"nominal twin; there are {len(twins)} twins"
-            )
+            raise ValueError(f"{who}: episode {episode.index} has no nominal twin")
         apart = np.abs(episode.true_state[0] - twin.true_state[0]).max(initial=0.0)
         if not apart <= START_TOLERANCE:
             raise ValueError(
-                f"{who}: the twin of episode {episode.index} starts in another state; their first "
-                f"states differ by {apart:.3g}"
+                f"{who}: the twin of episode {episode.index} starts in another state, {apart:.3g} "
+                "apart"
             )
         if DIVERGED in (episode.cause, twin.cause):
             _LOGGER.info("pair %d of '%s' diverged", episode.index, actual.info.scenario)
@@ -138,11 +126,7 @@ def used_episodes(feedback: Sequence[EpisodePair]) -> list[UsedEpisodes]:
 
 @dataclass(kw_only=True, eq=False)
 class FeedbackSegments(Segments):
-    """Segments of actual episodes, beside what became of their twins.
-
-    Attributes:
-        nominal_score: lambda of the twin, (N,).
-    """
+    """Segments of actual episodes, and the unsafety scores of their twins, (N,)."""
 
     nominal_score: np.ndarray
 
@@ -152,8 +136,7 @@ def feedback_segments(
 ) -> FeedbackSegments:
     """Splits actual episodes into segments as training episodes are split.
 
-    A twin that has left the safe set before a segment starts scores 1 there. As in training, an
-    unsafe episode has segments only where a complete one has them.
+    A twin that has left the safe set before a segment starts scores 1 there.
     """
     settings, discount = mode_settings(parameters), parameters.discount
     parts = []

@@ -19,26 +19,16 @@ from drake_safety.learning.training_scores import TrainingScores
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LabelledHeads:
-    """Heads and activations for rows of episodes, with the episodes' labels.
+    """Heads and activations for rows of episodes, with the episodes' labels and sample weights."""
 
-    Attributes:
-        heads: Inputs of the base logit, see `BaseLogit.heads`, (M, 2) or (M, 3).
-        activations: Activations of the maps' last hidden layer, (K, M, n).
-        is_unsafe: Whether the row's episode ended unsafely, (M,).
-        weight: Sample weight, (M,).
-    """
-
-    heads: np.ndarray
-    activations: np.ndarray
+    heads: np.ndarray  # (M, 2) or (M, 3)
+    activations: np.ndarray  # (K, M, n)
     is_unsafe: np.ndarray
     weight: np.ndarray
 
 
 def row_weights(num_rows: np.ndarray) -> np.ndarray:
-    """Returns sample weights: one for an episode's first row, and two spread over all its rows.
-
-    The rows of an episode share one label, so an episode counts as a few samples.
-    """
+    """Returns sample weights: one for an episode's first row, and two spread over all its rows."""
     first = np.cumsum(num_rows) - num_rows
     weight = np.repeat(2.0 / num_rows, num_rows)
     weight[first] += 1.0
@@ -147,14 +137,12 @@ def recalibrated(
     """Returns the correction and the beliefs, (K, R*R, 3 + n_c), by feedback and its segments.
 
     Only pairs with different outcomes are evidence of a reality gap; without any, the correction is
-    zero. Training scores are shifted as the base logit is; cells that training leaves empty are
-    filled by the feedback.
+    zero. Cells that training leaves empty are filled by the feedback.
 
-    Departure: the paper raises the uncertainty where nominal scores are unreliable. That hardly
-    changes the safe share of a cell, as F keeps the ratio of its masses and the discrepancy has no
-    sign. Adding sigma(ell + shift) - sigma(ell) to every score moves the boundary between safe and
-    unsafe. The hidden layer's contribution is known at the feedback only; its mean in a cell is
-    used for all training segments of the cell.
+    Departure: the paper raises the uncertainty where nominal scores are unreliable, which hardly
+    changes the safe share of a cell. Adding sigma(ell + shift) - sigma(ell) to every score moves
+    the boundary between safe and unsafe. The hidden layer's contribution is known at the feedback
+    only; its mean in a cell is used for all training segments of the cell.
     """
     assert model.base_logit is not None
     assert training.heads is not None and training.nearest is not None

@@ -1,9 +1,8 @@
 """Default seeds of each purpose, and the seeds that an assessment has used.
 
 Episode i of a set draws from `SeedSequence(seed, spawn_key=(i,))`: sets with one seed start in the
-same states for every plant. Episodes for evaluation must not share a seed with those used for
-training, calibration or adaptation. Choices are made on the default seeds; the figures of a release
-are of other ones, `RELEASE` above them, which nothing looks at before.
+same states for every plant. Choices are made on the default seeds; the figures of a release are of
+other ones, `RELEASE` above them, which nothing looks at before.
 """
 
 from __future__ import annotations
@@ -23,12 +22,7 @@ RELEASE = max(_RELEASES.values())
 
 
 class SeedBlock(NamedTuple):
-    """Consecutive seeds, one for each set of episodes that a command draws.
-
-    Attributes:
-        first: Default of the first seed; the blocks are at least 100 000 apart.
-        purposes: Purposes of the sets, in the order of their seeds.
-    """
+    """Consecutive seeds, the first one as a default, of the sets of episodes of a command."""
 
     first: int
     purposes: tuple[str, ...]
@@ -69,10 +63,6 @@ GATE = SeedBlock(11_000_000, ("pairs of two loops",))
 RATE = SeedBlock(12_000_000, ("failure rate",))
 FALLS = SeedBlock(13_000_000, ("falls",))
 """Episodes that go on after they leave the safe set."""
-BLOCKS = (
-    *(TRAINING, EVALUATION, CALIBRATION, PLANNING, ADAPTATION),
-    *(DEMONSTRATION, SHIFTS, MOTION, FRESH_MOTION, ANOMALIES, WALKING, GATE, RATE, FALLS),
-)
 
 
 def use_of(seed: int) -> str:
@@ -86,12 +76,7 @@ def _version(seed: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class UsedEpisodes:
-    """A set of episodes that an assessment has used.
-
-    Attributes:
-        purpose: "training", "falls", "calibration" or "adaptation".
-        seed: Seed of the set, or `NOT_DRAWN`.
-    """
+    """A set of episodes that an assessment has used for training, calibration or adaptation."""
 
     purpose: str
     variation: str
