@@ -273,14 +273,6 @@ def test_discrepancy_is_high_where_scores_differ_and_unknown_far_away():
         DiscrepancyFunction(points[7:8], np.ones(1))
 
 
-@pytest.mark.train
-def test_papers_update_of_sharpened_mode(sharpened):
-    adapted = sharpened.adapt(worse(), method="paper")
-    assert adapted.adaptation_.method == "paper"
-    np.testing.assert_array_equal(adapted.correction_.change, 0.0)
-    assert np.any(adapted.beliefs_[..., UNCERTAINTY] < 0.29)
-
-
 def test_diverged_pair_is_left_out():
     episodes = make_episodes(4, noise=0.002)
     broken = [replace(e, is_safe=False, cause="diverged") if e.index == 1 else e for e in episodes]
@@ -328,8 +320,6 @@ def test_crowded_cells_keep_few_segments_and_beliefs_of_all():
     [
         ("sharpened", {"scenario": "other"}, {}, "scenario differs: it is other, expected lip"),
         ("sharpened", {"constraint_names": ["a", "b"]}, {}, "constraint_names differs"),
-        ("sharpened", {}, {"method": "luck"}, "cannot adapt by 'luck'"),
-        ("paper", {}, {"method": "recalibration"}, "'recalibration' needs maps with heads"),
     ],
 )
 def test_feedback_and_methods_that_do_not_fit_are_refused(fitted, mode, changed, options, message):

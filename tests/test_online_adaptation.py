@@ -31,9 +31,9 @@ class Prior:
         self.parameters = SimpleNamespace(adaptation=AdaptationParameters(**settings))
         self.motions = []
 
-    def adapt(self, feedback, *, method=None, motions=None):
+    def adapt(self, feedback, *, motions=None):
         self.motions.append(motions)
-        return (method, len(feedback))
+        return len(feedback)
 
 
 class Watching:
@@ -67,9 +67,7 @@ def run(duration_s, capacity=400, prior=None, watching=None, **settings):
     )
 
     prior = prior or Prior(**settings)
-    adaptation = OnlineAdaptation(
-        None, prior, recorder, assessor, method="paper", capacity=capacity
-    )
+    adaptation = OnlineAdaptation(None, prior, recorder, assessor, capacity=capacity)
     simulator = Simulator(diagram)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(
@@ -90,7 +88,7 @@ def test_every_k_u_sets_the_assessor_adopts_what_all_feedback_has_shown(
     # Windows of four steps.
     adaptation, adopted = run(duration_s, update_interval=interval)
     assert len(adaptation.feedback) == duration_s // 0.4
-    assert adaptation.adapted == [("paper", number) for number in numbers]
+    assert adaptation.adapted == list(numbers)
     assert [adapted for _, adapted in adopted] == adaptation.adapted
     # At the last row of a window, and not within a step of the simulator.
     times = [0.4 * number for number in numbers]

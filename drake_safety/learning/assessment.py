@@ -248,30 +248,21 @@ class SafetyAssessment:
         self,
         feedback: Sequence[EpisodePair],
         *,
-        method: str | None = None,
         motions: Episodes | Sequence[np.ndarray] | None = None,
     ) -> SafetyAssessment:
         """Returns a copy adapted to feedback from the actual robot.
 
-        Every adaptation starts from the nominal episodes, as F is not associative: pass all
-        feedback, not only the new pairs.
+        In the paper's mode, a discrepancy function and feedback beliefs update the beliefs; when
+        sharpened, base logit and training scores are recalibrated. Every adaptation starts from the
+        nominal episodes, as F is not associative: pass all feedback, not only the new pairs.
 
         Args:
-            method: "recalibration" corrects the base logit and with it the training scores;
-                "paper" is the paper's update by a discrepancy function and feedback beliefs.
-                Default: "recalibration" for maps with heads, else "paper".
             motions: Motion of the actual robot that the monitor is to know as well, or its rows
                 (state, desired preview, features), (K, n) each, as far apart as in its training.
         """
         require_extra("train", "SafetyAssessment.adapt", "sklearn")
         model, columns, parameters = self.model, self.columns_, self.parameters
         parameters.check()
-        methods = ("paper",) if model.base_logit is None else ("recalibration", "paper")
-        method = method or methods[0]
-        if method not in methods:
-            raise ValueError(
-                f"{self._who}: cannot adapt by '{method}'; the methods are {list(methods)}"
-            )
         check_feedback(feedback, self.info_)
         used = used_episodes(feedback)
         self.check_unused(*{one_set.seed for one_set in used}, purpose="adaptation")
@@ -286,10 +277,9 @@ class SafetyAssessment:
         # The thresholds' promises hold for the old beliefs only.
         adapted.calibrations_ = {}
         adapted._replace_used("adaptation", used)
-        if method == "paper":
+        if model.base_logit is None:
             x = columns.of(segments.state, segments.desired_preview, segments.features)
             points = model.embedding.embed(x)
-            adapted.correction_ = Correction.none(model.embedding, model.grid, model.trees)
             adapted.beliefs_ = paper_beliefs(
                 self.training_, segments, points, model.grid, parameters, model.num_causes
             )
@@ -298,7 +288,7 @@ class SafetyAssessment:
                 model, feedback, segments, self.training_, columns, parameters
             )
         adapted.adaptation_ = Adaptation(
-            method=method,
+            method="paper" if model.base_logit is None else "recalibration",
             variation=feedback[0].info.variation,
             num_sets=len(feedback),
             num_differing=sum(pair.differs for pair in feedback),

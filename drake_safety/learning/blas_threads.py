@@ -1,8 +1,4 @@
-"""One thread for BLAS around a tick, whatever the user's settings.
-
-A small product takes microseconds in one thread. Handed to a pool it takes no less, and the idle
-threads spin for milliseconds after it.
-"""
+"""One thread for BLAS around a tick: the idle threads of a pool would spin for milliseconds."""
 
 from __future__ import annotations
 
@@ -21,8 +17,7 @@ _R = TypeVar("_R")
 class OneBlasThread:
     """A context in which BLAS runs in the calling thread; the settings are restored after it.
 
-    Contexts may be nested, and entered by several threads at once: the first one changes the
-    process' setting and the last one restores it. What somebody else changes meanwhile stays.
+    Contexts may be nested, and entered by several threads at once.
     """
 
     def __init__(self) -> None:

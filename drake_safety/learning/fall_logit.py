@@ -15,14 +15,10 @@ _INVERSE_PENALTY = 0.01  # Of inputs with unit variance.
 
 @dataclass(frozen=True, kw_only=True)
 class FallLogit:
-    """A logit of a fall, linear in an assessment's outputs and some of its inputs.
+    """A logit of a fall, linear in predicted margins, unsafe logit, and some columns of x.
 
     Departure: the paper's Γ has learned whether a motion leaves the safe set, which a walking robot
     often does without a fall.
-
-    Attributes:
-        columns: Columns of x that are inputs.
-        weights: Weights of the n_c predicted margins, the logit of an unsafe end, and the columns.
     """
 
     columns: tuple[NonNegativeInt, ...]

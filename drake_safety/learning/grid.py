@@ -19,16 +19,13 @@ _FILL = 1.1
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """A grid of resolution x resolution square cells, centred at the origin.
+    """A grid of R x R square cells, R the resolution, centred at the origin.
 
-    Cell (i, j) has the index i * resolution + j, where i counts along the first coordinate. A cell
-    contains its lower edges but not its upper ones.
+    Cell (i, j) has the index i * R + j, where i counts along the first coordinate. A cell contains
+    its lower edges but not its upper ones.
 
-    Attributes:
-        resolution: Number of cells a side, R.
-        cell_length: Side of a cell, in units of the embedding.
-        interpolates: Whether `read` interpolates between the cells' centres. Departure
-            ("sharpened" only): the paper reads the cell that contains Psi(x).
+    Departure ("sharpened" only): `read` interpolates between the cells' centres; the paper reads
+    the cell that contains Psi(x).
     """
 
     resolution: int
@@ -68,8 +65,7 @@ class Grid:
     def scale(self, points: np.ndarray) -> np.ndarray:
         """Centres points (N, 2) and scales them to 1.1 * max|y| = half width.
 
-        Departure: the extent of a t-SNE embedding grows with the number of points, so a cell length
-        in its units is not comparable across data sets.
+        Departure: the extent of a t-SNE embedding grows with the number of points.
         """
         centred = points - points.mean(axis=0)
         extent = float(np.abs(centred).max())
@@ -100,8 +96,7 @@ class Grid:
             values: Values of every cell of K grids, (K, R*R, C).
 
         Returns:
-            The values at the points, (K, N, C), zero outside the grid, and whether each point is
-            inside, (K, N).
+            The values (K, N, C), zero outside the grid, and whether points are inside, (K, N).
         """
         last = self.resolution - 1.0
         position = points / self.cell_length

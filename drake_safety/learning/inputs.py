@@ -16,12 +16,7 @@ def preview_names(info: EpisodesInfo) -> list[str]:
 class InputColumns:
     """The columns of x: [s; z*] in the paper's mode, [s; z*; features] when sharpened.
 
-    A feature unit u appends asinh(features / u).
-
-    Attributes:
-        has_features: Whether x has features.
-        plan: Which columns are the plan z*.
-        names: Names of the columns, (n_x,).
+    A feature unit u appends asinh(features / u). `plan` are the columns of z*.
     """
 
     def __init__(self, info: EpisodesInfo, parameters: AssessmentParameters):
@@ -43,23 +38,16 @@ class InputColumns:
     def of(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
-        """Returns x, (..., n_x).
+        """Returns x, (..., n_x), of inputs (..., n_s), (..., H*n_z) and (..., n_f).
 
-        Args:
-            state: Measured states, (..., n_s).
-            desired_preview: Desired outputs over the horizon, row-major in time, (..., H*n_z).
-            features: Features, (..., n_f); ignored in the paper's mode.
+        Features are ignored in the paper's mode.
         """
         parts: list[np.ndarray] = []
         given = (state, desired_preview, features)
         for (name, width), values in zip(self._widths.items(), given, strict=False):
             if values is None:
                 raise ValueError(f"{self._who}: {name} are missing, expected {width} columns")
-            try:
-                part = floats(values)
-            except (TypeError, ValueError) as error:
-                message = f"{self._who}: {name} must be an array of numbers: {error}"
-                raise ValueError(message) from error
+            part = floats(values)
             leading = parts[0].shape[:-1] if parts else part.shape[:-1]
             if part.shape != (*leading, width):
                 raise ValueError(

@@ -32,21 +32,13 @@ _Report = Callable[[float], object]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapData(Points):
-    """Training data of a map Psi.
+    """Training data of a map Psi."""
 
-    Attributes:
-        x: Inputs, (N, n_x).
-        is_unsafe: Whether the input's episode ended unsafely, (N,).
-        margins: Smallest future margins, (N, n_c).
-        sample_weight: Weight of each input in all losses, (N,).
-        input_scale: Spread of each column of x after standardisation, (n_x,).
-    """
-
-    x: np.ndarray
+    x: np.ndarray  # (N, n_x)
     is_unsafe: np.ndarray
-    margins: np.ndarray
+    margins: np.ndarray  # The smallest until the episode's end, (N, n_c).
     sample_weight: np.ndarray
-    input_scale: np.ndarray
+    input_scale: np.ndarray  # Spread of each column of x after standardisation, (n_x,).
 
     def take(self, rows: np.ndarray) -> MapData:
         """Selects inputs by a mask (N,)."""

@@ -18,12 +18,7 @@ from drake_safety.learning.segments import Segments
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Points:
-    """t-SNE's points of segments.
-
-    Attributes:
-        has_target: Whether the segment has a point, (N,).
-        target: The points of these segments, scaled to the grid, (M, 2).
-    """
+    """Which segments have a point of t-SNE, (N,), and these points, scaled to the grid, (M, 2)."""
 
     has_target: np.ndarray
     target: np.ndarray
@@ -35,10 +30,7 @@ def embedded_points(
     parameters: AssessmentParameters,
     progress: StageProgress | None = None,
 ) -> Points:
-    """Embeds segments by t-SNE, scaled to the grid; when sharpened, a segment every H/2 samples.
-
-    `progress` is called with "distances" or "t-SNE", the percentage done and 100.
-    """
+    """Embeds segments by t-SNE, scaled to the grid; when sharpened, a segment every H/2 samples."""
     _, first, episode = np.unique(segments.episode, return_index=True, return_inverse=True)
     since_start = segments.start_row - segments.start_row[first][episode]
     has_target = since_start % mode_settings(parameters).target_stride == 0
@@ -47,7 +39,7 @@ def embedded_points(
         raise ValueError(
             f"SafetyAssessment: perplexity {parameters.perplexity} needs more than "
             f"{num_neighbours} segments, the {len(first)} episodes give {num_targeted}: record "
-            "more episodes, or lower the perplexity"
+            "more episodes"
         )
     targeted = segments.take(has_target)
     graph = neighbour_graph(
@@ -77,15 +69,7 @@ def tsne(
     seed: int,
     progress: Callable[[float], object] = ignore,
 ) -> np.ndarray:
-    """Computes the t-SNE embedding of a neighbour graph, (N, 2), deterministically for a seed.
-
-    Distances are not squared here: openTSNE squares them. It runs on one thread, as more threads
-    do not speed up the FFT of large sets.
-
-    Args:
-        perplexity: Effective number of neighbours.
-        exaggeration: Factor of the attraction after the early phase, 1 for plain t-SNE.
-    """
+    """Computes the t-SNE embedding of a neighbour graph, (N, 2), deterministically for a seed."""
     import openTSNE
     from openTSNE.affinity import PerplexityBasedNN
     from openTSNE.initialization import spectral

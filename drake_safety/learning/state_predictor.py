@@ -28,19 +28,13 @@ class StatePredictor:
     usual range of an input it extrapolates and its errors say less: they are divided by the square
     root of one plus the largest distance from that range, in standard deviations. Without it a
     rare stumble of a walking robot looks like a changed plant.
-
-    Attributes:
-        mean, scale: Standardisation of an input, (n_u,).
-        low, high: Usual range of a standardised input, (n_u,).
-        unit: Standard deviations of the change, (n_w,).
-        weights: The linear map's and the layers' weights and biases, by name.
     """
 
     mean: np.ndarray
     scale: np.ndarray
-    low: np.ndarray
+    low: np.ndarray  # Usual range of a standardised input, (n_u,).
     high: np.ndarray
-    unit: np.ndarray
+    unit: np.ndarray  # Standard deviations of the change, (n_w,).
     weights: Mapping[str, np.ndarray]
 
     @classmethod

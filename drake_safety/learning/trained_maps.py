@@ -22,18 +22,11 @@ def are_usable(x: np.ndarray) -> bool:
 
 
 class EmbeddingOutput(NamedTuple):
-    """Outputs of a stack of K maps.
+    """Outputs of a stack of K maps; without heads, the logit is NaN, and there are no margins."""
 
-    Attributes:
-        embedding: y, (K, N, 2).
-        unsafe_logit: Logit of an unsafe end, (K, N); NaN for maps without heads.
-        margins: Predicted smallest future margin of each constraint [unit of the margins], (K, N,
-            n_c); no columns for maps without heads.
-    """
-
-    embedding: np.ndarray
-    unsafe_logit: np.ndarray
-    margins: np.ndarray
+    embedding: np.ndarray  # y, (K, N, 2)
+    unsafe_logit: np.ndarray  # (K, N)
+    margins: np.ndarray  # (K, N, n_c)
 
 
 class Embedding:

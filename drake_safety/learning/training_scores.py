@@ -23,8 +23,7 @@ class TrainingScores:
         points: Psi(x), (K, N, 2).
         score: lambda, (N,).
         cause: Column of the constraint that ended the episode, -1 when safe, (N,).
-        heads: Inputs of the base logit, see `BaseLogit.heads`, (N, 2) or (N, 3); None for maps
-            without heads.
+        heads: Inputs of the base logit, see `BaseLogit.heads`; None for maps without heads.
         nearest: Column of the constraint with the smallest predicted margin, (N,).
         multiplicity: Number of segments that each stands for, (N,); None for one each.
         count: Number of all training segments in every map's cells, (K, R*R); None if none of them

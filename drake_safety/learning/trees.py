@@ -18,9 +18,9 @@ _CHUNK = 16  # Rows, whose comparisons fit into the cache.
 class Trees:
     """An immutable sum of T decision trees: a logit of an unsafe end.
 
-    At a node with ``x[feature] > threshold`` an input goes to the right, in single precision. There
-    is no walk from root to leaf: every such node excludes the leaves on its left, and the first
-    leaf that no node excludes is reached ("QuickScorer", Lucchese et al., 2015).
+    At a node with ``x[feature] > threshold``, in single precision, an input goes to the right: the
+    node excludes the leaves on its left. The first leaf that no node excludes is reached
+    ("QuickScorer", Lucchese et al., 2015).
 
     Args:
         feature: Columns of x that the nodes compare, (M, T), M < 32.
@@ -60,10 +60,7 @@ class Trees:
     ) -> Trees:
         """Learns from finite inputs x (N, n_x) with both labels, deterministically for a seed.
 
-        Args:
-            weight: Weights of the inputs in the log loss, (N,).
-            is_held_out: Inputs, (N,), on which alone the number of trees is chosen.
-            num_trees: Number of trees, or the largest with held-out inputs.
+        With held-out inputs, `num_trees` is the largest number of trees; it is chosen on these.
         """
         from sklearn.ensemble import HistGradientBoostingClassifier
         from threadpoolctl import threadpool_limits
@@ -115,10 +112,7 @@ class Trees:
         return cls(feature=feature, threshold=single, left=left, value=value)
 
     def evaluate(self, x: np.ndarray) -> np.ndarray:
-        """Returns the logit at inputs (N, n_x), (N,); NaN for rows that are not finite.
-
-        A row has the same bits whatever the others are.
-        """
+        """Returns the logit (N,) at inputs (N, n_x), whatever the others; NaN if not finite."""
         if not are_usable(x):
             is_usable = (np.abs(x) < INPUT_LIMIT).all(axis=1)  # False for NaN.
             if not is_usable.all():

@@ -51,11 +51,10 @@ class OnlineAdaptation:
         recorder: FeedbackRecorder,
         assessor: MonitoredSafetyAssessor,
         *,
-        method: str | None = None,
         capacity: int = 400,
     ):
         require_extra("train", "OnlineAdaptation", "sklearn")
-        self._scenario, self._prior, self._method = scenario, prior, method
+        self._scenario, self._prior = scenario, prior
         self._recorder, self._assessor = recorder, assessor
         self._capacity, self._num_new = capacity, 0
         # Rows of the monitor, and None between motions.
@@ -111,7 +110,7 @@ class OnlineAdaptation:
         self._num_new = 0
         runs = itertools.groupby(self._motion, lambda row: row is not None)
         motions = [np.array([*rows]) for is_motion, rows in runs if is_motion]
-        adapted = self._prior.adapt(self.feedback, method=self._method, motions=motions)
+        adapted = self._prior.adapt(self.feedback, motions=motions)
         self.adapted = [*self.adapted, adapted][-_KEPT_UPDATES:]
         self.num_updates += 1
         self._assessor.adopt(self._assessor.GetMyMutableContextFromRoot(root_context), adapted)
