@@ -265,7 +265,7 @@ def test_a_strangers_scenario_is_checked_without_running_its_code(tmp_path, monk
     [
         ("name", "\x1b[2J\nOK  ready", "␛[2J\n    OK  ready"),
         ("name", "b\u202eyb", "b\ufffdyb"),
-        ("requires", "x; rm -rf ~", "must be a package"),
+        ("requires", "x; rm -rf ~", "must match pattern"),
     ],
 )
 def test_texts_of_strangers_print_nothing_but_themselves(tmp_path, key, text, seen):

@@ -25,7 +25,7 @@ def open_stages(
     It prints to standard error by default, a line at least every `period_s`.
     """
     console = console or Console(stderr=True)
-    # A log file that is told to have colours is no terminal either.
+    # A log file that is to have colours is no terminal either.
     is_live = console.is_jupyter or (console.is_interactive and console.file.isatty())
     numbers = [
         columns.MofNCompleteColumn(),
@@ -55,29 +55,22 @@ def open_stages(
             print_task(task)
 
     def print_task(task: columns.Task) -> None:
-        print_line(f"{task.description}:", *(str(column(task)) for column in numbers))
-
-    def print_line(*words: str) -> None:
         if not is_live:
+            words = f"{task.description}:", *(str(column(task)) for column in numbers)
             console.print(*words, highlight=False, markup=False, soft_wrap=True)
 
     def tick() -> None:
-        while not is_over.wait(None if is_live else period_s):
-            unfinished = [task for task in bars.tasks if not task.finished]
-            for task in unfinished:
-                print_task(task)
-            if not unfinished:
-                after = f", after '{bars.tasks[-1].description}'" if bars.tasks else ""
-                print_line(f"still working{after}")
+        while not is_over.wait(period_s):
+            for task in bars.tasks:
+                if not task.finished:
+                    print_task(task)
 
-    ticking = threading.Thread(target=tick, name="progress", daemon=True)
-    ticking.start()
+    threading.Thread(target=tick, name="progress", daemon=True).start()
     with bars:
         try:
             yield report
         finally:
             is_over.set()
-            ticking.join()
 
 
 @contextmanager

@@ -25,8 +25,7 @@ def reading(
 ) -> Iterator[None]:
     """Context manager in which a file is read: errors become `ValueError` with its name.
 
-    ``what``, such as "log", precedes the name. Readers of foreign formats raise any ``errors``;
-    those of the operating system, and classes of errors of this package, pass unchanged.
+    ``what``, such as "log", precedes the name. Readers of foreign formats raise any ``errors``.
     """
     try:
         yield
@@ -36,8 +35,6 @@ def reading(
         if is_of_system or is_own or not isinstance(error, errors):
             raise
         text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-        if isinstance(error, RecursionError):
-            text = "it is nested too deeply"
         if type(error) is not ValueError or str(path) not in text:
             text = f"{what} '{path}': {text}" if what else f"{path}: {text}"
         raise ValueError(shortened(text)) from error
@@ -51,8 +48,7 @@ def shortened(text: str) -> str:
 def check_memory(num_bytes: int, who: str) -> None:
     """Raises ValueError if the content of a file, by its header, takes too much memory."""
     if num_bytes > _MOST_BYTES:
-        gigabytes = f"{num_bytes / 1e9:.3g} GB; expected at most {_MOST_BYTES / 1e9:.3g} GB"
-        raise ValueError(f"{who} would take {gigabytes}")
+        raise ValueError(f"{who} would take {num_bytes / 1e9:.3g} GB")
 
 
 def is_number(value: Any) -> bool:
@@ -66,7 +62,7 @@ def is_number(value: Any) -> bool:
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """`` (did you mean 'x'?)`` for an error message, or "" if no known name is like it."""
-    near = difflib.get_close_matches(str(name), [str(one) for one in known], n=1, cutoff=0.7)
+    near = difflib.get_close_matches(str(name), [str(word) for word in known], n=1, cutoff=0.7)
     return f" (did you mean '{near[0]}'?)" if near else ""
 
 
@@ -113,10 +109,10 @@ def parse_yaml(text: str, who: str, loader: type[yaml.SafeLoader] = YamlLoader) 
         raise ValueError(f"{who}: {error}") from error
     pending, num_values = [value], 0
     while pending:
-        one = pending.pop()
+        item = pending.pop()
         num_values += 1
         if num_values > _MOST_VALUES:
             raise ValueError(f"{who} has more than {_MOST_VALUES} values with its aliases")
-        if isinstance(one, dict | list):
-            pending += [*one, *one.values()] if isinstance(one, dict) else one
+        if isinstance(item, dict | list):
+            pending += [*item, *item.values()] if isinstance(item, dict) else item
     return value

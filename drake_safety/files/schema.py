@@ -52,15 +52,6 @@ def _pattern(text: str) -> str:
     return text
 
 
-def _requirement(text: str) -> str:
-    """A package that a message advises to install: no options, nothing that a shell reads."""
-    if not re.fullmatch(
-        r"([A-Za-z0-9][\w.\[\],-]*( ?@ ?[\w.:/+@%-]+|[=<>~!][=<>~!.*,+\w-]*)?)?", text
-    ):
-        raise ValueError("must be a package, such as name==1.0")
-    return text
-
-
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -72,7 +63,9 @@ Bounds = Annotated[Pair[_Value], AfterValidator(_ascending)]
 """Lowest and highest, which may be the same."""
 Interval = Annotated[Pair[FiniteFloat], AfterValidator(_increasing)]
 Pattern = Annotated[str, AfterValidator(_pattern)]
-Requirement = Annotated[str, AfterValidator(_requirement)]
+_PACKAGE = r"^([A-Za-z0-9][\w.\[\],-]*( ?@ ?[\w.:/+@%-]+|[=<>~!][=<>~!.*,+\w-]*)?)?$"
+Requirement = Annotated[str, Field(pattern=_PACKAGE)]
+"""A package that a message advises to install: no options, nothing that a shell reads."""
 
 
 def check_times(who: str, *, or_zero: Collection[str] = (), **times: Any) -> None:
