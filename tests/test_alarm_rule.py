@@ -72,7 +72,6 @@ SAFE, UNSAFE, UNKNOWN = [0.7, 0.0, 0.3], [0.1, 0.6, 0.3], [0.0, 0.0, 1.0]
         ("", 0, UNKNOWN, UNKNOWN, "don't know: unlike training"),
         ("", 1, UNKNOWN, SAFE, "don't know: monitor's alarm since 0.10 s"),
         ("steps: ", 1, UNKNOWN, UNSAFE, "probability 0.030 < 0.06; likely cause: height, -2.0 cm"),
-        ("steps: ", 1, UNKNOWN, UNKNOWN, "don't know: unlike training"),
     ],
 )
 def test_an_event_names_the_reason_of_a_low_probability(

@@ -8,7 +8,6 @@ from lip_episodes import make_episodes
 from studies.baselines import (
     KINDS,
     DirectClassifier,
-    auc_difference,
     classifier_differences,
     classifier_scorers,
 )
@@ -49,14 +48,6 @@ def test_an_input_that_is_not_finite_is_unknown_and_disturbs_no_other(classifier
     probability = predict(classifier, some)
     assert np.flatnonzero(np.isnan(probability)).tolist() == [2, 4]
     np.testing.assert_allclose(probability[[0, 1, 3, 5]], expected[[0, 1, 3, 5]], rtol=1e-9)
-
-
-def test_a_classifier_without_features_has_the_papers_input(training, fresh):
-    blind = DirectClassifier("gradient_boosting", uses_features=False).fit(training)
-    other = fresh.take(np.arange(9))
-    expected = predict(blind, other)
-    other.features[:] = 7.0
-    np.testing.assert_array_equal(predict(blind, other), expected)
 
 
 def test_early_stopping_holds_out_whole_episodes(training):
@@ -107,18 +98,3 @@ def test_gamma_is_compared_with_the_mean_over_the_seeds_of_each_kind():
     each = [classifier_differences(gamma, [*equal, one], test) for one in worse]
     for key in (("difference.rows", "mlp", "auc"), ("difference.first", "mlp", "brier")):
         assert found[key].value == pytest.approx(np.mean([one[key].value for one in each]))
-
-
-def test_a_scorer_does_not_differ_from_itself_and_its_difference_is_antisymmetric(fresh):
-    label, episode = fresh.is_unsafe, fresh.episode
-    one, other = (label + np.random.default_rng(seed).normal(size=len(label)) for seed in range(2))
-    same = auc_difference(one, one, label, episode)
-    assert (same.value, same.low, same.high) == (0.0, 0.0, 0.0)
-    forth, back = (
-        auc_difference(one, other, label, episode),
-        auc_difference(other, one, label, episode),
-    )
-    assert (
-        forth.value == -back.value == area_under_curve(one, label) - area_under_curve(other, label)
-    )
-    assert forth.low == pytest.approx(-back.high)

@@ -80,12 +80,7 @@ def test_cells_are_fused_each_for_itself_from_the_minimum_count_on(beliefs, min_
     ("make", "message"),
     [
         (lambda: from_scores(np.array([1.5]), 0.3), "every score must lie"),
-        (lambda: from_scores(np.array([0.5]), np.array([np.nan])), "every uncertainty must lie"),
         (lambda: from_scores(np.array([0.5]), 0.3, np.array([-1]), 2), "needs a cause"),
-        (
-            lambda: fuse_cells(empty(3), np.zeros(2, dtype=int), num_cells=1, min_count=1),
-            "cells for beliefs",
-        ),
     ],
 )
 def test_beliefs_that_cannot_be_are_refused(make, message):

@@ -37,13 +37,6 @@ def test_nested_contexts_and_errors_restore_the_settings():
     assert num_threads() == {2}
 
 
-def test_setting_that_somebody_changes_meanwhile_stays():
-    with ONE_BLAS_THREAD:
-        limits = threadpool_limits(3, user_api="blas")
-    assert num_threads() == {3}
-    limits.restore_original_limits()
-
-
 def test_ticks_of_several_threads_restore_the_settings_after_the_last_one():
     barrier = Barrier(4, timeout=30.0)
 

@@ -76,7 +76,6 @@ def test_frozen_input_is_noticed_after_few_repeats():
     ("names", "value", "is_square", "cause"),
     [
         (["base_x", "velocity_y"], [0.0, 7.0], False, "pushed steadily to the left (velocity_y +7"),
-        (["base_x", "velocity_y"], [0.0, 8.0], True, "velocity_y changes unlike in training (velo"),
         (["knee", "knee_rate"], [0.0, 8.0], True, "joint knee answers unlike in training (knee_r"),
         (["angle", "speed"], [0.0, -7.0], False, "speed changes unlike in training (speed -7.0 st"),
     ],
@@ -168,7 +167,6 @@ def test_monitor_learns_safe_episodes_that_are_livelier_than_its_motion():
     ("change", "message"),
     [
         ({"step_s": 0.1}, "motions and episodes differ in step_s"),
-        ({"output_names": ["end"]}, "motions and episodes differ in output_names"),
         ({"monitored_states": ["wing"]}, r"monitored_states has \['wing'\], which are none of"),
     ],
 )

@@ -8,7 +8,6 @@ from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.maps import stack_members, train_map
 from drake_safety.learning.points import tsne
 from drake_safety.learning.segments import split
-from drake_safety.learning.trained_maps import Embedding
 from lip_assessments import map_data
 from lip_episodes import make_episodes
 
@@ -85,21 +84,6 @@ def test_training_gives_the_same_weights_for_a_seed_and_leaves_torchs_state_alon
         np.testing.assert_array_equal(first[name], again[name])
 
 
-def test_sample_weight_draws_the_map_towards_its_samples(data):
-    contrary = np.arange(600) < 40
-    is_unsafe = np.where(contrary, ~data.is_unsafe, data.is_unsafe)
-    x = data.x.copy()
-    x[contrary, 2] += 2.0
-    agreement = []
-    for weight in (0.01, 20.0):
-        sample_weight = np.where(contrary, weight, 1.0)
-        changed = replace(data, x=x, is_unsafe=is_unsafe, sample_weight=sample_weight)
-        trained = train_map(changed, replace(SETTINGS, epochs=4), seed=0)
-        logit = stack_members([trained]).evaluate(x[contrary]).unsafe_logit[0]
-        agreement.append(((logit > 0.0) == is_unsafe[contrary]).mean())
-    assert agreement[1] > agreement[0]
-
-
 def test_row_that_is_not_finite_gives_nan_and_leaves_the_others_alone(data, embedding):
     x = data.x[:4].copy()
     x[1, 2], x[2, 0] = np.nan, np.inf
@@ -131,8 +115,6 @@ def test_input_beyond_the_range_is_clipped_to_its_edge(embedding):
     [
         (lambda e: e.weights["output.bias"].fill(0.0), "read-only"),
         (lambda e: e.evaluate(np.zeros((2, 3))), r"inputs have shape \(2, 3\), expected \(N, 4\)"),
-        (lambda e: e.clipping(np.zeros((2, 3))), r"range of inputs has the shape \(2, 3\)"),
-        (lambda e: Embedding({}), "the arrays are"),
     ],
 )
 def test_what_does_not_fit_the_maps_is_refused(embedding, ask, message):

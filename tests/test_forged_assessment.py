@@ -88,7 +88,7 @@ def test_forged_array_is_refused_by_name(content, loaded, name, change):
     ("place", "value", "message"),
     [
         ("parameters.resolution", 10**9, "'resolution' must be less than"),
-        ("info.horizon", 10**12, r"horizon is 1000000000000, expected 1\.\.10000"),
+        ("info.horizon", 10**12, "horizon 1000000000000, prev"),
         ("info.constraint_names", ["a"], "has the shape"),
         ("numbers.base_logit.offset", float("nan"), "BaseLogit: 'offset' must"),
         ("numbers.novelty_limits", [float("nan")] * 4, "its novelty has the counts"),

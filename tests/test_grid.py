@@ -65,8 +65,3 @@ def test_each_map_reads_its_own_cells(seed):
         np.testing.assert_array_equal(found[k], values[k][GRID.locate(points[k])])
         alone, _ = GRID.interpolate(points[k : k + 1], values[k : k + 1])
         np.testing.assert_array_equal(GRID.interpolate(points, values)[0][k], alone[0])
-
-
-def test_points_without_an_extent_are_refused():
-    with pytest.raises(ValueError, match="extent is 0"):
-        GRID.scale(np.ones((5, 2)))

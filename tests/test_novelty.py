@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -142,9 +140,8 @@ def balancing_inputs():
     return [np.array(column) for column in zip(*rows, strict=True)]
 
 
-@pytest.mark.parametrize("mode", ["sharpened", "paper"])
-def test_shuffled_inputs_of_a_robot_are_unknown_in_every_output(balancing_inputs, mode):
-    assessment = load_assessment("laikago_balancing", mode)
+def test_shuffled_inputs_of_a_robot_are_unknown_in_every_output(balancing_inputs):
+    assessment = load_assessment("laikago_balancing")
     assert (assessment.predict(*balancing_inputs).novelty <= 1.0).mean() > 0.9
     rng = np.random.default_rng(0)
     result = assessment.predict(*(rng.permuted(part, axis=0) for part in balancing_inputs))
@@ -166,19 +163,3 @@ def test_file_keeps_what_is_known_from_training_and_from_feedback(tmp_path):
     loaded = SafetyAssessment.load(tmp_path / "adapted.safetensors").novelty_
     assert loaded.feedback.count == 50
     np.testing.assert_array_equal(loaded.of(x), assessment.novelty_.of(x))
-
-
-def test_robot_that_is_lifted_or_lies_is_in_no_state_of_training():
-    loop = load_scenario("laikago_balancing").make_loop()
-    context, start = loop.CreateDefaultContext(), loop.standing_start()
-    on_its_side = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
-    for orientation, height_m in ((start.q[:4], 1.5), (on_its_side, 0.2)):
-        q = start.q.copy()
-        q[:4], q[6] = orientation, height_m
-        loop.reset_to(context, None, replace(start, q=q))
-        names = ("state", "desired_preview", "features")
-        parts = [loop.GetOutputPort(name).Eval(context) for name in names]
-        for mode in ("sharpened", "paper"):
-            result = load_assessment("laikago_balancing", mode).predict_one(*parts)
-            assert result.novelty > 1.0
-            np.testing.assert_array_equal(result.belief, EMPTY)

@@ -7,7 +7,6 @@ import resource
 import shutil
 import subprocess
 import sys
-import sysconfig
 import tarfile
 import tomllib
 import zipfile
@@ -99,17 +98,6 @@ def environment_of(wheel, folder):
     return Path(run(python, "-c", code, cwd="/").strip())
 
 
-@pytest.fixture(scope="module")
-def clean_environment(wheel, tmp_path_factory):
-    """An environment with the wheel; the dependencies are this environment's, read in place."""
-    folder = tmp_path_factory.mktemp("clean") / "environment"
-    # Only a path: a .pth file inside that folder, an editable install's say, is not followed.
-    dependencies = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
-    paths = environment_of(wheel, folder) / "dependencies.pth"
-    paths.write_text("\n".join(dependencies) + "\n")
-    return folder
-
-
 def needed_by(*names):
     """Packages and all that they bring, as pip would install them."""
     found, wanted = set(), [*names]
@@ -174,14 +162,6 @@ def test_targets_are_asked_for_in_the_light_install_and_answered_at_once(light_e
     assert cpu_s() - started < 5.0
 
 
-def test_a_motion_is_run_in_the_light_install(light_environment, tmp_path):
-    command = light_environment / "bin" / "drake-safety"
-    run(command, "run", "laikago_balancing", "--push", "ball", "--out", tmp_path, cwd="/")
-    written = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert "torch" not in written["versions"]
-    assert (tmp_path / "run" / "timeline.png").is_file()
-
-
 def test_a_robot_is_written_and_checked_in_the_light_install(light_environment, tmp_path):
     command, folder = light_environment / "bin" / "drake-safety", tmp_path / "mine"
     urdf = ROOT / "models" / "laikago" / "laikago.urdf"
@@ -193,12 +173,8 @@ def test_a_robot_is_written_and_checked_in_the_light_install(light_environment, 
     ("command", "extra"),
     [
         ("train pendulum --out {}", "train"),
-        ("calibrate pendulum", "train"),
-        ("evaluate pendulum --assessment {}", "train"),
-        ("adapt pendulum", "train"),
         ("report {}", "report"),
         ("play pendulum", "live"),
-        ("train pendulum --out {} --cluster tcp://127.0.0.1:1", "train"),
     ],
 )
 def test_a_command_names_its_extra_before_it_does_anything(
@@ -252,13 +228,6 @@ def test_every_file_of_the_library_and_of_the_folders_beside_it_is_in_the_wheel_
     assert any(name.endswith("/licenses/LICENSE") for name in metadata)
 
 
-def test_no_dependency_names_an_index_or_an_address():
-    listed = sum(PROJECT["optional-dependencies"].values(), PROJECT["dependencies"])
-    pinned = pins("constraints.txt") + pins("lowest.txt")
-    assert not [line for line in listed + pinned if "://" in line or line.startswith("-")]
-    assert not [line for line in pinned if line.count("==") != 1]
-
-
 def test_every_lower_bound_of_what_users_install_is_a_version_that_is_tested():
     tested = {
         canonicalize_name(one.name): one.specifier for one in map(Requirement, pins("lowest.txt"))
@@ -270,17 +239,3 @@ def test_every_lower_bound_of_what_users_install_is_a_version_that_is_tested():
         if line.name != PROJECT["name"]:
             (bound,) = [one.version for one in line.specifier if one.operator == ">="]
             assert tested[canonicalize_name(line.name)].contains(bound), line
-
-
-def test_the_installed_package_imports_from_the_root_folder(clean_environment):
-    code = (
-        "import drake_safety, drake_safety.models as m, drake_safety.diagrams as d\n"
-        "import drake_safety.assessments as a\n"
-        "print(drake_safety.__file__, m.__file__, d.__file__, a.__file__, sep='\\n')\n"
-        "print(*drake_safety.__path__, drake_safety.__version__, sep='\\n')"
-    )
-    printed = run(clean_environment / "bin" / "python", "-c", code, cwd="/").splitlines()
-    *files, path, version = printed
-    # No trace of the checkout: __path__ has the one entry inside the environment.
-    assert all(Path(name).is_relative_to(clean_environment) for name in [*files, path])
-    assert version == PROJECT["version"]

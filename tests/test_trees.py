@@ -71,8 +71,7 @@ def test_the_logit_is_that_of_scikit_learn(monkeypatch):
 
 
 @pytest.mark.train
-@pytest.mark.parametrize("is_rare", [True, False])
-@pytest.mark.parametrize("num_rare", [0, 3])
+@pytest.mark.parametrize(("num_rare", "is_rare"), [(0, True), (3, False)])
 def test_where_the_rest_to_learn_from_has_one_label_there_are_no_trees(num_rare, is_rare):
     episode = np.repeat(np.arange(40), 20)
     is_held_out = episode < 10
