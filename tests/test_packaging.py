@@ -1,7 +1,6 @@
 """What a stranger gets: sdist → wheel → a clean environment, used from `/`."""
 
 import importlib.metadata
-import json
 import os
 import resource
 import shutil
