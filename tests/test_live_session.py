@@ -277,7 +277,7 @@ def test_an_alarm_of_the_monitor_is_shown_with_its_cause(pendulum):
 @train
 @pytest.mark.parametrize(
     ("state", "shown_after_s", "cause"),
-    [((0.0, 0.0), 2.0, ""), ((0.95, 0.0, 10.0, 0.0), TICK_S, "rail")],
+    [((0.0, 0.0), 2.0, ""), ((0.59, 10.0), TICK_S, "front")],
 )
 def test_the_end_of_an_episode_is_shown_until_the_next_start(pendulum, state, shown_after_s, cause):
     set_pendulum(pendulum, *state)
