@@ -151,26 +151,6 @@ def test_episodes_are_the_same_for_any_number_of_workers_and_in_any_order(walkin
     assert_identical(Episodes(episodes.info, backwards[::-1]), episodes)
 
 
-def test_a_reset_resets_the_memory(walking):
-    loop = walking.make_loop()
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-
-    def memory():
-        return np.concatenate([np.ravel(part) for part in loop.start_of(context).controller_state])
-
-    loop.reset_to(context, None, loop.standing_start())
-    first = memory()
-    simulator.Initialize()
-    simulator.AdvanceTo(0.1)
-    start, later = loop.start_of(context), memory()
-    assert np.any(later != first)
-    loop.reset_to(context, None, loop.standing_start())
-    np.testing.assert_array_equal(memory(), first)
-    loop.reset_to(context, None, start)  # The memory of a start is taken over.
-    np.testing.assert_array_equal(memory(), later)
-
-
 def windows(scenario):
     """Windows of a robot that walks on, and its recorder."""
     builder = DiagramBuilder()

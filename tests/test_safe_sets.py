@@ -131,18 +131,3 @@ def test_a_velocity_moves_the_capture_point_by_the_pendulums_time_constant():
     point = "capture_point_margin_0deg"
     assert pushed[point] - still[point] == pytest.approx(-0.5 * math.sqrt(q[6] / 9.81))
     assert pushed["base_margin_0deg"] == still["base_margin_0deg"]
-
-
-def test_height_and_tracking_features_are_the_hand_worked_differences():
-    kinematics, safe_set = safe_set_of("laikago", height_m=[0.3, 0.5])
-    q, v = state(kinematics)
-    base = np.append(kinematics.nominal_base_offset, q[6])
-    preview = np.tile(base + [0.01, -0.02, 0.03], (3, 1))
-    values = features(safe_set, q, v, preview)
-    assert values["height_over_lowest"] == pytest.approx(q[6] - 0.3)
-    assert values["height_under_highest"] == pytest.approx(0.5 - q[6])
-    error = [values[f"tracking_error_{axis}"] for axis in "xyz"]
-    np.testing.assert_allclose(error, [0.01, -0.02, 0.03], atol=1e-9)
-    # The feet turn with the base.
-    turned, _ = state(kinematics, rotation=(0, 0, 0.4))
-    assert features(safe_set, turned, v, preview)["yaw_error"] == pytest.approx(0, abs=1e-9)
