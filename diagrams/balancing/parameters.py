@@ -31,7 +31,6 @@ class RecoveryParameters:
     persistence_s: NotNegative = 0.02
     """Time for which "don't know" must have lasted to trigger [s]. The paper has none."""
     assessment_period_s: Positive = 0.02
-    """Time between two assessments [s]."""
     step: RecoveryStepParameters = field(default_factory=RecoveryStepParameters)
 
 

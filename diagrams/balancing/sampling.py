@@ -33,7 +33,6 @@ class StartSampling:
     base_offset_m: Pair[FiniteFloat] = field(default_factory=lambda: [0.08, 0.05])
     """Along x and along y of the stance frame."""
     base_height_m: Bounds[FiniteFloat] = field(default_factory=lambda: [0.36, 0.45])
-    """Lowest and highest height of the base."""
     tilt_rad: float = 0.1
     """Half-width of roll, pitch and yaw, each."""
     velocity_std_m_s: Triple = field(default_factory=lambda: [0.5, 0.35, 0.1])
@@ -46,9 +45,7 @@ class StartSampling:
     target_offset_m: Pair[FiniteFloat] = field(default_factory=lambda: [0.20, 0.11])
     """Where the plan ends, along x and along y of the stance frame."""
     target_height_m: Bounds[FiniteFloat] = field(default_factory=lambda: [0.34, 0.46])
-    """Lowest and highest height at which the plan ends."""
     plan_duration_s: Bounds[Positive] = field(default_factory=lambda: [0.8, 1.6])
-    """Shortest and longest duration of the planned motion."""
 
     def sample(self, kinematics: RobotKinematics, rng: np.random.Generator) -> EpisodeStart:
         """Samples a start with a moving base within the ranges and the feet at rest."""
@@ -81,13 +78,9 @@ class PushSampling:
     share: Share = 0.25
     """Share of nominal episodes that begin with the impact of a ball."""
     mass_kg: Bounds[Positive] = field(default_factory=lambda: [2.0, 4.0])
-    """Lowest and highest."""
     speed_m_s: Bounds[Positive] = field(default_factory=lambda: [2.0, 11.0])
-    """Lowest and highest."""
     offset_m: float = 0.0
-    """Half-width of a throw's ``offset_m``."""
     height_m: float = 0.03
-    """Half-width of a throw's ``height_m``."""
     target_offset_m: Pair[FiniteFloat] = field(default_factory=lambda: [0.05, 0.03])
     """Half-widths of the start and goal of the undisturbed motion, about the stance, x and y."""
 

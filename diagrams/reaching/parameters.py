@@ -31,25 +31,19 @@ class ReachingParameters:
     """The hand of the training episodes, a reaching frame of the robot; the first one by
     default."""
     plan_duration_s: Positive = 3.0
-    """Duration of the planned motion [s]."""
     monitor_period_s: Positive = 0.02
-    """Sampling period of the safe set [s]."""
     clearance_range_m: Positive = 0.1
     """Distances to obstacles are clipped to this [m]."""
     safe_set: ReachingLimits = field(default_factory=ReachingLimits)
     start: PostureSampling = field(default_factory=PostureSampling)
     target: TargetSampling = field(default_factory=TargetSampling)
     random_pushes: RandomPushes = field(default_factory=RandomPushes)
-    """Initial pushes of training episodes."""
     detours: Detours = field(default_factory=Detours)
     obstacles: list[Obstacle] = field(default_factory=list)
     decorations: list[Obstacle] = field(default_factory=list)
     """Models without collision geometry, for visualisation."""
     named_targets: dict[str, Triple] = field(default_factory=dict)
-    """Named targets in the world, (3,) [m] each."""
     pushes: dict[str, Push] = field(default_factory=dict)
-    """Named pushes for single runs."""
     assessment_period_s: Positive = 0.1
     """Time between two evaluations of Γ [s]; the features of a plan cost some 4 ms."""
     view: View = field(default_factory=View)
-    """The camera's pose when the trained hand reaches."""

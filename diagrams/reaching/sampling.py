@@ -19,9 +19,7 @@ class PostureSampling:
     """Random standing postures. Offsets are half-widths about the standing posture."""
 
     base_offset_m: Pair[NotNegative] = field(default_factory=lambda: [0.02, 0.02])
-    """Along x and along y."""
     base_lowering_m: NotNegative = 0.08
-    """Largest lowering of the base."""
     tilt_rad: NotNegative = 0.03
     """Half-width of roll, pitch and yaw of the base, each."""
     joint_offset_rad: NotNegative = 0.1
@@ -87,7 +85,6 @@ class Detours:
     """Random offsets of the middle of training plans, in the trained hand's stance frame [m]."""
 
     share: ShareBelowOne = 0.0
-    """Share of the training episodes with a detour."""
     lowest_m: Triple = field(default_factory=lambda: [-0.3, -0.2, -0.1])
     highest_m: Triple = field(default_factory=lambda: [0.0, 0.2, 0.3])
 

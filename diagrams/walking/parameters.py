@@ -27,7 +27,6 @@ class CommandSampling:
     num_segments: Bounds[Count] = field(default_factory=lambda: [1, 3])
     """Least and largest number of constant commands in an episode."""
     standing_share: Share = 0.1
-    """Share of commands that are zero."""
 
     def sample_command(
         self, limits: CommandLimits, rng: np.random.Generator, reach: float = 1.0
@@ -77,7 +76,6 @@ class WalkingStart:
     angular_velocity_rad_s: float = 1.5
     """Half-width of the base's angular velocity offset, per axis."""
     tilt_rad: float = 0.15
-    """Half-width of roll and pitch offsets."""
     joint_rad: float = 0.05
     """Standard deviation of the joints' offsets."""
 
@@ -110,7 +108,6 @@ class GuardParameters:
     threshold: Share = 0.9
     """Lowest probability of a command that is passed on; set after a look at figures."""
     period_s: Positive = 0.1
-    """Time between two decisions [s]."""
 
 
 @schema(kw_only=True)
@@ -151,12 +148,9 @@ class WalkingParameters:
     named_commands: dict[str, Triple] = field(default_factory=dict)
     """Named commands (v_x, v_y, ω_z) [m/s, rad/s]."""
     pushes: dict[str, Push] = field(default_factory=dict)
-    """Named pushes for single runs."""
     random_pushes: RandomPushes = field(default_factory=RandomPushes)
     """Pushes by which alarms and recovery are judged."""
     view: View = field(default_factory=View)
-    """The camera's pose."""
     guard: GuardParameters = field(default_factory=GuardParameters)
     recovery: WalkingRecovery = field(default_factory=WalkingRecovery)
     assessment_period_s: Positive = 0.02
-    """Time between two evaluations of Γ [s]."""

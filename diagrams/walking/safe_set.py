@@ -32,7 +32,6 @@ class WalkingLimits:
     fall_height_share: float = 0.45
     """Height of the base below which the robot has fallen, as a share of the standing height."""
     fall_tilt_rad: Annotated[float, Field(gt=0, lt=math.pi)] = 1.2
-    """Tilt beyond which it has fallen [rad]."""
 
     def __post_init__(self) -> None:
         if not 0 < self.fall_height_share <= self.height_share < 1:
