@@ -75,6 +75,7 @@ def commands_loop(meshcat):
 @pytest.fixture(scope="module")
 def pendulum_loop(meshcat):
     scenario = load_scenario("pendulum")
+    scenario.assessment.ensemble_size = 1
     return scenario.make_loop(assessment=learned(scenario, 200), meshcat=meshcat)
 
 
