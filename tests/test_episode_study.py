@@ -66,10 +66,8 @@ def test_plans_are_judged_once_by_a_stored_threshold_or_one_of_the_calibration_s
     assert found["plans", "outcomes", "safe"].value == fresh.num_safe / len(fresh)
 
 
-def test_a_promise_needs_unsafe_plans_and_is_what_their_number_allows(caplog):
+def test_a_promise_needs_unsafe_plans_and_is_what_their_number_allows():
     with pytest.raises(ValueError, match="0 of 9 calibration plans are unsafe; it takes 124"):
         promised_miss_rate(np.zeros(9, dtype=bool))
     assert promised_miss_rate(np.ones(500, dtype=bool)) == 1.0 - PROMISED_UNSAFE_RECALL
-    assert not caplog.records
     assert promised_miss_rate(np.ones(19, dtype=bool)) == pytest.approx(0.05)
-    assert "19 unsafe calibration episodes promise an unsafe recall of 0.950" in caplog.text

@@ -110,10 +110,9 @@ def given(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def command_line(program: str = "drake-safety", option: str = "") -> str:
-    """The command line, with an option that is added unless it is there or ""."""
-    added = [option] if option and option not in sys.argv else []
-    return shlex.join([*program.split(), *sys.argv[1:], *added])
+def command_line(program: str = "drake-safety", *options: str) -> str:
+    """The command line, with further options."""
+    return shlex.join([*program.split(), *sys.argv[1:], *options])
 
 
 def made_by(scenario: str, program: str = "drake-safety") -> dict[str, Any]:

@@ -249,8 +249,8 @@ def _report(
         headings = ("cause", "newly fail", *(f"Γ: {what}" for what in sides), "fail no longer")
         _show(f"{name}: by cause", headings, causes)
         for each in [*new, *old][:1]:
-            option = f"--replay={each.episode}"
-            console.say("to see one:", console.command_line(option=option))
+            replay = f"--replay={each.episode}"
+            console.say("to see one:", console.command_line("drake-safety", replay))
     console.say(
         "a verdict, or an end of an interval, is wrong with a probability of at most "
         f"{100 * alpha:.3g} % a candidate, whenever one looks; 'not worse': by "

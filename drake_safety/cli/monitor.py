@@ -58,10 +58,10 @@ def monitor(
     console.show(console.new_table(*columns, rows=[row for entry in logs for row in _rows(entry)]))
     console.say("figures ", folder / "monitor.json")
     console.say("pictures", folder)
-    if short := [entry["log"] for entry in logs if _is_too_short(entry)]:
+    if short := sum(not entry["alarms"] and entry["judged_s"] < _LEAST_S for entry in logs):
         raise ValueError(
-            f"{len(short)} of {len(logs)} logs have less than {_LEAST_S:g} s of motion without a "
-            f"missing value: {', '.join(short[:3])}"
+            f"{short} of {len(logs)} logs have less than {_LEAST_S:g} s of motion without a "
+            "missing value"
         )
 
 
@@ -125,10 +125,6 @@ def _judged(motions: Sequence[Motion], gamma: SafetyAssessment, picture: Path) -
     }
 
 
-def _is_too_short(entry: Mapping[str, Any]) -> bool:
-    return not entry["alarms"] and entry["judged_s"] < _LEAST_S
-
-
 def _rows(entry: Mapping[str, Any]) -> list[list[str]]:
     """A row of the table for each alarm of a log, or one that says that there is none."""
     number = "" if entry["sequence"] is None else f" [{entry['sequence']}]"
@@ -136,7 +132,7 @@ def _rows(entry: Mapping[str, Any]) -> list[list[str]]:
     share = entry["judged_s"] / max(entry["duration_s"], 1e-9)
     name = f"{Path(*Path(entry['log']).parts[-2:])}{number}"
     head = [name, f"{entry['end_s']:.2f}{left}", f"{share:.0%}"]
-    if _is_too_short(entry):
+    if not entry["alarms"] and entry["judged_s"] < _LEAST_S:
         return [[*head, "-", "-", "-", f"not judged: {entry['judged_s']:.2f} s"]]
     if not entry["alarms"]:
         return [[*head, "-", "-", f"{entry['level']:.2f}", f"no alarm; largest: {entry['state']}"]]

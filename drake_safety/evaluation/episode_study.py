@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -16,8 +15,6 @@ from drake_safety.learning.segments import DIVERGED, Episodes, Segments, split
 
 PROMISED_UNSAFE_RECALL = 0.992
 """Unsafe recall for which thresholds of plans are chosen where none is stored."""
-
-_LOGGER = logging.getLogger("drake_safety")
 
 
 def evaluate_episodes(
@@ -92,13 +89,4 @@ def promised_miss_rate(is_unsafe: np.ndarray) -> float:
             f"thresholds: 0 of {len(is_unsafe)} calibration plans are unsafe; it takes "
             f"{episodes_needed(wanted)} to promise an unsafe recall of {PROMISED_UNSAFE_RECALL:g}"
         )
-    least = least_miss_rate(num_unsafe)
-    if least > wanted:
-        _LOGGER.warning(
-            "%d unsafe calibration episodes promise an unsafe recall of %.3f; %.3f takes %d",
-            num_unsafe,
-            1.0 - least,
-            PROMISED_UNSAFE_RECALL,
-            episodes_needed(wanted),
-        )
-    return max(least, wanted)
+    return max(least_miss_rate(num_unsafe), wanted)

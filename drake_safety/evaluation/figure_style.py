@@ -18,18 +18,10 @@ SAFE_COLOUR = "#2b6cb0"
 UNSAFE_COLOUR = "#d1541b"
 UNKNOWN_COLOUR = "#c9ccd1"
 RECOVERY_COLOUR = "#1b9e77"
-FALSE_ALARM_COLOUR = "#c99700"
 BALL_COLOUR = "#e8730c"
 INK = "#22262b"
 FAINT_INK = "#8a9099"
-SERIES_COLOURS = (
-    SAFE_COLOUR,
-    UNSAFE_COLOUR,
-    RECOVERY_COLOUR,
-    "#8e5ea2",
-    FALSE_ALARM_COLOUR,
-    "#4d4d4d",
-)
+SERIES_COLOURS = (SAFE_COLOUR, UNSAFE_COLOUR, RECOVERY_COLOUR, "#8e5ea2", "#c99700", "#4d4d4d")
 """Colours of the curves in a panel, in this order."""
 SERIES_DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
 """Dashes of these curves, which distinguish them in print."""
