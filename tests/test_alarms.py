@@ -68,16 +68,6 @@ def test_an_alarm_between_push_and_leaving_is_a_detection_and_any_other_is_false
     assert figures_of([*TEST, early, unpushed]) == found
 
 
-def test_an_alarm_of_two_rows_comes_a_row_later_and_ignores_a_single_one():
-    blow = [motion_of(0, {1.0: np.nan, 1.1: 1.0})]
-    one, two = (figures_of([*TEST, *blow], num_rows=n) for n in (1, 2))
-    key = "sharpened.lead_to_fall_s"
-    assert one[key] - two[key] == pytest.approx(0.1)
-    # 3.6 s of each of three safe motions.
-    key = "sharpened.false_alarms_per_hour"
-    assert [found[key] * 3 * 3.6 / 3600 for found in (one, two)] == pytest.approx([2, 1])
-
-
 def test_an_unknown_row_is_an_alarm():
     motion = motion_of(0, {2.0: np.nan})
     value = motion["state"][:, 0]

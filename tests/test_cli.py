@@ -1,7 +1,6 @@
 """The command line: every command is listed, and what a user did wrong is one line."""
 
 import math
-import os
 import re
 import subprocess
 import sys
@@ -87,15 +86,6 @@ def stopped(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("drake_safety.simulation.rollouts.collect_episodes", stop)
-
-
-def test_a_shell_completes_commands_without_drake():
-    program = "import sys; sys.modules['pydrake'] = None; from drake_safety.cli import main; main()"
-    completing = os.environ | {"_DRAKE_SAFETY_COMPLETE": "complete_bash"}
-    completing |= {"COMP_WORDS": "drake-safety cal", "COMP_CWORD": "1"}
-    command = [sys.executable, "-c", program]
-    ended = subprocess.run(command, env=completing, capture_output=True, text=True)
-    assert ended.stdout.split() == ["calibrate"]
 
 
 @pytest.mark.train

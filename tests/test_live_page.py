@@ -104,17 +104,13 @@ HERE, ALL = "127.0.0.1", "0.0.0.0"
     [
         (HERE, "127.0.0.1:7000", "http://127.0.0.1:7000", True),
         (HERE, "LocalHost:8000", "http://localhost:8000", True),  # As through SSH.
-        (HERE, "[::1]:7000", None, True),
         (HERE, "127.0.0.1.evil.example:7000", None, False),
         (HERE, "evil.example", "http://evil.example", False),
         (HERE, "192.0.2.1:7000", None, False),
-        (HERE, "[", None, False),
         (HERE, "127.0.0.1:7000", "http://evil.example", False),
         (HERE, "127.0.0.1:7000", "http://127.0.0.1:9000", False),
-        (HERE, "127.0.0.1:7000", "null", False),
         (ALL, "192.0.2.1:7000", "http://192.0.2.1:7000", True),
         (ALL, f"{socket.gethostname()}:7000", None, True),
-        (ALL, "evil.example:7000", None, False),
         (ALL, "192.0.2.1:7000", "http://evil.example", False),
     ],
 )

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.learning.seeds import RELEASE
@@ -48,25 +47,6 @@ def test_a_study_says_whether_its_seeds_are_those_of_the_release(tmp_path):
             assert study.seeds["evaluation"] == study.seed == 5 + RELEASE * release
         entries = Results.read(tmp_path / "tried.json").entries
         assert entries["seed"] == study.seed and entries["seed_use"].split()[0] == use
-
-
-def test_rows_are_written_printed_and_plotted(tmp_path, capsys):
-    with open_study(
-        "tried", "pendulum", tmp_path, out=tmp_path / "out", plotted=lambda key: key[2] == "auc"
-    ) as study:
-        study.entries["pairs"] = 3
-        study.add("segments", "paper", {"auc": Estimate(0.5, 0.25, 0.75, 40)})
-        study.add("segments", "sharpened", {"auc": Estimate(0.9, 0.8, 1.0, 40)})
-        study.rows["pushes", "", "fallen"] = Estimate(0.125, 0.0, 0.5, 8)
-    found = Results.read(tmp_path / "out/tried.json")
-    assert dict(found) == dict(study.results())
-    assert found["segments", "paper", "auc"].n == 40
-    assert found.entries["scenario"] == "pendulum" and found.entries["pairs"] == 3
-    assert found.entries["command"].startswith("python -m studies")
-    printed = capsys.readouterr().out
-    for words in ("0.500 (0.250–0.750)", "0.900 (0.800–1.000)", "fallen", "0.125 (0.000–0.500)"):
-        assert words in printed
-    assert {path.suffix for path in (tmp_path / "out").iterdir()} == {".json", ".png", ".svg"}
 
 
 def test_a_fingerprint_is_of_all_that_determines_a_result():
