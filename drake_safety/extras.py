@@ -13,7 +13,7 @@ MODULES = {
     "onnx": ("onnx",),
     "report": ("jinja2",),
     "robots": ("trimesh", "collada"),
-    "train": ("dtaidistance", "openTSNE", "pyarrow", "sklearn", "torch"),
+    "train": ("dtaidistance", "openTSNE", "pyarrow", "sklearn", "torch", "tslearn"),
     "walking": ("onnx", "onnxruntime"),
 }
 """What the library imports of each extra."""

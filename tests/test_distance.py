@@ -25,16 +25,17 @@ def graph_of(segments, **changes):
     return neighbour_graph(segments.error, segments.length, segments.score, **options)
 
 
+@pytest.mark.parametrize("backend", distance.BACKENDS)
 @pytest.mark.parametrize("rows", [32, 7])
 @pytest.mark.parametrize("score_weight", [0.0, 0.01, 0.5])
 def test_graph_of_all_candidates_holds_exactly_the_nearest_neighbours(
-    segments, warping, rows, score_weight, monkeypatch
+    segments, warping, rows, score_weight, backend, monkeypatch
 ):
     monkeypatch.setattr(distance, "_ROWS", rows)
     monkeypatch.setattr(distance, "_BLOCK", 4 * rows)
     unlike = np.abs(segments.score[:, None] - segments.score)
     done = []
-    graph = graph_of(segments, score_weight=score_weight, progress=done.append)
+    graph = graph_of(segments, score_weight=score_weight, backend=backend, progress=done.append)
     assert done == sorted(done) and done[-1] == 1.0
     assert all(len(set(row)) == 15 for row in graph.indices.tolist())
     assert graph.max_dtw == pytest.approx(warping.max(), rel=1e-12)

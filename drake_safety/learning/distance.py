@@ -11,10 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal, get_args
 
 import numpy as np
 
 from drake_safety.files.progress import ignore
+
+Backend = Literal["dtaidistance", "tslearn"]
+BACKENDS = get_args(Backend)
 
 _ROWS = 32  # Segments that share their candidates.
 _BLOCK = 512
@@ -46,6 +50,7 @@ def neighbour_graph(
     score_weight: float,
     num_neighbours: int,
     num_candidates: int | None = None,
+    backend: Backend = "dtaidistance",
     progress: Callable[[float], object] = ignore,
 ) -> NeighbourGraph:
     """Finds nearest neighbours under Omega = DTW / w_max + delta |lambda_i - lambda_j|.
@@ -58,6 +63,7 @@ def neighbour_graph(
         num_neighbours: k, below N.
         num_candidates: Segments with the smallest bounds of Omega among which the neighbours of a
             segment are sought, at least k; None for all others, with the cost N².
+        backend: "dtaidistance", or "tslearn", which ignores the bounds.
     """
     from scipy.spatial import cKDTree
 
@@ -69,7 +75,7 @@ def neighbour_graph(
     steps = np.minimum(np.arange(error.shape[1]), np.asarray(length)[:, None] - 1)
     held = np.take_along_axis(error, steps[:, :, None], axis=1).reshape(num_segments, -1)
     # `_dtw` and bounds are roots of the sums of squares.
-    dtw = partial(_dtw, series)
+    dtw = partial(_dtw, series, backend=backend)
     largest = _max_dtw(held, dtw)
     scale = largest**-2.0 if largest > 0.0 else 0.0
 
@@ -126,12 +132,18 @@ def _dtw(
     rows: Iterable[int],
     columns: Iterable[int],
     *,
+    backend: str = BACKENDS[0],
     limit: float = np.inf,
 ) -> np.ndarray:
     """DTW, sqrt(sum ||.||^2), of rows and columns; above `limit` it may be infinite."""
+    sides = [series[i] for i in rows], [series[i] for i in columns]
+    if backend == "tslearn":
+        from tslearn.metrics import cdist_dtw
+        from tslearn.utils import to_time_series_dataset
+
+        return np.asarray(cdist_dtw(*map(to_time_series_dataset, sides)))
     from dtaidistance import dtw_ndim
 
-    sides = [series[i] for i in rows], [series[i] for i in columns]
     num_rows, num_columns = map(len, sides)
     distances = dtw_ndim.distance_matrix_fast(
         sides[0] + sides[1],

@@ -49,6 +49,7 @@ def embedded_points(
         score_weight=parameters.score_weight,
         num_neighbours=num_neighbours,
         num_candidates=parameters.candidates_per_neighbour * num_neighbours or None,
+        backend=parameters.distance_backend,
         progress=stage_of(progress, "distances"),
     )
     points = tsne(
