@@ -175,7 +175,7 @@ def test_the_scenario_names_the_trained_hand_and_the_other_is_its_image(tmp_path
     assert (right.hand, left.hand) == ("right", "left")
     assert right.mirror is None and left.mirror is not None
     np.testing.assert_array_equal(right.target_box, scenario.parameters.target.box)
-    with pytest.raises(ValueError, match="are 'right' of robot 'porter' and its mirror image 'l"):
+    with pytest.raises(ValueError, match="'right' and its mirror image 'left'"):
         scenario.make_loop(hand="head")
 
 

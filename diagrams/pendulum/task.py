@@ -188,9 +188,7 @@ class Pendulum(PlannedLoop):
         varied = self._plant_variation
         plain = PlantVariation(mass_scale=varied.mass_scale, joint_damping=varied.joint_damping)
         if varied != plain:
-            raise ValueError(
-                f"pendulum: variation '{variation}' may set mass_scale and joint_damping alone"
-            )
+            raise ValueError("pendulum: variations may set mass_scale and joint_damping alone")
         parameters, period_s = scenario.parameters, scenario.control_period_s
         outlook_s = scenario.episode_duration_s
         builder = DiagramBuilder()

@@ -89,10 +89,7 @@ class ReachingSafeSet:
         self._preview = KinematicPreview(model)
         self._hand = hand = self._preview.hand
         if not hand.joints:
-            raise ValueError(
-                f"robot '{kinematics.robot.name}', reaching frame '{hand.name}': joints must be "
-                "those of its arm, from the torso to the hand; got none"
-            )
+            raise ValueError(f"reaching frame '{hand.name}' must have the joints of its arm")
         self._shoulder = kinematics.plant.GetJointByName(hand.joints[0]).frame_on_parent()
         self._chain = chain_joints(kinematics, hand)
         self._reflect = np.array([1.0, -1.0 if is_mirrored else 1.0, 1.0])

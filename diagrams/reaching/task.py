@@ -142,8 +142,8 @@ class Reaching(LeggedLoop):
         mirror = Mirror(self.kinematics)
         if (image := mirror.hand(trained_hand)) != self.hand:
             raise ValueError(
-                f"reaching: hands of scenario '{self.scenario.name}' are '{trained_hand}' of robot "
-                f"'{self.robot.name}' and its mirror image '{image}'; got '{self.hand}'"
+                f"reaching: hands are '{trained_hand}' and its mirror image '{image}'; got "
+                f"'{self.hand}'"
             )
         return mirror
 

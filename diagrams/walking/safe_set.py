@@ -66,9 +66,7 @@ class WalkingSafeSet:
         self.limits = limits
         plant = kinematics.plant
         if unknown := [name for name in limits.clearance_m if not plant.HasBodyNamed(name)]:
-            raise ValueError(
-                f"robot '{kinematics.robot.name}' has no bodies {unknown} for clearance_m"
-            )
+            raise ValueError(f"robot '{kinematics.robot.name}' has no bodies {unknown}")
         self._clear = [(plant.GetBodyByName(n), h) for n, h in limits.clearance_m.items()]
         self._lowest_m = limits.height_share * kinematics.standing_height
         self._fallen_m = limits.fall_height_share * kinematics.standing_height

@@ -21,9 +21,6 @@ def connected(address: str, *, timeout_s: float = 20.0) -> Iterator[None]:
             client.wait_for_workers(1, timeout=timeout_s)
         # Another server's answer may be taken for the size of a huge message.
         except (MemoryError, OSError, TimeoutError, ValueError) as error:
-            raise ValueError(
-                f"no dask scheduler with workers answers at '{address}': {error}; start workers "
-                f"by `dask worker {address} --nthreads 1`"
-            ) from error
+            raise ValueError(f"no dask workers answer at '{address}': {error}") from error
         stack.enter_context(joblib.parallel_config("dask", client=client, n_jobs=-1))
         yield

@@ -292,9 +292,7 @@ def _read_shard(shard: Path, columns: list[str] | None = None) -> pa.Table:
             check_memory(8 * file.metadata.num_rows * sum(sizes), f"{shard}")
             table = file.read(columns=columns)
     except (pa.ArrowException, OSError) as error:
-        raise ValueError(
-            f"shard {shard} is truncated or damaged; remove it and resume: {error}"
-        ) from error
+        raise ValueError(f"shard {shard} is truncated or damaged: {error}") from error
     if columns is not None and table.column_names != columns:
         raise ValueError(f"{shard} holds no episodes: expected columns {columns}")
     return table

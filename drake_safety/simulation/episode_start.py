@@ -59,7 +59,7 @@ class EpisodeStart:
             np.shape(feet) != (kinematics.num_contacts, 3) or not np.isfinite(feet).all()
         ):
             raise ValueError(
-                f"{who}: foot_positions must be {kinematics.num_contacts} finite points; got {feet}"
+                f"{who}: expected {kinematics.num_contacts} finite foot_positions"
             )
         if abs(norm - 1.0) < _ROUNDING:
             return self

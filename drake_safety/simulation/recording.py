@@ -153,9 +153,7 @@ def record_episodes(
 def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str], dict[str, int]]:
     """The diagram's names of the contract's ports, and their sizes."""
     if unknown := set(given) - set(REQUIRED_PORTS):
-        raise ValueError(
-            f"record_episodes: ports has {sorted(unknown)}; expected some of {REQUIRED_PORTS}"
-        )
+        raise ValueError(f"record_episodes: no ports {sorted(unknown)} in {REQUIRED_PORTS}")
     there = port_sizes(diagram)
     used = {
         name: given.get(name, name)
@@ -171,8 +169,7 @@ def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str]
     n_z, n_preview = sizes["output"], sizes["desired_preview"]
     if n_z < 1 or n_preview < 1 or n_preview % n_z:
         raise ValueError(
-            f"record_episodes: port '{used['desired_preview']}' has size {n_preview}; expected H "
-            f"times the size {n_z} of the output"
+            f"record_episodes: size {n_preview} of desired_preview is not H times {n_z}"
         )
     return used, sizes
 
@@ -180,7 +177,5 @@ def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str]
 def _names(what: str, given: Sequence[str] | None, size: int) -> list[str]:
     names = [f"{what}_{i}" for i in range(size)] if given is None else list(given)
     if len(names) != size:
-        raise ValueError(
-            f"record_episodes: {what}_names has {len(names)} names, the port has {size} entries"
-        )
+        raise ValueError(f"record_episodes: {what}_names has {len(names)} names; expected {size}")
     return names

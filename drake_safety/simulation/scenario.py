@@ -260,10 +260,8 @@ def _imported(module_name: str, folder: str) -> ModuleType:
             sys.path.remove(folder)
     origin = getattr(module, "__file__", None)
     if origin is None or Path(origin).resolve() != file.resolve():
-        raise ValueError(
-            f"module '{module_name}' is {origin}, and not {file} beside the scenario: give the "
-            "file a name of its own"
-        )
+        text = f"module '{module_name}' is {origin}, and not {file} beside the scenario"
+        raise ValueError(f"{text}: give the file a name of its own")
     return module
 
 
@@ -277,10 +275,8 @@ def _import_task(task: str, scenario_name: str, folder: str) -> type[ClosedLoop]
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise
-        raise ValueError(
-            f"{who}: no module '{module_name}' for task '{task}', installed or beside the "
-            "scenario's file"
-        ) from error
+        text = f"{who}: no module '{module_name}', installed or beside the scenario's file"
+        raise ValueError(text) from error
     task_class: Any = getattr(module, class_name, None)
     is_task = isinstance(task_class, type) and issubclass(task_class, ClosedLoop)
     # A class without parameters is a base class of tasks.
@@ -331,10 +327,7 @@ def _scenario_file(name: str | Path) -> Path:
     if path.suffix not in (".yaml", ".yml"):
         path = _scenario_folder() / f"{name}.yaml"
         if not path.is_file():
-            raise ValueError(
-                f"scenario '{name}' does not exist; scenarios are {scenario_names()}, or give the "
-                "path of a YAML file"
-            )
+            raise ValueError(f"scenario '{name}' does not exist; scenarios are {scenario_names()}")
     if not path.is_file():
         raise ValueError(f"scenario file '{path}' does not exist")
     return path
@@ -354,10 +347,7 @@ def _parsed(text: str, name: str, folder: Path) -> Scenario:
     """The scenario with the parameters that stand in the text."""
     raw = parse_yaml(text, f"scenario '{name}'")
     if not isinstance(raw, dict) or "task" not in raw:
-        raise ValueError(
-            f"scenario '{name}' must be a mapping with the key 'task', and 'robot' if the task has "
-            "one"
-        )
+        raise ValueError(f"scenario '{name}' must be a mapping with the key 'task'")
     if own := sorted(raw.keys() & {"folder", "identity"}):
         raise ValueError(f"scenario '{name}': unknown keys {own}, which no file states")
     parameters: Any = raw.pop("parameters", None) or {}

@@ -84,9 +84,7 @@ def map_items(
     backend = type(get_active_backend()[0]).__name__
     is_local = backend in ("LokyBackend", "SequentialBackend")
     if not is_local and num_workers is not None:
-        raise ValueError(
-            f"joblib's {backend} has its own number of workers: leave out num_workers (--workers)"
-        )
+        raise ValueError(f"joblib's {backend} has its own number of workers: leave out num_workers")
     num_workers = num_workers or joblib.cpu_count()
     pending = list(items)
     batches = [pending[i : i + batch_size] for i in range(0, len(pending), batch_size)]
@@ -144,8 +142,7 @@ def _call_batch(
 
     if (own := _versions()) != versions:
         raise ValueError(
-            f"the worker at {socket.gethostname()} has {own}, expected {versions}, as here: "
-            "install the same there"
+            f"{socket.gethostname()} has {own}, expected {versions}, as here"
         )
     # Threads of one worker would share its diagram.
     with _lock, threadpool_limits(1):
