@@ -189,7 +189,7 @@ def test_a_diverged_simulation_is_counted_and_a_mistake_is_an_error(caplog):
     ("options", "message"),
     [
         ({"ports": {}}, r"exports no port \['state'\] for \['state'\]; it exports .*'margins'"),
-        ({"ports": {"state": "output", "output": "margins"}}, "size 5 of desired_preview is not H times 2"),
+        ({"ports": {"state": "output", "output": "margins"}}, "size 5 of .* is not H times 2"),
         ({"constraint_names": ["wall"]}, "constraint_names has 1 names; expected 2"),
     ],
 )
