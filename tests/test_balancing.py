@@ -78,22 +78,6 @@ def test_noise_is_only_where_it_was_configured():
     assert abs(np.corrcoef(errors)[0, 1]) < 0.1
 
 
-def test_starts_are_inside_the_ranges_that_the_scenario_gives():
-    loop = packaged_loop()
-    sampling, first_steps = loop.scenario.parameters.start, set()
-    low, high = np.add(sampling.base_height_m, [-0.03, 0.03])  # The tracking error's height.
-    lowest, highest = loop.kinematics.position_limits.T
-    for seed in range(30):
-        context = loop.CreateDefaultContext()
-        first_steps.add(loop.reset(context, np.random.default_rng(seed)))
-        state = loop.GetOutputPort("true_state").Eval(context)
-        joints = state[12 : 12 + loop.kinematics.num_joints]
-        assert np.all((joints >= lowest) & (joints <= highest))
-        assert low <= state[loop.state_names.index("base_z")] <= high
-        assert np.abs(state[3:5]).max() < 2 * sampling.tilt_rad
-    assert first_steps == {0, 1}
-
-
 def test_a_loop_without_a_ball_says_how_to_get_one_and_a_parked_one_changes_nothing():
     loop = standing_loop()
     with pytest.raises(ValueError, match="without a ball; pass ball=True"):

@@ -213,10 +213,6 @@ def test_the_preview_foresees_the_joints_of_a_reach():
     margins = loop.safe_set.margins(q, np.zeros(loop.kinematics.num_velocities))
     for name, margin in zip(loop.constraint_names[:3], margins, strict=False):
         assert x[f"preview_last_{name}"] == pytest.approx(margin, abs=0.03)
-    for goal in ([0.47, -0.27, 1.12], [0.54, -0.26, 1.12]):  # Across the body.
-        loop.reset_standing(context, np.array(goal))
-        x = dict(zip(loop.feature_names, evaluated(loop, context, "features"), strict=True))
-        assert x["preview_last_miss"] < 0.02
 
 
 def test_an_unsolved_program_is_in_the_solver_status():
@@ -234,12 +230,8 @@ def test_an_unsolved_program_is_in_the_solver_status():
     assert evaluated(loop, context, "num_controller_failures")[0] > 0
 
 
-@pytest.fixture(scope="module")
-def actual():
-    return load_scenario("atlas_reaching").make_loop("actual")
-
-
-def test_a_motion_to_a_goal_depends_on_its_seed_and_on_its_push_once_that_begins(actual):
+def test_a_motion_to_a_goal_depends_on_its_seed_and_on_its_push_once_that_begins():
+    actual = load_scenario("atlas_reaching").make_loop("actual")
     goal = np.array(actual.named_targets["blue_box"])
     alone = run_to_goal(actual, goal, duration_s=0.3, ports=("safe",))
     np.testing.assert_allclose(alone.time_s, 0.02 * np.arange(16), atol=1e-12)
@@ -255,13 +247,3 @@ def test_a_motion_to_a_goal_depends_on_its_seed_and_on_its_push_once_that_begins
     # The next motion is not pushed, and has the same noise.
     after = run_to_goal(actual, goal, duration_s=0.3)
     np.testing.assert_array_equal(after["plant_state"], alone["plant_state"])
-
-
-@pytest.mark.slow
-def test_a_motion_that_leaves_the_safe_set_goes_on_until_the_robot_falls(actual):
-    motion = run_to_goal(actual, np.array(actual.named_targets["red_can"]), duration_s=4.5)
-    assert motion.leave_time_s < motion.fall_time_s == motion.time_s[-1] < 4.5
-    row = int(np.argmin(np.abs(motion.time_s - motion.leave_time_s)))
-    assert motion["margins"][:row].min() >= 0
-    assert actual.constraint_names[int(np.argmin(motion["margins"][row]))] == motion.cause
-    assert motion["margins"][-1, actual.constraint_names.index(actual.fall_name)] < 0

@@ -102,20 +102,6 @@ def test_a_start_has_the_controllers_memory_so_that_the_motion_continues(loop):
     assert np.abs(forgotten - expected).max() > 0.01
 
 
-def test_a_goal_is_a_command_which_may_end_before_the_episode(scenario):
-    loop = scenario.make_loop(command_s=1.0)
-    context = loop.CreateDefaultContext()
-    loop.reset_standing(context, np.array([0.5, 0.1, -0.2]))
-    preview = loop.GetOutputPort("desired_preview").Eval(context).reshape(-1, 3)
-    np.testing.assert_allclose(preview[5], [0.5, 0.1, -0.2])
-    names = [f"last_command_{axis}" for axis in ("forward", "left", "yaw")]
-    last = loop.GetOutputPort("features").Eval(context)[list(map(loop.feature_names.index, names))]
-    np.testing.assert_allclose(last, np.zeros(3), atol=1e-12)
-    assert np.all(loop.target_box[1] > loop.policy.parameters.command.highest)
-    with pytest.raises(ValueError, match="a command is three finite numbers"):
-        loop.reset_standing(context, np.array([0.5, np.nan, 0.0]))
-
-
 @pytest.mark.parametrize(
     ("branch", "slowest", "fastest"), [("stop", -0.15, 0.15), ("slower", 0.1, 0.8)]
 )
