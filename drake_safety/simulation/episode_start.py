@@ -58,9 +58,7 @@ class EpisodeStart:
         if feet is not None and (
             np.shape(feet) != (kinematics.num_contacts, 3) or not np.isfinite(feet).all()
         ):
-            raise ValueError(
-                f"{who}: expected {kinematics.num_contacts} finite foot_positions"
-            )
+            raise ValueError(f"{who}: expected {kinematics.num_contacts} finite foot_positions")
         if abs(norm - 1.0) < _ROUNDING:
             return self
         return replace(self, q=np.concatenate([self.q[:4] / norm, self.q[4:]]))

@@ -141,9 +141,7 @@ def _call_batch(
     from threadpoolctl import threadpool_limits
 
     if (own := _versions()) != versions:
-        raise ValueError(
-            f"{socket.gethostname()} has {own}, expected {versions}, as here"
-        )
+        raise ValueError(f"{socket.gethostname()} has {own}, expected {versions}, as here")
     # Threads of one worker would share its diagram.
     with _lock, threadpool_limits(1):
         diagram = [] if make is None else [make()]
