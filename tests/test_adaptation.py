@@ -11,7 +11,7 @@ from drake_safety.learning.assessment import (
     AssessmentParameters,
     SafetyAssessment,
 )
-from drake_safety.learning.beliefs import EMPTY, UNCERTAINTY, from_scores, fuse, safe_share
+from drake_safety.learning.beliefs import EMPTY, UNCERTAINTY, from_scores, fuse
 from drake_safety.learning.change_detector import usual_rows
 from drake_safety.learning.feedback import feedback_segments, pair_episodes
 from drake_safety.learning.grid import Grid
@@ -188,21 +188,6 @@ def test_adapted_loaded_and_overridden_assessments_predict_the_same_bits(fitted,
 
 
 @pytest.mark.train
-def test_grid_and_probability_move_the_same_way(sharpened, adapted_worse):
-    given = inputs(feedback_segments(worse(), sharpened.parameters), slice(None, None, 3))
-    before, after = sharpened.predict(*given), adapted_worse.predict(*given)
-    # Rows that were unknown have no probability to move.
-    was_known = before.probability > 0.0
-    published = (after.probability - before.probability)[was_known]
-    grid = (safe_share(after.belief) - safe_share(before.belief))[was_known]
-    assert published.mean() < -0.05 and grid.mean() < -0.05
-    assert np.corrcoef(published, grid)[0, 1] > 0.6
-    beliefs = adapted_worse.beliefs_
-    np.testing.assert_allclose(beliefs[..., :3].sum(axis=2), 1.0)
-    np.testing.assert_allclose(beliefs[..., 3:].sum(axis=2), beliefs[..., 1], atol=1e-12)
-
-
-@pytest.mark.train
 @pytest.mark.parametrize("num_sets", [1, NUM_PAIRS])
 def test_in_papers_mode_cell_without_feedback_has_refused_prior(paper, num_sets):
     feedback = worse()[:num_sets]
@@ -235,17 +220,6 @@ def test_feedback_belief_is_average_with_decaying_uncertainty():
     np.testing.assert_allclose(beliefs[0], [0.5 * (1 - mu), 0.5 * (1 - mu), mu, 0.5 * (1 - mu)])
     np.testing.assert_allclose(beliefs[3], [0.0, 0.7, 0.3, 0.7])
     np.testing.assert_array_equal(beliefs[1], [*EMPTY, 0.0])
-
-
-def test_prior_and_feedback_are_fused_by_hand_worked_weights():
-    prior = np.array([[0.63, 0.07, 0.3], [0.5, 0.2, 0.3], [0.0, 0.0, 1.0]])
-    feedback = np.array([[0.0, 0.9, 0.1], EMPTY, [0.7, 0.0, 0.3]])
-    both = adaptation.combined(prior, feedback)
-    weights = np.array([0.7 / 0.3, 0.9 / 0.1])
-    np.testing.assert_allclose(both[0, 0], weights[0] * 0.63 / weights.sum())
-    np.testing.assert_allclose(both[0, 2], (0.7 + 0.9) / weights.sum())
-    np.testing.assert_array_equal(both[1], prior[1])
-    np.testing.assert_allclose(both[2], feedback[2])
 
 
 @pytest.mark.train

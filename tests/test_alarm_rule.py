@@ -1,14 +1,12 @@
 """When an alarm begins and ends, and what a run prints and draws of it."""
 
-import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from drake_safety.cli.run import event_rows, reason_events
-from drake_safety.evaluation.timeline_figure import levels_figure
-from drake_safety.learning.change_detector import RECOVERED_LEVEL, RECOVERY_S, Alarm
+from drake_safety.learning.change_detector import RECOVERED_LEVEL, RECOVERY_S
 from drake_safety.simulation.motion import Motion
 from sprung_motions import INFO, STEP_S, learned, motion
 
@@ -27,14 +25,6 @@ def test_an_alarm_ends_after_five_seconds_of_low_levels():
         if largest[row + 1 - size : row + 1].max() < RECOVERED_LEVEL
     ]
     assert alarm.end == ends[0]
-
-
-def test_rows_that_are_not_charted_are_no_time_without_an_alarm():
-    rows = motion(30.0, 50, slice(100, 140))
-    ((begin, end, _),) = learned().watch([rows], INFO.state_names)[1]
-    cut = end - 20
-    (alarm,) = learned().watch([rows[:cut], rows[cut:]], INFO.state_names)[1]
-    assert (alarm.begin, alarm.end) == (begin, end + 2)
 
 
 def test_the_events_of_a_run_have_begin_and_end_of_every_alarm():
@@ -90,22 +80,3 @@ def test_an_event_names_the_reason_of_a_low_probability(
     )
     motion = Motion(time_s=0.02 * np.arange(20), ports=ports)
     assert reason_events(loop, motion, [0.2], 0.06, happens) == [(0.2, happens + reason)]
-
-
-def test_the_figure_has_the_largest_levels_the_limit_and_the_alarms():
-    time_s = 0.02 * np.arange(20_000)
-    names = ["a", "b", "c", "d", "e"]
-    levels = np.full((20_000, 5), 0.5) * [1.0, 0.2, 1.1, 1.2, 1.3]
-    levels[10_001, 0] = 7.0
-    figure = levels_figure(time_s, levels, names, [Alarm(10_001, 10_500, "inputs frozen")], 1.0)
-    (axes,) = figure.axes
-    *curves, limit = axes.lines
-    assert [curve.get_label() for curve in curves] == ["a", "e", "d", "c"]
-    assert max(curves[0].get_ydata()) == 7.0
-    assert len(curves[0].get_ydata()) <= 4000
-    assert [*limit.get_ydata()] == [1.0, 1.0]
-    (span,) = axes.patches
-    assert (span.get_x(), span.get_width()) == pytest.approx((200.02, 9.96))
-    assert [text.get_text() for text in axes.texts] == ["inputs frozen"]
-    (axes,) = levels_figure(time_s, levels, names, [], math.inf).axes
-    assert len(axes.lines) == 4

@@ -16,7 +16,6 @@ from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import split, training_segments
 from lip_assessments import (
     QUICK,
-    calibration,
     held_out_segments,
     inputs,
     quick_assessment,
@@ -53,13 +52,6 @@ def assert_same(prediction, other):
 def assert_same_detector(assessment, other):
     for name, array in assessment.detector_.arrays().items():
         np.testing.assert_array_equal(array, other.detector_.arrays()[name], err_msg=name)
-
-
-def test_parameters_are_copied():
-    parameters = AssessmentParameters(hidden_sizes=[8, 8])
-    learner = SafetyAssessment(parameters)
-    parameters.mode, parameters.hidden_sizes[0] = "paper", 3
-    assert (learner.parameters.mode, learner.parameters.hidden_sizes) == ("sharpened", [8, 8])
 
 
 def test_held_out_episodes_are_told_apart_by_consistent_masses(assessment, held_out):
@@ -245,14 +237,6 @@ def test_saved_assessment_is_loaded_to_the_bit(assessment, held_out, tmp_path, p
     # The same assessment gives the same bytes.
     loaded.save(tmp_path / "again")
     assert path.read_bytes() == (tmp_path / "again").read_bytes()
-
-
-def test_calibration_is_kept_with_the_assessment(assessment, tmp_path):
-    path = tmp_path / "gamma.safetensors"
-    for calibrations in ({"plan": calibration(confidence=0.9)}, {}):
-        assessment.calibrations_ = calibrations
-        assessment.save(path)
-        assert SafetyAssessment.load(path).calibrations_ == calibrations
 
 
 @pytest.mark.parametrize(

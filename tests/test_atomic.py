@@ -1,22 +1,12 @@
 """Files are complete or not there, also when other processes write them."""
 
 import errno
-import os
 from pathlib import Path
 
 import pytest
 
 from drake_safety.evaluation.figure_style import new_figure, save
 from drake_safety.files.atomic import replacing, write_file
-
-
-def test_file_that_another_process_is_writing_stays(tmp_path):
-    other = tmp_path / f".a.json.{os.getppid()}.tmp"
-    other.write_text("half")
-    with replacing(tmp_path / "a.json") as temporary:
-        temporary.write_text("whole")
-    assert other.read_text() == "half"
-    assert (tmp_path / "a.json").read_text() == "whole"
 
 
 def test_file_that_is_not_finished_leaves_the_earlier_one(tmp_path):

@@ -35,16 +35,6 @@ def fitted(output, segments, logit, seed=0, trees_logit=None):
     return fitted_base_logit(output, relabelled, parameters(), trees_logit)
 
 
-def test_whole_episodes_are_held_out_and_at_most_half_of_them(segments):
-    held_out = held_out_segments(segments, parameters(held_out=0.1))
-    left_out = set(segments.episode[held_out])
-    assert len(left_out) == int(0.1 * len(np.unique(segments.episode)))
-    assert left_out.isdisjoint(segments.episode[~held_out])
-    most = held_out_segments(segments, parameters(held_out=0.9))
-    assert len(set(segments.episode[most])) == len(np.unique(segments.episode)) // 2
-    assert not held_out_segments(segments, parameters(held_out=0.0)).any()
-
-
 @pytest.mark.train
 def test_logit_is_fitted_on_ensemble_that_has_not_learned_the_episodes(monkeypatch):
     episodes = make_episodes(120, noise=0.002)

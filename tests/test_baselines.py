@@ -9,7 +9,6 @@ from studies.baselines import (
     KINDS,
     DirectClassifier,
     classifier_differences,
-    classifier_scorers,
 )
 
 pytestmark = pytest.mark.train
@@ -58,22 +57,6 @@ def test_early_stopping_holds_out_whole_episodes(training):
     for is_class in (segments.is_unsafe, ~segments.is_unsafe):
         share = len(np.unique(segments.episode[is_held_out & is_class]))
         assert share / len(np.unique(segments.episode[is_class])) == pytest.approx(0.1, abs=0.02)
-
-
-def test_short_segments_teach_the_ends_of_safe_episodes(fresh):
-    episodes = make_episodes(40, seed=3, noise=0.05)
-    reports = []
-    whole, other = classifier_scorers(episodes, lambda *report: reports.append(report))
-    assert [done for _, done, _ in reports] == list(range(len(KINDS) + 1))
-    assert [whole.name, other.name] == list(KINDS) and whole.used[0].seed == 3
-    assert not np.array_equal(whole.unsafe_score(fresh), other.unsafe_score(fresh))
-    for scorer in (whole, other):
-        score = scorer.unsafe_score(fresh)
-        assert score[fresh.is_unsafe].mean() > score[~fresh.is_unsafe].mean()
-    short, *_ = classifier_scorers(episodes, lambda *report: None, shortest=1)
-    segments = split(episodes, stride=1, discount=1.0, shortest=1)
-    rows = segments.take(~segments.is_unsafe & (segments.length < episodes.info.horizon))
-    assert short.unsafe_score(rows).mean() < whole.unsafe_score(rows).mean()
 
 
 def test_gamma_is_compared_with_the_mean_over_the_seeds_of_each_kind():

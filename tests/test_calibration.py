@@ -11,7 +11,6 @@ from drake_safety.learning.calibration import (
     SAFE,
     UNKNOWN,
     UNSAFE,
-    Calibration,
     allowed_misses,
     calibrate,
     episode_scores,
@@ -99,29 +98,9 @@ def test_either_class_is_called_the_other_as_seldom_as_promised():
     assert np.mean(unknown) > 0.1
 
 
-def test_classes_that_lie_apart_leave_nothing_unknown():
-    score = np.concatenate([np.linspace(0.0, 0.2, 50), np.linspace(0.8, 1.0, 50)])
-    found = calibrate(score, score > 0.5, kind=PLAN, miss_rate=0.05, false_alarm_rate=0.05)
-    assert found.unsafe_below == found.threshold
-    assert (found.num_missed, found.num_accepted) == (1, 50)
-    assert UNKNOWN not in found.verdicts(np.linspace(0, 1, 11))
-
-
 def test_verdict_changes_at_the_thresholds():
     verdicts = calibration().verdicts(np.array([0.8, 0.79, 0.3, 0.29, np.nan]))
     assert verdicts.tolist() == [SAFE, UNKNOWN, UNKNOWN, UNSAFE, UNKNOWN]
-
-
-def test_calibration_says_what_it_promises():
-    promise = (
-        "at most 5 % of unsafe episodes called safe, on average, "
-        "on the plant 'nominal' as long as it behaves as in its episodes"
-    )
-    assert calibration().promise == promise
-    origin = f"calibrated on 100 episodes for a promised miss rate: {promise}"
-    assert calibration().origin == origin
-    assert "safe, 95 % confidence, on the plant" in calibration(confidence=0.95).promise
-    assert Calibration(**calibration().to_json()) == calibration()
 
 
 def test_plan_is_scored_by_its_first_row_and_motion_by_its_worst():

@@ -75,10 +75,3 @@ def test_largest_dtw_is_found_though_euclidean_bound_misleads():
     length, score = np.full(len(error), 12), np.zeros(len(error))
     graph = neighbour_graph(error, length, score, score_weight=0.0, num_neighbours=3)
     assert graph.max_dtw == pytest.approx(naive.dtw(error, length).max(), rel=1e-12)
-
-
-def test_identical_segments_are_at_distance_zero_of_each_other():
-    error = np.zeros((20, 5, 2))
-    graph = neighbour_graph(error, np.full(20, 5), np.zeros(20), score_weight=0.1, num_neighbours=4)
-    assert graph.max_dtw == 0.0
-    np.testing.assert_array_equal(graph.distances, 0.0)

@@ -189,16 +189,6 @@ def test_a_command_names_its_extra_before_it_does_anything(
     assert not folder.exists()
 
 
-def test_the_sdist_holds_what_is_needed_to_build_and_test(sdist):
-    with tarfile.open(sdist) as archive:
-        names = {name.partition("/")[2] for name in archive.getnames()}
-    top = "pyproject.toml LICENSE README.md constraints.txt lowest.txt Makefile"
-    top += " .ci/build_backend.py .ci/shadow.py"
-    assert {*top.split(), *SHIPPED} <= names
-    for folder in ("tests", "studies", "assessments", "examples"):
-        assert {f"{folder}/{name}" for name in files_under(ROOT / folder)} <= names
-
-
 def test_a_folder_that_hides_an_editable_install_is_named(sdist, tmp_path):
     with tarfile.open(sdist) as archive:
         archive.extractall(tmp_path / "unpacked", filter="data")

@@ -1,12 +1,17 @@
 import numpy as np
 import pytest
 
-from drake_safety.learning.assessment import AdaptationParameters
 from drake_safety.learning.prediction import BaseLogit, sigmoid
-from drake_safety.learning.recalibration import LabelledHeads, fitted_change, row_weights
+from drake_safety.learning.recalibration import (
+    HIDDEN_STD,
+    OFFSET_STD,
+    SLOPE_STD,
+    LabelledHeads,
+    fitted_change,
+    row_weights,
+)
 
 LOGIT = BaseLogit(margin_unit=0.02, margin_range=(-0.03, 0.1), margin_slope=0.5, trees_slope=0.4)
-SETTINGS = AdaptationParameters()
 
 
 def labelled(heads, is_unsafe, activations=None):
@@ -34,7 +39,7 @@ def test_the_change_solves_its_own_equation(made):
     actual, twins = drawn(rng, 50, made), drawn(rng, 50, np.zeros(len(made)))
     mean = actual.activations.mean(axis=1, keepdims=True)
     unit = np.sqrt(np.mean(np.sum((actual.activations - mean) ** 2, axis=(0, 2))))
-    change, hidden, hidden_range = fitted_change(actual, twins, LOGIT, SETTINGS)
+    change, hidden, hidden_range = fitted_change(actual, twins, LOGIT)
     added = np.einsum("kni,ki->n", actual.activations, hidden[:, :-1]) + hidden[:, -1].sum()
     np.testing.assert_allclose(hidden_range, [added.min(), added.max()])
     np.testing.assert_allclose(hidden[:, -1], -np.sum(hidden[:, :-1] * mean[:, 0], axis=1))
@@ -45,8 +50,8 @@ def test_the_change_solves_its_own_equation(made):
         phi = np.column_stack([np.ones(len(of.heads)), of.heads, centred])
         return phi.T @ (sigmoid(LOGIT.of_heads(of.heads) + phi @ w) - of.is_unsafe)
 
-    of_slopes = [SETTINGS.slope_std] * (len(made) - 1)
-    deviation = [SETTINGS.offset_std, *of_slopes, *[SETTINGS.hidden_std] * 6]
+    of_slopes = [SLOPE_STD] * (len(made) - 1)
+    deviation = [OFFSET_STD, *of_slopes, *[HIDDEN_STD] * 6]
     residual = slope(actual, w) - slope(twins, np.zeros(len(w))) + w / np.array(deviation) ** 2
     np.testing.assert_allclose(residual, 0.0, atol=1e-3)
     assert change[0] > 0.3
@@ -56,9 +61,9 @@ def test_what_is_wrong_of_the_twins_too_is_not_adapted_to():
     rng = np.random.default_rng(2)
     wrong = (1.0, 0.0, 0.0)
     both = drawn(rng, 20_000, wrong), drawn(rng, 20_000, wrong)
-    assert np.abs(fitted_change(*both, LOGIT, SETTINGS)[0]).max() < 0.15
+    assert np.abs(fitted_change(*both, LOGIT)[0]).max() < 0.15
     # Were L right of the twins, all of that would be the actual robot's.
-    change, *_ = fitted_change(both[0], drawn(rng, 20_000), LOGIT, SETTINGS)
+    change, *_ = fitted_change(both[0], drawn(rng, 20_000), LOGIT)
     assert change[0] == pytest.approx(1.0, abs=0.1)
 
 
@@ -67,7 +72,7 @@ def test_more_danger_never_counts_as_less():
     heads = rng.normal(scale=2.0, size=(5000, 3))
     upside_down = labelled(heads, rng.random(5000) < sigmoid(-3.0 * heads.sum(axis=1)))
     right = labelled(heads, rng.random(5000) < sigmoid(LOGIT.of_heads(heads)))
-    change, *_ = fitted_change(upside_down, right, LOGIT, SETTINGS)
+    change, *_ = fitted_change(upside_down, right, LOGIT)
     np.testing.assert_allclose(change[1:], -np.array(LOGIT.slopes))
 
 
@@ -86,7 +91,7 @@ def test_what_the_heads_and_the_hidden_layer_know_of_the_actual_robot_is_found(c
     rng = np.random.default_rng(4)
     actual = drawn(rng, 20_000, change, hidden)
     twins = drawn(rng, 20_000, np.zeros(len(change)))
-    found, weights, _ = fitted_change(actual, twins, LOGIT, SETTINGS)
+    found, weights, _ = fitted_change(actual, twins, LOGIT)
     np.testing.assert_allclose(weights[:, :-1], hidden, atol=0.15)
     # The last column takes off what the hidden layer adds on average.
     found[0] += weights[:, -1].sum()

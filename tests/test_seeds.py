@@ -1,30 +1,20 @@
 import dataclasses
-import inspect
 from itertools import combinations
 
 import pytest
-import typer
 
 from drake_safety import __version__
-from drake_safety.cli import adapt, calibrate, evaluate, gate, play, prepare, run, train
 from drake_safety.evaluation.episode_study import evaluate_episodes
-from drake_safety.evaluation.loop_comparison import compare_loops
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning import seeds
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.feedback import pair_episodes
 from drake_safety.learning.seeds import NOT_DRAWN, RELEASE, UsedEpisodes, check_unused, use_of
 from drake_safety.learning.segments import Episodes
-from drake_safety.simulation.feedback import run_pairs
 from lip_assessments import calibration, quick_assessment, quick_episodes
 from lip_episodes import make_episodes
-from studies.__main__ import app as studies
 
 BLOCKS = [block for block in vars(seeds).values() if isinstance(block, seeds.SeedBlock)]
-
-
-def default_seed(function):
-    return inspect.signature(function).parameters["seed"].default
 
 
 def used(seed, purpose="training", num_episodes=7):
@@ -63,27 +53,6 @@ def test_the_seeds_of_a_release_are_far_from_those_of_development():
         assert use_of(block.first + RELEASE) == f"release {__version__.removesuffix('.dev0')}"
         assert block.first_beside(seeds.SHIFTS.first) == block.first
         assert block.first_beside(seeds.SHIFTS.first + RELEASE) == block.first + RELEASE
-
-
-def test_every_study_with_seeds_has_those_of_the_release():
-    group = typer.main.get_command(studies)
-    for name, command in group.commands.items():
-        options = {parameter.name for parameter in command.params}
-        if name != "walking":  # It has no first seed.
-            assert ("seed" in options) == ("release" in options), name
-    assert "release" in {parameter.name for parameter in group.commands["walking"].params}
-
-
-def test_every_command_takes_its_default_seed_from_the_table():
-    commands = (train.train, calibrate.calibrate, adapt.adapt)
-    blocks = (seeds.TRAINING, seeds.CALIBRATION, seeds.ADAPTATION)
-    assert [default_seed(command) for command in commands] == [block.first for block in blocks]
-    # The default of `evaluate` is that of what it evaluates.
-    assert default_seed(evaluate.evaluate) is None
-    shown = [default_seed(command) for command in (run.run, play.play, prepare.check)]
-    assert shown == [seeds.DEMONSTRATION.first] * 3
-    assert default_seed(run_pairs) == seeds.ADAPTATION.first
-    assert default_seed(gate.gate) == default_seed(compare_loops) == seeds.GATE.first
 
 
 def test_a_used_seed_is_refused_with_what_it_was_used_for_and_one_that_is_free():

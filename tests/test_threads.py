@@ -4,7 +4,6 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_safety import load_assessment, load_scenario
-from drake_safety.robots.robot import Scratch
 
 NUM_THREADS, DURATION_S = 4, 0.2
 PORTS = ("state", "features", "margins")
@@ -30,11 +29,3 @@ def test_threads_with_one_diagram_give_the_same_bits_as_one_after_the_other():
         together = list(pool.map(lambda seed: final_values(loop, seed, ports), range(NUM_THREADS)))
     for one, other in zip(alone, together, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def test_each_thread_has_a_value_of_its_own():
-    scratch = Scratch(list)
-    scratch.value.append("main")
-    with ThreadPoolExecutor(1) as pool:
-        assert pool.submit(lambda: scratch.value).result() == []
-    assert scratch.value == ["main"]

@@ -106,15 +106,6 @@ class SafetyAssessment:
         # A copy, so that later changes of a scenario do not change a trained assessment.
         self.parameters = copy.deepcopy(parameters or AssessmentParameters())
 
-    def __repr__(self) -> str:
-        mode = f"mode '{self.parameters.mode}'"
-        if not hasattr(self, "beliefs_"):
-            return f"SafetyAssessment({mode}, not fitted)"
-        words = [f"'{self.info_.scenario}'", mode, f"{len(self.beliefs_)} maps"]
-        for used in self.used_:
-            words.append(f"{used.purpose} on {used.num_episodes} episodes of '{used.variation}'")
-        return f"SafetyAssessment({', '.join(words)})"
-
     @property
     def settings(self) -> ModeSettings:
         """What the stages of learning read of the parameters in this mode."""

@@ -34,10 +34,6 @@ class AdaptationParameters:
         decay_rate: alpha, rate at which feedback beliefs lose uncertainty (paper).
         first_uncertainty: beta, uncertainty of a feedback belief from one sample (paper).
         update_interval: k_u, pairs of episodes between two updates.
-        offset_std: Prior standard deviation of the change of the base logit's offset (sharpened).
-        slope_std: The same for each of its slopes (sharpened).
-        hidden_std: The same for the contribution of the maps' last hidden layer at the feedback's
-            mean distance of activations from their mean (sharpened).
     """
 
     gate: NotNegative = 0.3
@@ -45,9 +41,6 @@ class AdaptationParameters:
     decay_rate: NotNegative = 0.4
     first_uncertainty: Share = 0.3
     update_interval: Count = 40
-    offset_std: Positive = 2.0
-    slope_std: Positive = 0.5
-    hidden_std: Positive = 1.0
 
 
 @schema(kw_only=True)

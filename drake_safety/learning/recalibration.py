@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 
 from drake_safety.learning import beliefs as belief_masses
-from drake_safety.learning.assessment_parameters import AdaptationParameters, AssessmentParameters
+from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.feedback import EpisodePair, FeedbackSegments
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.prediction import BaseLogit, Correction, Model, hidden_sum, sigmoid
 from drake_safety.learning.training_scores import TrainingScores
+
+OFFSET_STD, SLOPE_STD, HIDDEN_STD = 2.0, 0.5, 1.0
+"""Prior standard deviations of the changes of offset, slopes and hidden layer's contribution."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,10 +64,7 @@ def _labelled(
 
 
 def fitted_change(
-    actual: LabelledHeads,
-    twins: LabelledHeads,
-    base_logit: BaseLogit,
-    settings: AdaptationParameters,
+    actual: LabelledHeads, twins: LabelledHeads, base_logit: BaseLogit
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fits `change` (3,) or (4,), `hidden` (K, n + 1) and `hidden_range` (2,) of a `Correction`.
 
@@ -72,7 +72,7 @@ def fitted_change(
     sigma(ell + w . phi) on the actual episodes with a normal prior, minus the error of ell at the
     start of the twins, w . sum phi (sigma(ell) - label), so that errors that a pair shares cancel.
     Activations are centred and divided by their mean distance from the mean, so that their joint
-    contribution has the standard deviation `hidden_std`. The corrected slopes stay >= 0.
+    contribution has the standard deviation `HIDDEN_STD`. The corrected slopes stay >= 0.
     """
     from scipy.optimize import minimize
 
@@ -90,8 +90,8 @@ def fitted_change(
     error = sigmoid(base_logit.of_heads(twins.heads)) - twins.is_unsafe
     expected = columns(twins).T @ (twins.weight * error)
     num_heads = actual.heads.shape[1]
-    deviation = np.full(phi.shape[1], settings.hidden_std)
-    deviation[: 1 + num_heads] = settings.offset_std, *[settings.slope_std] * num_heads
+    deviation = np.full(phi.shape[1], HIDDEN_STD)
+    deviation[: 1 + num_heads] = OFFSET_STD, *[SLOPE_STD] * num_heads
     precision = deviation**-2.0
 
     def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
@@ -152,7 +152,7 @@ def recalibrated(
     correction = Correction.none(model.embedding, grid, model.trees)
     if any(pair.differs for pair in feedback):
         actual, twins = _labelled(feedback, columns, model)
-        change = fitted_change(actual, twins, model.base_logit, parameters.adaptation)
+        change = fitted_change(actual, twins, model.base_logit)
         # Where most feedback was unsafe, the base logit must not fall.
         vote = np.where(segments.is_unsafe, 1.0, -1.0)
         guard = (_cell_means(vote, points, grid) > 0.0).astype(float)
