@@ -334,10 +334,7 @@ class SafetyAssessment:
         state: np.ndarray,
         desired_preview: np.ndarray,
         features: np.ndarray | None = None,
-        *,
-        beliefs: np.ndarray | None = None,
-        correction: Correction | None = None,
-        novelty: Novelty | None = None,
+        **learned: Any,
     ) -> Prediction:
         """Assesses N inputs; novel ones and those that are not finite get the empty belief.
 
@@ -347,12 +344,20 @@ class SafetyAssessment:
             state: Measured states, (N, n_s).
             desired_preview: Desired outputs over the horizon, row-major in time, (N, H*n_z).
             features: Features, (N, n_f); ignored in the paper's mode.
-            beliefs: Beliefs of the cells; `beliefs_` by default, (K, R*R, 3 + n_c).
-            correction: Correction of the base logit; `correction_` by default.
-            novelty: Says which inputs are novel; `novelty_` by default.
+            **learned: `beliefs`, `correction` or `novelty` in place of the assessment's own.
         """
-        x = self._checked_inputs(2, state, desired_preview, features)
-        return self._predict(x, beliefs=beliefs, correction=correction, novelty=novelty)
+        return self._predict(self._checked_inputs(2, state, desired_preview, features), **learned)
+
+    def predict_one(
+        self,
+        state: np.ndarray,
+        desired_preview: np.ndarray,
+        features: np.ndarray | None = None,
+        **learned: Any,
+    ) -> Prediction:
+        """Assesses one input, with the same bits; arguments as of `predict` without the axis N."""
+        x = self._checked_inputs(1, state, desired_preview, features)[None]
+        return self._predict(x, **learned).one(0)
 
     def predict_rows(self, rows: Episode | Segments, variation: str = "nominal") -> Prediction:
         """Assesses recorded rows of a plant; see `InputColumns.of_rows`."""
@@ -360,30 +365,14 @@ class SafetyAssessment:
         return self._predict(self.columns_.of_rows(rows, variation))
 
     @one_blas_thread
-    def _predict(self, x: np.ndarray, **others: Any) -> Prediction:
-        """Predicts with other beliefs, correction or novelty where they are not None."""
+    def _predict(self, x: np.ndarray, **learned: Any) -> Prediction:
         own = self.model
-        changed = {name: value for name, value in others.items() if value is not None}
-        model = replace(own, **changed) if changed else own
+        model = replace(own, **learned) if learned else own
         if (given := model.shapes) != (expected := own.shapes):
             raise ValueError(
                 f"{self._who}: beliefs and correction have the shapes {given}, expected {expected}"
             )
         return model.predict(x)
-
-    def predict_one(
-        self,
-        state: np.ndarray,
-        desired_preview: np.ndarray,
-        features: np.ndarray | None = None,
-        *,
-        beliefs: np.ndarray | None = None,
-        correction: Correction | None = None,
-        novelty: Novelty | None = None,
-    ) -> Prediction:
-        """Assesses one input, with the same bits; arguments as of `predict` without the axis N."""
-        x = self._checked_inputs(1, state, desired_preview, features)[None]
-        return self._predict(x, beliefs=beliefs, correction=correction, novelty=novelty).one(0)
 
     def _checked_inputs(self, ndim: int, state: np.ndarray, *others: Any) -> np.ndarray:
         x = self.inputs_of(state, *others)
