@@ -293,7 +293,7 @@ def test_feedback_that_does_not_fit_is_refused(sharpened, change, message):
 
 def test_twin_that_is_missing_or_begins_elsewhere_is_refused():
     episodes = make_episodes(3, noise=0.002)
-    with pytest.raises(ValueError, match=r"episode 2 .* has no nominal twin"):
+    with pytest.raises(ValueError, match="episode 2 has no nominal twin"):
         pair_episodes(episodes, episodes[:2])
     shifted = [replace(e, true_state=e.true_state + 0.1 * (e.index == 1)) for e in episodes]
     with pytest.raises(ValueError, match="twin of episode 1 starts in another state"):

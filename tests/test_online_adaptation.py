@@ -109,7 +109,7 @@ def test_the_newest_feedback_is_kept_so_that_a_long_simulation_needs_no_more_mem
     # Ten windows, the last three of which are kept.
     assert len(adopted) == 10
     assert [one.actual.index for one in adaptation.feedback] == [7, 8, 9]
-    assert [number for _, number in adaptation.adapted] == [3] * 8  # Of the newest updates.
+    assert adaptation.adapted == [3] * 8  # Of the newest updates.
     assert adaptation.num_updates == 10
 
 

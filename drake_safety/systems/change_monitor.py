@@ -89,7 +89,7 @@ class ChangeMonitor(LeafSystem):
             begin_s, end_s = min(begin_s, begin), max(end_s, end)
         context.SetDiscreteState(self._groups["expected_s"], [begin_s, end_s])
 
-    def _row(self, context: Context) -> np.ndarray:
+    def row(self, context: Context) -> np.ndarray:
         """State, preview and features at the ports, (n,); features not read are 0."""
         features = np.zeros(self._features_port.size())
         if self.reads_features:
@@ -118,7 +118,7 @@ class ChangeMonitor(LeafSystem):
             part["x"][:] = part["previous"][:] = np.nan
             part["repeats"][0] = part["num_lost"][0] = 0.0
         else:
-            self._chart(part, self._detector_of(context), self._row(context))
+            self._chart(part, self._detector_of(context), self.row(context))
         for name, index in self._groups.items():
             discrete_state.set_value(index, part[name])
 
