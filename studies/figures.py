@@ -17,14 +17,17 @@ from drake_safety.assessments import shipped_folder
 from drake_safety.cli.console import say
 from drake_safety.cli.run import run
 from drake_safety.cli.training_folder import MODES, load_assessment
+from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.interval_figure import interval_figure
 from drake_safety.evaluation.results import Results
+from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from studies.moving_pictures import recovery, walking
+from studies.path_figure import path_figure
 
 _ROOT = Path(__file__).resolve().parents[1]
 _SEED = DEMONSTRATION.first
@@ -32,7 +35,7 @@ _REACHING: dict[str, Any] = {"target": "blue_box", "push": ["torso"], "force": T
 _WALKING: dict[str, Any] = {"target": "0.5 0 0", "push": ["side"], "force": True}
 _WALKING |= {"variation": "nominal"}  # On another one the monitor may alarm before the push.
 _ELSEWHERE = (
-    "adaptation.png and region.png, of commit f358026; path.png, of b310981; compose.svg, which "
+    "adaptation.png and region.png, of commit f358026; compose.svg, which "
     "`python docs/generator/diagram_picture.py` draws by GraphViz; alarms_*.png of "
     "`python -m studies walking`"
 )
@@ -42,6 +45,28 @@ def _of_run(picture: str, scenario: str, folder: Path, **options: Any) -> Path:
     """A picture of `drake-safety run`."""
     run(scenario, out=folder, **options)
     return folder / "run" / picture
+
+
+def _path(folder: Path) -> Figure:
+    """Two balls thrown at Laikago, in the plane of the paper's Γ."""
+    scenario = load_scenario("laikago_balancing")
+    gamma = load_assessment(shipped_folder(scenario.name), "paper")
+    throws = scenario.parameters.demonstration
+    motion = run_throw(
+        scenario.make_loop(assessment=gamma, ball=True),
+        0,
+        throws=throws,
+        seed=_SEED,
+        duration_s=5.0,
+        ports=("embedding", "safety_probability", "belief"),
+    )
+    steps = [begin_s for begin_s, _ in motion.recovery_intervals_s]
+    events = {f"ball {i}": throw.time_s for i, throw in enumerate(throws, start=1)}
+    events |= {f"recovery {i}": begin_s for i, begin_s in enumerate(steps, start=1)}
+    is_known = ~is_unknown(motion["belief"], gamma.parameters.initial_uncertainty)
+    curve = motion.time_s, motion["embedding"], is_known, motion["safety_probability"][:, 0]
+    threshold = scenario.parameters.recovery.threshold
+    return path_figure(gamma, *curve, threshold, {"start": 0.0} | events)
 
 
 def _embedding(folder: Path) -> Figure:
@@ -75,6 +100,7 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
     "recovery": recovery,
     "walking": walking,
     "timeline": partial(_of_run, "timeline.png", "laikago_balancing", push=["ball"]),
+    "path": _path,
     "reaching": partial(_of_run, "timeline.png", "atlas_reaching", **_REACHING),
     "walking_timeline": partial(_of_run, "timeline.png", "g1_walking", **_WALKING),
     "embedding": _embedding,

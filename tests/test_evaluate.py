@@ -40,6 +40,7 @@ def test_fresh_targets_are_judged_kept_and_not_simulated_again(monkeypatch, caps
     for place in ("calibration", "calibration.rows"):
         error = first[place, "sharpened", "expected_calibration_error"]
         assert error.low <= error.high and error.n == 30
+    assert (folder / "reliability.png").is_file()
     # What takes throws or runs is no part of it.
     assert not {"throws", "segments"} & {key[0] for key in first}
     hash_ = load_scenario(file).simulation_hash()

@@ -1,13 +1,14 @@
 import numpy as np
 import pytest
 
-from drake_safety.evaluation.reliability import calibration_error, verdict_shares
+from drake_safety.evaluation.metrics import proportion
+from drake_safety.evaluation.reliability import reliability, verdict_shares
 from drake_safety.learning.calibration import PLAN, calibrate
 from lip_assessments import scored_episodes
 
 
-def error(p, label, **options):
-    return calibration_error(p, label, np.arange(len(p)), **options)
+def once(p, label, **options):
+    return reliability(p, label, np.arange(len(p)), **options)
 
 
 def test_every_episode_has_one_verdict():
@@ -21,26 +22,35 @@ def test_every_episode_has_one_verdict():
     assert shares["unsafe_unknown"] > 0.0
 
 
-def test_probabilities_that_come_true_have_no_error_and_overconfident_ones_have():
+def test_probabilities_that_come_true_lie_on_the_diagonal_and_overconfident_ones_do_not():
     rng = np.random.default_rng(4)
     p = rng.random(20000)
     label = rng.random(20000) < p
-    assert error(p, label).value < 0.02
+    true = once(p, label)
+    assert true.error.value < 0.02
+    for expected, observed in zip(true.expected, true.observed, strict=True):
+        assert observed.low <= expected <= observed.high
     # As far from one half again as it should be, where that is possible: off by |p - 1/2|.
-    bold = error(np.clip(2.0 * p - 0.5, 0.0, 1.0), label)
-    assert bold.value == pytest.approx(0.125, abs=0.02)
-    assert bold.low < bold.value < bold.high
+    bold = once(np.clip(2.0 * p - 0.5, 0.0, 1.0), label)
+    assert bold.error.value == pytest.approx(0.125, abs=0.02)
+    assert bold.error.low < bold.error.value < bold.error.high
 
 
 def test_equal_probabilities_share_a_bin():
-    one = error(np.array([0.2, 0.2, 0.2, 1.0]), np.array([True, False, False, True]))
-    assert one.value == pytest.approx(3 / 4 * (1 / 3 - 0.2))
+    one = once(np.array([0.2, 0.2, 0.2, 1.0]), np.array([True, False, False, True]))
+    np.testing.assert_allclose(one.expected, [0.2, 1.0])
+    assert one.observed == [proportion(1, 3), proportion(1, 1)]
+    assert one.error.value == pytest.approx(3 / 4 * (1 / 3 - 0.2))
 
 
 def test_repeating_the_rows_of_an_episode_adds_no_certainty():
     score, label = scored_episodes(np.random.default_rng(5), n=200)
     rows = (np.repeat(score, 20), np.repeat(label, 20))
-    often = calibration_error(*rows, np.repeat(np.arange(200), 20), num_bins=2)
-    single = error(score, label, num_bins=2)
-    assert often.value == pytest.approx(single.value)
-    assert (often.n, often.high) == (single.n, pytest.approx(single.high))
+    often = reliability(*rows, np.repeat(np.arange(200), 20), num_bins=2)
+    independent = reliability(*rows, np.arange(4000), num_bins=2)
+    single = once(score, label, num_bins=2)
+    for many, alone, few in zip(often.observed, independent.observed, single.observed, strict=True):
+        assert many.n == few.n == alone.n / 20
+        assert many.high - many.low > 3.0 * (alone.high - alone.low)
+        assert many.high - many.low == pytest.approx(few.high - few.low, rel=0.3)
+    assert often.error.value == pytest.approx(single.error.value)

@@ -27,7 +27,7 @@ from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.episode_study import evaluate_episodes, evaluate_plans
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.reliability import calibration_error, verdict_shares
+from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
 from drake_safety.evaluation.results import Key, Results
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
@@ -191,18 +191,20 @@ def add_verdicts(
 
 def add_reliability(evaluation: Evaluation, test: Episodes) -> None:
     """Evaluates the reliability of either mode, and its stored calibrations."""
-    segments, estimates = split(test, stride=1, discount=1.0, shortest=1), {}
+    segments = split(test, stride=1, discount=1.0, shortest=1)
+    estimates, curves = {}, {}
     for scorer in evaluation.scorers:
         mode, score = scorer.name, scorer.unsafe_score(segments)
         of_first, label = episode_scores(segments, score, PLAN)
-        first = calibration_error(of_first, label, np.arange(len(label)))
-        rows = calibration_error(score, segments.is_unsafe, segments.episode)
-        estimates["calibration", mode, "expected_calibration_error"] = first
-        estimates["calibration.rows", mode, "expected_calibration_error"] = rows
+        first = curves[f"{mode}, first row"] = reliability(of_first, label, np.arange(len(label)))
+        rows = reliability(score, segments.is_unsafe, segments.episode)
+        curves[f"{mode}, every row"] = rows
+        estimates["calibration", mode, "expected_calibration_error"] = first.error
+        estimates["calibration.rows", mode, "expected_calibration_error"] = rows.error
         for kind, one in evaluation.assessments[mode].calibrations_.items():
             shares = verdict_shares(one, *episode_scores(segments, score, kind))
             estimates |= {(f"calibration.{kind}", mode, what): n for what, n in shares.items()}
-    evaluation.add(estimates)
+    evaluation.add(estimates, reliability=reliability_figure(curves))
 
 
 def add_throws(

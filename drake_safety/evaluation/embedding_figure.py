@@ -42,10 +42,7 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
         _draw_segments(fig, left, assessment, episodes)
         most = max(1.0 - assessment.parameters.initial_uncertainty, cells[:, SAFE].max())
         is_empty = cells[:, UNCERTAINTY] >= 1.0
-        shade = ScalarMappable(Normalize(0.0, most), _SAFETY)
-        colours = shade.to_rgba(cells[:, SAFE])
-        _draw_cells(middle, grid, colours, is_empty)
-        _add_colour_bar(fig, middle, shade, "belief: safe")
+        colours = draw_values(fig, middle, grid, cells[:, SAFE], is_empty, "belief: safe", most)
         is_bright = colours[:, :3] @ [0.299, 0.587, 0.114] > 0.6
         ink = np.where(is_empty, style.FAINT_INK, np.where(is_bright, style.INK, "white"))
         place: dict[str, Any] = {"ha": "center", "va": "center_baseline", "fontsize": 6.5}
@@ -61,6 +58,23 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
         for last in others:
             _draw_causes(last, grid, cells, assessment.info_.constraint_names)
     return fig
+
+
+def draw_values(
+    fig: Figure,
+    axes: Axes,
+    grid: Grid,
+    value: np.ndarray,
+    is_empty: np.ndarray,
+    label: str,
+    most: float = 1.0,
+) -> np.ndarray:
+    """Draws cells coloured by a value (R*R,), with a colour bar; returns the colours (R*R, 4)."""
+    shade = ScalarMappable(Normalize(0.0, most), _SAFETY)
+    colours = shade.to_rgba(value)
+    _draw_cells(axes, grid, colours, is_empty)
+    _add_colour_bar(fig, axes, shade, label)
+    return colours
 
 
 def _draw_segments(

@@ -1,10 +1,15 @@
-"""Reliability of probabilities, and of stored thresholds."""
+"""Reliability: predicted probabilities beside outcomes, and stored thresholds."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
-from drake_safety.evaluation.metrics import Bootstrap, Estimate, proportion
+import numpy as np
+from matplotlib.figure import Figure
+
+from drake_safety.evaluation import figure_style as style
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, proportion, share
 from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE, Calibration
 
 _BOOTSTRAP = Bootstrap(num_resamples=100)
@@ -29,22 +34,65 @@ def verdict_shares(
     }
 
 
-def calibration_error(
-    unsafe_probability: np.ndarray, is_unsafe: np.ndarray, episode: np.ndarray, num_bins: int = 10
-) -> Estimate:
-    """The expected calibration error: mean distance of predicted and observed shares of bins.
+class Reliability(NamedTuple):
+    """Predicted probabilities against observed frequencies, in bins of equal numbers of rows.
 
-    Bins have about equal numbers of rows (N,); rows of equal probability share one.
+    Attributes:
+        expected: Mean predicted probability of an unsafe end, (B,).
+        observed: Share of unsafe ends, by bin.
+        error: Expected calibration error, the mean distance between the two over all rows.
     """
+
+    expected: np.ndarray
+    observed: list[Estimate]
+    error: Estimate
+
+
+def reliability(
+    unsafe_probability: np.ndarray, is_unsafe: np.ndarray, episode: np.ndarray, num_bins: int = 10
+) -> Reliability:
+    """Compares 1 - probability of rows, (N,), with outcomes of their episodes."""
     p = unsafe_probability
 
     def error(weight: np.ndarray) -> float:
         drawn = np.repeat(np.arange(len(p)), weight.astype(int))
-        # Edges are occurring values.
-        quantiles = np.linspace(0, 1, num_bins + 1)[1:-1]
-        edges = np.unique(np.quantile(p[drawn], quantiles, method="nearest"))
-        bins = np.searchsorted(edges, p[drawn], side="right")
-        apart = np.bincount(bins, p[drawn] - is_unsafe[drawn])
-        return float(np.abs(apart).sum() / len(drawn))
+        bins = _bins(p[drawn], num_bins)
+        distances = [abs(p[drawn[b]].mean() - is_unsafe[drawn[b]].mean()) for b in bins]
+        return float([len(b) for b in bins] @ np.array(distances) / len(drawn))
 
-    return _BOOTSTRAP.over_episodes(error, episode)
+    bins = _bins(p, num_bins)
+    return Reliability(
+        expected=np.array([p[b].mean() for b in bins]),
+        observed=[share(is_unsafe[b], episode[b], bootstrap=_BOOTSTRAP) for b in bins],
+        error=_BOOTSTRAP.over_episodes(error, episode),
+    )
+
+
+def _bins(p: np.ndarray, num_bins: int) -> list[np.ndarray]:
+    # Edges are occurring values, so that equal probabilities share a bin.
+    edges = np.unique(np.quantile(p, np.linspace(0, 1, num_bins + 1)[1:-1], method="nearest"))
+    members = np.searchsorted(edges, p, side="right")
+    return [np.flatnonzero(members == i) for i in np.unique(members)]
+
+
+def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
+    """Plots the observed share of unsafe ends over the predicted probability."""
+    with style.drawing_style():
+        fig = style.new_figure(5.4, 6.6)
+        axes = fig.subplots()
+        axes.axline((0, 0), slope=1, color=style.FAINT_INK, linewidth=0.8)
+        axes.set_prop_cycle(color=style.SERIES_COLOURS, linestyle=style.SERIES_DASHES)
+        look: dict[str, Any] = {"marker": "o", "markersize": 5, "linewidth": 1.4, "elinewidth": 0.8}
+        for name, one in curves.items():
+            value, low, high = np.array([(s.value, s.low, s.high) for s in one.observed]).T
+            interval = np.clip([value - low, high - value], 0.0, None)
+            label = f"{name}   {one.error.value:.3f}"
+            axes.errorbar(one.expected, value, yerr=interval, label=label, **look)
+        axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal", title="Reliability")
+        axes.set_xlabel("predicted probability of an unsafe end")
+        axes.set_ylabel("share of unsafe ends, 95 % intervals over episodes")
+        axes.grid(color="#eceef0", linewidth=0.7)
+        # Outside: intervals may be anywhere in the axes.
+        title = "expected calibration error"
+        fig.legend(loc="outside lower center", ncols=2, title=title, alignment="left")
+    return fig
