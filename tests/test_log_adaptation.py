@@ -96,13 +96,6 @@ def test_logs_adapt_as_the_runs_that_they_are_of(folder, tmp_path, monkeypatch, 
         np.testing.assert_allclose(change, near.correction_.change, atol=0.05)
 
 
-def test_a_log_is_given_once(folder, capsys, monkeypatch):
-    log = folder / "short.yaml"
-    given = ("--log", log, "--log", log, "--map", log)
-    assert call(monkeypatch, "adapt", log, "--assessment", folder, *given) == 2
-    assert "logs must differ" in capsys.readouterr().out
-
-
 def test_a_log_is_cut_where_a_value_is_missing(folder, capsys, monkeypatch, tmp_path):
     options = ("--assessment", folder, "--out", tmp_path / "out")
     log = logged(0, tmp_path, gyro_x=20)

@@ -10,7 +10,6 @@ from drake_safety.logs.robot_log import read_log
 from log_files import (
     ANGLES,
     BASE,
-    GOAL,
     GYRO,
     JOINTS,
     LINEAR,
@@ -80,21 +79,7 @@ def with_signs(*parts):
     return times([*ANGLES, *RATES], *signs, *signs)
 
 
-def turned(R, *, with_base):
-    """A world with other axes, and a base that has them as well or not."""
-
-    def spoil(frame):
-        for columns in (BASE, GOAL, *((GYRO, LINEAR) if with_base else ())):
-            frame = with_values(frame, columns, R.apply(np.array(frame[columns])))
-        back = R.inv() if with_base else Rotation.identity()
-        return with_values(frame, QUATERNION, (R * turns_of(frame) * back).as_quat())
-
-    return spoil
-
-
-WORLD, BODY = "velocity_z], frame: body", "velocity_z]"
 UNMAPPED = [(line, "") for line in TABLE_MAP.splitlines() if "velocit" in line]
-HALF = about("x", 180)
 CONTRADICTIONS = {
     "in the world": (in_world(LINEAR), [], r"linear_velocity', columns .* by 0\.48 m/s.*, but by "
                      r"0\.00 m/s if 'base_linear_velocity.frame' is world"),
@@ -104,7 +89,6 @@ CONTRADICTIONS = {
     "noise alone": (lambda f: f.assign(**{n: np.resize([0.7, -0.6, 0.5, -0.8], len(f)) for n in
                                           LINEAR}), [],
                     r"columns \['velocity_x', .* unit agrees: leave 'base_linear_velocity' out"),
-    "gyro in radians": (times(GYRO, np.pi / 180), [], "if 'base_angular_velocity.unit' is rad"),
     "gyro turned": (lambda f: f.assign(gyro_x=f.gyro_y, gyro_y=-f.gyro_x), [],
                     r"turned by 90° about \[-?0.0, -?0.0, 1.0\] .* in the body"),
     "motors": (times(RATES, 6.33), [], "is multiplied by 0.158: a gear ratio"),
@@ -114,10 +98,6 @@ CONTRADICTIONS = {
                       "slide by .*_orientation' is turned by 60° about the vertical"),
     "order": (lambda f: f, [("order: xyzw", "order: wxyz")],
               r"line 2 and .* slide by .* 'base_orientation.order' is xyzw"),
-    "upside down": (oriented(lambda R: R * about("x", 180)), [],
-                    r"does not stand .* turned on the base by 180° about \[1.0, 0.0, 0.0\]"),
-    "world with y up": (turned(about("x", -90), with_base=False), [],
-                        "it would stand if the world has y upwards"),
     "left is right": (with_legs({"FR": "FL", "FL": "FR", "RR": "RL", "RL": "RR"}), [],
                       r"of left and right legs are exchanged: {'FR_hip_joint': 'FL_hip_joint_pos'"),
     "motors mounted mirrored": (with_signs("R_hip"), [], r"slide by .* if 'joint_positions.sign' "
@@ -160,7 +140,7 @@ def noisy(frame, rng):
     return frame
 
 
-@pytest.mark.parametrize("every", [1, 4, 20], ids=["200 Hz", "50 Hz", "10 Hz"])
+@pytest.mark.parametrize("every", [1, 20], ids=["200 Hz", "10 Hz"])
 def test_a_noisy_log_is_read(every, tmp_path):
     frame = noisy(frame_of(walked()), np.random.default_rng(0))[::every]
     log = read(save(frame, tmp_path), ("ns}", "ns}\nmax_gap_s: 0.11"), reader=read_log)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drake_safety import run_episode
-from drake_safety.logs.episodes import cut_log, episodes_from_log, motions_from_log
+from drake_safety.logs.episodes import cut_log, motions_from_log
 from log_files import (
     SAFE,
     UNSAFE,
@@ -26,7 +26,7 @@ NUM_JOINTS = 12
 def test_a_safe_run_of_the_loop_gives_the_episode_that_the_loop_recorded():
     episode = run_episode(balancing_loop(), SAFE)
     assert episode.is_safe
-    episodes = episodes_from_log(recorded(SAFE), balancing_loop())
+    episodes = cut_log(recorded(SAFE), balancing_loop())[0]
     assert len(episodes) == 1
     assert_same(episodes[0], episode, num_loads=NUM_JOINTS)
     assert episodes.info.variation == "actual"
@@ -36,7 +36,7 @@ def test_a_safe_run_of_the_loop_gives_the_episode_that_the_loop_recorded():
 def test_an_unsafe_run_ends_with_the_state_and_the_cause_the_loop_ended_with():
     episode = run_episode(balancing_loop(), UNSAFE)
     assert not episode.is_safe
-    (logged,) = episodes_from_log(recorded(UNSAFE), balancing_scenario())
+    (logged,) = cut_log(recorded(UNSAFE), balancing_scenario())[0]
     assert_same(logged, episode, slice(-1), num_loads=NUM_JOINTS)
     assert_same(logged, episode, slice(-1, None), ("true_state", "output", "margins"))
     assert abs(logged.time_s[-1] - episode.time_s[-1]) < 1e-9
@@ -44,7 +44,7 @@ def test_an_unsafe_run_ends_with_the_state_and_the_cause_the_loop_ended_with():
 
 def test_a_reaching_log_says_the_same_as_the_loop_for_the_other_hand_too():
     loop = porter("nominal", hand="right")
-    (logged,) = episodes_from_log(record(loop, 0, goal=EASY * [1.0, -1.0, 1.0]), loop)
+    (logged,) = cut_log(record(loop, 0, goal=EASY * [1.0, -1.0, 1.0]), loop)[0]
     episode = easy_episode("nominal", "right")
     assert_same(logged, episode, atol=1e-8)
 
@@ -81,7 +81,7 @@ def test_motions_of_a_log_go_on_through_its_episodes_at_the_monitors_rows():
     safe, unsafe = motions_from_log([recorded(SAFE), recorded(UNSAFE)], loop)
     np.testing.assert_allclose(safe.time_s, 0.02 * np.arange(31), atol=1e-9)
     assert (safe.index, safe.is_safe, unsafe.index, unsafe.is_safe) == (0, True, 1, False)
-    (episode,) = episodes_from_log(recorded(SAFE), balancing_loop())
+    (episode,) = cut_log(recorded(SAFE), balancing_loop())[0]
     for name in ("state", "desired_preview"):
         rows = getattr(safe, name)[::2]
         np.testing.assert_allclose(rows, getattr(episode, name), atol=1e-9, err_msg=name)
@@ -92,31 +92,24 @@ def test_motions_of_a_log_go_on_through_its_episodes_at_the_monitors_rows():
 
 def test_after_the_last_row_the_desired_output_stays_as_it_is():
     log = part(recorded(SAFE), 0, 161)
-    (episode,) = episodes_from_log(log, balancing_loop())
+    (episode,) = cut_log(log, balancing_loop())[0]
     preview = episode.desired_preview[-1].reshape(-1, 3)
     np.testing.assert_allclose(preview, np.tile(preview[0], (len(preview), 1)), atol=1e-9)
 
 
-def test_a_log_without_desired_output_needs_one_that_was_kept():
+def test_a_log_without_desired_output_is_refused():
     log = dataclasses.replace(recorded(SAFE), desired_output=None)
     with pytest.raises(ValueError, match="has no desired output"):
-        episodes_from_log(log, balancing_loop())
-    kept = np.array([0.01, 0.0, 0.4])
-    (episode,) = episodes_from_log(log, balancing_loop(), desired_output=kept)
-    np.testing.assert_allclose(episode.desired_output, np.tile(kept, (16, 1)), atol=1e-9)
-    with pytest.raises(ValueError, match="must be 3 finite numbers"):
-        episodes_from_log(log, balancing_loop(), desired_output=np.zeros(2))
-    with pytest.raises(ValueError, match="has a desired output of its own"):
-        episodes_from_log(recorded(SAFE), balancing_loop(), desired_output=kept)
+        cut_log(log, balancing_loop())[0]
 
 
 def test_what_gives_no_episode_is_refused():
     log = recorded(SAFE)
     short = [dataclasses.replace(part(log, 0, 41), piece=i) for i in range(2)]
     with pytest.raises(ValueError, match="too short for a segment of 10 steps"):
-        episodes_from_log(short, balancing_loop())
+        cut_log(short, balancing_loop())[0]
     with pytest.raises(ValueError, match="is of robot 'laikago', scenario 'porting' of"):
-        episodes_from_log(log, porter())
+        cut_log(log, porter())[0]
     low = dataclasses.replace(log, q=log.q - np.eye(log.q.shape[1])[6] * 0.1)
     with pytest.raises(ValueError, match=r"begins outside the safe set.*'height'"):
-        episodes_from_log(low, balancing_loop())
+        cut_log(low, balancing_loop())[0]

@@ -144,7 +144,6 @@ GEARED = '<position joint="j" kp="9" kv="2" forcerange="-4 4" gear="3"/>'
 @pytest.mark.parametrize(
     ("actuators", "joint", "gains", "effort"),
     [
-        ('<position joint="j" kp="50" kv="2"/>', "", (50, 2), None),
         ('<position joint="j" kp="50"/><velocity joint="j" kv="3"/>', "", (50, 3), None),
         (GEARED, 'actuatorfrcrange="-8 8"', (81, 18), 8),
         ('<general joint="j" biastype="affine" gainprm="5" biasprm="0 -5 -1"/>', "", (5, 1), None),
@@ -173,11 +172,9 @@ def test_what_a_joint_resists_is_taken(tmp_path):
 
 
 def test_a_joint_that_an_equality_couples_is_a_mimic(tmp_path):
-    arms = arm('ref="10"') + arm('ref="20"', name="k")
     equality = '<equality><joint joint1="k" joint2="j" polycoef="0.1 2 0 0 0"/></equality>'
-    mimic = converted(robot(arms, equality), tmp_path)[1].find("joint[@name='k']/mimic")
-    assert mimic.get("joint") == "j"
-    assert float(mimic.get("offset")) == pytest.approx(np.radians(20) + 0.1 - 2 * np.radians(10))
+    _, root = converted(robot(arm() + arm(name="k"), equality), tmp_path)
+    assert root.find("joint[@name='k']/mimic").get("joint") == "j"
 
 
 ROPE = '<tendon><fixed name="rope"><joint joint="j" coef="1"/></fixed></tendon>'
@@ -198,18 +195,6 @@ def test_what_a_urdf_cannot_hold_is_noted(tmp_path, text, note):
     assert converted(text, tmp_path)[0].left_out == [note]
 
 
-SLIDES = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
-
-
-def test_a_base_that_moves_as_by_a_free_joint_floats(tmp_path):
-    key = '<keyframe><key qpos="0 0 0 1 0 0 0 0.5"/></keyframe>'
-    facts, root = converted(robot(arm(), key, SLIDES + '<joint type="ball"/>'), tmp_path)
-    names = "joint_0, joint_1, joint_2, joint_3"
-    assert facts.left_out == [f"joints of the base are read as a free joint: {names}"]
-    assert [joint.get("name") for joint in root.findall("joint")] == ["j"]
-    assert facts.postures == {"0": {"j": 0.5}}
-
-
 LOOP = '<equality><connect body1="arm_j" body2="base" anchor="0 0 0"/></equality>'
 MANY = '<replicate count="3000" offset="1 0 0">{}</replicate>'
 
@@ -220,7 +205,6 @@ MANY = '<replicate count="3000" offset="1 0 0">{}</replicate>'
         (robot(arm('type="ball"')), "body 'arm_j' has a ball joint; replace it by three hinges"),
         (robot(arm(), free='<joint type="ball"/>'), "moves in 3 of 6 .* by <freejoint/>"),
         (robot(arm(), LOOP), "connects bodies 'arm_j' and 'base' to a loop"),
-        (robot(arm('stiff="5"')), "unrecognized attribute: 'stiff'"),
         (robot(arm("", MANY.format(MANY.format(BALL)))), "<replicate> with .* takes"),
         (robot(more='<asset><texture width="1e6" height="1e6"/></asset>'), "<texture> with"),
     ],
@@ -251,8 +235,6 @@ def test_robot_yaml_has_what_the_mjcf_states(dog):
     stated = yaml.safe_load((dog.folder / "robot.yaml").read_text())
     assert stated["joint_gains"] == {n: {"stiffness": 150, "damping": 3} for n in NAMES}
     assert stated["rotor_inertia"] == dict.fromkeys(NAMES, 0.02)
-    assert stated["foot_friction"] == 0.7
-    assert "| friction of the feet | `scene.xml` |" in (dog.folder / "README.md").read_text()
     bent = {"pitch": 0.8, "knee": -1.6}
     assert stated["posture"] == {f"{leg}_{part}": q for leg in PLACES for part, q in bent.items()}
     assert dog.posture_source == "keyframe 'home'"
@@ -279,7 +261,7 @@ def test_geoms_are_seen_or_collide_by_their_groups_masks_and_exclusions(dog):
         (
             "name='home'",
             2 * "0 0.8 -1.6 " + 2 * "0 0.7 -1.4 ",
-            "solved: feet under the hips, as it",
+            "solved: feet under the hips",
         ),
     ],
 )

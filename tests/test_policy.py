@@ -2,18 +2,12 @@
 
 import math
 import re
-import signal
-import threading
 import zipfile
-from contextlib import suppress
 from types import SimpleNamespace
-from unittest import mock
 
 import numpy as np
 import pytest
-from pydrake.math import RotationMatrix
 
-from drake_safety.extras import MissingExtraError
 from drake_safety.policies.policy import (
     CommandLimits,
     GaitClock,
@@ -21,7 +15,6 @@ from drake_safety.policies.policy import (
     Policy,
     PolicyParameters,
     WholeHistory,
-    network_file,
     observation_term,
     with_policy,
 )
@@ -30,7 +23,6 @@ from drake_safety.policies.policy_network import (
     load_network,
     network_files,
     read_metadata,
-    waited,
 )
 from drake_safety.robots.robot_model import JointGains, RobotModel, by_pattern
 from policy_networks import save_network, save_onnx, save_script
@@ -93,21 +85,6 @@ def test_the_observation_has_its_terms_in_order_scaled_and_clipped(tmp_path):
     np.testing.assert_allclose(observation, expected)
 
 
-@pytest.mark.train
-def test_gravity_and_velocities_do_not_depend_on_the_heading(tmp_path):
-    made = policy(tmp_path)
-    tilted = RotationMatrix.MakeXRotation(0.3)
-    results = []
-    for yaw in (0.0, 2.0):
-        R_WB = RotationMatrix.MakeZRotation(yaw) @ tilted
-        q = np.concatenate([R_WB.ToQuaternion().wxyz(), [0, 0, 0.4, 0, 0, 0]])
-        v = np.zeros(9)
-        v[:3] = R_WB.matrix() @ [0.1, 0.2, 0.3]
-        results.append(made.observe(see(made, q, v), np.full(13, np.nan)))
-    np.testing.assert_allclose(results[0], results[1], atol=1e-12)
-    np.testing.assert_allclose(results[0][3:6], [0, -math.sin(0.3), -math.cos(0.3)])
-
-
 WHOLE, DOWN = terms("last_action", "projected_gravity"), [0, 0, -1]
 
 
@@ -159,7 +136,6 @@ def test_commands_change_no_faster_than_the_policy_takes_them(tmp_path):
     [
         ({"joints": ["knee", "elbow"]}, r"lacks \['elbow'\]; it has \['hip', 'knee', 'tail'\]"),
         ({"joints": ["knee"]}, r"takes no observation of 11 entries .*joint_pos_rel 1"),
-        ({"joints": []}, r"'joints' in the network's order; the robot has \['hip'"),
         ({"gains": {}, "observation": []}, r"'gains' \[N·m/rad\] of joints .*; 'observation', the"),
         ({"observation": terms("lidar")}, r"unknown term 'lidar'; registered"),
         ({"observation": terms("last_action", scale=[1.0] * 3)}, "has 2 entries; got 3 scales"),
@@ -169,12 +145,6 @@ def test_commands_change_no_faster_than_the_policy_takes_them(tmp_path):
 def test_policy_that_does_not_fit_its_robot_is_refused(tmp_path, changed, message):
     with pytest.raises(ValueError, match=message):
         policy(tmp_path, **changed)
-
-
-def test_a_policy_of_a_missing_package_says_how_to_install_it():
-    stated = PolicyParameters(network="package://no-such-policy/a.onnx", requires="no-such==1.0")
-    with pytest.raises(MissingExtraError, match=r"pip install --no-deps .* no-such==1\.0"):
-        network_file(stated)
 
 
 WEIGHTS = ["policy.onnx.data", "weights/W", "weights/more/R"]
@@ -195,19 +165,6 @@ def test_external_weights_are_files_of_the_network_below_its_folder(tmp_path):
     (tmp_path / "x").write_bytes(b"0" * 100)
     with pytest.raises(ValueError, match=r"there is no \.\./x"):
         network_files(path)
-
-
-@pytest.mark.train
-def test_external_weights_of_a_constant_are_files_of_the_network(tmp_path):
-    onnx = pytest.importorskip("onnx")
-    tensor = onnx.numpy_helper.from_array(np.ones(2, dtype=np.float32), "c")
-    node = onnx.helper.make_node("Constant", [], ["y"], value=tensor)
-    onnx.external_data_helper.set_external_data(node.attribute[0].t, "c.data")
-    output = onnx.helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [2])
-    model = onnx.helper.make_model(onnx.helper.make_graph([node], "g", [], [output]))
-    (tmp_path / "c.data").write_bytes(node.attribute[0].t.raw_data)
-    (tmp_path / "p.onnx").write_bytes(model.SerializeToString())
-    assert network_files(tmp_path / "p.onnx") == [tmp_path / "p.onnx", tmp_path / "c.data"]
 
 
 @pytest.mark.train
@@ -232,7 +189,6 @@ TWO = {"joint_names": "a,b"}
         ({"dof_names": '["a+b"]', "kp": "[1.5]"}, {"joints": ["a+b"], "stiffness": {r"a\+b": 1.5}}),
         (TWO | {"action_scale": "0.25"}, {"action_scale": {".*": 0.25}}),
         (TWO | {"joint_damping": "{'a.*': 0.5}"}, {"damping": {"a.*": 0.5}}),
-        ({"command_ranges": '{"lin_vel_x": [-1, 1]}'}, {"command": {"lin_vel_x": [-1, 1]}}),
         (
             {NAMES: "command,height_scan"}
             | {"observation_terms_scale": "2.000;0.500,4.000"}
@@ -257,16 +213,15 @@ def test_metadata_are_read_as_exporters_write_them(raw, expected):
 @pytest.mark.parametrize(
     ("raw", "message"),
     [
-        ({"dof_names": '["a"]', "kp": "[1, 2]"}, r"'stiffness' .* the joints \['a'\].* got \[1, 2"),
-        (TWO | {"action_scale": "nan"}, "'action_scale' must be a number for each of the joints"),
+        ({"dof_names": '["a"]', "kp": "[1, 2]"}, r"'stiffness' do not fit the joints \['a'\]"),
+        (TWO | {"action_scale": "nan"}, "'action_scale' do not fit the joints"),
         ({NAMES: "x", "observation_terms_clip": "-1;2"}, r"'clip' .* got \['-1;2'\]"),
-        ({"command_ranges": '{"lin_vel_x": [1, -1]}'}, "'command' must be the lowest and highest"),
     ],
 )
 def test_metadata_that_do_not_fit_are_named_and_left_out(raw, message):
     metadata = read_metadata(raw)
     assert re.search(message, *metadata.unread)
-    assert not metadata.action_scale and not metadata.stiffness and not metadata.command
+    assert not metadata.action_scale and not metadata.stiffness
     assert all(term.keys() == {"name"} for term in metadata.observation)
 
 
@@ -309,22 +264,6 @@ def test_a_network_whose_actions_are_not_finite_for_some_observations_is_refused
         PolicyNetwork(None, evaluate, (9, 2)).check("p", 9, 2, "terms")
 
 
-def test_ctrl_c_ends_the_wait_for_a_network_that_loops_for_ever():
-    is_over = threading.Event()
-
-    def evaluate(batch, parts):
-        for _ in range(50):  # As native code, it does not end by a signal.
-            with suppress(KeyboardInterrupt):
-                is_over.wait(0.1)
-        return batch[:, :2], {}
-
-    main = threading.main_thread().ident
-    threading.Timer(0.2, lambda: signal.pthread_kill(main, signal.SIGINT)).start()
-    with pytest.raises(KeyboardInterrupt), mock.patch("atexit.register"):
-        waited(PolicyNetwork(None, evaluate, (9, 2)).check, "p", 9, 2, "terms")
-    is_over.set()
-
-
 @pytest.mark.train
 def test_a_term_has_the_joints_that_it_names_also_those_that_are_not_moved(tmp_path):
     observed = terms("joint_pos_rel", "joint_vel_rel", joints=["tail", "hip"])
@@ -344,7 +283,6 @@ class Last(torch.nn.Module if torch else object):
     [
         ([1, 5, 9], 45),
         (["batch", "time", 9], None),
-        ([5, 1, 9], 45),
         ("script", None),
     ],
 )
@@ -384,17 +322,8 @@ def test_the_first_of_two_outputs_is_the_action_in_double_precision(tmp_path):
     with pytest.raises(ValueError, match=r"returns 2 actions, .*'\[1, 3\]'\], the first"):
         network.check("p", 9, 3, "terms")
     lost = load_network(save_script(tmp_path / "q.pt", OnGpu()))
-    with pytest.raises(ValueError, match=r"\): \w+Error: .*export it on the CPU$"):
+    with pytest.raises(ValueError, match=r"\): \w+Error: .*(cuda|CUDA)"):
         lost.check("p", 9, 2, "terms")
-
-
-def pickled(*keys):
-    """A dictionary of ones, as Python would write it."""
-    items = (b"X" + len(key).to_bytes(4, "little") + key.encode() + b"K\x01s" for key in keys)
-    return b"\x80\x02}" + b"".join(items) + b"."
-
-
-CHECKPOINT = ("model_state_dict", "actor.0.weight", "iter")
 
 
 @pytest.mark.train
@@ -404,9 +333,8 @@ CHECKPOINT = ("model_state_dict", "actor.0.weight", "iter")
         ("a.onnx", b"no network", "a.onnx: not an ONNX network: "),
         ("a.txt", b"", "a.txt: .* is one of"),
         ("a.pt", None, "a.pt: .* does not exist"),
-        ("a.pt", CHECKPOINT, r"checkpoint \(model_state_dict, .* iter\): export .* TorchScript"),
-        ("a.pth", ("optimizer",), r"got '\.pth', but a training checkpoint"),
-        ("a.pkl", pickled(), "but a Python pickle: export"),
+        ("a.pt", "zip", "but a pickle, such as a training checkpoint: export .* TorchScript"),
+        ("a.pth", b"\x80\x02}.", r"got '\.pth', but a pickle"),
     ],
 )
 def test_a_file_that_is_no_network_is_called_what_it_is(tmp_path, name, content, message):
@@ -415,6 +343,6 @@ def test_a_file_that_is_no_network_is_called_what_it_is(tmp_path, name, content,
         path.write_bytes(content)
     elif content is not None:
         with zipfile.ZipFile(path, "w") as archive:
-            archive.writestr("model/data.pkl", pickled(*content))
+            archive.writestr("model/data.pkl", "")
     with pytest.raises(ValueError, match=message):
         load_network(path)

@@ -108,7 +108,7 @@ class Draws(torch.nn.Module):
 @pytest.mark.parametrize(
     ("network", "message"),
     [
-        (Hidden, "a memory that is no buffer of a fixed"),
+        (Hidden, "has a memory that is not read"),
         (Draws, "it draws random numbers"),
         (onnx(memory=[("state", "next")]), r"inputs .*'state \[1, 1, 4\].* pairs .* as h_in and"),
     ],

@@ -29,20 +29,21 @@ _STL = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
 
 @dataclass(kw_only=True)
 class ModelFacts:
-    """What a model file says of a robot beyond a URDF, by the names of its joints and bodies."""
+    """What a model file says of a robot beyond a URDF, by the names of its joints and bodies.
+
+    Attributes:
+        gains: Stiffness and damping of position servos [N·m/rad, N·m·s/rad].
+        rotor_inertia: Inertia of the rotors as the joints feel it [kg·m²].
+        postures: Joint positions [rad] by keyframe.
+        apart: Pairs of bodies that do not collide, each in alphabetical order.
+        left_out: What is left out, a note each.
+    """
 
     gains: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Stiffness and damping of position servos [N·m/rad, N·m·s/rad]."""
     rotor_inertia: dict[str, float] = field(default_factory=dict)
-    """Inertia of the rotors as the joints feel it [kg·m²]."""
     postures: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Joint positions [rad] by keyframe."""
-    friction: dict[str, list[tuple[np.ndarray, float]]] = field(default_factory=dict)
-    """Centre (3,) [m] and friction coefficient [1] of each collision shape, by body."""
     apart: set[tuple[str, str]] = field(default_factory=set)
-    """Pairs of bodies that do not collide, each in alphabetical order."""
     left_out: list[str] = field(default_factory=list)
-    """What is left out, a note each."""
 
 
 def is_mjcf(path: Path) -> bool:
@@ -56,11 +57,9 @@ def is_mjcf(path: Path) -> bool:
 def mjcf_to_urdf(path: Path, target: Path) -> ModelFacts:
     """Writes the robot of an MJCF as a URDF, with its meshes as STL in folders beside it.
 
-    MuJoCo compiles the file, which resolves classes, includes, units, and inertias of shapes. The
-    robot is the tree of bodies with the most joints. Links and joints have the names, frames and
-    zero positions of bodies and joints. Joints with actuators get transmissions, and those that a
-    linear equality couples a <mimic>. Geoms of the groups 0 to 2 are visuals, those that can touch
-    others are collision shapes.
+    MuJoCo compiles the file. The robot is the tree of bodies with the most joints. Links and joints
+    have the names, frames and zero positions of bodies and joints. Joints with actuators get
+    transmissions, and those that an equality couples a <mimic>.
     """
     require_extra("mujoco", f"'{path}' is MJCF")
     import mujoco
@@ -117,9 +116,7 @@ class _Robot:
             if model.jnt_type[j] == kinds.mjJNT_BALL:
                 child = self.bodies[int(model.jnt_bodyid[j])]
                 raise ValueError(f"body '{child}' has a ball joint; replace it by three hinges")
-        likewise = ids[is_base & (model.jnt_type[ids] != kinds.mjJNT_FREE)].tolist()
         fixed = [] if num_ways else [base]
-        self._note("joints of the base are read as a free joint", "joint", likewise)
         self._note("moving bodies beside the robot are left out", "body", [i for i, _ in others])
         self._note("the base is fixed to the world there, and floats here", "body", fixed)
         self._note("tendons are left out", "tendon", range(model.ntendon))
@@ -196,15 +193,12 @@ class _Robot:
                 if model.eq_objtype[i] == self.mujoco.mjtObj.mjOBJ_SITE:
                     pair = model.site_bodyid[pair].tolist()
                 if self.bodies.keys() >= set(pair):
+                    one, other = (self.bodies[i] for i in pair)
                     raise ValueError(
-                        f"a constraint connects bodies '{self.bodies[pair[0]]}' and "
-                        f"'{self.bodies[pair[1]]}' to a loop; expected a tree of bodies"
+                        f"a constraint connects bodies '{one}' and '{other}' to a loop"
                     )
-            constant, slope, *higher = model.eq_data[i, :5].tolist()
-            if kind == kinds.mjEQ_JOINT and self.joints.keys() >= set(pair) and not any(higher):
-                zero, zero_of_driver = (float(model.joint(j).qpos0[0]) for j in pair)
-                driver, offset = self.joints[pair[1]], zero + constant - slope * zero_of_driver
-                self.mimics[pair[0]] = _tag("mimic", joint=driver, multiplier=slope, offset=offset)
+            if kind == kinds.mjEQ_JOINT and self.joints.keys() >= set(pair):
+                self.mimics[pair[0]] = _tag("mimic", joint=self.joints[pair[1]])
             else:
                 left_out.append(i)
         self._note("constraints are left out", "equality", left_out)
@@ -217,10 +211,10 @@ class _Robot:
             mass, origin = _tag("mass", value=one.mass), _origin(_pose(one.ipos, one.iquat))
             inside.append(_tag("inertial", origin, mass, inertia))
         for geom in range(one.geomadr[0], one.geomadr[0] + one.geomnum[0]):
-            inside += self._shapes(geom, self.bodies[body])
+            inside += self._shapes(geom)
         self.parts.append(_tag("link", *inside, name=self.bodies[body]))
 
-    def _shapes(self, geom: int, body: str) -> list[str]:
+    def _shapes(self, geom: int) -> list[str]:
         """A geom as visual, as collision shape, or both."""
         model, size = self.model, self.model.geom_size[geom]
         radius, length = size[0], 2.0 * size[1]
@@ -248,8 +242,6 @@ class _Robot:
         paired = geom in model.pair_geom1 or geom in model.pair_geom2
         if model.geom_contype[geom] or model.geom_conaffinity[geom] or paired:
             shapes.append(_tag("collision", origin, shape))
-            mu = float(model.geom_friction[geom, 0])
-            self.facts.friction.setdefault(body, []).append((model.geom_pos[geom], mu))
         return shapes
 
     def _mesh(self, mesh: int) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import yaml
 from drake_safety.files.atomic import write_file
 from drake_safety.files.reading import yaml_text
 from drake_safety.importing.foreign_policy import converted_policy
-from drake_safety.policies.policy import registered_terms
+from drake_safety.policies.policy import TERMS
 from drake_safety.policies.policy_network import (
     PolicyNetwork,
     load_network,
@@ -78,21 +78,21 @@ class PolicyTemplate:
             what = ""
         if what:
             known.pop("joints", None)
-            names = ", ".join(map(yaml_text, observed or robot_joints))
-            ask(f"joints: [{names}]", what)
-        keys = {yaml_text(as_pattern(name)): value for name, value in posture.items() if value}
-        values = ", ".join(f"{key}: {value:g}" for key, value in keys.items())
+            ask(f"joints: [{', '.join(map(yaml_text, observed or robot_joints))}]", what)
+        angles = [f"{yaml_text(as_pattern(name))}: {q:g}" for name, q in posture.items() if q]
         said = vars(metadata) | {"gains": metadata.stiffness and metadata.damping} | known
-        for line, what in (
-            (f"default_positions: {{{values}}}", "joint positions at zero action [rad]"),
-            ("action_scale: {.*: 0.25}", "joint positions per unit of action [rad]"),
+        servo, units = "{.*: {stiffness: 20.0, damping: 0.5}}", "[N·m/rad, N·m·s/rad]"
+        for key, example, what in (
             (
-                "gains: {.*: {stiffness: 20.0, damping: 0.5}}",
-                "the servos' gains of training [N·m/rad, N·m·s/rad]",
+                "default_positions",
+                f"{{{', '.join(angles)}}}",
+                "joint positions at zero action [rad]",
             ),
+            ("action_scale", "{.*: 0.25}", "joint positions per unit of action [rad]"),
+            ("gains", servo, f"the servos' gains of training {units}"),
         ):
-            if not said[line.partition(":")[0]]:
-                ask(line, what)
+            if not said[key]:
+                ask(f"{key}: {example}", what)
         lines.append("# rotor_inertia: {.*: 0.01}  # that of training, if it had any [kg·m²]")
         if "action_clip" not in known:
             ask("action_clip: 1.0", "the limit of actions in training, if any")
@@ -109,8 +109,9 @@ class PolicyTemplate:
                     term["joints"] = [*observed]
             unstated = [k for k in ("scale", "history") if k not in metadata.observation[0]]
             if unstated:
-                what = f"{' and '.join(unstated)} of the terms of the observation"
-                asked.append(f"{what}; 1 is assumed, as the network only names them")
+                asked.append(
+                    f"{' and '.join(unstated)} of the terms of the observation; 1 is assumed"
+                )
         if "observation" not in known:
             width, _ = self.network.widths
             entries = "" if width is None else f", {width} entries"
@@ -119,24 +120,19 @@ class PolicyTemplate:
                 "#   - {name: base_ang_vel, scale: [0.25]}",
                 "#   - {name: projected_gravity}",
                 "#   - {name: velocity_commands}",
-                f"# registered terms: {', '.join(registered_terms())}",
+                f"# registered terms: {', '.join(sorted(TERMS))}",
             ]
         terms = {term["name"] for term in known.get("observation", [])}
-        if unknown := sorted(terms - set(registered_terms())):
+        if unknown := sorted(terms - set(TERMS)):
             asked.append(f"functions of the terms {unknown}, by @observation_term")
         if "gait" in known and "period_s" not in known["gait"]:
             gait = {"period_s": 0.8, **known.pop("gait")}
             ask(f"gait: {gait}".replace("'", ""), "the period of the gait's clock [s]")
         if "command" not in known:
-            ranges, words = metadata.command, ""
-            yaw = "ang_vel_z" if "ang_vel_z" in ranges else "ang_vel_yaw"
-            pairs = [ranges.get(key) for key in ("lin_vel_x", "lin_vel_y", yaw)]
-            if None in pairs:
-                what = "the ranges of commands in training [m/s, m/s, rad/s]"
-                pairs, words = [[-1.0, 1.0]] * 3, f"  # ASK {what}"
-                asked.append(f"{what}; ±1 is assumed")
-            lowest, highest = ([pair[i] for pair in pairs if pair] for i in (0, 1))
-            lines += [f"command:{words}", f"  lowest: {lowest}", f"  highest: {highest}"]
+            what = "the ranges of commands in training [m/s, m/s, rad/s]"
+            lines += [f"command:  # ASK {what}", "  lowest: [-1.0, -1.0, -1.0]"]
+            lines.append("  highest: [1.0, 1.0, 1.0]")
+            asked.append(f"{what}; ±1 is assumed")
         head = [
             f"# Written from {self.source}. Commented lines marked ASK have values that it lacks:",
             "# correct them, and delete the sign. docs/walking.md has all keys.",
@@ -150,18 +146,16 @@ class PolicyTemplate:
 
 
 def survey_policy(
-    path: Path, motors: Sequence[str] = (), announce: Callable[[str], object] = lambda text: None
+    path: Path, announce: Callable[[str], object] = lambda text: None
 ) -> PolicyTemplate:
     """Reads what the files of a policy tell.
 
     Args:
-        path: A network (``.onnx``, ``.pt``, ``.jit``), a ``deploy.yaml`` of unitree_rl_lab or a
-            ``config.yaml`` of rl_sar.
-        motors: Joints in the order of the robot's motors, which a ``deploy.yaml`` numbers.
+        path: A network (``.onnx``, ``.pt``, ``.jit``) or a ``config.yaml`` of rl_sar.
         announce: Called with what the network is, before it is loaded.
     """
     is_described = path.suffix in (".yaml", ".yml")
-    converted = converted_policy(path, motors) if is_described else {}
+    converted = converted_policy(path) if is_described else {}
     file = Path(converted.pop("network", path))
     for text in network_kinds([file]):
         announce(text)

@@ -1,14 +1,13 @@
 """The part of a check that reads a robot's URDF as its exporter meant it."""
 
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.importing.urdf_copy import read_drives
-from drake_safety.importing.urdf_survey import WITHOUT_STOPS_RAD, Limb, Survey
+from drake_safety.importing.urdf_survey import WITHOUT_STOPS_RAD
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import by_pattern
 from drake_safety.robots.urdf import read_urdf
@@ -31,30 +30,24 @@ def check_urdf(kinematics: RobotKinematics) -> Iterator[Finding]:
         )
     free = np.ptp(kinematics.position_limits, axis=1) > WITHOUT_STOPS_RAD
     endless = {name for name, is_free in zip(kinematics.joint_names, free, strict=True) if is_free}
-    legs = [Limb(body=foot.body, joints=foot.joints) for foot in robot.feet.values()]
-    legs = [limb for limb in legs if limb.joints and limb.joints[-1] in endless]
-    with suppress(ValueError):  # Meshes that Drake does not read, which `add_robot` replaces.
-        if wheels := Survey(path).wheels(legs) if legs else []:
-            yield passed(
-                "wheels",
-                f"joints {wheels} turn wheels, and position servos hold them",
-                "judge by this scenario only a robot whose wheels are braked",
-            )
-    if not robot.without_collision:
-        return
+    last = [name for foot in robot.feet.values() for name in foot.joints[-1:]]
+    if wheels := [name for name in last if name in endless]:
+        yield passed(
+            "wheels",
+            f"joints {wheels} have no stops; if they turn wheels, position servos hold these",
+            "judge by this scenario only a robot whose wheels are braked",
+        )
     shaped = {link.get("name") for link in root.iter("link") if link.find("collision") is not None}
     bare = [
         name
         for name in robot.without_collision
         if name not in shaped and by_pattern(robot.shapes, name, "shapes", robot.name) is None
     ]
-    if not bare:
-        yield passed("collision shapes", "every link that lost its meshes has a shape")
-        return
-    yield passed(
-        "collision shapes",
-        f"{len(bare)} links have none, as their meshes were left out; everything passes through "
-        f"{', '.join(bare)}",
-        f"add a <collision> with a box, sphere or capsule [m] to those that touch something, in "
-        f"{Path(robot.urdf).name}, or delete them from 'without_collision' in robot.yaml",
-    )
+    if bare:
+        yield passed(
+            "collision shapes",
+            f"{len(bare)} links have none, as their meshes were left out; everything passes "
+            f"through {', '.join(bare)}",
+            "add a <collision> with a box, sphere or capsule [m] to those that touch something, in "
+            f"{Path(robot.urdf).name}, or delete them from 'without_collision' in robot.yaml",
+        )

@@ -12,7 +12,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from pydrake.math import RigidTransform
 
 from drake_safety.files.reading import yaml_text
 from drake_safety.importing.mjcf import ModelFacts, is_mjcf, mjcf_to_urdf
@@ -33,7 +32,6 @@ from drake_safety.importing.urdf_survey import (
 from drake_safety.robots.meshes import above
 from drake_safety.robots.plausibility import (
     effort_unit,
-    extent,
     listed,
     odd_inertias,
     odd_limits,
@@ -56,7 +54,6 @@ class NewRobot:
 
     Attributes:
         posture: Joint positions while it stands [rad].
-        posture_source: Where the posture comes from.
         wheels: Joints that turn wheels at the ends of legs.
         fixed: Joints that move neither a foot nor a hand.
         odd: Joints with efforts that no such motor has; robot.yaml estimates them.
@@ -112,16 +109,6 @@ class NewRobot:
         """Number of convex hulls that replace collision meshes."""
         return sum(map(len, self.copy.hulls.values()))
 
-    @property
-    def foot_friction(self) -> float:
-        """Least friction of the shapes nearest to the contact points [1]; 0 if none is stated."""
-        stated = [
-            min(shapes, key=lambda shape: np.linalg.norm(shape[0] - limb.points.mean(axis=0)))[1]
-            for limb in self.legs
-            if (shapes := self.facts.friction.get(limb.body))
-        ]
-        return min(filter(None, stated), default=0.0)
-
     @cached_property
     def sizes(self) -> Sizes:
         """Sizes of the robot as it stands."""
@@ -165,12 +152,9 @@ def write_robot(
     """Writes a robot's folder: a URDF that Drake can simulate, robot.yaml, README and a scenario.
 
     Args:
-        model: Its URDF or MJCF.
-        task: ``balancing``, ``reaching`` or ``walking``.
         feet: Links that touch the ground; found by their height by default.
         hands: Links that arms end in; those of limbs of four joints or more by default.
-        moved: Joints that a policy moves: they are not fixed, though they may move neither a foot
-            nor a hand; None for all.
+        moved: Joints that a policy moves, which are not fixed; None for all.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise ValueError(f"new: a robot's name is letters, digits and _; got '{name}'")
@@ -211,17 +195,14 @@ def _find_limbs(
     new: NewRobot, feet: list[str] | None, hands: list[str] | None, moved: Collection[str]
 ) -> None:
     copy = new.copy
-
     if feet is None:
         require_feet(new.survey, copy)
     root = new.survey.base
-    pose, why = base_at_hips(new.survey, new.survey.legs(feet))
+    pose = base_at_hips(new.survey, new.survey.legs(feet))
     if pose is not None:
         base = copy.add_root("hips", root, pose)
-        copy.warn(f"the root link '{root}' {why}; the base is a new link '{base}'")
+        copy.warn(f"the root link '{root}' is far from the hips; the base is a new link '{base}'")
         new.renew_survey()
-    elif why:
-        copy.warn(f"the root link '{root}' {why}")
     new.legs = new.survey.legs(feet)
     require_motors(new.survey, new.legs, moved)
     new.arms = new.survey.arms(new.legs, hands)
@@ -230,42 +211,34 @@ def _find_limbs(
             f"new: '{copy.source}' has no arm (a limb of four joints or more that is not a leg) to "
             "reach with; name its end by --hands, or use --task balancing"
         )
-    new.wheels = new.survey.wheels(new.legs)
+    ends = [limb.joints[-1] for limb in new.legs]
+    new.wheels = [name for name in ends if np.ptp(new.survey.limits[name]) > WITHOUT_STOPS_RAD]
 
 
 def _fix_joints(new: NewRobot, moved: Collection[str] | None) -> None:
     """Fixes what moves no foot or hand, and notes couplings, motors and wheels."""
     survey, copy, stated = new.survey, new.copy, set(moved or ())
-    drives = copy.drives
+    mimics = copy.drives.mimics
     legged, armed = (
         {joint for limb in limbs for joint in survey.chain(limb.body)}
         for limbs in (new.legs, new.arms)
     )
     used = legged | armed | (set(survey.limits) if moved is None else stated)
-    used -= {name for name, (leader, *_) in drives.mimics.items() if leader in legged}
-    coupled = used & set(drives.mimics)
-    leaders = {drives.mimics[name][0] for name in coupled}
-    if coupled and new.task != "balancing":
-        raise ValueError(
-            f"new: '{copy.source}': joints {sorted(coupled)} follow others by <mimic>, for which "
-            f"--task {new.task} has no controller; use --task balancing, or remove <mimic>"
-        )
-    passive = drives.passive(sorted(used - legged - coupled - leaders - stated))
-    used = used - set(passive) | leaders
-    loose = {name for name, (leader, *_) in drives.mimics.items() if leader in used} - used
+    coupled = used & set(mimics)
+    passive = copy.drives.passive(sorted(used - legged - coupled - stated))
+    used -= coupled | set(passive)
     spans = {name: high - low for name, (low, high) in survey.limits.items() if name in legged}
-    turns = [name for name, span in spans.items() if 2 * WITHOUT_STOPS_RAD < span < 720]
+    turns = [name for name, span in spans.items() if 8 * math.pi < span <= WITHOUT_STOPS_RAD]
     for names, note in (
-        (coupled, "follow others by <mimic>, in the posture too"),
-        (loose, "follow joints that move, by <mimic>, but move no foot or hand and are fixed"),
+        (coupled, "follow others by <mimic> and are fixed"),
         (passive, f"have no motor and are fixed: {listed(passive)}"),
         (
-            {*turns} - {*new.wheels},
+            turns,
             "of legs turn more than four times: are their limits in degrees instead of radians?",
         ),
         (
             new.wheels,
-            "turn wheels: position servos hold them, so that they neither roll nor drive",
+            "have no stops: if they turn wheels, servos hold these, so that they do not roll",
         ),
     ):
         if names:
@@ -276,28 +249,22 @@ def _fix_joints(new: NewRobot, moved: Collection[str] | None) -> None:
         elif limb.body in copy.hulls:
             copy.set_hulls(limb.body, [])
             copy.notes.append(f"foot '{limb.body}' has no hull: its spheres alone touch")
-    poses: dict[str, RigidTransform | None] = {}
-    for joint in (joint for joint in survey.joints if joint.name() not in used):
-        ends = joint.parent_body(), joint.child_body()
-        X_BP, X_BC = (survey.pose(body.name()) for body in ends)
-        poses[joint.name()] = X_BP.inverse() @ X_BC if joint.name() in drives.mimics else None
-    copy.fix_joints(poses)
-    new.fixed = sorted(poses.keys() - loose - set(passive))
+    idle = survey.limits.keys() - used
+    copy.fix_joints(idle)
+    new.fixed = sorted(idle - coupled - set(passive))
     for limb in (*new.legs, *new.arms):
-        limb.joints = [name for name in limb.joints if name not in poses]
+        limb.joints = [name for name in limb.joints if name in used]
     new.renew_survey()
 
 
 def _stand(new: NewRobot) -> None:
     """Finds the posture, and what touches what in it."""
-    copy, source = new.copy, new.copy.source
+    copy = new.copy
     require_masses(new.survey)
     try:
         new.posture, new.posture_source = standing_posture(new.survey, new.legs, new.facts.postures)
     except ValueError as error:
-        plant, context = new.survey.plant, new.survey.context
-        size = f"The robot is {extent(plant, context, new.survey.instance):.2g} m large"
-        raise ValueError(". ".join([f"{error}", size, *copy.warnings, *copy.left_out])) from error
+        raise ValueError(". ".join([f"{error}", *copy.warnings, *copy.left_out])) from error
     for limb in new.legs:
         # Hulls welded to a foot end at the height of its contact points, which alone touch.
         lowest = float(new.survey.positions(limb)[:, 2].min())
@@ -321,24 +288,18 @@ def _stand(new: NewRobot) -> None:
     sizes = new.sizes
     if not _LEAST_HEIGHT_M < sizes.height_m < _GREATEST_HEIGHT_M:
         raise ValueError(
-            f"new: '{source}': base '{survey.base}' would stand {sizes.height_m:.3g} m high. "
+            f"new: '{copy.source}': base '{survey.base}' would stand {sizes.height_m:.3g} m high. "
             "Are the <origin>s in millimetres?"
         )
     if min(sizes.half_length_m, sizes.half_width_m) < _LEAST_STANCE * sizes.height_m:
-        copy.warn(
-            "the contact points of the feet lie on a line: on them, no posture stands by servos; "
-            "--task walking takes a policy that balances"
-        )
+        copy.warn("the contact points of the feet lie on a line, on which no posture stands")
     new.asked += [
         f"where foot '{limb.body}' touches: the file has no shape there [m]"
         for limb in new.legs
         if limb.is_guess
     ]
     if not any(survey.geometries(survey.welded(survey.base))):  # Balls are thrown at it.
-        new.asked.append(
-            f"a <collision> shape of the base '{survey.base}', in {new.name}.urdf [m]: without "
-            "one no ball can hit it"
-        )
+        new.asked.append(f"a <collision> shape of the base '{survey.base}', in {new.name}.urdf [m]")
 
 
 def _robot_yaml(new: NewRobot) -> str:
@@ -356,17 +317,16 @@ def _robot_yaml(new: NewRobot) -> str:
         "feet:  # contact_points are centres of spheres, in the body's frame [m]",
     ]
 
-    def ask(title: str, entries: list[str], what: str = "") -> None:
+    def add(title: str, entries: list[str]) -> None:
         """Adds a block, unless it is empty."""
         lines.extend([title, *_indented(entries)] if entries else [])
-        new.asked.extend([what] if entries and what else [])
 
     for limb in new.legs:
         points = [[round(float(value), 5) for value in point] for point in limb.points]
         about = [f"contact_points: {points}", f"radius_m: {float(f'{limb.radius_m:.5g}')}"]
         lines += _limb_lines(limb, about, "  # ASK its contact points [m]" * limb.is_guess)
         if limb.joints[-1] in new.wheels:
-            lines[-1] += "  # the last turns a wheel, which its servo holds"
+            lines[-1] += "  # a wheel of the last is held by its servo"
     lines += ["reaching_frames:"] * bool(new.arms)
     for limb in new.arms:
         about = [
@@ -389,11 +349,10 @@ def _robot_yaml(new: NewRobot) -> str:
     if guessed:
         which = f" of {len(guessed)} joints" if len(guessed) < len(keys) else ""
         new.asked.append(
-            f"the maker's servo gains{which} [N·m/rad, N·m·s/rad]; estimated from mass and height: "
-            f"{_STIFFNESS * sizes.load:.3g} and {_STIFFNESS * _DAMPING_S * sizes.load:.2g} in legs"
+            f"the maker's servo gains{which} [N·m/rad, N·m·s/rad]; estimated from mass and height"
         )
     rotors = [f"{keys[j]}: {facts.rotor_inertia[j]:.4g}" for j in names if j in facts.rotor_inertia]
-    ask(f"rotor_inertia:  # of {source} [kg·m²]", rotors)
+    add(f"rotor_inertia:  # of {source} [kg·m²]", rotors)
     survey, efforts = new.survey, []
     indices = survey.plant.GetJointActuatorIndices(survey.instance)
     motors = [*map(survey.plant.get_joint_actuator, indices)]
@@ -403,24 +362,21 @@ def _robot_yaml(new: NewRobot) -> str:
         unit, note = effort_unit(survey.plant.GetJointByName(name, survey.instance)), ""
         if name in new.odd or not 0 < limit < math.inf:
             limit = float(f"{_FORCE * sizes.mass_kg if unit == 'N' else _TORQUE * sizes.load:.3g}")
-            what = f"largest {'force' if unit == 'N' else 'torque'}"
             said = f" ({source} says {stated:g})" * (name in new.odd)
-            note = f"  # ASK the motor's {what}{said} [{unit}]"
-            new.asked.append(f"the {what} of joint '{name}'{said} [{unit}]")
+            note = f"  # ASK the motor's largest torque or force{said} [{unit}]"
+            new.asked.append(f"the largest torque or force of joint '{name}'{said} [{unit}]")
         efforts.append(f"{keys[name]}: {limit:g}{note}")
-    ask("effort_limits:  # where the file has no motor, or no plausible limit [N·m, N]", efforts)
-    mu = new.foot_friction or 0.6
-    origin = f"that of {source}" if new.foot_friction else "assumed"
-    lines.append(f"foot_friction: {mu:g}  # ASK Coulomb's coefficient of feet on your ground [1]")
-    new.asked.append(f"the friction of feet on your ground [1]; {mu:g} is {origin}")
+    add("effort_limits:  # where the file has no motor, or no plausible limit [N·m, N]", efforts)
+    lines.append("foot_friction: 0.6  # ASK Coulomb's coefficient of feet on your ground [1]")
+    new.asked.append("the friction of feet on your ground [1]; 0.6 is assumed")
     partners = {keys[name]: other.replace("\\", r"\\") for name, other in mirrored(names).items()}
-    ask("mirror:", [f"{key}: {yaml_text(other)}" for key, other in partners.items()])
-    bare = new.copy.bare_links
-    ask(
-        "without_collision:  # ASK shapes in place of these links' lost meshes [m]",
-        [f"- {yaml_text(link)}" for link in bare],
-        f"collision shapes of the {len(bare)} links under 'without_collision' in robot.yaml [m]",
-    )
+    add("mirror:", [f"{key}: {yaml_text(other)}" for key, other in partners.items()])
+    if bare := new.copy.bare_links:
+        lines.append("without_collision:  # ASK shapes in place of these links' lost meshes [m]")
+        lines += [f"  - {yaml_text(link)}" for link in bare]
+        new.asked.append(
+            f"collision shapes of the {len(bare)} links under 'without_collision' in robot.yaml [m]"
+        )
     lines += ["whole_body:", f"  orientation: {{{base}: {{weight: 20.0}}}}"]
     if new.task == "balancing" and len(new.legs) > 2:
         lines.append("  posture: {weight: 0.001}")
@@ -441,31 +397,17 @@ def _readme(new: NewRobot) -> str:
     sizes = new.sizes
     notes = "\n".join(f"- {note[0].upper()}{note[1:]}." for note in new.copy.notes)
     asked = "\n".join(f"- [ ] {what}" for what in new.asked)
-    stated = f"`{new.copy.source.name}`"
-    has_gains = set(new.joints) <= new.facts.gains.keys()
-    gains = stated if has_gains else "estimated from mass and height; replace them by ..."
-    friction = stated if new.foot_friction else "assumed; replace it by ..."
     return f"""# {new.name}
 
 {sizes.mass_kg:.2f} kg; its base, `{sizes.base}`, stands {sizes.height_m:.3f} m high on
 {len(new.legs)} feet.
 
-## Where the figures come from
-Fill in the sources, so that every figure can be looked up.
-
-| figure | source |
-|---|---|
-| masses, inertias, joints, limits | {stated}, from ... (address, version) |
-| standing posture | {new.posture_source} |
-| servo gains | {gains} |
-| friction of the feet | {friction} |
+## Source and licence of `{new.copy.source.name}`
+...
 
 ## Values that the file lacks
 {asked}
 
 ## Changes of the URDF
 {notes or "- Nothing."}
-
-## Licence of the file
-...
 """

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import glob
-import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
 from itertools import chain, count
@@ -17,7 +15,6 @@ from urllib.parse import unquote
 import numpy as np
 
 from drake_safety.extras import MissingExtraError
-from drake_safety.files.reading import is_number
 from drake_safety.importing.urdf_copy import UrdfCopy, pose_of
 from drake_safety.robots.meshes import (
     SHOWN_FORMATS,
@@ -52,9 +49,7 @@ _PLACED = "origin", "geometry"  # Parts that a collision shape and a visual shar
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ROWS, _COLUMNS = np.triu_indices(3)
 _ROUNDING = 1e-6  # Of the digits of moments of inertia.
-_DESCRIPTIONS = ("urdf", "urdfs", "xacro", "robots", "models", "mjcf")  # Folders in a package.
 _NOISE = 1e-12  # Of moments of inertia that should be zero [kg·m²].
-_WATER_KG_M3 = 1000.0  # Density of the ball in place of a body whose inertia is negative.
 
 
 def simulatable_copy(path: Path) -> UrdfCopy:
@@ -74,40 +69,35 @@ def simulatable_copy(path: Path) -> UrdfCopy:
         copy.warn(f"{words}: it is left out")
     _simplify_joints(copy)
     _fix_inertias(copy)
-    _tell_materials_apart(copy)
+    _name_materials(copy)
     _gather_meshes(copy)
     return copy
 
 
 def _simplify_joints(copy: UrdfCopy) -> None:
     """Removes speed limits of zero, dry friction, and transmissions that Drake ignores."""
-    fixed, zeros = set(), []
+    fixed = set()
     for joint in joint_elements(copy.root):
         name, limit, dynamics = joint.get("name", ""), joint.find("limit"), joint.find("dynamics")
         if joint.get("type") == "fixed":
             fixed.add(name)
         elif limit is not None and number(limit, "velocity") == 0:
             del limit.attrib["velocity"]  # At which no joint would move.
-            zeros.append(name)
+            copy.warn(f"velocity=\"0\" of joint '{name}' is read as no limit")
         friction = None if dynamics is None else dynamics.attrib.pop("friction", None)
         if as_number(friction) > 0:
             copy.joint_friction[name] = as_number(friction)
-    if zeros:
-        copy.warn(f'velocity="0" of joints {zeros} is read as no limit')
     for transmission in copy.root.findall("transmission"):
         kind, driven = transmission.findtext("type", "").strip(), transmission.find("joint")
         is_simple = kind.rpartition("/")[2] == "SimpleTransmission"
         if not is_simple or (driven is not None and driven.get("name") in fixed):
             copy.root.remove(transmission)
     if copy.joint_friction:
-        copy.notes.append(
-            f"the dry friction of {len(copy.joint_friction)} joints is left out; the scenario sets "
-            "it as joint_friction_nm"
-        )
+        copy.notes.append("the joints' dry friction is joint_friction_nm of the scenario")
 
 
 def _fix_inertias(copy: UrdfCopy) -> None:
-    """Removes impossible products of inertia, and inertias of bodies without mass."""
+    """Corrects impossible inertias, and removes those of bodies without mass."""
     for link in copy.root.iter("link"):
         inertia, mass = link.find("inertial/inertia"), number(link.find("inertial/mass"), "value")
         if inertia is None:
@@ -115,58 +105,44 @@ def _fix_inertias(copy: UrdfCopy) -> None:
         if not mass > 0:
             remove(link, "inertial")
             continue
-        moments = np.zeros((3, 3))
+        name, moments = link.get("name"), np.zeros((3, 3))
         moments[_ROWS, _COLUMNS] = np.nan_to_num([number(inertia, key) for key in _MOMENTS])
         moments[_COLUMNS, _ROWS] = moments[_ROWS, _COLUMNS]
-        values, axes = np.linalg.eigh(moments)
-        lowest, tell = moments.diagonal().min(), copy.notes.append
+        values, diagonal = np.linalg.eigvalsh(moments), moments.diagonal().copy()
+        if (lowest := diagonal.min()) < -max(_ROUNDING * values[2], _NOISE):
+            raise ValueError(
+                f"new: '{copy.source}': link '{name}' has a negative moment of inertia, {lowest:g}"
+            )
+        is_singular = values[0] < _ROUNDING * values[2] and np.triu(moments, 1).any()
         # Flat and thin bodies are allowed.
-        if lowest < -max(_ROUNDING * values[2], _NOISE):
-            radius_m = (0.75 * mass / (np.pi * _WATER_KG_M3)) ** (1 / 3)
-            changed, tell = 0.4 * mass * radius_m**2 * np.eye(3), copy.warn
-            remark = f"{lowest:g} is replaced by {changed[0, 0]:.3g} kg·m² about all axes, as of a "
-            remark += "ball of water of its mass"
-        elif values[0] < _ROUNDING * values[2] and np.triu(moments, 1).any():
-            changed, remark = np.diag(np.diag(moments)), "its products of inertia are set to zero"
-        elif values[1] > 0 and values[2] > (1 + _ROUNDING) * (values[0] + values[1]):
-            # The moments of any body satisfy the triangle inequality.
-            values[2] = max(0.999 * (values[0] + values[1]), values[1])  # Digits are rounded.
-            changed = axes @ np.diag(values) @ axes.T
-            remark = "its largest moment is reduced to the sum of the others"
-        else:
+        if not is_singular and values[2] <= (1 + _ROUNDING) * (values[0] + values[1]):
             continue
-        for key, row, column in zip(_MOMENTS, _ROWS, _COLUMNS, strict=True):
-            if changed[row, column] != moments[row, column]:
-                inertia.set(key, f"{changed[row, column]:.9g}")
-        tell(f"link '{link.get('name')}' has an impossible inertia; {remark}")
+        largest = int(np.argmax(diagonal))
+        _, second, _ = np.sort(diagonal)
+        most = max(0.999 * (diagonal.sum() - diagonal[largest]), second)  # Digits are rounded.
+        diagonal[largest] = min(diagonal[largest], most)
+        for key, value in zip(_MOMENTS, np.diag(diagonal)[_ROWS, _COLUMNS], strict=True):
+            inertia.set(key, f"{value:.9g}")
+        copy.notes.append(
+            f"link '{name}' has an impossible inertia; its products of inertia are set to zero, "
+            "its largest moment is at most the sum of the others"
+        )
 
 
-def _tell_materials_apart(copy: UrdfCopy) -> None:
-    """Gives visuals the colours of their materials; those of one name and two colours get two."""
-    materials = reversed([*copy.root.iter("material")])
-    parts = {one.get("name", ""): [*one] for one in materials if len(one)}  # The first of a name.
-    colours: dict[str, list[list[str]]] = {}
-    for parent in (copy.root, *copy.root.findall("link/visual")):
-        for material in parent.findall("material"):
+def _name_materials(copy: UrdfCopy) -> None:
+    """Gives every visual a material of its own, as Drake refuses two colours of one name."""
+    stated = reversed([*copy.root.iter("material")])
+    parts = {material.get("name"): [*material] for material in stated if len(material)}
+    for material in copy.root.findall("material"):
+        copy.root.remove(material)
+    for index, visual in enumerate(copy.root.findall("link/visual")):
+        for material in visual.findall("material"):
             name = material.get("name", "")
             if not len(material):
                 material.extend(parts.get(name, []))
-            values = " ".join(value for part in material for value in part.attrib.values()).split()
-            if not values:
-                parent.remove(material)
-                continue
-            # 0 and 0.0 are equal.
-            colour = [f"{float(value):g}" if is_number(value) else value for value in values]
-            others = colours.setdefault(name, [])
-            if colour not in others:
-                others.append(colour)
-            if index := others.index(colour):
-                material.set("name", f"{name}_{index}")
-    copy.notes += [
-        f"the material '{name}' has {len(several)} colours; now each has its own name"
-        for name, several in colours.items()
-        if len(several) > 1
-    ]
+            material.set("name", f"{name}_{index}")
+            if not any(part.attrib for part in material):
+                visual.remove(material)
 
 
 def _gather_meshes(copy: UrdfCopy) -> None:
@@ -182,17 +158,12 @@ def _gather_meshes(copy: UrdfCopy) -> None:
 
     def converted(kind: str, url: str, convert: Callable[[Path], str]) -> str:
         """What a mesh becomes; "", with the reason in ``lost``, if it is left out."""
-        candidates = _mesh_files(url, copy.source)
-        file = next((path for path in candidates if path.is_file()), None)
-        name, why = url if file is None else file.name, "are not where the URDF says are left out"
+        name, why = url, "are not where the URDF says are left out"
         try:
-            if file is not None:
-                if not _is_inside(file, url, copy.source):
-                    raise ValueError("it lies outside the folders of the URDF and of its package")
+            if (file := _mesh_file(url, copy.source)) is not None:
+                name = file.name
                 check_meshes(file)
                 return convert(file)
-            for other in (other for path in candidates for other in _alike(path)):
-                name = f"{url} (but '{Path(*other.parts[-len(Path(url).parts) :])}' is there)"
         except MissingExtraError as error:
             why = "Drake does not read are left out, until you "
             why += f"`pip install '{error.needs}'` and write the folder again"
@@ -250,43 +221,32 @@ def _counted(names: dict[str, list[str]]) -> list[str]:
     return [f"{what}: {', '.join(dict.fromkeys(meshes))}" for what, meshes in names.items()]
 
 
-def _alike(path: Path) -> Iterator[Path]:
-    """Paths that differ from one by case, or by - and _, alone."""
-    path = path.resolve()
-    letters = (f"[{c.lower()}{c.upper()}]" if c.isalpha() else glob.escape(c) for c in str(path))
-    pattern = re.sub("[-_]", "[-_]", "".join(letters))
-    return Path(path.anchor).glob(pattern.lstrip("/"))
+def _mesh_file(url: str, source: Path) -> Path | None:
+    """The file of a mesh beside a URDF, in a ROS package around it, or in an installed one.
 
-
-def _is_inside(file: Path, url: str, source: Path) -> bool:
-    """Whether a mesh lies in the package of a URDF, in its folder, or in a folder beside that."""
-    folder, real = source.resolve().parent, file.resolve()
+    Raises:
+        ValueError: It lies outside these folders.
+    """
+    scheme, _, rest = url.rpartition("://")
+    rest = unquote(rest.replace("\\", "/"))
+    folder = source.resolve().parent
     around = [folder, *folder.parents]
-    homes = [folder, *(path for path in around if (path / "package.xml").is_file())]
-    homes += [folder.parent] * (folder.name in _DESCRIPTIONS)
-    scheme, _, rest = url.rpartition("://")
-    name = unquote(rest).lstrip("/").partition("/")[0]
-    if name and scheme in ("package", "model"):
-        named = [path / name for path in around]
-        near = [*around, *named[:4]]
-        homes += [path for path in named if path in near or (path / "package.xml").is_file()]
-        with contextlib.suppress(ValueError, MissingExtraError):
-            homes.append(model_file(f"package://{name}"))
-    is_beside = folder.parent in real.parent.parents
-    return is_beside or any(home.resolve() in real.parents for home in homes)
-
-
-def _mesh_files(url: str, source: Path) -> list[Path]:
-    """Where a mesh's URL may be: in a ROS package around the URDF, or in an installed package."""
-    scheme, _, rest = url.rpartition("://")
-    candidates: list[Path] = []
-    for name in (rest, unquote(rest.replace("\\", "/"))):  # As written, or as of Windows.
-        if scheme in ("", "file"):
-            candidates.append(source.parent / name)
-        elif scheme in ("package", "model"):
-            folders = source.resolve().parents
-            candidates += [folder / name.lstrip("/") for folder in folders]
-    if scheme == "package":
-        with contextlib.suppress(ValueError):
-            candidates.append(model_file(url))
-    return candidates
+    if scheme in ("", "file"):
+        homes = [path for path in around if (path / "package.xml").is_file()] + [folder.parent]
+        places = [(folder / rest, home) for home in homes]
+    else:
+        name, _, path = rest.lstrip("/").partition("/")
+        packages = [parent / name for parent in around]
+        near = {*around, *packages[:4]}
+        homes = [home for home in packages if home in near or (home / "package.xml").is_file()]
+        if scheme == "package":
+            with contextlib.suppress(ValueError, MissingExtraError):
+                homes.append(model_file(f"package://{name}"))
+        places = [(home / path, home) for home in homes]
+    files = [(file, home) for file, home in places if file.is_file()]
+    for file, home in files:
+        if file.resolve().is_relative_to(home.resolve()):
+            return file
+    if files:
+        raise ValueError("it lies outside the folders of the URDF and of its package")
+    return None

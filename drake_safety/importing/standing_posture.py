@@ -28,22 +28,15 @@ def standing_posture(
     """Returns a standing posture [rad] and its source: a keyframe, home or stand first, or solved.
 
     A keyframe serves if the robot stands in it: joints within their stops and not all at zero,
-    contact points equally low, and the centre of mass amid them. Otherwise joints of no leg are as
-    in the first keyframe, or at zero, but off their stops.
+    contact points equally low, and the centre of mass amid them.
     """
     names = sorted(keyframes, key=lambda name: not re.search("home|stand", name.lower()))
     for name in names:
         posture = {joint: round(keyframes[name][joint], 4) for joint in survey.posture()}
         if _stands(survey, legs, posture):
             return posture, f"keyframe '{name}'"
-    source = "solved: feet under the hips"
-    resting: Mapping[str, float] = dict.fromkeys(survey.limits, 0.0)
-    if names:
-        resting = keyframes[names[0]]
-        source += f", as it stands in no keyframe; other joints as in keyframe '{names[0]}'"
-    legged = {joint for leg in legs for joint in leg.joints}
-    survey.rest_joints({joint: q for joint, q in resting.items() if joint not in legged})
-    return solve_standing_posture(survey, legs), source
+    survey.rest_joints(survey.limits.keys() - {joint for leg in legs for joint in leg.joints})
+    return solve_standing_posture(survey, legs), "solved: feet under the hips"
 
 
 def _stands(survey: Survey, legs: list[Limb], posture: dict[str, float]) -> bool:
@@ -61,10 +54,9 @@ def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]
     """Solves for joint positions by name [rad] in which the robot can stand.
 
     Every foot is level and under its hip, the joint where the long links begin; legs that spread
-    at zero, as a spider's, keep half of their spread. The height of the hips is four fifths of a
-    leg's length, or the nearest feasible share. Of several solutions for a leg, the one with small
-    angles and a knee that bends backwards (bipeds: forwards, spread legs: upwards) is taken. If the
-    centre of mass is not amid the feet, all feet are moved under it.
+    at zero, as a spider's, keep half of their spread. Of several solutions for a leg, the one with
+    small angles and a knee that bends backwards (bipeds: forwards, spread legs: upwards) is taken.
+    If the centre of mass is not amid the feet, all feet are moved under it.
     """
     survey.set_joints({})
     solvers = [_Leg(survey, leg, len(legs)) for leg in legs]
@@ -150,15 +142,17 @@ class _Leg:
                 parts.append(0.1 * turn.angle() * np.asarray(turn.axis()))
             return np.concatenate(parts)
 
-        def residual(angles: np.ndarray) -> np.ndarray:
-            return np.concatenate([errors(angles), 1e-4 * angles])
-
         low, high = self._bounds
         rng = np.random.default_rng(0)
         solutions: list[np.ndarray] = []
         for index in range(_NUM_GUESSES):
             guess = rng.uniform(low, high) if index else np.clip(0.0, low, high)
-            angles = least_squares(residual, guess, bounds=(low, high), max_nfev=40).x
+            angles = least_squares(
+                lambda angles: np.concatenate([errors(angles), 1e-4 * angles]),
+                guess,
+                bounds=(low, high),
+                max_nfev=40,
+            ).x
             if np.abs(errors(angles)).max() <= _TOLERANCE_M:
                 solutions.append(angles)
             if len(solutions) == _ENOUGH:

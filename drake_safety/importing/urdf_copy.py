@@ -7,7 +7,7 @@ import re
 import shutil
 import xml.etree.ElementTree as ET
 import zlib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from drake_safety.robots.urdf import DRAKE, as_number, joint_elements, number, remove
+from drake_safety.robots.urdf import DRAKE, joint_elements, number, remove
 
 if TYPE_CHECKING:
     import trimesh
@@ -25,17 +25,20 @@ _MOVABLE = ("revolute", "continuous", "prismatic", "screw")
 
 @dataclass(frozen=True, kw_only=True)
 class JointDrives:
-    """Drives of the joints of a URDF."""
+    """Drives of the joints of a URDF.
 
-    mimics: dict[str, tuple[str, float, float]] = field(default_factory=dict)
-    """Coupled joints: the joint that each follows, multiplier and offset [rad, m]."""
+    Attributes:
+        mimics: The joint that a coupled one follows.
+        listed: Joints with a transmission (ROS 1) or a command interface (``<ros2_control>``).
+        efforts: Effort limits [N·m]; NaN without one.
+    """
+
+    mimics: dict[str, str] = field(default_factory=dict)
     listed: set[str] = field(default_factory=set)
-    """Joints with a transmission (ROS 1) or a command interface (``<ros2_control>``)."""
     efforts: dict[str, float] = field(default_factory=dict)
-    """Effort limits [N·m]; NaN without one."""
 
     def passive(self, names: Collection[str]) -> dict[str, str]:
-        """Returns those of some joints that have no motor, and the evidence."""
+        """Returns the joints of some that have no motor, and the evidence."""
         listed = self.listed.intersection(names)
         if listed:
             lacking = [name for name in names if name not in listed]
@@ -44,39 +47,33 @@ class JointDrives:
         weak = [name for name in names if has_efforts and self.efforts[name] == 0]
         return dict.fromkeys(weak, 'effort="0"')
 
-    def coupled(self, positions: Mapping[str, float]) -> dict[str, float]:
-        """Returns joint positions in which coupled joints follow the others [rad, m]."""
-        coupled = dict(positions)
-        for _ in self.mimics:  # They may follow each other.
-            for name, (leader, multiplier, offset) in self.mimics.items():
-                if name in coupled and leader in coupled:
-                    coupled[name] = multiplier * coupled[leader] + offset
-        return coupled
-
 
 @dataclass(kw_only=True)
 class UrdfCopy:
-    """An editable copy of a URDF file."""
+    """An editable copy of a URDF file.
+
+    Attributes:
+        notes: Descriptions of the changes, one sentence each.
+        warnings: Notes that the user should see at once.
+        left_out: Notes about meshes that were removed.
+        mesh_urls: Collision meshes of the file by link.
+        lost_links: Links of collision meshes that were removed.
+        joint_friction: Removed dry friction by joint [N·m].
+        meshes: Original files by name relative to the copy.
+        hulls: Convex hulls in place of collision meshes, by link, in its frame [m].
+    """
 
     source: Path
     root: ET.Element
     drives: JointDrives = field(init=False)
     notes: list[str] = field(default_factory=list)
-    """Descriptions of the changes, one sentence each."""
     warnings: list[str] = field(default_factory=list)
-    """Notes that the user should see at once."""
     left_out: list[str] = field(default_factory=list)
-    """Notes about meshes that were removed."""
     mesh_urls: dict[str, list[str]] = field(default_factory=dict)
-    """Collision meshes of the file by link."""
     lost_links: set[str] = field(default_factory=set)
-    """Links of collision meshes that were removed."""
     joint_friction: dict[str, float] = field(default_factory=dict)
-    """Removed dry friction by joint [N·m]."""
     meshes: dict[str, Path] = field(default_factory=dict)
-    """Meshes of the copy: name relative to the copy -> original file."""
     hulls: dict[str, list[trimesh.Trimesh]] = field(default_factory=dict)
-    """Convex hulls in place of collision meshes, by link, in its frame [m]."""
 
     def __post_init__(self) -> None:
         self.drives = read_drives(self.root)
@@ -121,27 +118,24 @@ class UrdfCopy:
         joint = ET.SubElement(self.root, "joint", name=f"{name}_fixed", type="fixed")
         ET.SubElement(joint, "parent", link=name)
         ET.SubElement(joint, "child", link=below)
-        _set_pose(joint, pose.inverse())
+        X_NB = pose.inverse()
+        rpy = as_text(X_NB.rotation().ToRollPitchYaw().vector())
+        ET.SubElement(joint, "origin", xyz=as_text(X_NB.translation()), rpy=rpy)
         return name
 
-    def fix_joints(self, poses: Mapping[str, RigidTransform | None]) -> None:
-        """Fixes joints at zero, or at the pose of the child in the parent."""
+    def fix_joints(self, names: Collection[str]) -> None:
+        """Fixes joints at zero."""
         for joint in joint_elements(self.root):
-            if joint.get("name") in poses:
-                pose = poses[joint.get("name", "")]
-                if pose is not None:
-                    _set_pose(joint, pose)
+            if joint.get("name") in names:
                 joint.tag = "joint"
                 joint.set("type", "fixed")
                 remove(joint, "mimic")
         for transmission in self.root.findall("transmission[joint]"):
-            if any(joint.get("name") in poses for joint in transmission.findall("joint")):
+            if any(joint.get("name") in names for joint in transmission.findall("joint")):
                 self.root.remove(transmission)
-        if poses:
-            self.notes.append(
-                f"{len(poses)} joints that move neither a foot nor a hand are fixed at zero: "
-                + ", ".join(sorted(poses))
-            )
+        if names:
+            text = ", ".join(sorted(names))
+            self.notes.append(f"{len(names)} joints that move no foot or hand are fixed: {text}")
 
     def replace_collisions(self, link_name: str, points: np.ndarray, radius_m: float) -> None:
         """Replaces all collision shapes of a link by spheres at points (n, 3) [m] in its frame."""
@@ -153,10 +147,7 @@ class UrdfCopy:
             ET.SubElement(collision, "origin", xyz=" ".join(f"{value:.5g}" for value in point))
             geometry = ET.SubElement(collision, "geometry")
             ET.SubElement(geometry, "sphere", radius=f"{radius_m:.5g}")
-        self.notes.append(
-            f"the collision shapes of link '{link_name}' are replaced by {len(points)} spheres on "
-            "the ground"
-        )
+        self.notes.append(f"link '{link_name}' collides as {len(points)} spheres on the ground")
 
     def set_hulls(self, link_name: str, hulls: list[trimesh.Trimesh]) -> None:
         """Sets the convex hulls in place of a link's collision meshes; earlier ones go."""
@@ -212,14 +203,6 @@ def pose_of(element: ET.Element) -> RigidTransform:
     return RigidTransform(RollPitchYaw(rpy), xyz)
 
 
-def _set_pose(element: ET.Element, pose: RigidTransform) -> None:
-    origin = element.find("origin")
-    if origin is None:
-        origin = ET.SubElement(element, "origin")
-    origin.set("xyz", as_text(pose.translation()))
-    origin.set("rpy", as_text(pose.rotation().ToRollPitchYaw().vector()))
-
-
 def as_text(values: Iterable[float]) -> str:
     """Returns numbers with nine digits, as attributes have them."""
     return " ".join(f"{value:.9g}" for value in values)
@@ -240,13 +223,7 @@ def read_drives(root: ET.Element) -> JointDrives:
     mimics = {name: joint.find("mimic") for name, joint in joints.items()}
     return JointDrives(
         mimics={
-            name: (
-                mimic.get("joint", ""),
-                as_number(mimic.get("multiplier"), 1.0),
-                as_number(mimic.get("offset"), 0.0),
-            )
-            for name, mimic in mimics.items()
-            if mimic is not None
+            name: mimic.get("joint", "") for name, mimic in mimics.items() if mimic is not None
         },
         listed={joint.get("name", "") for place in motors for joint in root.findall(place)},
         efforts={name: number(joint.find("limit"), "effort") for name, joint in joints.items()},

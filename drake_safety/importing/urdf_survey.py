@@ -9,26 +9,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Box, Capsule, Cylinder, Shape, Sphere
+from pydrake.geometry import Capsule, Cylinder, Shape, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.multibody.tree import (
-    Joint,
-    RevoluteJoint,
-    ScrewJoint,
-)
+from pydrake.multibody.tree import Joint
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_safety.importing.urdf_copy import JointDrives, UrdfCopy
 from drake_safety.robots.model_files import package_parser
 from drake_safety.robots.plausibility import listed
 
-WITHOUT_STOPS_RAD = 4 * math.pi
-"""Range of a joint from which it may turn a wheel."""
+WITHOUT_STOPS_RAD = 720.0
+"""Range of a leg's last joint from which it turns a wheel; below, limits may be degrees."""
 _CORNER_RADIUS_M = 0.005  # Radius of spheres at the corners of a flat foot.
 _GUESSED_RADIUS_M = 0.02
 _STOP_RAD = 0.05  # Distance from a stop of a joint that cannot be at zero.
-_ROUND = 0.15  # Of a wheel's radius, by which it may be out of round.
 _FLAT_M = 1e-3  # Height over a sole's lowest part within which other parts touch as well.
 _LEVEL_M = 0.005  # Height over the lowest sphere within which others count as contacts.
 _LEAST_INERTIA = 1e-10  # Of what a joint moves [kg·m², kg].
@@ -39,17 +34,13 @@ _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("L", "R"), (
 class Limb:
     """A leg or an arm."""
 
-    body: str
-    """The body at its end, which touches the ground or reaches."""
-    joints: list[str]
-    """Its own joints, starting at the base."""
+    body: str  # At its end, which touches the ground or reaches.
+    joints: list[str]  # Its own, starting at the base.
     points: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
     """Centres of contact spheres in the body's frame, (n, 3) [m]."""
     radius_m: float = _GUESSED_RADIUS_M
-    is_own_shape: bool = False
-    """Whether the URDF has these spheres."""
-    is_guess: bool = True
-    """Whether the URDF has no collision shape at the end."""
+    is_own_shape: bool = False  # The URDF has these spheres.
+    is_guess: bool = True  # The URDF has no collision shape at the end.
 
 
 @dataclass(frozen=True)
@@ -79,7 +70,7 @@ class Survey:
             plant.Finalize()
         # Where a condition of Drake's C++ fails, pydrake raises SystemExit.
         except (RuntimeError, ValueError, SystemExit) as error:
-            reason = re.sub(rf"{re.escape(str(path))}:\d+: ", "", str(error))
+            reason = str(error).replace(str(path), "")
             raise ValueError(f"Drake cannot read '{self.source}': {reason}") from error
         self.plant, self._diagram = plant, builder.Build()
         self._root = self._diagram.CreateDefaultContext()
@@ -103,12 +94,11 @@ class Survey:
             for joint in self.joints
         }
         self._index = {joint.name(): joint.position_start() for joint in self.joints}
-        neutral = {}
+        self._neutral = {}
         for name, (low, high) in self.limits.items():
             # The position nearest to zero that is not beyond a stop, nor at one unless zero is.
             room = 0.0 if low <= 0.0 <= high else min(_STOP_RAD, 0.1 * (high - low))
-            neutral[name] = float(np.clip(0.0, low + room, high - room))
-        self._neutral = self.drives.coupled(neutral)
+            self._neutral[name] = float(np.clip(0.0, low + room, high - room))
         self.set_joints({})
         self.total_mass = plant.CalcTotalMass(self.context, [self.instance])
 
@@ -119,13 +109,12 @@ class Survey:
             q[self._index[name]] = value
         self.plant.SetPositions(self.context, q)
 
-    def rest_joints(self, values: Mapping[str, float]) -> None:
-        """Sets the positions [rad] of joints that are not set otherwise, off their stops."""
-        for name in self.limits.keys() & values.keys():
+    def rest_joints(self, names: Collection[str]) -> None:
+        """Moves joints, where they are not set otherwise, off their stops."""
+        for name in names:
             low, high = self.limits[name]
             room = min(_STOP_RAD, 0.25 * (high - low))
-            self._neutral[name] = float(np.clip(values[name], low + room, high - room))
-        self._neutral = self.drives.coupled(self._neutral)
+            self._neutral[name] = float(np.clip(0.0, low + room, high - room))
 
     def posture(self) -> dict[str, float]:
         """Returns the present joint positions by name [rad]."""
@@ -153,13 +142,6 @@ class Survey:
         """Returns the position of a joint in the base's frame, (3,) [m]."""
         frame = self.plant.GetJointByName(joint, self.instance).frame_on_child()
         return frame.CalcPoseInWorld(self.context).translation()
-
-    def joint_axis(self, joint: str) -> np.ndarray:
-        """Returns the direction of a joint's axis in the base's frame, (3,)."""
-        moved = self.plant.GetJointByName(joint, self.instance)
-        kinds = {RevoluteJoint: "revolute_axis", ScrewJoint: "screw_axis"}
-        axis = getattr(moved, kinds.get(type(moved), "translation_axis"))()
-        return moved.frame_on_parent().CalcPoseInWorld(self.context).rotation().matrix() @ axis
 
     def positions(self, limb: Limb) -> np.ndarray:
         """Returns a limb's contact points in the base's frame, (n, 3) [m]."""
@@ -234,32 +216,6 @@ class Survey:
             others = set().union(*(chains[body] for body in chains if body != arm.body))
             arm.joints = [name for name in arm.joints if name not in others]
         return arms
-
-    def wheels(self, legs: list[Limb]) -> list[str]:
-        """Returns joints without stops that turn a round body at a leg's end.
-
-        Such legs touch by a sphere as large as the wheel, unless they have one of their own.
-        """
-        wheels = []
-        for limb in legs:
-            low, high = self.limits[limb.joints[-1]]
-            axis, origin = self.joint_axis(limb.joints[-1]), self.joint_origin(limb.joints[-1])
-            group = self.welded(limb.body) if high - low > WITHOUT_STOPS_RAD else []
-            for _, shape, _, X_WO, half in self.geometries(group):
-                along = np.abs(X_WO.rotation().matrix().T @ axis)
-                across = np.delete(half, np.argmax(along))
-                radius, center = float(across.max()), X_WO.translation()
-                is_low = center[2] - 1.5 * radius < self.lowest(group)
-                is_turned = along.max() > 0.95 or isinstance(shape, Sphere)
-                offset = max(np.ptp(across), np.linalg.norm(np.cross(axis, center - origin)))
-                is_round = not isinstance(shape, Box) and offset < _ROUND * radius
-                if is_low and is_turned and is_round:
-                    wheels.append(limb.joints[-1])
-                    if not limb.is_own_shape:
-                        limb.points = (self.pose(limb.body).inverse() @ center)[None]
-                        limb.radius_m = radius
-                    break
-        return wheels
 
     def geometries(
         self, bodies: list[str]
@@ -387,8 +343,7 @@ def require_feet(survey: Survey, copy: UrdfCopy) -> None:
         raise ValueError(
             f"new: '{survey.source}': collision meshes at the ends of limbs were not found or not "
             f"read, so that the feet cannot be told: {'; '.join(lost)}. Put them where the URDF "
-            "says, give these links a box or sphere, or name the feet by --feet. "
-            f"{'. '.join(copy.left_out)}"
+            f"says, or name the feet by --feet. {'. '.join(copy.left_out)}"
         )
 
 
@@ -396,16 +351,14 @@ def require_motors(survey: Survey, legs: list[Limb], moved: Collection[str]) -> 
     """Refuses legs with joints that no motor moves by itself, unless a policy ``moved`` them."""
     drives = survey.drives
     joints = list(dict.fromkeys(joint for limb in legs for joint in survey.chain(limb.body)))
-    mimics = {name: drives.mimics[name] for name in joints if name in drives.mimics}
-    coupled = {name: "= {1:g} · '{0}' + {2:g}".format(*mimic) for name, mimic in mimics.items()}
+    coupled = {name: drives.mimics[name] for name in joints if name in drives.mimics}
     passive = {name: why for name, why in drives.passive(joints).items() if name not in moved}
     limits = ((name, *survey.limits[name]) for name in survey.limits if name in joints)
     stuck = {name: f"{low:g}" for name, low, high in limits if low == high}
-    fix = 'or fix them (type="fixed"); the base floats without joints that carry all legs'
     for names, what, remedy in (
         (coupled, "follow others by <mimic>", "remove <mimic> if each has a motor of its own"),
-        (passive, "have no motor", f"add a <transmission> if they have one, {fix}"),
-        (stuck, "have equal limits", f"correct <limit>, {fix}"),
+        (passive, "have no motor", "add a <transmission> if they have one, or fix them"),
+        (stuck, "have equal limits", "correct <limit>, or fix them"),
     ):
         if names:
             raise ValueError(
@@ -421,26 +374,18 @@ def require_masses(survey: Survey) -> None:
         if M[joint.velocity_start(), joint.velocity_start()] < _LEAST_INERTIA:
             raise ValueError(
                 f"new: '{survey.source}': joint '{joint.name()}' moves link "
-                f"'{joint.child_body().name()}', which has no mass or inertia about its axis, and "
-                'carries none. Correct its <inertial>, or fix the joint (type="fixed")'
+                f"'{joint.child_body().name()}', which has no mass or inertia about its axis"
             )
 
 
-def base_at_hips(survey: Survey, legs: list[Limb]) -> tuple[RigidTransform | None, str]:
-    """Returns a pose between the hips if the root link is far from them; and what is odd of it."""
+def base_at_hips(survey: Survey, legs: list[Limb]) -> RigidTransform | None:
+    """Returns a pose between the hips if the root link is far from them."""
     hips = np.array([survey.joint_origin(limb.joints[0]) for limb in legs])
     feet = np.array([survey.positions(limb).mean(axis=0) for limb in legs])
     length = np.linalg.norm(feet - hips, axis=1).mean()
     x, y, z = middle = 0.5 * (hips.min(axis=0) + hips.max(axis=0))
-    if not (-0.2 * length < -z < 1.2 * length and math.hypot(x, y) < 0.5 * length):
-        why = f"lies {z:.2f} m below the hips and {math.hypot(x, y):.2f} m aside"
-        return RigidTransform(middle), why
-    origins = {name: survey.joint_origin(name) for limb in legs for name in limb.joints}
-    sides = [origins[left] - origins[right] for left, right in mirrored(list(origins)).items()]
-    across = np.mean(sides, axis=0) if sides else np.array([0.0, 1.0, 0.0])
-    if across[1] < 0.5 * np.linalg.norm(across):
-        return None, "is turned: its left is not along +y, so that x is not forwards"
-    return None, ""
+    is_near = -0.2 * length < -z < 1.2 * length and math.hypot(x, y) < 0.5 * length
+    return None if is_near else RigidTransform(middle)
 
 
 def mirrored(names: list[str]) -> dict[str, str]:

@@ -41,7 +41,7 @@ _SHORTEST_S = 0.5  # Of a log that says how feet move.
 _SLIP_M, _SLIP_FACTOR, _HIGH_M = 0.004, 3.0, 0.01
 _LONGEST_LEG = 7
 _MEASURES = ("from their means", "while the lowest one stands", "or rest at several heights")
-_MIRRORS = {"left and right": (1, -1), "front and rear": (-1, 1), "diagonal": (-1, -1)}
+_MIRRORS = {"left and right": (1, -1), "front and rear": (-1, 1)}
 _INVERSE = "'base_orientation' is the inverse, of the world in the base"
 
 _Reading = tuple[str, np.ndarray, np.ndarray]
@@ -282,9 +282,8 @@ def _poses(source: Source, kinematics: RobotKinematics) -> Iterator[_Pose]:
     p_BC = contacts(joints)
     for what, R, p in _readings(source.log_map.base_orientation.order, R_WB, p_WB):
         yield pose(what, R, p, joints, p_BC)
-    J = np.split(kinematics.contact_jacobian(q[0])[:, 6:], kinematics.num_contacts)
-    moves = np.array([np.any(J[s], axis=(0, 1)) for s in kinematics.foot_slices])
-    legs = [np.flatnonzero(one & (moves.sum(axis=0) == 1)) for one in moves]
+    feet = kinematics.robot.feet.values()
+    legs = [np.array([source.joints.index(name) for name in foot.joints]) for foot in feet]
     if len(set(map(len, legs))) > 1 or len(legs[0]) > _LONGEST_LEG:
         return
     columns = source.log_map.joint_positions.names(source.joints)
@@ -319,14 +318,9 @@ def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rot
     yield "", R, p
     yield text, other, p
     yield _INVERSE, R.inv(), p
-    yield f"{_INVERSE}, and {text}", other.inv(), p
     yield "the whole pose is the inverse, of the world in the base", R.inv(), -R.inv().apply(p)
-    for up, angle in (("z downwards", 180), ("y upwards", 90)):
-        turn = Rotation.from_euler("x", angle, degrees=True)
-        yield f"world and base have {up}", turn * R * turn.inv(), turn.apply(p)
-        yield f"the world has {up}", turn * R, turn.apply(p)
-    quarters = [one for one in Rotation.create_group("O") if one.magnitude() > 0]
-    for turn in sorted(quarters, key=lambda one: np.count_nonzero(abs(one.as_rotvec()) > 1e-6)):
+    quarters = [turn for turn in Rotation.create_group("O") if turn.magnitude() > 0]
+    for turn in sorted(quarters, key=lambda turn: np.count_nonzero(abs(turn.as_rotvec()) > 1e-6)):
         what = f"'base_orientation' is of a sensor turned on the base by {_turn_text(turn)}"
         yield what, R * turn.inv(), p
     for angle in (*range(-170, 0, 10), *range(10, 180, 10)):
@@ -340,9 +334,9 @@ def _check_velocities(source: Source) -> None:
         if name not in source.channels:
             continue
         names = {positions, name} if "joint" in name else {positions, name, "base_orientation"}
-        channels = [source.channels[one] for one in names]
+        channels = [source.channels[other] for other in names]
         begin, end = common_span(channels)
-        step = max(float(np.median(np.diff(one.time_s))) for one in channels)
+        step = max(float(np.median(np.diff(channel.time_s))) for channel in channels)
         width = min(max(_WINDOW_S, 2 * step), end - begin)
         number = 1 + int(min((end - begin - width) / step + 1e-6, _MANY_WINDOWS))
         windows = np.linspace(begin, end - width, number) + np.array([[0.0], [width]])

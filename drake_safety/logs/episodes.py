@@ -27,73 +27,53 @@ from drake_safety.simulation.scenario import Scenario
 _ROUNDING_S = 1e-9
 
 
-def episodes_from_log(
-    log: RobotLog | Sequence[RobotLog],
-    loop: LeggedLoop | Scenario,
-    *,
-    desired_output: np.ndarray | None = None,
-) -> Episodes:
-    """Returns the episodes of :func:`cut_log` without their starts."""
-    return cut_log(log, loop, desired_output=desired_output)[0]
-
-
-def require_loggable(loop: LeggedLoop) -> None:
-    """Raises ValueError if the controller has a memory, which no log has."""
+def _loggable_loop(loop: LeggedLoop | Scenario) -> LeggedLoop:
+    """The actual loop; one whose controller has a memory, which no log has, is refused."""
+    if isinstance(loop, Scenario):
+        loop = loop.make_loop("actual")
     if loop.memory_features:
         raise ValueError(
             f"scenario '{loop.scenario.name}' reads {sorted(loop.memory_features)}, its policy's "
-            "memory, which a log of positions and velocities does not have: 'adapt' has no logs of "
-            "such robots; for 'monitor' write what the policy observes and commands as sequences "
-            "of an .npz file"
+            "memory, which no log has: 'adapt' takes none of such robots, 'monitor' sequences of "
+            "what the policy observes and commands, an .npz file"
         )
+    return loop
 
 
 def cut_log(
-    log: RobotLog | Sequence[RobotLog],
-    loop: LeggedLoop | Scenario,
-    *,
-    desired_output: np.ndarray | None = None,
+    log: RobotLog | Sequence[RobotLog], loop: LeggedLoop | Scenario
 ) -> tuple[Episodes, list[EpisodeStart]]:
     """Converts logs to consecutive episodes of the actual robot, with the starts of their twins.
 
-    Episodes have the scenario's duration; none reaches over a cut of
-    :func:`~drake_safety.logs.robot_log.read_pieces`. The last episode of a log ends where the robot
-    leaves the safe set at a tick of the loop's monitor; later rows are ignored. A safe remainder
-    that is too short for a segment is dropped. No noise is added to the logged states, which
-    contain measurement noise. The preview is the logged z*, constant after the last row, in the
-    stance frame of the episode's first row.
+    Episodes have the scenario's duration; none reaches over a cut of a log. The last one ends where
+    the robot leaves the safe set; later rows are ignored. A safe remainder that is too short for a
+    segment is dropped. The preview is the logged z*, constant after the last row, in the stance
+    frame of the episode's first row.
 
     Args:
         log: The log, or several of one robot, whose episodes are numbered consecutively.
         loop: The loop without Γ that evaluates the states, or a scenario with an ``actual`` one.
-        desired_output: Constant z* in the world for logs without it, (n_z,) [m].
 
     Returns:
         The episodes and their starts: ``run_episode(nominal_loop, start=starts[i])`` is the twin
         of ``episodes[i]``.
-
-    Raises:
-        ValueError: A log is of another robot, has no z*, begins outside the safe set, or is
-            too short for one segment; or the loop's controller has a memory, which no log has.
     """
-    if isinstance(loop, Scenario):
-        loop = loop.make_loop("actual")
-    require_loggable(loop)
+    loop = _loggable_loop(loop)
     scenario, assessment = loop.scenario, loop.scenario.assessment
     shortest = assessment.preview_stride * mode_settings(assessment).shortest
-    cutter = _Cutter(loop, desired_output, scenario.step_s, scenario.episode_duration_s, shortest)
+    cutter = _Cutter(loop, scenario.step_s, scenario.episode_duration_s, shortest)
     episodes: list[Episode] = []
     starts: list[EpisodeStart] = []
     for parts in cutter.parts(log):
-        found = [both for _, several in parts for both in several]
-        if not found:
-            longest = max((one for one, _ in parts), key=lambda one: one.duration_s)
+        pairs = [pair for _, several in parts for pair in several]
+        if not pairs:
+            longest = max((piece for piece, _ in parts), key=lambda piece: piece.duration_s)
             raise ValueError(
                 f"log '{longest.path}' lasts {longest.duration_s:g} s: too short for a segment of "
                 f"{shortest} steps of {scenario.step_s} s of scenario '{scenario.name}'"
             )
-        episodes += [episode for episode, _ in found]
-        starts += [start for _, start in found]
+        episodes += [episode for episode, _ in pairs]
+        starts += [start for _, start in pairs]
     episodes = [replace(episode, index=i) for i, episode in enumerate(episodes)]
     return Episodes(episodes_info(loop, seed=NOT_DRAWN), episodes), starts
 
@@ -102,23 +82,19 @@ def motions_from_log(
     log: RobotLog | Sequence[RobotLog],
     loop: LeggedLoop | Scenario,
     *,
-    desired_output: np.ndarray | None = None,
     step_s: float | None = None,
 ) -> Episodes:
-    """Converts logs to motions for a `ChangeDetector`, with their times in the log.
+    """Converts logs to motions of up to a minute for a `ChangeDetector`, with their times in it.
 
-    Each lasts up to a minute, in the stance frame of its first row. The arguments and errors are
-    those of :func:`cut_log`. Rows are `step_s` apart, by default the scenario's `monitor_step_s`.
+    Rows are ``step_s`` apart, by default the scenario's ``monitor_step_s``.
     """
-    if isinstance(loop, Scenario):
-        loop = loop.make_loop("actual")
-    require_loggable(loop)
+    loop = _loggable_loop(loop)
     step_s = step_s or loop.scenario.monitor_step_s
-    cutter = _Cutter(loop, desired_output, step_s, MOTION_PIECE_S, shortest=2)
+    cutter = _Cutter(loop, step_s, MOTION_PIECE_S, shortest=2)
     motions: list[Episode] = []
-    for one, found in itertools.chain.from_iterable(cutter.parts(log)):
-        begin_s = one.begin_s
-        for motion, _ in found:
+    for piece, pairs in itertools.chain.from_iterable(cutter.parts(log)):
+        begin_s = piece.begin_s
+        for motion, _ in pairs:
             time_s = begin_s + motion.time_s
             motions.append(replace(motion, index=len(motions), time_s=time_s))
             begin_s = float(time_s[-1])
@@ -127,18 +103,12 @@ def motions_from_log(
 
 @dataclass(frozen=True)
 class _Cutter:
-    """Evaluates a loop's ports at the states of logs, in rows of the given distance.
-
-    Attributes:
-        duration_s: Longest duration of an episode [s].
-        shortest: Least number of steps of a safe episode.
-    """
+    """Evaluates a loop's ports at the states of logs, in rows of the given distance."""
 
     loop: LeggedLoop
-    desired_output: np.ndarray | None
     step_s: float
-    duration_s: float
-    shortest: int
+    duration_s: float  # Longest of an episode.
+    shortest: int  # Least number of steps of a safe episode.
 
     def parts(
         self, log: RobotLog | Sequence[RobotLog]
@@ -148,21 +118,29 @@ class _Cutter:
         begins = [i for i, one in enumerate(logs) if i == 0 or one.piece == 0]
         for begin, end in itertools.pairwise([*begins, len(logs)]):
             parts = []
-            for one in logs[begin:end]:
-                found, has_left = self._cut(one)
-                parts.append((one, found))
+            for piece in logs[begin:end]:
+                pairs, has_left = self._cut(piece)
+                parts.append((piece, pairs))
                 if has_left:
                     break
             yield parts
 
     def _cut(self, log: RobotLog) -> tuple[list[tuple[Episode, EpisodeStart]], bool]:
         """Episodes and starts of a piece, and whether it leaves the safe set."""
-        desired = self._desired(log)
+        if log.robot != self.loop.robot.name:
+            raise ValueError(
+                f"log '{log.path}' is of robot '{log.robot}', scenario "
+                f"'{self.loop.scenario.name}' of '{self.loop.robot.name}'"
+            )
+        if log.desired_output is None:
+            raise ValueError(
+                f"log '{log.path}' has no desired output, which the preview needs: map it"
+            )
         context = self.loop.CreateDefaultContext()
         found: list[tuple[Episode, EpisodeStart]] = []
         begin_s = 0.0
         while log.duration_s - begin_s > self.step_s:
-            start = self._start(log, desired, begin_s)
+            start = self._start(log, log.desired_output, begin_s)
             self.loop.reset_to(context, None, start)
             episode = self._episode(log, context, begin_s)
             if not episode.is_safe and episode.num_steps == 0 and not found:
@@ -179,28 +157,6 @@ class _Cutter:
                 return found, True
             begin_s += float(episode.time_s[-1])
         return found, False
-
-    def _desired(self, log: RobotLog) -> np.ndarray:
-        """z* of a log, its own or the given constant, (N, n_z) [m]."""
-        who, loop, given = f"log '{log.path}'", self.loop, self.desired_output
-        if log.robot != loop.robot.name:
-            raise ValueError(
-                f"{who} is of robot '{log.robot}', scenario '{loop.scenario.name}' of "
-                f"'{loop.robot.name}'"
-            )
-        if log.desired_output is not None:
-            if given is not None:
-                raise ValueError(f"{who} has a desired output of its own; got another one")
-            return log.desired_output
-        if given is None:
-            raise ValueError(
-                f"{who} has no desired output, which the preview needs: map 'desired_output', or "
-                "pass a constant one"
-            )
-        size, value = len(loop.output_names), np.asarray(given, dtype=float)
-        if value.shape != (size,) or not np.isfinite(value).all():
-            raise ValueError(f"{who}: desired_output must be {size} finite numbers; got {value}")
-        return np.tile(value, (len(log.time_s), 1))
 
     def _start(self, log: RobotLog, desired: np.ndarray, begin_s: float) -> EpisodeStart:
         """The logged state at a time, with the later z* (N, n_z) [m] as a plan."""

@@ -15,9 +15,8 @@ Frame = Literal["world", "body"]
 TIME_UNITS: dict[TimeUnit, int] = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}
 """Units per second."""
 LENGTH_UNITS: dict[LengthUnit, float] = {"m": 1.0, "mm": 1e-3}
-"""Metres per unit; for velocities, per second."""
 ANGLE_UNITS: dict[AngleUnit, float] = {"rad": 1.0, "deg": 0.017453292519943295}
-"""Radians per unit; for rates, per second."""
+"""Metres and radians per unit; for velocities, per second."""
 VELOCITIES = {
     "base_linear_velocity": "base_position",
     "base_angular_velocity": "base_orientation",
@@ -28,11 +27,6 @@ COMMANDS = ("desired_output", "foot_positions")
 """What a log may have that is valid until its next value."""
 QUANTITIES = (*VELOCITIES.values(), *VELOCITIES, *COMMANDS)
 """Fields of a LogMap that name columns."""
-_NO_POSITION = (
-    ": a log of joints and an inertial measurement unit has none; a state estimator for legged "
-    "robots adds it, such as MUSE, Pronto or invariant-ekf (docs/logs.md, 'Logs without a base "
-    "position')"
-)
 
 
 @schema(kw_only=True)
@@ -158,9 +152,12 @@ class LogMap:
     """Largest time between two rows [s]."""
 
     def __post_init__(self) -> None:
-        for name, hint in (("base_position", _NO_POSITION), ("base_orientation", "")):
+        for name in ("base_position", "base_orientation"):
             if not getattr(self, name).columns:
-                raise ValueError(f"'{name}.columns' is missing{hint}")
+                raise ValueError(
+                    f"'{name}.columns' is missing; a state estimator adds what the robot does not "
+                    "log (docs/logs.md, 'Logs without a base position')"
+                )
         for name in ("base_position", "desired_output"):
             if len(columns := getattr(self, name).columns) > 3:
                 raise ValueError(f"'{name}.columns' must be [x, y, z]; got {columns}")
@@ -169,15 +166,11 @@ class LogMap:
 
 
 def si_units(part: object) -> float:
-    """Returns the SI units, m or rad, per unit of a quantity's columns; 1 if it has no unit."""
+    """Returns m or rad per unit of a quantity's columns; 1 if it has no unit."""
     units: dict[Any, float] = {**LENGTH_UNITS, **ANGLE_UNITS}
     return units.get(getattr(part, "unit", ""), 1.0)
 
 
 def load_log_map(path: str | Path) -> LogMap:
-    """Reads a ``columns.yaml``.
-
-    Raises:
-        ValueError: The file does not exist or does not fit the schema.
-    """
+    """Reads a ``columns.yaml``."""
     return load_typed_file(LogMap, Path(path), f"map '{path}'")

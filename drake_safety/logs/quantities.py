@@ -10,35 +10,14 @@ import numpy as np
 
 from drake_safety.learning.segments import LARGEST
 from drake_safety.logs.channel import Channel
-from drake_safety.logs.log_map import COMMANDS, QUANTITIES, TIME_UNITS, VELOCITIES, LogMap, si_units
+from drake_safety.logs.log_map import COMMANDS, QUANTITIES, TIME_UNITS, VELOCITIES, LogMap
 
-RESTART_GAPS = 2.0
-"""Gap where time begins anew, relative to the longest one."""
 MIN_ROWS = 3
 """Least number of rows, for derivatives."""
 _INTERVALS_S = (1e-4, 0.5)  # Range of the median time between two rows.
 _SPARSE = 0.9  # Share of complete rows below which every quantity has rows of its own.
 _MANY_HELD, _REGULAR = 6, 0.9  # Least rows of whole holds of a value, and share of equal holds.
-_MANY_SAME, _MANY_RESTARTS = 0.4, 0.1  # Of the rows.
-_JUMPS = {"base_position": 0.1, "base_orientation": 0.1, "joint_positions": 0.3}
-"""Least change from what is logged before an estimator starts [m, 1, rad]."""
-
-
-def continued(channel: Channel, max_gap_s: float) -> tuple[Channel, dict[str, float | int]]:
-    """Lets a time that begins anew, as in every episode of a data set, go on after a gap.
-
-    Returns also where it does, with the later time. A time that does so in many rows is unchanged.
-    """
-    step = np.diff(channel.time)
-    gap = step.dtype.type(RESTART_GAPS * max_gap_s * TIME_UNITS[channel.time_unit])
-    rows = np.flatnonzero(step < -max_gap_s * TIME_UNITS[channel.time_unit]) + 1
-    if not 0 < len(rows) <= _MANY_RESTARTS * len(step):
-        return channel, {}
-    shift = np.zeros_like(channel.time)
-    shift[rows] = gap - step[rows - 1]
-    time = channel.time + np.cumsum(shift)
-    places = [channel.where(row, channel.time_name) for row in rows.tolist()]
-    return replace(channel, time=time), dict(zip(places, time[rows].tolist(), strict=True))
+_MANY_SAME = 0.4  # Of the rows.
 
 
 def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
@@ -82,16 +61,7 @@ def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
 def quantities(
     topics: Mapping[str, Channel], log_map: LogMap, joints: list[str]
 ) -> tuple[dict[str, Channel], LogMap, list[str]]:
-    """Returns the channel of each mapped quantity, the map of them, and what was made of it.
-
-    - Velocities that are 0 or missing in every row were never filled in: they are left out.
-    - A table or topic of which few rows are complete has values of several sources: each quantity
-      has the rows with a value of it, and a column that is missing there is interpolated.
-    - Of values that are repeated until the next measurement the first is kept.
-    - What is logged before an estimator starts is made missing: zero quaternions, and values that
-      are repeated from the first row on and then jump.
-    - Commands that come rarely are valid until the next one.
-    """
+    """Returns the channel of each mapped quantity, the map of them, and what was made of it."""
     notes: list[str] = []
     own: dict[str, Channel] = {}
     for name in QUANTITIES:
@@ -100,6 +70,7 @@ def quantities(
             continue
         channel = topics[part.topic]
         channel = replace(channel, frame=channel.frame[columns])
+        # Velocities that are 0 or missing in every row were never filled in.
         if name in VELOCITIES and not channel.frame.fillna(0.0).any(axis=None):
             notes.append(
                 f"{_start_of(name, channel)} is 0 or missing in every row: the derivative of "
@@ -109,11 +80,11 @@ def quantities(
         else:
             own[name] = channel
     for topic, channel in topics.items():
-        used = {name: one for name, one in own.items() if getattr(log_map, name).topic == topic}
-        missing = [one.frame.isna().any(axis=1) for one in used.values()]
+        used = {name: part for name, part in own.items() if getattr(log_map, name).topic == topic}
+        missing = [part.frame.isna().any(axis=1) for part in used.values()]
         share = 1.0 - np.any(missing, axis=0).sum() / max(len(channel.time), 1)
-        if share < _SPARSE:
-            own |= {name: _present(one, log_map.max_gap_s) for name, one in used.items()}
+        if share < _SPARSE:  # The values are of several sources.
+            own |= {name: _present(part, log_map.max_gap_s) for name, part in used.items()}
             rows = f"the messages of topic '{topic}'" if topic else "the rows"
             notes.append(
                 f"log '{channel.path}': {share:.0%} of {rows} have every value: each "
@@ -129,9 +100,9 @@ def quantities(
                 f"{_start_of(name, channel)} changes only at every {number:.3g}th row: the rows "
                 "that repeat it are left out"
             )
-        if name in _JUMPS:
-            jump = _JUMPS[name] / si_units(getattr(log_map, name))
-            own[name] = _started(own[name], jump)
+        if name == "base_orientation":  # Zero quaternions are those before an estimator starts.
+            frame = own[name].frame
+            own[name] = replace(own[name], frame=frame.where(frame.any(axis=1)))
     return own, log_map, notes
 
 
@@ -166,18 +137,6 @@ def _without_holds(channel: Channel) -> tuple[Channel, float]:
     since = np.arange(len(hold)) - np.searchsorted(hold, hold)
     # A value that stays the same for longer was measured again.
     return channel.select(since % int(2 * number) == 0), number
-
-
-def _started(channel: Channel, jump: float) -> Channel:
-    """Makes missing what is logged before an estimator starts."""
-    values = channel.frame.to_numpy()
-    is_unfilled = ~values.any(axis=1) & (values.shape[1] == 4)
-    first = int(np.argmax((values != values[:1]).any(axis=1))) if len(values) else 0
-    is_known = first > 1 or (first == 1 and not values[0].any())
-    if is_known and np.abs(values[first] - values[0]).max() > jump:
-        is_unfilled[:first] = True
-    frame = channel.frame
-    return replace(channel, frame=frame[~is_unfilled].reindex(frame.index))
 
 
 def _held(command: Channel, base: Channel, max_gap_s: float) -> Channel:

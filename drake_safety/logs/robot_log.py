@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from os import PathLike
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,20 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.extras import require_extra
-from drake_safety.files.schema import load_typed
 from drake_safety.logs.channel import Wanted
 from drake_safety.logs.checks import check
 from drake_safety.logs.conversion import Source, common_span, rotations_at, values_at
-from drake_safety.logs.log_map import COMMANDS, QUANTITIES, TIME_UNITS, Joints, LogMap, load_log_map
+from drake_safety.logs.log_map import COMMANDS, QUANTITIES, Joints, LogMap, load_log_map
 from drake_safety.logs.messages import read_messages
-from drake_safety.logs.quantities import (
-    MIN_ROWS,
-    RESTART_GAPS,
-    continued,
-    cut,
-    in_order,
-    quantities,
-)
+from drake_safety.logs.quantities import MIN_ROWS, cut, in_order, quantities
 from drake_safety.logs.tables import read_csv, read_parquet
 from drake_safety.robots.robot_model import RobotModel
 
@@ -52,7 +42,7 @@ class RobotLog:
         v: Velocities: of the base in the world, angular first, then of the joints, (N, n_v).
         desired_output: z* in the world, (N, n_z) [m], or None.
         foot_positions: Desired foot positions, (N, 3 n_c) [m], or None.
-        piece: Number of this piece of a log that was cut, from 0, and again where time begins anew.
+        piece: Number of this piece of a log that was cut, from 0.
         begin_s: Time of the first row since the log's first row of any topic [s].
     """
 
@@ -88,7 +78,7 @@ class LogPieces:
         duration_s: Duration of the whole log [s].
         row_share: Share of its rows that have a time of their own.
         lost: What was cut or left out, and where.
-        notes: What was resampled, or is a derivative, and where.
+        notes: What was resampled, or is a derivative.
     """
 
     pieces: list[RobotLog]
@@ -113,30 +103,20 @@ class LogPieces:
             return ""
         num_more = len(self.cuts) - _MOST_CUTS
         more = [f"... and {num_more} more"] if num_more > 0 else []
-        head = (
-            f"log '{self.pieces[0].path}': {100 * self.kept_share:.1f} % of {self.duration_s:.1f} s"
-            f" are kept, in {len(self.pieces)} pieces"
-        )
+        kept = f"{100 * self.kept_share:.1f} % of {self.duration_s:.1f} s are kept"
+        head = f"log '{self.pieces[0].path}': {kept}, in {len(self.pieces)} pieces"
         return "\n".join([head, *self.cuts[:_MOST_CUTS], *more])
 
 
-def read_pieces(
-    path: str | PathLike[str],
-    log_map: LogMap | str | PathLike[str],
-    robot: RobotModel,
-) -> LogPieces:
+def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> LogPieces:
     """Reads, checks and converts a log, cut where values are missing and at gaps.
 
     Args:
         path: A ``.csv``, ``.tsv``, ``.parquet``, ``.mcap`` or ``.bag`` file, or the folder of a
             ROS 2 bag.
-        log_map: The map of its columns, or the path of a ``columns.yaml``.
+        map_file: The ``columns.yaml`` that names its columns.
     """
-    path = Path(path)
-    if isinstance(log_map, LogMap):  # Its values may have been set since the construction.
-        log_map = load_typed(LogMap, asdict(log_map), "map")
-    else:
-        log_map = load_log_map(Path(log_map))
+    path, log_map = Path(path), load_log_map(map_file)
     kinematics = RobotKinematics(robot)
     joints = kinematics.joint_names
     require_extra("logs", f"log '{path}'", "pandas")
@@ -149,23 +129,18 @@ def read_pieces(
             "a ROS 2 bag"
         )
     topics = _READERS[suffix](path, _wanted(log_map, kinematics), log_map.time)
-    lost: list[str] = []
-    restarts, row_share = dict[str, float | int](), 1.0
+    lost, row_share = list[str](), 1.0
     for topic, channel in topics.items():
-        if len(topics) == 1:  # Else all topics would have to begin anew together.
-            channel, restarts = continued(channel, log_map.max_gap_s)
-        topics[topic], unsorted = in_order(channel, log_map.max_gap_s)
-        lost += unsorted
-        if unsorted:
+        topics[topic], joined = in_order(channel, log_map.max_gap_s)
+        lost += joined
+        if joined:
             row_share = min(row_share, len(topics[topic].time) / len(channel.time))
-    origin = min((one.time[0] for one in topics.values() if len(one.time)), default=0)
+    origin = min((channel.time[0] for channel in topics.values() if len(channel.time)), default=0)
     topics = {topic: replace(channel, origin=origin) for topic, channel in topics.items()}
     channels, log_map, notes = quantities(topics, log_map, joints)
-    read = partial(Source, log_map=log_map, joints=joints)
-    found, reasons = cut(channels, log_map.max_gap_s)
-    lost += [f"{where}: time begins anew, with another log" for where in restarts]
-    lost += [one for one in reasons if not one.startswith(tuple(restarts))]
-    sources = [read(channels=part) for part in found]
+    parts, reasons = cut(channels, log_map.max_gap_s)
+    lost += reasons
+    sources = [Source(log_map=log_map, joints=joints, channels=part) for part in parts]
     sources = [source for source in sources if len(source.at_s) > 1]
     measured = {getattr(log_map, name).topic for name in channels if name not in COMMANDS}
     begin, end = common_span(topics[topic] for topic in measured)
@@ -179,35 +154,27 @@ def read_pieces(
             f"them: {why}"
         )
     notes += check(sources, kinematics)
-    channel = next(iter(topics.values()))
-    begins = (np.array([*restarts.values()]) - origin) / TIME_UNITS[channel.time_unit]
-    logs = np.searchsorted(begins, [one.at_s[0] for one in sources], "right")
     pieces = [
         RobotLog(
             path=path,
             robot=robot.name,
-            time_s=one.at_s - one.at_s[0],
-            q=one.positions(one.at_s),
-            v=one.velocities(one.at_s),
-            piece=i - int(np.searchsorted(logs, logs[i])),
-            begin_s=float(one.at_s[0]),
-            **{name: one.at(name, one.at_s) for name in COMMANDS if name in one.channels},
+            time_s=source.at_s - source.at_s[0],
+            q=source.positions(source.at_s),
+            v=source.velocities(source.at_s),
+            piece=i,
+            begin_s=float(source.at_s[0]),
+            **{name: source.at(name, source.at_s) for name in COMMANDS if name in source.channels},
         )
-        for i, one in enumerate(sources)
+        for i, source in enumerate(sources)
     ]
-    duration_s = end - begin - RESTART_GAPS * log_map.max_gap_s * len(restarts)
     return LogPieces(
-        pieces=pieces, duration_s=duration_s, row_share=row_share, lost=lost, notes=notes
+        pieces=pieces, duration_s=end - begin, row_share=row_share, lost=lost, notes=notes
     )
 
 
-def read_log(
-    path: str | PathLike[str],
-    log_map: LogMap | str | PathLike[str],
-    robot: RobotModel,
-) -> RobotLog:
+def read_log(path: str | Path, map_file: str | Path, robot: RobotModel) -> RobotLog:
     """Reads a log as :func:`read_pieces` does, but refuses one of which something is lost."""
-    pieces = read_pieces(path, log_map, robot)
+    pieces = read_pieces(path, map_file, robot)
     if pieces.lost:
         raise ValueError(f"{pieces.lost[0]}, expected a log of which nothing is lost")
     return pieces.pieces[0]
@@ -225,9 +192,8 @@ def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> Wanted:
             missing = [joint for joint, column in zip(joints, columns, strict=True) if not column]
             if unknown or missing:
                 raise ValueError(
-                    f"map: '{name}' must give a column to every joint of robot "
-                    f"'{kinematics.robot.name}', {joints}; it has none for {missing}, and the "
-                    f"robot has no joints {unknown}"
+                    f"map: '{name}' must give a column to every joint {joints}; it has none for "
+                    f"{missing}, and the robot has no joints {unknown}"
                 )
         if name == "foot_positions" and len(columns) not in (0, 3 * kinematics.num_contacts):
             raise ValueError(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_safety.files.reading import check_memory, did_you_mean, reading
+from drake_safety.files.reading import check_memory, reading
 from drake_safety.files.schema import NotNegative, schema
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.inputs import preview_names
@@ -39,21 +39,14 @@ def read_sequences(
 ) -> list[list[Motion]]:
     """Reads the motions of each sequence in an ``.npz`` file; none reaches over a missing value.
 
-    The detector's inputs are read, which the info of its training names; the other columns are 0.
-
-    Raises:
-        ValueError: An array or an observation is missing, a shape or the step does not fit, or the
-            map names what the detector does not read.
+    Only the detector's inputs are read, which the info of its training names; others are 0.
     """
     every = [*info.state_names, *preview_names(info), *info.feature_names]
     inputs = {every[i]: i for i in detector.columns.tolist()}
     scale, offset = sequence_map.scale, sequence_map.offset
     for name in (*sequence_map.columns, *scale, *offset):
         if name not in inputs:
-            raise ValueError(
-                f"map: '{name}'{did_you_mean(name, inputs)} is none of the monitor's inputs "
-                f"{list(inputs)}"
-            )
+            raise ValueError(f"map: '{name}' is none of the monitor's inputs {list(inputs)}")
     given_s, step_s = sequence_map.step_s, detector.step_s
     stride = max(1, round(step_s / max(given_s, 1e-6)))
     if not math.isclose(stride * given_s, step_s, rel_tol=1e-6):

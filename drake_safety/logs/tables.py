@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_safety.extras import require_extra
-from drake_safety.files.reading import check_memory, is_number, reading
+from drake_safety.files.reading import check_memory, reading
 from drake_safety.logs.channel import Channel, Wanted, listed
 from drake_safety.logs.log_map import LogTime
 
@@ -44,27 +44,17 @@ def read_csv(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel]:
 
 
 def read_parquet(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel]:
-    """Reads columns of a Parquet file; the entries of lists are columns."""
+    """Reads columns of a Parquet file."""
     require_extra("logs", f"log '{path}'", "pyarrow")
-    import pandas as pd
     import pyarrow.parquet as pq
 
-    roots = {name.split("[")[0] for name in (time.column, *wanted.get("", ()))}
     with (
         reading(path, "damaged, cut off, or not a Parquet file: log", Exception),
         pq.ParquetFile(path, page_checksum_verification=True) as file,
     ):
         check_memory(8 * file.metadata.num_rows * len(wanted.get("", ())), f"'{path}'")
-        existing = list(file.schema_arrow.names)
-        table = file.read(columns=[name for name in existing if name in roots])
-        frame = table.to_pandas(timestamp_as_object=False, ignore_metadata=True)
-        for field in table.schema:
-            if hasattr(field.type, "value_field"):
-                cells = [[] if cell is None else cell for cell in frame.pop(field.name)]
-                entries = pd.DataFrame(cells).add_prefix(f"{field.name}[").add_suffix("]")
-                existing += list(entries.columns)
-                frame = frame.join(entries)
-        frame = frame[_columns(path, wanted, time, existing)]
+        names = _columns(path, wanted, time, list(file.schema_arrow.names))
+        frame = file.read(columns=names).to_pandas(timestamp_as_object=False, ignore_metadata=True)
         return {"": _channel(path, frame, time, "row")}
 
 
@@ -87,41 +77,27 @@ def _columns(path: Path, wanted: Wanted, time: LogTime, existing: list[str]) -> 
 def _channel(path: Path, frame: pd.DataFrame, time: LogTime, row_name: str) -> Channel:
     import pandas as pd
 
-    def numbers(name: str, kind: str = "number") -> np.ndarray:
+    def numbers(name: str) -> np.ndarray:
         """A column as numbers; integers stay exact, as clocks in nanoseconds require."""
         if frame[name].dtype.kind in "iuf":
             return frame[name].to_numpy()
+        if frame[name].dtype.kind in "Mm":
+            return frame[name].to_numpy(f"{frame[name].dtype.kind}8[ns]")
         cells = frame[name].astype("string").str.strip()
         cells = cells.mask(cells.str.lower().isin(_MISSING))
         values = pd.to_numeric(cells.astype(object), errors="coerce")
         if (is_bad := (values.isna() & cells.notna()).to_numpy()).any():
             row = int(np.argmax(is_bad))
             where = f"log '{path}', {row_name} {frame.index[row]}, column '{name}'"
-            raise ValueError(f"{where}: '{frame[name].iloc[row]}' is not a {kind}")
+            raise ValueError(f"{where}: '{frame[name].iloc[row]}' is not a number")
         return values.to_numpy()
 
-    if (dates := _dates(frame[time.column])) is None:
-        stamps = numbers(time.column, "number or a date")
-    else:
-        stamps = dates.to_numpy(f"{dates.dtype.kind}8[ns]")
     columns = {name: numbers(name).astype(float) for name in frame.columns.drop(time.column)}
     return Channel(
         path=path,
-        time=stamps,
+        time=numbers(time.column),
         time_unit=time.unit,
         time_name=time.column,
         frame=pd.DataFrame(columns, index=frame.index),
         row_name=row_name,
     )
-
-
-def _dates(stamps: pd.Series) -> pd.Series | None:
-    """Dates, if all cells of a column are dates."""
-    import pandas as pd
-
-    if stamps.dtype.kind in "Mm":
-        return stamps
-    if stamps.dtype.kind in "iuf" or is_number(next(iter(stamps), 0)):
-        return None
-    dates = pd.to_datetime(stamps.str.strip(), utc=True, format="ISO8601", errors="coerce")
-    return None if dates.isna().any() else dates

@@ -22,11 +22,9 @@ from drake_safety.files.schema import (
     load_typed_file,
     schema,
 )
-from drake_safety.policies.policy_network import PolicyNetwork, load_network, waited
+from drake_safety.policies.policy_network import PolicyNetwork, load_network
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot_model import JointGains, RobotModel, as_pattern, by_pattern
-
-_DOWN = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(kw_only=True, eq=False)
@@ -35,15 +33,12 @@ class PolicyInput:
 
     Attributes:
         R_WB: Orientation of the base, (3, 3).
-        w_WB: Angular velocity of the base in the world, (3,) [rad/s].
-        v_WB: Velocity of the base in the world, (3,) [m/s].
+        w_WB, v_WB: Its velocities in the world, (3,) [rad/s, m/s].
         positions: Joint positions less those of zero action, in the policy's order, (n_a,) [rad].
-        rates: Joint rates, (n_a,) [rad/s].
         command: (v_x, v_y, ω_z), (3,) [m/s, rad/s].
         action: The last action, (n_a,).
         phases: Phases of the gait clock, in [-π, π], (n_p,) [rad].
         all_positions: As ``positions``, of all joints of the robot in its order, (n_j,) [rad].
-        all_rates: Their rates, (n_j,) [rad/s].
     """
 
     R_WB: np.ndarray
@@ -59,7 +54,21 @@ class PolicyInput:
 
 
 Term = Callable[[PolicyInput], np.ndarray]
-TERMS: dict[str, Term] = {}
+# Names of Isaac Lab; those of the gait clock and of the parts of the command are Holosoma's.
+TERMS: dict[str, Term] = {
+    "base_lin_vel": lambda inputs: inputs.R_WB.T @ inputs.v_WB,
+    "base_ang_vel": lambda inputs: inputs.R_WB.T @ inputs.w_WB,
+    "projected_gravity": lambda inputs: inputs.R_WB.T @ [0.0, 0.0, -1.0],
+    "velocity_commands": lambda inputs: inputs.command,
+    "command_lin_vel": lambda inputs: inputs.command[:2],
+    "command_ang_vel": lambda inputs: inputs.command[2:],
+    "joint_pos_rel": lambda inputs: inputs.positions,
+    "joint_vel_rel": lambda inputs: inputs.rates,
+    "last_action": lambda inputs: inputs.action,
+    "sin_phase": lambda inputs: np.sin(inputs.phases),
+    "cos_phase": lambda inputs: np.cos(inputs.phases),
+    "gait_phase": lambda inputs: np.hstack([np.sin(inputs.phases), np.cos(inputs.phases)]),
+}
 """Registered terms by name."""
 
 
@@ -72,28 +81,6 @@ def observation_term(name: str) -> Callable[[Term], Term]:
         return term
 
     return register
-
-
-def registered_terms() -> list[str]:
-    """Names of all registered observation terms."""
-    return sorted(TERMS)
-
-
-# Names of Isaac Lab; those of the gait clock and of the parts of the command are Holosoma's.
-observation_term("base_lin_vel")(lambda seen: seen.R_WB.T @ seen.v_WB)
-observation_term("base_ang_vel")(lambda seen: seen.R_WB.T @ seen.w_WB)
-observation_term("projected_gravity")(lambda seen: seen.R_WB.T @ _DOWN)
-observation_term("velocity_commands")(lambda seen: seen.command)
-observation_term("command_lin_vel")(lambda seen: seen.command[:2])
-observation_term("command_ang_vel")(lambda seen: seen.command[2:])
-observation_term("joint_pos_rel")(lambda seen: seen.positions)
-observation_term("joint_vel_rel")(lambda seen: seen.rates)
-observation_term("last_action")(lambda seen: seen.action)
-observation_term("sin_phase")(lambda seen: np.sin(seen.phases))
-observation_term("cos_phase")(lambda seen: np.cos(seen.phases))
-observation_term("gait_phase")(
-    lambda seen: np.concatenate([np.sin(seen.phases), np.cos(seen.phases)])
-)
 
 
 @schema(kw_only=True)
@@ -145,17 +132,14 @@ class WholeHistory:
     """Samples of the whole observation in the network's input."""
 
     ages: list[int] = field(default_factory=list)
-    """Age of each sample in periods, 0 for the newest, in the network's order; empty for policies
-    whose terms have histories of their own, or none."""
+    """Age of each sample in periods, 0 for the newest, in the network's order."""
     by: Literal["time", "term"] = "time"
-    """``time``: one sample of all terms after the other; ``term``: all samples of a term together.
-    """
+    """What is kept together: all terms of a ``time``, or all samples of a ``term``."""
 
     def __post_init__(self) -> None:
         if sorted(self.ages) != list(range(len(self.ages))):
             raise ValueError(
-                f"ages must name each of the newest {len(self.ages)} samples once, from "
-                f"0; got {self.ages}"
+                f"ages must name each of the newest {len(self.ages)} samples once; got {self.ages}"
             )
 
 
@@ -170,17 +154,16 @@ class PolicyParameters:
     joints: list[str] = field(default_factory=list)
     """Joints in the network's order; by default those of the network's metadata."""
     default_positions: dict[Pattern, float] = field(default_factory=dict)
-    """Joint positions at zero action [rad], by regular expression over joint names; by default
-    those of the network's metadata; 0 for joints without one."""
+    """Joint positions at zero action [rad], by regular expression; 0 for others. The default of
+    this, ``action_scale`` and ``gains`` is in the network's metadata."""
     action_scale: dict[Pattern, float] = field(default_factory=dict)
-    """Joint positions per unit of action [rad], by regular expression; by default those of the
-    network's metadata."""
+    """Joint positions per unit of action [rad], by regular expression."""
     action_clip: Annotated[float, Field(gt=0)] = 100.0
     """Largest absolute action."""
     gains: dict[Pattern, JointGains] = field(default_factory=dict)
-    """Servo gains, by regular expression; by default those of the network's metadata."""
+    """Servo gains, by regular expression."""
     rotor_inertia: dict[Pattern, float] = field(default_factory=dict)
-    """Reflected rotor inertia of the joints [kg·m²], by regular expression."""
+    """Rotor inertia as the joints feel it [kg·m²], by regular expression."""
     period_s: Positive = 0.02
     """Time between two actions [s]."""
     observation: list[ObservationTerm] = field(default_factory=list)
@@ -196,13 +179,9 @@ class PolicyParameters:
 
 
 class Policy:
-    """A network with its observation, for one robot.
-
-    Args:
-        joint_names: The robot's joints, in the order of its positions.
+    """A network with its observation, for one robot, whose joints are named in its order.
 
     Attributes:
-        parameters: Contents of ``policy.yaml``.
         joints: The policy's joints as indices into the robot's, (n_a,).
         default_positions: Positions of all joints of the robot at zero action, (n_j,) [rad].
         action_scale: Joint positions per unit of action, (n_a,) [rad].
@@ -264,10 +243,7 @@ class Policy:
                 missing.append(f"{key} of joints {without}")
         if not parameters.observation:
             entries = "" if width is None else f", {width} entries in all"
-            missing.append(
-                f"'observation', the terms of the network's input in its order{entries}; "
-                f"registered are {registered_terms()}"
-            )
+            missing.append(f"'observation', the terms of the network's input{entries}")
         if missing:
             missing += metadata.unread
             raise ValueError(f"{who}: state in policy.yaml {'; '.join(missing)}")
@@ -308,7 +284,7 @@ class Policy:
         self._entries = np.array([entry for entry, _ in order], dtype=int)
         self._earlier = np.array([places.get((i, age - 1), -1) for i, age in order], dtype=int)
         num_samples = max(len(parameters.history.ages), 1)
-        waited(self.network.check, who, len(order), len(names), ", ".join(described), num_samples)
+        self.network.check(who, len(order), len(names), ", ".join(described), num_samples)
 
     def see(
         self,
@@ -333,11 +309,13 @@ class Policy:
             all_rates=rates,
         )
 
-    def observe(self, seen: PolicyInput, history: np.ndarray) -> np.ndarray:
+    def observe(self, inputs: PolicyInput, history: np.ndarray) -> np.ndarray:
         """The network's input; ``history`` is its last one, (n_o,), NaN before the first."""
-        scaled = ((term(seen) * np.asarray(spec.scale), spec.clip) for term, spec in self._terms)
-        present = np.concatenate([np.clip(values, -most, most) for values, most in scaled])
-        observation = present[self._entries]
+        present = [
+            np.clip(term(inputs) * np.asarray(spec.scale), -spec.clip, spec.clip)
+            for term, spec in self._terms
+        ]
+        observation = np.concatenate(present)[self._entries]
         if np.isfinite(history).all():
             aged = self._earlier >= 0
             observation[aged] = history[self._earlier[aged]]
@@ -375,18 +353,15 @@ class Policy:
 def _term(spec: ObservationTerm, joint_names: list[str], who: str) -> Term:
     """The function of a term, of its own joints if it has some."""
     if spec.name not in TERMS:
-        raise ValueError(f"{who}: unknown term '{spec.name}'; registered are {registered_terms()}")
+        raise ValueError(f"{who}: unknown term '{spec.name}'; registered are {sorted(TERMS)}")
     if unknown := [name for name in spec.joints if name not in joint_names]:
-        raise ValueError(
-            f"{who}: term '{spec.name}' has joints {unknown} that the robot lacks; it has "
-            f"{joint_names}"
-        )
+        raise ValueError(f"{who}: term '{spec.name}' has joints {unknown} that the robot lacks")
     term = TERMS[spec.name]
     if not spec.joints:
         return term
     own = [joint_names.index(name) for name in spec.joints]
-    return lambda seen: term(
-        replace(seen, positions=seen.all_positions[own], rates=seen.all_rates[own])
+    return lambda inputs: term(
+        replace(inputs, positions=inputs.all_positions[own], rates=inputs.all_rates[own])
     )
 
 
@@ -419,12 +394,10 @@ def load_policy(path: Path, kinematics: RobotKinematics, network: str = "") -> P
 
 def with_policy(robot: RobotModel, policy: Policy, joint_names: list[str]) -> RobotModel:
     """A robot, whose joints are named, with the gains, rotor inertias and posture of a policy."""
-    names = map(as_pattern, joint_names)
-    posture = dict(zip(names, policy.default_positions.tolist(), strict=True))
-    inertia = policy.parameters.rotor_inertia
+    posture = zip(map(as_pattern, joint_names), policy.default_positions.tolist(), strict=True)
     return replace(
         robot,
-        posture=posture,
+        posture=dict(posture),
         joint_gains={as_pattern(name): gains for name, gains in policy.gains.items()},
-        rotor_inertia=inertia or robot.rotor_inertia,
+        rotor_inertia=policy.parameters.rotor_inertia or robot.rotor_inertia,
     )

@@ -3,48 +3,37 @@
 from __future__ import annotations
 
 import ast
-import atexit
 import json
 import math
-import os
 import re
-import sys
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import numpy as np
 from pydantic import FiniteFloat
 
 from drake_safety.extras import require_extra
-from drake_safety.files.schema import Bounds, Pattern, load_typed
+from drake_safety.files.schema import Pattern, load_typed
 
 _SUPPORTED = (
     "supported are one observation, an action, and as memory further inputs and outputs of ONNX in "
     "pairs of one shape, such as h_in and h_out, or buffers of TorchScript"
 )
-_MOST_PICKLED = 1_000_000  # Bytes of a checkpoint that are searched for its keys.
-_KEYS_OF_CHECKPOINTS = r".*state_dict|.*\.(weight|bias)|iter|epoch|optimizer"
+_SCRIPT = "TorchScript: code of its author, which runs here"
+_KINDS = {".onnx": "ONNX, which is no code", ".pt": _SCRIPT, ".jit": _SCRIPT}
 _Memory = Mapping[str, np.ndarray]
 
 
 @dataclass(kw_only=True)
 class PolicyMetadata:
-    """What an ONNX file says of its policy; empty where it says nothing.
+    """What an ONNX file says of its policy as in ``policy.yaml``; empty where it says nothing.
 
     Attributes:
-        joints: Joint names in the network's order.
-        stiffness, damping: Servo gains by regular expression [N·m/rad, N·m·s/rad].
-        default_positions, action_scale: As in ``policy.yaml``, by regular expression [rad].
-        observation: As in ``policy.yaml``, but terms have only the keys that the file states.
-        command: Lowest and highest v_x, v_y and ω_z by name [m/s, rad/s].
         unread: Entries that do not fit, and why.
     """
 
@@ -54,7 +43,6 @@ class PolicyMetadata:
     default_positions: dict[str, float] = field(default_factory=dict)
     action_scale: dict[str, float] = field(default_factory=dict)
     observation: list[dict[str, Any]] = field(default_factory=list)
-    command: dict[str, list[float]] = field(default_factory=dict)
     unread: list[str] = field(default_factory=list)
 
 
@@ -67,28 +55,25 @@ _KEYS = {
     "scale": ("observation_terms_scale",),
     "clip": ("observation_terms_clip",),
     "history": ("observation_history_lengths", "observation_terms_history_length"),
-    "command": ("command_ranges",),
 }
-_VELOCITIES = ("lin_vel_x", "lin_vel_y", "ang_vel_z", "ang_vel_yaw")
-TERM_NAMES = {
+# Registered terms by the names of Isaac Lab's and mjlab's tasks, where these differ.
+_TERM_NAMES = {
     "command": "velocity_commands",
     "keyboard_velocity_commands": "velocity_commands",
     "joint_pos": "joint_pos_rel",
     "joint_vel": "joint_vel_rel",
     "actions": "last_action",
 }
-"""Registered terms by the names of Isaac Lab's and mjlab's tasks, where these differ."""
 
 
 def read_metadata(raw: Mapping[str, str]) -> PolicyMetadata:
     """Reads the entries of an ONNX file's metadata that describe its policy.
 
-    Values are JSON, Python's, or words and numbers between commas. Numbers are one for all joints,
-    one for each, or by regular expression.
+    Numbers are one for all joints, one for each, or by regular expression.
     """
     joints = _words(raw.get("dof_names", raw.get("joint_names", "")))
     names = _words(raw.get("observation_names", ""))
-    terms: list[dict[str, Any]] = [{"name": TERM_NAMES.get(name, name)} for name in names]
+    terms: list[dict[str, Any]] = [{"name": _TERM_NAMES.get(name, name)} for name in names]
     metadata = PolicyMetadata(joints=joints, observation=terms)
     for name, keys in _KEYS.items():
         text = next((raw[key] for key in keys if raw.get(key)), "")
@@ -97,24 +82,18 @@ def read_metadata(raw: Mapping[str, str]) -> PolicyMetadata:
             continue
         value = _parsed(text)
         try:
-            if name == "command":
-                expected = "the lowest and highest velocity by name"
-                stated = {key: pair for key, pair in dict(value).items() if key in _VELOCITIES}
-                metadata.command = load_typed(dict[str, Bounds[FiniteFloat]], stated, name)
-            elif is_of_terms:
-                expected = f"a value for each of the terms {names}"
+            if is_of_terms:
                 values = _by_term(value, names, terms, name)
-                for term, of_term in list(zip(terms, values, strict=True)):
-                    term[name] = of_term
+                for term, term_value in list(zip(terms, values, strict=True)):
+                    term[name] = term_value
             else:
-                expected = f"a number for each of the joints {joints}, one for all or by regular "
-                expected += "expression"
                 if isinstance(value, list):
                     value = dict(zip(map(re.escape, joints), value, strict=True))
                 by_joint = value if isinstance(value, dict) else {".*": value}
                 setattr(metadata, name, load_typed(dict[Pattern, FiniteFloat], by_joint, name))
         except (KeyError, TypeError, ValueError):
-            metadata.unread.append(f"its metadata '{name}' must be {expected}; got {value}")
+            whose = f"the terms {names}" if is_of_terms else f"the joints {joints}"
+            metadata.unread.append(f"its metadata '{name}' do not fit {whose}; got {value}")
     return metadata
 
 
@@ -127,17 +106,15 @@ def _by_term(value: Any, names: list[str], terms: list[dict[str, Any]], key: str
         return [max(1, int(length)) for (length,) in numbers]
     if key == "clip":
         clips = zip(terms, numbers, strict=True)
-        return [limit(low, high, term.get("scale", [1.0])) for term, (low, high) in clips]
+        return [_limit(low, high, term.get("scale", [1.0])) for term, (low, high) in clips]
     return numbers
 
 
-def limit(low: float, high: float, factors: list[float], who: str = "") -> float:
-    """Returns the largest absolute value after scaling by factors, of limits before it."""
+def _limit(low: float, high: float, factors: list[float]) -> float:
+    """The largest absolute value after scaling by factors, of limits before it."""
     limits = {abs(high * factor) for factor in factors}
     if low != -high or len(limits) != 1:
-        raise ValueError(
-            f"{who} clip must be symmetric, with one scale; got {[low, high]} and {factors}"
-        )
+        raise ValueError("a clip must be symmetric, with one scale")
     return limits.pop()
 
 
@@ -162,10 +139,8 @@ class PolicyNetwork:
     Attributes:
         evaluate: Maps a batch and parts of the memory by name to the action and the new parts.
         widths: Entries of observation and action; None where the file does not say them.
-        start: Parts of the memory at the start by name; all that may be memory until
-            :meth:`check`.
+        start: Parts of the memory at the start; all that may be memory until :meth:`check`.
         shape: Shape of a batch of one observation.
-        dtype: Type of a batch.
         outputs: Names and shapes of what it returns, the action first.
     """
 
@@ -188,8 +163,8 @@ class PolicyNetwork:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns the action (n_a,) for an observation (n_o,), and the new memory (n_m,)."""
         ends = np.cumsum([part.size for part in self.start.values()])
-        pairs = zip(self.start.items(), np.split(memory, ends), strict=False)
-        given = {name: new.reshape(old.shape).astype(old.dtype) for (name, old), new in pairs}
+        parts = zip(self.start.items(), np.split(memory, ends), strict=False)
+        given = {name: new.reshape(old.shape).astype(old.dtype) for (name, old), new in parts}
         batch = np.asarray(observation, dtype=self.dtype).reshape(self.shape)
         action, after = self.evaluate(batch, given)
         return np.asarray(action, dtype=float).reshape(-1), _flat(after[name] for name in given)
@@ -199,14 +174,13 @@ class PolicyNetwork:
     ) -> None:
         """Checks widths and actions of the network, and that it remembers only its memory.
 
-        An observation of several samples that is no row for it is one of (1, num_samples, n).
+        An observation of several samples may be an array (1, num_samples, n) for it.
         """
         width, num_acting = self.widths
         if width not in (None, num_inputs):
             raise ValueError(
                 f"{who}: the network expects an observation of {width} entries; the terms have "
-                f"{num_inputs}: {terms}. If it observes joints that it does not move, name them "
-                "under 'joints' of a term"
+                f"{num_inputs}: {terms}. 'joints' of a term name joints that it does not move"
             )
         probe = np.linspace(-1.0, 1.0, num_inputs, dtype=np.float32)
         try:
@@ -220,7 +194,7 @@ class PolicyNetwork:
             action, later = self(probe, self.initial_memory)
             self(probe, later)
             again, _ = self(probe, self.initial_memory)
-        except Exception as error:  # Those of onnxruntime have no common base but this.
+        except Exception as error:  # Errors of onnxruntime have no common base but this.
             if self.shape == (1, -1) and num_samples > 1:
                 self.shape = (1, num_samples, -1)
                 return self.check(who, num_inputs, num_outputs, terms, num_samples)
@@ -236,48 +210,20 @@ class PolicyNetwork:
         if not np.isfinite(action).all():
             raise ValueError(
                 f"{who}: the network returns {np.sum(~np.isfinite(action))} of {num_outputs} "
-                "actions that are not finite, for an observation that is: it is damaged, or its "
-                "training has diverged"
+                "actions that are not finite: it is damaged, or its training has diverged"
             )
         if action.tobytes() != again.tobytes():
             raise ValueError(
-                f"{who}: the network answers the same observation differently after another, "
-                f"though its memory of {len(self.start)} buffers was set back: it draws random "
-                f"numbers, or has a memory that is no buffer of a fixed size; {_SUPPORTED}"
+                f"{who}: the network answers the same observation differently after another: it "
+                f"draws random numbers, or has a memory that is not read; {_SUPPORTED}"
             )
-
-
-def waited(call: Callable[..., Any], *arguments: Any) -> Any:
-    """Calls a network in a thread: Ctrl-C ends the wait for a network that loops for ever."""
-    result: Future[Any] = Future()
-
-    def run() -> None:
-        try:
-            result.set_result(call(*arguments))
-        except BaseException as error:
-            result.set_exception(error)
-
-    def leave() -> None:
-        if thread.is_alive():  # It would abort the process as this ends.
-            sys.stdout.flush()
-            os._exit(130)
-
-    thread = Thread(target=run, daemon=True)
-    thread.start()
-    try:
-        return result.result()
-    except KeyboardInterrupt:
-        atexit.register(leave)
-        raise
 
 
 def _reason(error: Exception) -> str:
     """The line of an error that says why; TorchScript puts tracebacks before it."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     reasons = [line for line in lines if re.match(r"[\w.]*(Error|Exception): ", line)]
-    text = (reasons or [" ".join(lines)])[-1][:200]
-    is_of_gpu = re.search("cuda|nvidia", text, re.IGNORECASE)
-    return f"{text}; export it on the CPU" if is_of_gpu else text
+    return (reasons or [" ".join(lines)])[-1][:200]
 
 
 def _flat(parts: Iterable[np.ndarray]) -> np.ndarray:
@@ -286,22 +232,20 @@ def _flat(parts: Iterable[np.ndarray]) -> np.ndarray:
 
 def load_network(path: Path) -> PolicyNetwork:
     """Loads a network from an ONNX (``.onnx``) or TorchScript (``.pt``, ``.jit``) file."""
-    if path.suffix not in LOADERS:
+    if path.suffix not in _KINDS:
         raise ValueError(
-            f"{path}: a policy's network is one of {list(LOADERS)}; got '{path.suffix}'"
+            f"{path}: a policy's network is one of {list(_KINDS)}; got '{path.suffix}'"
             f"{_described(path)}"
         )
     if not path.is_file():
         raise ValueError(f"{path}: the policy's network does not exist")
-    return LOADERS[path.suffix](path)
+    return _load_onnx(path) if path.suffix == ".onnx" else _load_torchscript(path)
 
 
 def network_kinds(paths: Iterable[Path]) -> list[str]:
     """Texts on which of some files are networks, and which of these are code."""
-    script = "TorchScript: code of its author, which runs here"
-    kinds = {end: "ONNX, which is no code" if end == ".onnx" else script for end in LOADERS}
-    networks = dict.fromkeys(path for path in paths if path.suffix in kinds)
-    return [f"the policy's network {path} is {kinds[path.suffix]}" for path in networks]
+    networks = dict.fromkeys(path for path in paths if path.suffix in _KINDS)
+    return [f"the policy's network {path} is {_KINDS[path.suffix]}" for path in networks]
 
 
 def network_files(path: Path) -> list[Path]:
@@ -314,7 +258,6 @@ def network_files(path: Path) -> list[Path]:
 
     with _reading(path, "an ONNX network"):
         model = onnx.load(str(path), load_external_data=False)
-        # Those of constants and of inner graphs, too.
         weights = [*onnx.external_data_helper._get_all_tensors(model)]
     entries = (entry for weight in weights for entry in weight.external_data)
     names = sorted({entry.value for entry in entries if entry.key == "location"})
@@ -341,21 +284,14 @@ def _described(path: Path) -> str:
     """Text on a file that is a pickle, such as a training checkpoint; nothing of it is run."""
     head = b""
     with suppress(OSError), path.open("rb") as file:
-        head = file.read(_MOST_PICKLED)
+        head = file.read(1)
     with suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
-        names = {Path(name).name: name for name in archive.namelist()}
+        names = {Path(name).name for name in archive.namelist()}
         if "data.pkl" in names and "constants.pkl" not in names:  # With both it is TorchScript.
-            head = archive.open(names["data.pkl"]).read(_MOST_PICKLED)
-    if not head.startswith(b"\x80"):
-        return ""
-    # The strings of a pickle stand after their length, of one byte or four.
-    texts = (
-        head[match.end() : match.end() + (match[1] or match[2])[0]].decode(errors="replace")
-        for match in re.finditer(rb"X(.)\0{3}|\x8c(.)", head, re.DOTALL)
-    )
-    keys = [text for text in texts if re.fullmatch(_KEYS_OF_CHECKPOINTS, text)]
-    kind = f"a training checkpoint ({', '.join(keys[:4])})" if keys else "a Python pickle"
-    return f", but {kind}: export the policy as TorchScript (torch.jit.save) or ONNX"
+            head = b"\x80"
+    is_pickle = head == b"\x80"
+    text = ", but a pickle, such as a training checkpoint: export the policy as TorchScript or ONNX"
+    return text if is_pickle else ""
 
 
 def _load_onnx(path: Path) -> PolicyNetwork:
@@ -374,9 +310,8 @@ def _load_onnx(path: Path) -> PolicyNetwork:
     inputs, outputs = session.get_inputs(), session.get_outputs()
     shapes = {value.name: _shape(value) for value in outputs}
     # Such as h_out after h_in, or hn after h0.
-    pairs = ((value, value.name.replace("_in", "_out")) for value in inputs)
-    names = [(value, name) for value, out in pairs for name in (out, re.sub("0$", "n", out))]
-    after = {value.name: name for value, name in names if shapes.get(name) == _shape(value)}
+    names = {value.name: re.sub("0$", "n", value.name.replace("_in", "_out")) for value in inputs}
+    after = {v.name: names[v.name] for v in inputs if shapes.get(names[v.name]) == _shape(v)}
     memory = [value for value in inputs if value.name in after]
     observed = [value for value in inputs if value.name not in after]
     acting = [value for value in outputs if value.name not in after.values()]
@@ -458,17 +393,9 @@ def _load_torchscript(path: Path) -> PolicyNetwork:
     kinds = [str(parameter.dtype).removeprefix("torch.") for parameter in module.parameters()]
     return PolicyNetwork(
         path,
-        partial(waited, evaluate),
+        evaluate,
         (None, None),
         start=start,
         dtype=np.dtype(next((kind for kind in kinds if kind.startswith("float")), "float32")),
         outputs=outputs,
     )
-
-
-LOADERS: dict[str, Callable[[Path], PolicyNetwork]] = {
-    ".onnx": _load_onnx,
-    ".pt": partial(waited, _load_torchscript),
-    ".jit": partial(waited, _load_torchscript),
-}
-"""Readers of networks by suffix."""
