@@ -65,7 +65,7 @@ def formats(tmp_path_factory):
     for kind in FORMATS:
         (folder / kind).mkdir()
         path = write(log, folder / kind, kind)
-        log_map = load_log_map(map_beside(path))
+        log_map = map_beside(path)
         inner = path if path.is_file() else next(path.glob("*.db3"))
         found[kind] = path, inner, lambda p, m=log_map: read_log(p, m, ROBOT)
     found["map"] = *[folder / "csv" / "columns.yaml"] * 2, load_log_map

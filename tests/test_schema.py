@@ -65,7 +65,7 @@ CASES = {
         "shapes: {a: [{radius_m: 1}]}": r"shapes \['a'\] need collision: stated",
     },
     PolicyParameters: {
-        "history: {ages: [0, 2]}": r"newest 2 samples once, from 0; got \[0, 2\]",
+        "history: {ages: [0, 2]}": r"newest 2 samples once; got \[0, 2\]",
         "history: {ages: [0, 1]}, observation: [{name: a, history: 2}]": r"got both, \['a'\]",
         "command: {lowest: [2, 0, 0]}": "'command': lowest must not exceed",
     },
@@ -108,7 +108,7 @@ CASES = {
         "base_orientation: {order: zyxw}": r"n\.order' must be 'wxyz' or 'xyzw'",
         "time: {column: t, unit: h}": r"'time\.unit' must be 's', 'ms', 'us' or 'ns'",
         "joint_positions: {template: q_}": "'joint_positions': template must contain",
-        "joint_positions: {template: 'q_{joint}'}": ".columns' is missing: .* MUSE, Pronto or",
+        "joint_positions: {template: 'q_{joint}'}": ".columns' is missing; a state estimator",
     },
     SequenceMap: {"scales: {}": r"unknown key 'scales' \(did you mean 'scale'\?\)"},
 }
