@@ -98,6 +98,10 @@ class ChangeMonitor(LeafSystem):
             [self._state_port.Eval(context), self._preview_port.Eval(context), features]
         )
 
+    def is_held(self, context: Context) -> bool:
+        """Whether the port ``hold`` makes it wait."""
+        return self._hold_port.HasValue(context) and bool(self._hold_port.Eval(context)[0] > 0.5)
+
     def _value(self, context: Context, name: str) -> np.ndarray:
         value: np.ndarray = context.get_discrete_state(self._groups[name]).get_value()
         return value
@@ -110,7 +114,7 @@ class ChangeMonitor(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         part = {name: self._value(context, name).copy() for name in self._groups}
         now_s, (begin_s, end_s) = context.get_time(), part["expected_s"]
-        if self._hold_port.HasValue(context) and self._hold_port.Eval(context)[0] > 0.5:
+        if self.is_held(context):
             part["held_s"][0] = now_s
         if begin_s <= now_s:
             part["held_s"][0] = max(part["held_s"][0], min(now_s, end_s))
