@@ -143,7 +143,7 @@ def test_the_search_finds_a_goal_nearly_as_near_as_the_boundary(signed_distance,
 
 
 def test_a_suggested_goal_exceeds_the_threshold_by_the_reserve():
-    # Γ = 1 - x: the threshold 0.5 is met at x = 0.5, the reserve of 0.8 at x = 0.1.
+    # Γ = 1 - x: the threshold 0.5 is met at x = 0.5, the reserve of 0.8 by default at x = 0.1.
     nearest = search(lambda goals: 1.0 - goals[:, 0], np.array([0.9, 0.0, 1.0]))
     assert nearest.probability >= 0.9
     assert 0.05 <= nearest.goal[0] <= 0.1 + 1e-9

@@ -14,8 +14,6 @@ from drake_safety.planning.goal_verdict import GoalVerdict, assess_goals, checke
 from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
-_RESERVE = 0.8  # Share of the interval from the threshold to the largest probability.
-_RESOLUTION_M = 1e-3  # Of the grid of candidates.
 _DIFFERENCE_M = 1e-3  # Step of the finite differences of the inputs by the goal.
 _MAX_STEPS = 12  # Along the gradient.
 _LONGEST_STEP_M = 0.15  # The logit is nearly linear over that distance.
@@ -36,27 +34,29 @@ def nearest_accepted_goal(
     *,
     threshold: float,
     rng: np.random.Generator,
+    reserve: float = 0.8,
     num_candidates: int = 64,
+    resolution_m: float = 1e-3,
 ) -> GoalVerdict | None:
     """Finds an accepted goal near a given one, with a reserve; None if there is none.
 
-    With reserve: probability ≥ threshold + 0.8 (p - threshold), where p is the largest
+    With reserve: probability ≥ threshold + reserve (p - threshold), where p is the largest
     probability: 1, or 1 - mu_ini without heads, as in the paper's mode.
 
     Descent along the gradient of the safety head's logit finds an accepted goal with few
     evaluations, but often not the nearest one. It bounds the radius of a search in all directions.
     If it finds nothing, or the maps have no safety head, the search covers the whole region. All
-    candidates lie on a grid of 1 mm, so that rounding does not change a verdict. The goal, (3,) [m]
-    in the world, may lie outside the region sampled in training.
+    candidates lie on a grid of ``resolution_m``, so that rounding does not change a verdict. The
+    goal, (3,) [m] in the world, may lie outside the region sampled in training.
     """
     # Without heads the probability is b_safe.
     unknown = assessment.parameters.initial_uncertainty if assessment.base_logit_ is None else 0.0
-    stricter = threshold + _RESERVE * max(1.0 - unknown - threshold, 0.0)
+    stricter = threshold + reserve * max(1.0 - unknown - threshold, 0.0)
     goal = checked_goal(goal)
     if not np.isfinite(goal).all():
         return None
     box = require(loop, HasGoals).target_box
-    near = _Search(loop, assessment, goal, box, stricter)
+    near = _Search(loop, assessment, goal, box, stricter, resolution_m)
     best = near.descend() if assessment.embedding_.has_heads else None
     best = near.search(best, rng, num_candidates)
     return None if best is None else replace(best, threshold=threshold)
@@ -71,10 +71,11 @@ class _Search:
     goal: np.ndarray
     box: np.ndarray
     threshold: float
+    resolution_m: float
 
     def accepted(self, candidates: np.ndarray) -> GoalVerdict | None:
         """The nearest candidate (N, 3) [m] that is accepted, if any."""
-        points = np.unique(_on_grid(candidates), axis=0)
+        points = np.unique(_on_grid(candidates, self.resolution_m), axis=0)
         inside = points[np.all((points >= self.box[0]) & (points <= self.box[1]), axis=1)]
         verdicts = assess_goals(self.loop, self.assessment, inside, threshold=self.threshold)
         return self.nearest(verdict for verdict in verdicts if verdict.is_accepted)
@@ -117,7 +118,7 @@ class _Search:
             ahead = goal + slope * (slope @ (point - goal) - (logit[0] - aim)) / steepness
             step = np.clip(ahead, *box) - point
             length = float(np.linalg.norm(step))
-            if length < _RESOLUTION_M:
+            if length < self.resolution_m:
                 break
             point = point + step * min(1.0, _LONGEST_STEP_M / length)
         return None if best is None else self.bisect(best)
@@ -149,7 +150,7 @@ class _Search:
         for _ in range(num_rounds):
             best = self.bisect(best)
             distance = self.distance(best.goal)
-            if distance < _RESOLUTION_M:
+            if distance < self.resolution_m:
                 break
             about = best.goal + _SPREAD * distance * _in_unit_ball(rng, num_candidates // 2)
             ball = goal + distance * _in_unit_ball(rng, num_candidates - num_candidates // 2)
@@ -163,7 +164,7 @@ class _Search:
     def bisect(self, best: GoalVerdict) -> GoalVerdict:
         """Moves an accepted goal straight towards the given one while it stays accepted."""
         refused = centre = np.clip(self.goal, *self.box)
-        while np.linalg.norm(best.goal - refused) > _RESOLUTION_M:
+        while np.linalg.norm(best.goal - refused) > self.resolution_m:
             between = 0.5 * (best.goal + refused)
             nearer = self.accepted(between[None])
             if nearer is None:
@@ -175,10 +176,10 @@ class _Search:
         return best
 
 
-def _on_grid(points: np.ndarray) -> np.ndarray:
+def _on_grid(points: np.ndarray, resolution_m: float) -> np.ndarray:
     """Rounds points to the grid of candidates."""
     # A multiple of the spacing differs in its last bits from the same number read from a text.
-    return np.round(np.round(points / _RESOLUTION_M) * _RESOLUTION_M, 9)
+    return np.round(np.round(points / resolution_m) * resolution_m, 9)
 
 
 def _in_unit_ball(rng: np.random.Generator, num_points: int) -> np.ndarray:
