@@ -82,7 +82,7 @@ def test_a_task_beside_its_scenario_is_found_and_nothing_else_afterwards(beside)
     assert scenario.task_class().__module__ == "beside_task"
     assert scenario.simulation_hash() == load_scenario(beside).simulation_hash()
     assert sys.path == searched
-    with pytest.raises(ValueError, match=r"no module 'beside_other' .*beside the scenario"):
+    with pytest.raises(ValueError, match=r"no module 'beside_other', .*beside the scenario"):
         load_scenario(changed(beside, "beside_task:", "beside_other:"))
 
 
