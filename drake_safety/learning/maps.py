@@ -222,16 +222,15 @@ def train_map(
                 y, w = output[:, :2], weight[batch]
                 distance = ((y - target[batch]) ** 2).sum(dim=1)
                 distance = (target_weight[batch] * distance).mean()
-                distance = distance / mean_target_weight
                 if settings.is_paper:
-                    loss = distance
+                    loss = distance / mean_target_weight
                 else:
                     entropy = functional.binary_cross_entropy_with_logits(
                         net["safety"](y)[:, 0], is_unsafe[batch], weight=w
                     )
                     huber = functional.huber_loss(output[:, 2:], margins[batch], reduction="none")
-                    loss = _TARGET_WEIGHT * distance + _SAFETY_WEIGHT * entropy
-                    loss = loss + (w * huber.mean(dim=1)).mean()
+                    loss = _TARGET_WEIGHT * distance / mean_target_weight
+                    loss = loss + _SAFETY_WEIGHT * entropy + (w * huber.mean(dim=1)).mean()
                 optimiser.zero_grad(set_to_none=True)
                 loss.backward()
                 optimiser.step()
