@@ -1,4 +1,4 @@
-"""Policies described in the form of rl_sar: converted, or refused with a reason."""
+"""Policies described in the forms of other projects: converted, or refused with a reason."""
 
 import copy
 import math
@@ -16,6 +16,24 @@ from policy_networks import save_network
 pytestmark = pytest.mark.train
 
 JOINTS = ["tail", "hip", "knee"]  # The robot's.
+MOTORS = ["knee", "tail", "hip"]
+
+RANGES = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.3, 0.3], "ang_vel_z": [-0.2, 0.2]}
+# The network's joints are hip and knee.
+DEPLOY = {
+    "joint_ids_map": [2, 0],
+    "step_dt": 0.02,
+    "stiffness": [30.0, 0.0, 20.0],
+    "damping": {"hip": 2.0, "tail|knee": 3.0},
+    "default_joint_pos": [0.1, -0.2],
+    "commands": {"base_velocity": {"ranges": RANGES | {"heading": None}}},
+    "actions": {"JointPositionAction": {"scale": [0.25, 0.5], "clip": None, "joint_ids": None}},
+    "observations": {
+        "base_ang_vel": {"params": {}, "clip": [-10.0, 10.0], "scale": [0.2] * 3},
+        "velocity_commands": {"params": {"command_name": "base_velocity"}, "scale": [1, 1, 2]},
+        "joint_pos_rel": {"clip": None, "scale": None, "history_length": 2},
+    },
+}
 
 CONFIG = {
     "beast/lab": {
@@ -55,11 +73,21 @@ def rl_sar(folder, **changes):
     return config
 
 
-def loaded(path):
+def deploy(folder, inputs=10, **changes):
+    """A deploy.yaml with its network."""
+    for name in ("params", "exported"):
+        (folder / name).mkdir(exist_ok=True)
+    save_network(folder / "exported" / "policy.pt", inputs, 2)
+    path = folder / "params" / "deploy.yaml"
+    path.write_text(yaml.safe_dump(DEPLOY | changes, sort_keys=False))
+    return path
+
+
+def loaded(path, motors=()):
     """The policy of what `new` writes."""
     robot = SimpleNamespace(joint_names=JOINTS, robot=SimpleNamespace(name="beast"))
     (path.parent / "robot").mkdir(exist_ok=True)
-    (_, file), _ = survey_policy(path).write(path.parent / "robot", JOINTS, {})
+    (_, file), _ = survey_policy(path, motors).write(path.parent / "robot", JOINTS, {})
     return load_policy(file, robot)
 
 
@@ -71,6 +99,51 @@ def inputs(policy, action=(0.0, 0.0)):
     return policy.observe(seen, np.full(policy.num_inputs, np.nan))
 
 
+def test_a_deploy_yaml_says_all_but_the_names_of_the_motors(tmp_path):
+    policy = loaded(deploy(tmp_path), MOTORS)
+    assert policy.joint_names == ["hip", "knee"]
+    gains = [(policy.gains[name].stiffness, policy.gains[name].damping) for name in ("hip", "knee")]
+    assert gains == [(20.0, 2.0), (30.0, 3.0)]  # In the motors' order, unlike the rest.
+    np.testing.assert_allclose(policy.targets(np.array([1.0, 1.0])), [0.0, 0.35, 0.3])
+    # The clip is of values before scaling.
+    expected = [0.2, 0.4, 2.0, 0.5, 0.1, 0.4, 0.3, 0.5, 0.3, 0.5]
+    np.testing.assert_allclose(inputs(policy), expected)
+    assert (policy.parameters.period_s, policy.parameters.action_clip) == (0.02, math.inf)
+    assert policy.parameters.command.lowest == [-0.5, -0.3, -0.2]
+
+
+def test_history_of_whole_observations_is_the_oldest_first(tmp_path):
+    terms = {"joint_pos_rel": {}, "last_action": {}, "gait_phase": {"params": {"period": 0.8}}}
+    terms = {name: {**term, "history_length": 2} for name, term in terms.items()}
+    path = deploy(tmp_path, 12, observations={"obs": {"use_gym_history": True, **terms}})
+    policy = loaded(path, MOTORS)
+    assert (policy.parameters.history.ages, policy.parameters.gait.period_s) == ([1, 0], 0.8)
+    np.testing.assert_allclose(inputs(policy, (5.0, 6.0)), 2 * [0.3, 0.5, 5.0, 6.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("joint_ids: null", "joint_ids: !!python/object/apply:builtins.slice [0, null]", "all 2 join"),
+        ("joint_ids: null", "joint_ids: !!python/name:os.system ''", "is not YAML"),
+        ("clip: null", "offset: [0.0, 0.0]", "offset must equal default_joint_pos"),
+        ("- 10.0", "- 5.0", "clip must be symmetric"),
+        ("JointPosition", "JointVelocity", "unknown keys"),
+    ],
+)
+def test_what_a_deploy_yaml_cannot_say_here_is_refused(tmp_path, old, new, message):
+    path = deploy(tmp_path)
+    with pytest.raises(ValueError, match="by --motors"):
+        converted_policy(path)
+    text = path.read_text()
+    slices = "joint_ids: !!python/object/apply:builtins.slice [null, null, null]"
+    path.write_text(text.replace("joint_ids: null", slices))
+    assert converted_policy(path, MOTORS)["joints"] == ["hip", "knee"]
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(ValueError, match=message):
+        converted_policy(path, MOTORS)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -80,7 +153,7 @@ def inputs(policy, action=(0.0, 0.0)):
         ({"rl_kp": [1, 2, 3]}, "'rl_kp' must have 2 entries; got 3"),
         ({"clip_actions_upper": [8, 9]}, "must be the same for all joints"),
         ({"observations_history": [0, 2]}, "newest 2 samples once"),
-        ({"model_name": "gone.pt"}, "no network 'gone.pt' beside it"),
+        ({"model_name": "gone.pt"}, "no network .* beside it"),
     ],
 )
 def test_what_a_file_cannot_say_here_is_refused(tmp_path, changes, message):

@@ -177,6 +177,14 @@ def test_a_joint_that_an_equality_couples_is_a_mimic(tmp_path):
     assert root.find("joint[@name='k']/mimic").get("joint") == "j"
 
 
+def test_three_slides_and_a_ball_are_a_free_joint(tmp_path):
+    slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    facts, root = converted(robot(arm(), free=slides + '<joint type="ball"/>'), tmp_path)
+    expected, free = converted(robot(arm()), tmp_path)
+    assert facts == expected
+    assert ElementTree.tostring(root) == ElementTree.tostring(free)
+
+
 ROPE = '<tendon><fixed name="rope"><joint joint="j" coef="1"/></fixed></tendon>'
 CRATE = f'<worldbody><body name="box" pos="9 0 0"><freejoint/>{BALL}</body></worldbody>'
 OTHER = "actuators that are neither motors nor position servos of a joint have no gains: v"

@@ -131,6 +131,22 @@ def test_rows_out_of_order_are_sorted_and_a_time_that_repeats_is_left_out(tmp_pa
         read(save(frame.sample(frac=1.0, random_state=0), tmp_path))
 
 
+def test_a_time_that_begins_anew_is_another_log(tmp_path):
+    frame = frame_of(PLAIN)
+    path = save(pd.concat([frame, frame[:20]]), tmp_path)
+    found = read(path)
+    assert [(len(log.time_s), log.piece) for log in found.pieces] == [(60, 0), (20, 0)]
+    assert found.kept_share == pytest.approx(1.0)
+    assert "line 62, column 'stamp': time begins anew" in found.cuts[0]
+
+
+def test_entries_of_lists_are_columns_of_parquet(tmp_path):
+    frame = frame_of(PLAIN)
+    listed = frame.drop(columns=BASE).assign(**{"state.base": [*frame[BASE].to_numpy()]})
+    names = ("[base_x, base_y, base_z]", "['state.base[0]', 'state.base[1]', 'state.base[2]']")
+    assert_reads(read(save(listed, tmp_path, "parquet"), names))
+
+
 def split_joints(number, *, shift_ns=0):
     """Joint messages that name some of the joints each, in an order of their own."""
 

@@ -47,7 +47,10 @@ def new(
     task: Annotated[str, Option(help="'balancing', 'reaching' or 'walking'.")] = "balancing",
     policy: Annotated[
         Path | None,
-        Option(help="For 'walking': a network, or a config.yaml of rl_sar.", dir_okay=False),
+        Option(help="For 'walking': a network, a deploy.yaml or a config.yaml.", dir_okay=False),
+    ] = None,
+    motors: Annotated[
+        str | None, Option(help="Joints in the order of a deploy.yaml's motors, with commas.")
     ] = None,
     feet: Annotated[
         str | None, Option(help="Links that touch the ground, with commas; the lowest by default.")
@@ -62,7 +65,7 @@ def new(
     if (task == "walking") != (policy is not None):
         raise ValueError(f"new: --policy is that of --task walking; got '{task}' and {policy}")
     # Before anything is written.
-    template = None if policy is None else survey_policy(policy, console.say)
+    template = None if policy is None else survey_policy(policy, _names(motors), console.say)
     moved = () if template is None else template.joints or None
     limbs = {"feet": _names(feet) or None, "hands": _names(hands) or None}
     written = write_robot(name, model, task, out or Path(name), **limbs, moved=moved)

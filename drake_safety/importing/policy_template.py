@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -146,16 +146,18 @@ class PolicyTemplate:
 
 
 def survey_policy(
-    path: Path, announce: Callable[[str], object] = lambda text: None
+    path: Path, motors: Sequence[str] = (), announce: Callable[[str], object] = lambda text: None
 ) -> PolicyTemplate:
     """Reads what the files of a policy tell.
 
     Args:
-        path: A network (``.onnx``, ``.pt``, ``.jit``) or a ``config.yaml`` of rl_sar.
+        path: A network (``.onnx``, ``.pt``, ``.jit``), a ``deploy.yaml`` of unitree_rl_lab or a
+            ``config.yaml`` of rl_sar.
+        motors: Joints in the order of the robot's motors, which a ``deploy.yaml`` numbers.
         announce: Called with what the network is, before it is loaded.
     """
     is_described = path.suffix in (".yaml", ".yml")
-    converted = converted_policy(path) if is_described else {}
+    converted = converted_policy(path, motors) if is_described else {}
     file = Path(converted.pop("network", path))
     for text in network_kinds([file]):
         announce(text)

@@ -17,7 +17,22 @@ MIN_ROWS = 3
 _INTERVALS_S = (1e-4, 0.5)  # Range of the median time between two rows.
 _SPARSE = 0.9  # Share of complete rows below which every quantity has rows of its own.
 _MANY_HELD, _REGULAR = 6, 0.9  # Least rows of whole holds of a value, and share of equal holds.
-_MANY_SAME = 0.4  # Of the rows.
+_MANY_SAME, _MANY_RESTARTS = 0.4, 0.1  # Of the rows.
+
+
+def continued(channel: Channel, max_gap_s: float) -> tuple[Channel, dict[str, float]]:
+    """Lets a time that begins anew, as in every episode of a data set, go on after two long gaps.
+
+    Returns also the later times of these rows, by location; many of them are left as they are.
+    """
+    step, gap = np.diff(channel.time), max_gap_s * TIME_UNITS[channel.time_unit]
+    rows = np.flatnonzero(step < -gap) + 1
+    if not 0 < len(rows) <= _MANY_RESTARTS * len(step):
+        return channel, {}
+    shift = np.zeros_like(channel.time)
+    shift[rows] = step.dtype.type(2 * gap) - step[rows - 1]
+    channel = replace(channel, time=channel.time + np.cumsum(shift))
+    return channel, {channel.where(i, channel.time_name): channel.time[i] for i in rows.tolist()}
 
 
 def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:

@@ -13,9 +13,9 @@ from drake_safety.extras import require_extra
 from drake_safety.logs.channel import Wanted
 from drake_safety.logs.checks import check
 from drake_safety.logs.conversion import Source, common_span, rotations_at, values_at
-from drake_safety.logs.log_map import COMMANDS, QUANTITIES, Joints, LogMap, load_log_map
+from drake_safety.logs.log_map import COMMANDS, QUANTITIES, TIME_UNITS, Joints, LogMap, load_log_map
 from drake_safety.logs.messages import read_messages
-from drake_safety.logs.quantities import MIN_ROWS, cut, in_order, quantities
+from drake_safety.logs.quantities import MIN_ROWS, continued, cut, in_order, quantities
 from drake_safety.logs.tables import read_csv, read_parquet
 from drake_safety.robots.robot_model import RobotModel
 
@@ -42,7 +42,7 @@ class RobotLog:
         v: Velocities: of the base in the world, angular first, then of the joints, (N, n_v).
         desired_output: z* in the world, (N, n_z) [m], or None.
         foot_positions: Desired foot positions, (N, 3 n_c) [m], or None.
-        piece: Number of this piece of a log that was cut, from 0.
+        piece: Number of this piece of a log that was cut, from 0, and again where time begins anew.
         begin_s: Time of the first row since the log's first row of any topic [s].
     """
 
@@ -129,8 +129,10 @@ def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> Lo
             "a ROS 2 bag"
         )
     topics = _READERS[suffix](path, _wanted(log_map, kinematics), log_map.time)
-    lost, row_share = list[str](), 1.0
+    lost, row_share, restarts = list[str](), 1.0, dict[str, float]()
     for topic, channel in topics.items():
+        if len(topics) == 1:  # Else all topics would have to begin anew together.
+            channel, restarts = continued(channel, log_map.max_gap_s)
         topics[topic], joined = in_order(channel, log_map.max_gap_s)
         lost += joined
         if joined:
@@ -139,7 +141,8 @@ def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> Lo
     topics = {topic: replace(channel, origin=origin) for topic, channel in topics.items()}
     channels, log_map, notes = quantities(topics, log_map, joints)
     parts, reasons = cut(channels, log_map.max_gap_s)
-    lost += reasons
+    lost += [f"{where}: time begins anew, with another log" for where in restarts]
+    lost += [reason for reason in reasons if not reason.startswith(tuple(restarts))]
     sources = [Source(log_map=log_map, joints=joints, channels=part) for part in parts]
     sources = [source for source in sources if len(source.at_s) > 1]
     measured = {getattr(log_map, name).topic for name in channels if name not in COMMANDS}
@@ -154,6 +157,9 @@ def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> Lo
             f"them: {why}"
         )
     notes += check(sources, kinematics)
+    unit = TIME_UNITS[next(iter(topics.values())).time_unit]
+    begins = (np.array([*restarts.values()]) - origin) / unit
+    logs = np.searchsorted(begins, [source.at_s[0] for source in sources], "right")
     pieces = [
         RobotLog(
             path=path,
@@ -161,14 +167,15 @@ def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> Lo
             time_s=source.at_s - source.at_s[0],
             q=source.positions(source.at_s),
             v=source.velocities(source.at_s),
-            piece=i,
+            piece=i - int(np.searchsorted(logs, logs[i])),
             begin_s=float(source.at_s[0]),
             **{name: source.at(name, source.at_s) for name in COMMANDS if name in source.channels},
         )
         for i, source in enumerate(sources)
     ]
+    duration_s = end - begin - 2 * log_map.max_gap_s * len(restarts)
     return LogPieces(
-        pieces=pieces, duration_s=end - begin, row_share=row_share, lost=lost, notes=notes
+        pieces=pieces, duration_s=duration_s, row_share=row_share, lost=lost, notes=notes
     )
 
 

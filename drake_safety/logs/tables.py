@@ -44,8 +44,9 @@ def read_csv(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel]:
 
 
 def read_parquet(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel]:
-    """Reads columns of a Parquet file."""
+    """Reads columns of a Parquet file; the entries of lists are columns."""
     require_extra("logs", f"log '{path}'", "pyarrow")
+    import pandas as pd
     import pyarrow.parquet as pq
 
     with (
@@ -53,8 +54,17 @@ def read_parquet(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel
         pq.ParquetFile(path, page_checksum_verification=True) as file,
     ):
         check_memory(8 * file.metadata.num_rows * len(wanted.get("", ())), f"'{path}'")
-        names = _columns(path, wanted, time, list(file.schema_arrow.names))
-        frame = file.read(columns=names).to_pandas(timestamp_as_object=False, ignore_metadata=True)
+        existing = list(file.schema_arrow.names)
+        roots = {name.split("[")[0] for name in (time.column, *wanted.get("", ()))}
+        table = file.read(columns=[name for name in existing if name in roots])
+        frame = table.to_pandas(timestamp_as_object=False, ignore_metadata=True)
+        for field in table.schema:
+            if hasattr(field.type, "value_field"):
+                cells = [[] if cell is None else cell for cell in frame.pop(field.name)]
+                entries = pd.DataFrame(cells).add_prefix(f"{field.name}[").add_suffix("]")
+                existing += list(entries.columns)
+                frame = frame.join(entries)
+        frame = frame[_columns(path, wanted, time, existing)]
         return {"": _channel(path, frame, time, "row")}
 
 

@@ -57,7 +57,7 @@ _KEYS = {
     "history": ("observation_history_lengths", "observation_terms_history_length"),
 }
 # Registered terms by the names of Isaac Lab's and mjlab's tasks, where these differ.
-_TERM_NAMES = {
+TERM_NAMES = {
     "command": "velocity_commands",
     "keyboard_velocity_commands": "velocity_commands",
     "joint_pos": "joint_pos_rel",
@@ -73,7 +73,7 @@ def read_metadata(raw: Mapping[str, str]) -> PolicyMetadata:
     """
     joints = _words(raw.get("dof_names", raw.get("joint_names", "")))
     names = _words(raw.get("observation_names", ""))
-    terms: list[dict[str, Any]] = [{"name": _TERM_NAMES.get(name, name)} for name in names]
+    terms: list[dict[str, Any]] = [{"name": TERM_NAMES.get(name, name)} for name in names]
     metadata = PolicyMetadata(joints=joints, observation=terms)
     for name, keys in _KEYS.items():
         text = next((raw[key] for key in keys if raw.get(key)), "")
@@ -106,11 +106,11 @@ def _by_term(value: Any, names: list[str], terms: list[dict[str, Any]], key: str
         return [max(1, int(length)) for (length,) in numbers]
     if key == "clip":
         clips = zip(terms, numbers, strict=True)
-        return [_limit(low, high, term.get("scale", [1.0])) for term, (low, high) in clips]
+        return [limit(low, high, term.get("scale", [1.0])) for term, (low, high) in clips]
     return numbers
 
 
-def _limit(low: float, high: float, factors: list[float]) -> float:
+def limit(low: float, high: float, factors: list[float]) -> float:
     """The largest absolute value after scaling by factors, of limits before it."""
     limits = {abs(high * factor) for factor in factors}
     if low != -high or len(limits) != 1:
