@@ -92,9 +92,10 @@ def test_less_is_said_by_an_argument(assessment, inputs):
 def test_a_port_that_is_needed_is_not_left_out_by_mistake(assessment, inputs):
     with pytest.raises(TypeError, match="margins"):
         added(assessment, {name: inputs[name] for name in INPUTS[:3]})
-    with pytest.raises(ValueError, match="was fitted with features"):
-        added(assessment, {name: inputs[name] for name in INPUTS if name != "features"})
-    with pytest.raises(ValueError, match=r"port 'y0' for state has size 1; .* fitted with 6"):
+    with pytest.raises(RuntimeError, match=r"features.* is not connected"):
+        without = {name: inputs[name] for name in INPUTS if name != "features"}
+        added(assessment, without)[1].AdvanceTo(STEP_S)
+    with pytest.raises(RuntimeError, match="ismatched vector sizes"):
         added(assessment, {**inputs, "state": np.zeros(1)})
 
 

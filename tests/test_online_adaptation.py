@@ -159,5 +159,6 @@ def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterw
     expected = adapt(online.feedback[: 2 * len(online.adapted)])
     np.testing.assert_array_equal(online.adapted[-1].beliefs_, expected.beliefs_)
     context = assessor.assessor.GetMyContextFromRoot(root)
-    np.testing.assert_array_equal(assessor.assessor.get_beliefs(context), expected.beliefs_)
+    learned = assessor.assessor.GetOutputPort("learned").Eval(context)
+    np.testing.assert_array_equal(learned["beliefs"], expected.beliefs_)
     assert not np.array_equal(expected.beliefs_, prior.beliefs_)

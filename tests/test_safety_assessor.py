@@ -113,7 +113,7 @@ def test_an_adapted_assessment_is_adopted_in_one_context_while_the_simulation_ru
     assert assessment.novelties[0] is assessment.novelty_
     assert assessment.novelties[-1] is adapted.novelty_
     for one, factor in ((bench, 2), (other, 1)):
-        beliefs = one.system.get_beliefs(one.context)
+        beliefs = one.system.GetOutputPort("learned").Eval(one.context)["beliefs"]
         np.testing.assert_array_equal(beliefs, factor * assessment.beliefs_)
     assert other.begin().get("safety_probability")[0] == 0.25
 

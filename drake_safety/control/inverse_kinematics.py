@@ -25,12 +25,11 @@ def solve_inverse_kinematics(
 ) -> np.ndarray:
     """Returns joint positions (n_j,) [rad] with desired contact points at a given base pose.
 
-    Damped Gauss-Newton from ``guess`` (n_j,) [rad]. An unreachable goal ends at the nearest
-    reachable point. Joints outside the legs keep the guess, and every joint stays inside its
-    limits. ``p_WC`` has the desired centres of the contact spheres, (n_c, 3) [m].
+    Damped Gauss-Newton from ``guess`` (n_j,) [rad] to the contact spheres' centres ``p_WC``,
+    (n_c, 3) [m], or the nearest reachable points. Joints outside the legs keep the guess, and every
+    joint stays inside its limits.
     """
-    q = kinematics.positions_at(X_WB, guess)
-    return solve_from(kinematics, q, p_WC)[0]
+    return solve_from(kinematics, kinematics.positions_at(X_WB, guess), p_WC)[0]
 
 
 def solve_from(

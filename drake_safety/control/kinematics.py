@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context
@@ -51,11 +51,10 @@ class _Instant:
 
 
 class RobotKinematics:
-    """Kinematics of a robot without ground or scene.
+    """Kinematics of a robot without ground or scene, with the masses of a variation.
 
     Positions are Drake's ``q = [q_WB (w, x, y, z), p_WB, joints]`` and velocities
-    ``v = [w_WB, v_WB, joint rates]``. Every method overwrites the thread's scratch Context. Of a
-    plant variation only the masses are used.
+    ``v = [w_WB, v_WB, joint rates]``. Every method overwrites the thread's scratch Context.
     """
 
     def __init__(self, robot: RobotModel, variation: PlantVariation | None = None):
@@ -73,8 +72,7 @@ class RobotKinematics:
                 f"joint must have one degree of freedom"
             )
         model = self.plant.CreateDefaultContext()
-        if variation is not None:
-            apply_masses(self.plant, model, robot, variation)
+        apply_masses(self.plant, model, robot, variation or PlantVariation())
         self._scratch = Scratch(lambda: _Instant(model.Clone()))
         self.num_positions = self.plant.num_positions()
         self.num_velocities = self.plant.num_velocities()
@@ -213,11 +211,6 @@ def planar_pose(stance_pose: np.ndarray) -> RigidTransform:
     """Returns X_WS of a stance pose ``[x, y, yaw]`` on the ground."""
     x, y, yaw = stance_pose
     return RigidTransform(RotationMatrix.MakeZRotation(yaw), [x, y, 0.0])
-
-
-def yaw_of(R_WB: RotationMatrix) -> float:
-    """Returns the yaw of a rotation in the roll-pitch-yaw convention [rad]."""
-    return float(RollPitchYaw(R_WB).yaw_angle())
 
 
 def fit_stance(p_WC: np.ndarray, nominal_contacts: np.ndarray) -> np.ndarray:

@@ -23,22 +23,13 @@ class Mirror:
 
     def __init__(self, kinematics: RobotKinematics):
         self._kinematics = kinematics
-        names = kinematics.joint_names
+        names, plant = kinematics.joint_names, kinematics.plant
         self._partners = kinematics.robot.mirror_partners(names)
         order = np.array([names.index(self._partners[name]) for name in names], dtype=int)
-        # Mirrored joint i has the value of joint `order[i]`, times its sign.
-        signs = self._signs(order)
-        self._joint_order, self._joint_signs = order, signs
-        self._state_order = np.concatenate([np.arange(12), 12 + order, 12 + len(order) + order])
-        self._state_signs = np.concatenate([_POLAR, _AXIAL, _AXIAL, _POLAR, signs, signs])
-
-    def _signs(self, order: np.ndarray) -> np.ndarray:
-        kinematics, plant = self._kinematics, self._kinematics.plant
         q = np.zeros(kinematics.num_positions)
         q[0] = 1.0
         kinematics.set_positions(q)
         instance = plant.GetModelInstanceByName(kinematics.robot.name)
-        names = kinematics.joint_names
         axes = [self._axis(plant.GetJointByName(name, instance)) for name in names]
         signs = np.zeros(len(names))
         for i, (axis, point, is_revolute) in enumerate(axes):
@@ -54,7 +45,10 @@ class Mirror:
                     f"'{names[order[i]]}', which is not its reflection: axis {axis} through "
                     f"{point} against {partner_axis} through {partner_point}"
                 )
-        return signs
+        # Mirrored joint i has the value of joint `order[i]`, times its sign.
+        self._joint_order, self._joint_signs = order, signs
+        self._state_order = np.concatenate([np.arange(12), 12 + order, 12 + len(order) + order])
+        self._state_signs = np.concatenate([_POLAR, _AXIAL, _AXIAL, _POLAR, signs, signs])
 
     def _axis(self, joint: Joint) -> tuple[np.ndarray, np.ndarray, bool]:
         """Direction, a point, and whether the joint turns about it, in the world."""
@@ -100,12 +94,11 @@ class Mirror:
     def hand(self, name: str) -> str:
         """Returns the name of the mirrored reaching frame."""
         robot = self._kinematics.robot
-        arms = {other: set(frame.joints) for other, frame in robot.reaching_frames.items()}
         wanted = {self._partners[joint] for joint in robot.reaching_frame(name).joints}
-        for other, joints in arms.items():
-            if joints == wanted:
+        for other, frame in robot.reaching_frames.items():
+            if set(frame.joints) == wanted:
                 return other
         raise ValueError(
             f"robot '{robot.name}': no reaching frame has the joints {sorted(wanted)} opposite "
-            f"hand '{name}'; there are {list(arms)}"
+            f"hand '{name}'"
         )

@@ -23,9 +23,7 @@ def rotation_vector(R: RotationMatrix) -> np.ndarray:
     """Returns the rotation vector (3,) with an angle in [0, π] [rad]."""
     angle_axis = R.ToAngleAxis()
     angle, axis = angle_axis.angle(), angle_axis.axis()
-    if angle > math.pi:
-        angle, axis = 2 * math.pi - angle, -axis
-    return angle * axis
+    return angle * axis if angle <= math.pi else (2 * math.pi - angle) * -axis
 
 
 def state_names(kinematics: RobotKinematics) -> list[str]:
@@ -44,8 +42,8 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
 
     S lies on the ground at the centroid of the contact points, with the yaw of their planar fit.
     Departure: the paper's s_k has configurations only; without velocities a pushed robot cannot be
-    distinguished from one at rest. The (12 + 2 n_j,) entries [m, rad, m/s, rad/s] have the order of
-    :func:`state_names`; they are NaN without a finite state with an orientation.
+    distinguished from one at rest. The (12 + 2 n_j,) entries [m, rad, m/s, rad/s], named by
+    :func:`state_names`, are NaN without a finite state with an orientation.
     """
     if not is_state(q, v):
         return np.full(12 + 2 * kinematics.num_joints, np.nan)
@@ -69,8 +67,8 @@ def walking_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> 
     """Returns the state s_k of a walking robot, which does not depend on its place and heading.
 
     Departure: feet that swing define no stance frame. Height is over the ground z = 0, and the
-    direction of gravity and the velocities are in the base's frame. The (10 + 2 n_j,) entries have
-    the order of :func:`walking_state_names`; they are NaN as those of :func:`stance_state`.
+    direction of gravity and the velocities are in the base's frame. The (10 + 2 n_j,) entries,
+    named by :func:`walking_state_names`, are NaN as those of :func:`stance_state`.
     """
     if not is_state(q, v):
         return np.full(10 + 2 * kinematics.num_joints, np.nan)
@@ -93,9 +91,8 @@ def gravity_in_foot_plane(
 ) -> np.ndarray:
     """Components (2,) of gravity's direction along the x and y axes of the stance frame.
 
-    On level ground they are zero; on a slope, the sine of its inclination downhill. The plane is
-    fitted to the contact points; along a direction in which these do not extend it is level. NaN
-    without a state.
+    On a slope, they are the sine of its inclination downhill. The plane is fitted to the contact
+    points; along a direction in which these do not extend it is level. NaN without a state.
     """
     if not is_state(q, gravity):
         return np.full(2, np.nan)
@@ -120,13 +117,8 @@ def add_noise(
     dq = noise.position * unit_noise[:n_v]
     w, x, y, z = q[:4]
     a, b, c = 0.5 * dq[:3]
-    quaternion = np.array(
-        [
-            w - a * x - b * y - c * z,
-            x + a * w + b * z - c * y,
-            y + b * w + c * x - a * z,
-            z + c * w + a * y - b * x,
-        ]
-    )
+    turned_w, turned_x = w - a * x - b * y - c * z, x + a * w + b * z - c * y
+    turned_y, turned_z = y + b * w + c * x - a * z, z + c * w + a * y - b * x
+    quaternion = np.array([turned_w, turned_x, turned_y, turned_z])
     quaternion /= math.sqrt(quaternion @ quaternion)
     return np.concatenate([quaternion, q[4:] + dq[3:]]), v + noise.velocity * unit_noise[n_v:]

@@ -95,12 +95,8 @@ def foothold(
 
     Raibert's neutral point is the hip at touchdown plus half the distance travelled in the next
     stance, ``p + v (t_rem + T/2)``; the foothold adds ``k v``, where k grows with every swing. It
-    is within reach of the hip at touchdown, and on its own side of the base.
-
-    Args:
-        hip_offset: The foot's position in the standing posture, in the heading frame, (2,) [m].
-        remaining_s: Time to touchdown [s].
-        num_steps: Number of swings before this one.
+    is within reach of the hip at touchdown, and on its own side of the base. ``hip_offset`` is the
+    standing foot's position in the heading frame, (2,) [m].
     """
     c, s = math.cos(yaw), math.sin(yaw)
     R_WS = np.array([[c, -s], [s, c]])

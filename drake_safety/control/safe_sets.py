@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import field
-from types import MappingProxyType
+from typing import ClassVar
 
 import numpy as np
 
@@ -41,28 +41,22 @@ def convex_hull(points: Iterable[Sequence[float]]) -> list[tuple[float, float]]:
 def signed_distance_to_polygon(
     point: Sequence[float] | np.ndarray, corners: list[tuple[float, float]]
 ) -> float:
-    """Signed distance of a point (2,) to a convex polygon's boundary, positive inside [m].
+    """Signed distance of a point to a convex polygon (counter-clockwise), positive inside [m].
 
-    Corners are counter-clockwise. The distance to a segment or a point is never positive, without
-    corners it is minus infinity.
+    The distance to a segment or a point is never positive, without corners it is minus infinity.
     """
     if not corners:
         return -math.inf
     px, py = float(point[0]), float(point[1])
-    inside = len(corners) >= 3
-    nearest = math.inf
-    previous = corners[-1]
-    for corner in corners:
-        ax, ay = previous
-        ex, ey = corner[0] - ax, corner[1] - ay
+    inside, nearest = len(corners) >= 3, math.inf
+    for (ax, ay), (bx, by) in zip([corners[-1], *corners[:-1]], corners, strict=True):
+        ex, ey = bx - ax, by - ay
         dx, dy = px - ax, py - ay
-        if ex * dy - ey * dx < 0:
-            inside = False
+        inside = inside and not ex * dy - ey * dx < 0
         length_squared = ex * ex + ey * ey
         s = 0.0 if length_squared == 0 else (dx * ex + dy * ey) / length_squared
         s = min(max(s, 0.0), 1.0)
         nearest = min(nearest, math.hypot(dx - s * ex, dy - s * ey))
-        previous = corner
     return nearest if inside else -nearest
 
 
@@ -106,20 +100,14 @@ class BalanceLimits:
 
 
 class BalanceSafeSet:
-    """Safe set of a balancing robot: base over its feet, at a safe height, not fallen.
-
-    The constraints are :func:`support_margin`, the distance to the nearer limit of the height [m],
-    and :func:`fall_margin`.
-    """
+    """Safe set of a balancing robot: base over its feet, at a safe height, not fallen."""
 
     names = ("support_polygon", "height", "fall")
     fall_name = "fall"
-    watched_features = MappingProxyType(
-        {
-            "capture_point_margin": "capture_point_support_distance",
-            "support_margin": "base_support_distance",
-        }
-    )
+    watched_features: ClassVar[dict[str, str]] = {
+        "capture_point_margin": "capture_point_support_distance",
+        "support_margin": "base_support_distance",
+    }
     """Features for baseline monitors, by name of the monitor."""
 
     def __init__(self, kinematics: RobotKinematics, limits: BalanceLimits):
@@ -140,13 +128,9 @@ class BalanceSafeSet:
             return np.full(len(self.names), -np.inf)
         kinematics, limits = self.kinematics, self.limits
         height, (lowest, highest) = float(q[6]), limits.height_m
-        return np.array(
-            [
-                support_margin(kinematics, q, limits.support_clearance_m),
-                min(height - lowest, highest - height),
-                fall_margin(kinematics, q, limits.fall_height_m, self._cos_fall_tilt),
-            ]
-        )
+        support = support_margin(kinematics, q, limits.support_clearance_m)
+        fall = fall_margin(kinematics, q, limits.fall_height_m, self._cos_fall_tilt)
+        return np.array([support, min(height - lowest, highest - height), fall])
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
         """Returns the features (n_f,), from the desired base positions in the stance frame (M, 3).
@@ -167,28 +151,23 @@ class BalanceSafeSet:
         is_support = clearance < limits.support_clearance_m
         if not is_support.any():
             is_support = np.ones_like(is_support)
-        base = R_SW @ (q[4:6] - origin)
-        height = q[6]
+        base, height = R_SW @ (q[4:6] - origin), q[6]
         velocity = R_SW @ v[3:5]
         capture_point = base + velocity * math.sqrt(max(height, 0.05) / GRAVITY_M_S2)
-        goal = preview[-1, :2]
         reach = (contacts[is_support] @ DIRECTIONS).max(axis=0)
         corners = convex_hull(contacts[is_support].tolist())
-        points = np.stack([base, capture_point, goal])
+        points = np.stack([base, capture_point, preview[-1, :2]])
         qw, qx, qy, qz = q[:4]
         base_yaw = math.atan2(2 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
         yaw_error = math.remainder(base_yaw - yaw, 2 * math.pi)
         lowest, highest = limits.height_m
         heights = preview[:, 2].tolist()
+        on_plan = [signed_distance_to_polygon(p, corners) for p in preview[:, :2].tolist()]
         return np.concatenate(
             [
                 (reach - points @ DIRECTIONS).ravel(),
                 [signed_distance_to_polygon(p, corners) for p in points.tolist()],
-                [
-                    min(signed_distance_to_polygon(p, corners) for p in preview[:, :2].tolist()),
-                    min(min(heights) - lowest, highest - max(heights)),
-                    heights[-1],
-                ],
+                [min(on_plan), min(min(heights) - lowest, highest - max(heights)), heights[-1]],
                 clearance,
                 [height - lowest, highest - height, yaw_error],
                 preview[0, :2] - base,

@@ -73,7 +73,6 @@ class StandingFoot:
         self.body = body
         self.frame: Frame = body.body_frame()
         self.points = points  # (3, n)
-        self.num_points = points.shape[1]
         self.center = points.mean(axis=1)
         _, spread, directions = np.linalg.svd((points - self.center[:, np.newaxis]).T)
         dimensions = int(np.sum(spread > _COINCIDENT_M))
@@ -122,21 +121,14 @@ class WholeBodyModel:
             actuator = plant.get_joint_actuator(index)
             joint = kinematics.joint_names.index(actuator.joint().name())
             self.torque_limits[joint] = actuator.effort_limit()
-        self._set_constraints()
-
-    def _set_constraints(self) -> None:
-        """Sets the constant entries of the program's constraints.
-
-        The rows are the equations of motion (n_v), the contact constraints and the friction
-        pyramids; the columns v̇ (n_v) and the forces of the feet's points (3 each).
-        """
-        n_v = self.num_velocities
-        num_points = sum(foot.num_points for foot in self.feet)
+        # Rows of constraints: equations of motion (n_v), contact constraints, friction pyramids.
+        # Columns: v̇ (n_v), forces of the feet's points (3 each).
+        n_v, num_points = self.num_velocities, kinematics.num_contacts
         num_still = sum(foot.num_rows for foot in self.feet)
         self.still_rows = slice(n_v, n_v + num_still)
         num_rows = n_v + num_still + 4 * num_points
         # |f_x| ≤ μ f_z and |f_y| ≤ μ f_z imply f_z ≥ 0.
-        mu = self.parameters.friction
+        mu = parameters.friction
         pyramid = np.array([[1, 0, -mu], [-1, 0, -mu], [0, 1, -mu], [0, -1, -mu]])
         self.A = np.zeros((num_rows, n_v + 3 * num_points))
         self.A[n_v + num_still :, n_v:] = np.kron(np.eye(num_points), pyramid)
@@ -169,16 +161,13 @@ class WholeBodyModel:
         """Checks that a reference is complete and finite, and of the right sizes."""
         points = reference.center_of_mass, reference.reaching
         vectors = [vector for point in points for vector in (point.position, point.rate)]
-        is_sized = (
-            all(np.shape(vector) == (3,) for vector in vectors)
-            and len(reference.orientations) == len(self.bodies)
-            and len(reference.posture) == self.num_joints
-        )
+        sizes = *map(np.shape, vectors), len(reference.orientations), len(reference.posture)
+        is_sized = sizes == (*[(3,)] * 4, len(self.bodies), self.num_joints)
         if not (is_sized and np.isfinite(np.concatenate([*vectors, reference.posture])).all()):
             raise ValueError(
                 f"robot '{self.kinematics.robot.name}': the whole-body reference needs finite "
-                f"points (3,), orientations of {self.body_names} and a posture of "
-                f"{self.num_joints} joints; got {reference}"
+                f"points, orientations of {self.body_names} and a posture of {self.num_joints} "
+                f"joints; got {reference}"
             )
 
     def reaching_position(self, q: np.ndarray) -> np.ndarray:

@@ -25,7 +25,6 @@ _OPTIONS = {"eq_reduction": daqp.EQ_REDUCTION_OFF} if hasattr(daqp, "EQ_REDUCTIO
 _ITERATIONS_PER_ROW = 1.5  # Random episodes and pushes take up to 0.8 until the robot has fallen.
 _BOUNDLESS = 1e12  # Squared norms from this size on count as not finite.
 _TINY = 1e-300
-_ORIGIN = np.zeros(3)
 _FIRST, _LAST = slice(0, 3), slice(-3, None)
 
 
@@ -141,17 +140,13 @@ def _add_contacts(
     Jdot_v = np.empty(model.still_rows.stop - n_v)
     row, column = n_v, n_v
     for foot in model.feet:
-        J = plant.CalcJacobianTranslationalVelocity(
-            context, kv, foot.frame, foot.points, world, world
-        )
+        of_points = kv, foot.frame, foot.points, world, world
+        J = plant.CalcJacobianTranslationalVelocity(context, *of_points)
         A[:n_v, column : column + len(J)] = -model.force_scale * J.T
         column += len(J)
-        J_foot = plant.CalcJacobianSpatialVelocity(
-            context, kv, foot.frame, foot.center, world, world
-        )
-        foot_bias = plant.CalcBiasSpatialAcceleration(
-            context, kv, foot.frame, foot.center, world, world
-        ).get_coeffs()
+        of_center = kv, foot.frame, foot.center, world, world
+        J_foot = plant.CalcJacobianSpatialVelocity(context, *of_center)
+        foot_bias = plant.CalcBiasSpatialAcceleration(context, *of_center).get_coeffs()
         if foot.edge_turns is not None:
             turns_W = foot.edge_turns @ foot.body.EvalPoseInWorld(context).rotation().matrix().T
             J_foot = np.concatenate([turns_W @ J_foot[:3], J_foot[3:]])
@@ -207,24 +202,19 @@ def _set_body_biases(model: WholeBodyModel, Jdot_v: np.ndarray) -> None:
     plant, context, world = kinematics.plant, kinematics.context, kinematics.world_frame
     for rows, body in zip(model.orientation_rows, model.bodies, strict=True):
         if body is not kinematics.base:
-            acceleration = plant.CalcBiasSpatialAcceleration(
-                context, kv, body.body_frame(), _ORIGIN, world, world
-            )
-            Jdot_v[rows] = acceleration.rotational()
-    frame, p = model.hand.frame, model.hand.point
-    acceleration = plant.CalcBiasTranslationalAcceleration(context, kv, frame, p, world, world)
-    Jdot_v[_LAST] = acceleration[:, 0]
+            of_body = kv, body.body_frame(), np.zeros(3), world, world
+            Jdot_v[rows] = plant.CalcBiasSpatialAcceleration(context, *of_body).rotational()
+    of_hand = kv, model.hand.frame, model.hand.point, world, world
+    Jdot_v[_LAST] = plant.CalcBiasTranslationalAcceleration(context, *of_hand)[:, 0]
 
 
 @one_blas_thread
 def solve_qp(qp: WholeBodyQP) -> WholeBodySolution:
     """Solves the program by daqp's dual active-set method, deterministically without warm start.
 
-    The number of iterations is limited by that of constraints: programs of a robot that has fallen
-    have no solution, and would take several times as many.
+    Iterations are limited: programs of a fallen robot have no solution, and would take many.
     """
-    n_v = len(qp.bias)
-    n = qp.A.shape[1]
+    n_v, n = len(qp.bias), qp.A.shape[1]
     # With H = UᵀU and v̇ = U⁻¹z the quadratic cost is ½|[z; y]|². LAPACK's factorisation takes a
     # third of the time of daqp's, which ignores the matrix's structure.
     U, _ = dpotrf(qp.H.T)

@@ -31,20 +31,16 @@ class AssessorInputs(LeafSystem):
           controller_memory: n_m (with ``memory``)]
         output_ports: [state: n_s, features: n_f, margins: n_c]
 
-    The features are those of the safe set. Gravity in the plane of the feet, the loads of the
-    servos and the controller's memory follow them where they are asked for.
+    The features are those of the safe set. Where they are asked for, three others follow: gravity
+    in the plane of the feet, which shows the slope of the ground; with ``servo_loads``, commanded
+    minus measured joint positions, (n_j,) [rad]; and the controller's memory.
 
     Args:
         num_outlook: M, samples of the outlook.
-        gravity: In the world of ``plant_state``, (3,) [m/s²]; None for no features of gravity. They
-            show the slope of the ground, which a state relative to the feet does not.
-        servo_loads: Whether features are commanded minus measured joint positions, (n_j,) [rad].
+        gravity: In the world of ``plant_state``, (3,) [m/s²].
         memory: Names of the entries of ``controller_memory``.
         mirror: If given, state and gravity are those of the robot's mirror image.
         is_walking: See :class:`~drake_safety.systems.state_observer.StateObserver`.
-
-    Attributes:
-        state_names, feature_names, constraint_names: Names of the ports' entries.
     """
 
     def __init__(
@@ -65,9 +61,8 @@ class AssessorInputs(LeafSystem):
         self._gravity = None if gravity is None else np.array(gravity)
         self.state_names = (walking_state_names if is_walking else state_names)(kinematics)
         self.constraint_names = list(safe_set.names)
-        self.feature_names = list(safe_set.feature_names)
-        if gravity is not None:
-            self.feature_names += ["gravity_x", "gravity_y"]
+        gravity_names = [] if gravity is None else ["gravity_x", "gravity_y"]
+        self.feature_names = [*safe_set.feature_names, *gravity_names]
         self._state_port = self.DeclareVectorInputPort("plant_state", kinematics.num_states)
         self._outlook_port = self.DeclareVectorInputPort("desired_outlook", 3 * num_outlook)
         self._command_port = self._memory_port = None

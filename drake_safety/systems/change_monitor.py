@@ -28,13 +28,11 @@ class ChangeMonitor(LeafSystem):
 
     Every step of its training it predicts the state and updates the charts of a
     :class:`~drake_safety.learning.change_detector.ChangeDetector`. When a watched state's level
-    exceeds its limit of 1, ``alarm`` becomes 1 and ``alarm_cause`` says why. The alarm ends when
-    all levels were below 0.7 for five seconds, or with a reset.
-
-    An input that is not finite cannot be judged, nor the two after it. ``judged_share`` is the
-    share of the others over the last two seconds, and below a half every level is above 1. The
-    charts wait while a known disturbance acts, by ``hold`` or :meth:`expect_disturbance`, and
-    `SETTLING_S` longer. The detector is a parameter of the Context, see :meth:`adopt`.
+    exceeds 1, ``alarm`` becomes 1 and ``alarm_cause`` says why, until all levels were below 0.7 for
+    five seconds. Inputs that are not finite, and the two after each, cannot be judged.
+    ``judged_share`` is the share of the others over two seconds; below a half every level is above
+    1. The charts wait while a known disturbance acts, by ``hold`` or :meth:`expect_disturbance`,
+    and `SETTLING_S` longer. The detector is a parameter of the Context.
     """
 
     def __init__(self, assessment: SafetyAssessment):
@@ -91,12 +89,10 @@ class ChangeMonitor(LeafSystem):
 
     def row(self, context: Context) -> np.ndarray:
         """State, preview and features at the ports, (n,); features not read are 0."""
-        features = np.zeros(self._features_port.size())
-        if self.reads_features:
-            features = self._features_port.Eval(context)
-        return np.concatenate(
-            [self._state_port.Eval(context), self._preview_port.Eval(context), features]
-        )
+        port = self._features_port
+        features = port.Eval(context) if self.reads_features else np.zeros(port.size())
+        state, preview = self._state_port.Eval(context), self._preview_port.Eval(context)
+        return np.concatenate([state, preview, features])
 
     def is_held(self, context: Context) -> bool:
         """Whether the port ``hold`` makes it wait."""
@@ -105,10 +101,6 @@ class ChangeMonitor(LeafSystem):
     def _value(self, context: Context, name: str) -> np.ndarray:
         value: np.ndarray = context.get_discrete_state(self._groups[name]).get_value()
         return value
-
-    def _detector_of(self, context: Context) -> ChangeDetector:
-        detector: ChangeDetector = context.get_abstract_parameter(self._detector).get_value()
-        return detector
 
     @one_blas_thread
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -122,7 +114,8 @@ class ChangeMonitor(LeafSystem):
             part["x"][:] = part["previous"][:] = np.nan
             part["repeats"][0] = part["num_lost"][0] = 0.0
         else:
-            self._chart(part, self._detector_of(context), self.row(context))
+            detector = context.get_abstract_parameter(self._detector).get_value()
+            self._chart(part, detector, self.row(context))
         for name, index in self._groups.items():
             discrete_state.set_value(index, part[name])
 
@@ -159,5 +152,6 @@ class ChangeMonitor(LeafSystem):
         if self._value(context, "alarm")[0] > 0.0:
             *_, repeats, share = at_alarm = self._value(context, "at_alarm")
             charts = at_alarm[:-2].reshape(-1, len(self.level_names))
-            cause = self._detector_of(context).cause(charts, repeats, self.level_names, share)
+            detector = context.get_abstract_parameter(self._detector).get_value()
+            cause = detector.cause(charts, repeats, self.level_names, share)
         output.set_value(cause)

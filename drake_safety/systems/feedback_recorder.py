@@ -53,17 +53,11 @@ class FeedbackRecorder(LeafSystem):
         output_ports: [num_finished: 1]
 
     A row is recorded every ``info.step_s``. A window ends safe after ``num_steps`` steps, and the
-    next one begins with its last row. It ends unsafe as soon as ``safe`` is below one, and the next
-    one begins when it is one again. The open window is dropped when time jumps, as at a reset, and
-    while ``recovery_active`` is not zero, since its twin has no recovery. The finished windows, at
-    most the newest 400, are state of the Context; :meth:`take_windows` removes them.
-
-    ``true_state`` defaults to ``state``. ``plant_state`` and ``controller_memory`` of a window's
-    first row are where its twin begins.
-
-    Args:
-        num_steps: Steps of a safe window.
-        watch_period_s: Sampling period of ``safe`` [s].
+    next one begins with its last row. It ends unsafe as soon as ``safe``, sampled every
+    ``watch_period_s`` [s], is below one, and the next one begins when it is one again. The open
+    window is dropped when time jumps, and while ``recovery_active`` is not zero, since its twin has
+    no recovery. The newest 400 finished windows are state of the Context. ``true_state`` defaults
+    to ``state``. ``plant_state`` and ``controller_memory`` are where a window's twin begins.
     """
 
     def __init__(
@@ -140,11 +134,9 @@ class FeedbackRecorder(LeafSystem):
             row = (*row[:-1], np.minimum(row[-1], left_margins))
         has_left = was_left or not self._is_safe(context)
         without_open = Recording(windows=recording.windows, num_finished=recording.num_finished)
-        if recording.times_s:
-            lapse_s = time_s - recording.times_s[-1]
-            if abs(lapse_s - self.info.step_s) > 0.01 * self.info.step_s:
-                recording = without_open
-        recovery = ports["recovery_active"]
+        step_s, recovery = self.info.step_s, ports["recovery_active"]
+        if recording.times_s and abs(time_s - recording.times_s[-1] - step_s) > 0.01 * step_s:
+            recording = without_open
         if recovery.HasValue(context) and recovery.Eval(context)[0] != 0.0:
             recording = without_open
         elif recording.rows or not has_left:

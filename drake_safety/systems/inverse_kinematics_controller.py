@@ -30,13 +30,9 @@ class InverseKinematicsController(LeafSystem):
     over the feet on the ground, which removes the sag of a servo of finite stiffness. They respect
     the joint limits, and move at most at 0.7 of the joints' speed limits.
 
-    Without ``desired_foot_positions`` the feet are those of the first state that the controller
-    sees when a simulation is initialised, put on level ground. Without ``desired_yaw`` the base's
-    yaw is that of the planar fit of the feet.
-
-    Args:
-        stiffness: Servo stiffness of every joint, (n_j,) [N·m/rad]; robot.yaml's by default.
-        offset_s: Time of the first update, after those of its inputs [s].
+    Without ``desired_foot_positions`` the feet are those of the first state of a simulation, put on
+    level ground. Without ``desired_yaw`` the base's yaw is that of the planar fit of the feet.
+    ``offset_s`` [s] is after the updates of the inputs.
     """
 
     def __init__(
@@ -83,10 +79,8 @@ class InverseKinematicsController(LeafSystem):
     def foot_positions(self, context: Context) -> np.ndarray:
         """The present set points of the feet: centres of the contact spheres, (n_c, 3) [m]."""
         if self._feet_port.HasValue(context):
-            feet = self._feet_port.Eval(context)
-        else:
-            feet = context.get_discrete_state(self._feet).value()
-        return feet.reshape(-1, 3)
+            return self._feet_port.Eval(context).reshape(-1, 3)
+        return context.get_discrete_state(self._feet).value().reshape(-1, 3)
 
     def start(self, context: Context) -> None:
         """Sets the command for the present inputs, as the start of a simulation does."""
@@ -102,16 +96,15 @@ class InverseKinematicsController(LeafSystem):
         """Returns joint positions and the torques of the weight, (n_j,) each."""
         kinematics = self._kinematics
         if self._yaw_port.HasValue(context):
-            half_yaw = 0.5 * self._yaw_port.Eval(context)[0]
+            yaw = self._yaw_port.Eval(context)[0]
         else:
-            half_yaw = 0.5 * fit_stance(p_WC, kinematics.nominal_contacts)[2]
-        n_b = NUM_BASE_POSITIONS
+            yaw = fit_stance(p_WC, kinematics.nominal_contacts)[2]
         q = np.zeros(kinematics.num_positions)
-        q[0], q[3] = math.cos(half_yaw), math.sin(half_yaw)
-        q[4:n_b] = self._desired_port.Eval(context)
-        q[n_b:] = guess
+        q[0], q[3] = math.cos(0.5 * yaw), math.sin(0.5 * yaw)
+        q[4:NUM_BASE_POSITIONS] = self._desired_port.Eval(context)
+        q[NUM_BASE_POSITIONS:] = guess
         joints, J = solve_from(kinematics, q, p_WC)
-        q[n_b:] = joints
+        q[NUM_BASE_POSITIONS:] = joints
         is_stance = p_WC[:, 2] - kinematics.foot_radii <= _LIFTED_M
         return joints, kinematics.gravity_torques(q, is_stance, J)
 

@@ -77,11 +77,6 @@ class MonitoredSafetyAssessor(Diagram):
                 builder.ExportOutput(port, port.get_name())
         builder.BuildInto(self)
 
-    @property
-    def reads_features(self) -> bool:
-        """Whether assessor or monitor reads the features."""
-        return any(system.reads_features for system in (self.assessor, self.monitor) if system)
-
     def connect_recovery(self, builder: DiagramBuilder, recovery: System) -> None:
         """Connects a recovery trigger or switch, which follows Γ also during an alarm."""
         for name, port in (("safety_probability", "probability"), ("belief", "belief")):
@@ -111,41 +106,21 @@ def AddSafetyAssessor(
 ) -> MonitoredSafetyAssessor:
     """Adds a :class:`MonitoredSafetyAssessor` named ``safety_assessor``, and connects it.
 
-    It warns of plants whose ports show the next state to what updates at the same time, and of a
-    monitor that never alarms.
-
-    Args:
-        margins: Port of the measured state's margins; None if nothing checks them.
-        hold: Port that is 1 while a known disturbance acts: the monitor waits then.
+    Without ``margins``, those of the measured state, nothing checks them. The monitor waits while
+    ``hold`` is 1, as a known disturbance acts. Plants with sampled output ports, and a monitor that
+    never alarms, are warned of.
     """
     assessor = MonitoredSafetyAssessor(
         assessment, period_s=period_s, checks_margins=margins is not None, on_alarm=on_alarm
     )
-    if assessor.reads_features and features is None:
-        raise ValueError(
-            "AddSafetyAssessor: the assessment was fitted with features "
-            f"{assessment.info_.feature_names}; give the port that carries them"
-        )
-    given = {
-        "state": state,
-        "desired_preview": desired_preview,
-        "features": features,
-        "margins": margins,
-        "hold": hold,
-    }
-    ports = {name: port for name, port in given.items() if port is not None}
-    for name, port in ports.items():
-        if port.size() != (size := assessor.GetInputPort(name).size()):
-            raise ValueError(
-                f"AddSafetyAssessor: port '{port.get_name()}' for {name} has size {port.size()}; "
-                f"the assessment was fitted with {size}"
-            )
     warn_of_sampled_ports("AddSafetyAssessor", builder.GetSystems())
     if on_alarm is not None and math.isinf(assessment.detector_.alarm_level):
         _LOGGER.warning("AddSafetyAssessor: %s", assessment.detector_.describe())
     builder.AddNamedSystem("safety_assessor", assessor)
-    for name, port in ports.items():
-        builder.Connect(port, assessor.GetInputPort(name))
+    ports = {"state": state, "desired_preview": desired_preview}
+    for name, port in {**ports, "features": features, "margins": margins, "hold": hold}.items():
+        if port is not None:
+            builder.Connect(port, assessor.GetInputPort(name))
     return assessor
 
 

@@ -23,12 +23,11 @@ class PolicyController(LeafSystem):
         output_ports: [desired_joint_state: 2 n_j, action_state: n_m, status: 1, num_failures: 1,
           memory: n]
 
-    ``command`` is (v_x, v_y, ω_z) in the base's heading frame [m/s, rad/s]. All outputs and a
-    recurrent network's memory are discrete states, and ``memory`` has all that a clone needs.
-    ``action_state`` is the last action (n_a,), its largest change in the last period (1,), sine and
-    cosine of the phases (2 n_p,), and the command that the policy followed (3,), whose change it
-    may limit. An action that is not finite is replaced by the last one; ``status`` is then
-    ``HELD``, and ``num_failures`` counts it.
+    ``command`` is (v_x, v_y, ω_z) in the base's heading frame [m/s, rad/s]. ``memory`` has all that
+    a clone needs. ``action_state`` is the last action (n_a,), its largest change in the last period
+    (1,), sine and cosine of the phases (2 n_p,), and the command that the policy followed (3,),
+    whose change it may limit. An action that is not finite is replaced by the last one; ``status``
+    is then ``HELD``, and ``num_failures`` counts it.
     """
 
     def __init__(self, kinematics: RobotKinematics, policy: Policy, *, offset_s: float = 0.0):

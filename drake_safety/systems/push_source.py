@@ -25,8 +25,8 @@ class PushSource(LeafSystem):
         name: PushSource
         output_ports: [applied_spatial_force: abstract]
 
-    The port fits the plant's ``applied_spatial_force`` input. A push begins and ends with the
-    plant's first step after the first multiple of ``period_s`` that is not before its time.
+    A push begins and ends with the plant's first step after the first multiple of ``period_s`` that
+    is not before its time.
     """
 
     def __init__(self, plant: MultibodyPlant, instance: ModelInstanceIndex, *, period_s: float):
@@ -48,8 +48,7 @@ class PushSource(LeafSystem):
         if push.body not in self._bodies:
             raise ValueError(f"push: no body '{push.body}'; there are {list(self._bodies)}")
         values = [self._bodies[push.body].index(), *push.force_n, push.time_s, push.duration_s]
-        parameter = context.get_mutable_numeric_parameter(self._parameter)
-        parameter.SetFromVector(np.array(values, dtype=float))
+        context.get_mutable_numeric_parameter(self._parameter).SetFromVector(values)
 
     def push(self, context: Context) -> np.ndarray:
         """Index of the body, force [N], start and duration [s] of the push, (6,)."""
@@ -60,7 +59,7 @@ class PushSource(LeafSystem):
         context.get_mutable_numeric_parameter(self._parameter).SetFromVector(np.zeros(_SIZE))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        push = context.get_numeric_parameter(self._parameter).get_value()
+        push = self.push(context)
         elapsed = context.get_time() - push[_START] + _TOLERANCE_S
         discrete_state.set_value([float(0.0 <= elapsed < push[_DURATION])])
 
@@ -68,10 +67,10 @@ class PushSource(LeafSystem):
         if not context.get_discrete_state_vector().GetAtIndex(0):
             output.set_value([])
             return
-        push = context.get_numeric_parameter(self._parameter).get_value()
+        push = self.push(context)
         body = next(b for b in self._bodies.values() if int(b.index()) == int(push[_BODY]))
         force = ExternallyAppliedSpatialForce()
         force.body_index = body.index()
         force.p_BoBq_B = body.default_com()
-        force.F_Bq_W = SpatialForce(np.zeros(3), push[_FORCE].copy())
+        force.F_Bq_W = SpatialForce(np.zeros(3), push[_FORCE])
         output.set_value([force])

@@ -6,10 +6,10 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, State
 
-from drake_safety.control.kinematics import RobotKinematics, fit_stance, is_state, yaw_of
+from drake_safety.control.kinematics import RobotKinematics, fit_stance, is_state
 from drake_safety.control.observation import quaternion_of
 from drake_safety.control.recovery_step import (
     RecoveryStepParameters,
@@ -40,16 +40,13 @@ class RecoveryStepPlanner(LeafSystem):
     While idle, the feet keep the positions of the first state that the planner sees, put on level
     ground, or those of :meth:`set_stance`. When ``recovery_active`` rises, groups of feet swing by
     turns to Raibert footholds. The base set point follows the measured base at the standing height,
-    so that the stance legs do not pull the base back, and the legs twist the base towards the
-    heading of the initial stance.
+    so that the stance legs do not pull it back, and the legs twist it towards the first heading.
 
     Groups alternate until the capture point is well inside the support polygon and the heading
     error is small. The base then comes to rest like an inverted pendulum over its capture point,
-    and moves to the nominal set point in the stance frame of the new footholds. If the capture
-    point comes near the polygon's edge meanwhile, the robot steps again. After that
-    ``recovery_done`` is 1 until ``recovery_active`` has fallen.
-
-    Preview and outlook are the base set point, held constant, in the stance frame.
+    and moves to the nominal set point in the new stance frame. If the capture point comes near the
+    polygon's edge meanwhile, the robot steps again. After that ``recovery_done`` is 1 until
+    ``recovery_active`` has fallen. Preview and outlook repeat the set point, in the stance frame.
     """
 
     def __init__(
@@ -113,9 +110,8 @@ class RecoveryStepPlanner(LeafSystem):
 
     def _values(self, discrete_state: DiscreteValues) -> SimpleNamespace:
         """Copies of all discrete states, by name."""
-        return SimpleNamespace(
-            **{name: discrete_state.get_value(i).copy() for name, i in self._groups.items()}
-        )
+        groups = self._groups.items()
+        return SimpleNamespace(**{name: discrete_state.get_value(i).copy() for name, i in groups})
 
     def _set_values(self, discrete_state: DiscreteValues, values: SimpleNamespace) -> None:
         for name, index in self._groups.items():
@@ -150,26 +146,23 @@ class RecoveryStepPlanner(LeafSystem):
             if is_last or self._margin(now, q, v) >= parameters.resume_margin_m:
                 self._return(now, nominal, time_s)
                 return
-            self._begin(now, q, v, time_s)
         elif now.mode == _IDLE:
             now.num_steps, now.heading = np.zeros(1), now.stance_pose[2:]
-            self._begin(now, q, v, time_s)
         elif time_s - now.start_s >= parameters.step_duration_s - 1e-9:
             self._plant(now, q, time_s)
             if self._can_stand(now, q, v):
                 self._stand(now, q, v)
                 return
+        if now.mode != _STEPPING:
+            centres = self._foot_centres(now.planted.reshape(-1, 3))
+            group = first_group(self._swing_groups, centres, capture_point(q[4:7], v[3:6]))
+            now.mode, now.group, now.start_s = [_STEPPING], [group], [time_s]
         self._swing(now, q, v, time_s)
 
     def _foot_centres(self, contacts: np.ndarray) -> np.ndarray:
         """Centres (n_feet, 2) of the feet's contact points (n_c, ...)."""
         slices = self._kinematics.foot_slices
         return np.array([contacts[rows, :2].mean(axis=0) for rows in slices])
-
-    def _begin(self, now: SimpleNamespace, q: np.ndarray, v: np.ndarray, time_s: float) -> None:
-        centres = self._foot_centres(now.planted.reshape(-1, 3))
-        group = first_group(self._swing_groups, centres, capture_point(q[4:7], v[3:6]))
-        now.mode, now.group, now.start_s = [_STEPPING], [group], [time_s]
 
     def _plant(self, now: SimpleNamespace, q: np.ndarray, time_s: float) -> None:
         """Ends a swing at the measured foot positions, and starts that of the other group."""
@@ -191,12 +184,10 @@ class RecoveryStepPlanner(LeafSystem):
         parameters = self._parameters
         if now.num_steps >= parameters.max_steps:
             return True
-        if now.num_steps < parameters.min_steps:
+        yaw = RollPitchYaw(RotationMatrix(quaternion_of(q))).yaw_angle()
+        is_turned = abs(_heading_error(now, yaw)) > parameters.settle_heading_rad
+        if now.num_steps < parameters.min_steps or (is_turned and parameters.max_twist_rad > 0):
             return False
-        if parameters.max_twist_rad > 0:
-            yaw = yaw_of(RotationMatrix(quaternion_of(q)))
-            if abs(_heading_error(now, yaw)) > parameters.settle_heading_rad:
-                return False
         return self._margin(now, q, v) >= parameters.settle_margin_m
 
     def _stand(self, now: SimpleNamespace, q: np.ndarray, v: np.ndarray) -> None:
@@ -218,7 +209,7 @@ class RecoveryStepPlanner(LeafSystem):
     def _swing(self, now: SimpleNamespace, q: np.ndarray, v: np.ndarray, time_s: float) -> None:
         kinematics, parameters = self._kinematics, self._parameters
         R_WB = RotationMatrix(quaternion_of(q))
-        yaw, p_WB, v_WB = yaw_of(R_WB), q[4:7], v[3:6]
+        yaw, p_WB, v_WB = RollPitchYaw(R_WB).yaw_angle(), q[4:7], v[3:6]
         base = np.array([p_WB[0], p_WB[1], kinematics.standing_height])
         elapsed_s = time_s - now.start_s[0]
         phase = elapsed_s / parameters.step_duration_s

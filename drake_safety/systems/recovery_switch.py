@@ -24,11 +24,8 @@ class RecoverySwitch(Diagram):
           desired_foot_positions: 3 n_p, desired_yaw: 1, stance_pose: 3, recovery_active: 1]
 
     Connect ``stance_pose`` to the TrajectoryPlanner, so that the plan continues over the new
-    footholds, ``desired_foot_positions`` and ``desired_yaw`` to the controller,
-    ``desired_preview`` to the assessor, and ``desired_outlook`` to the features.
-
-    The trigger updates ``offset_s`` after the assessor, and the step planner as much after the
-    trigger: updates of one time would see the state before all of them.
+    footholds. The trigger updates ``offset_s`` after the assessor, and the step planner as much
+    after the trigger: updates of one time would see the state before all of them.
     """
 
     def __init__(
@@ -46,27 +43,23 @@ class RecoverySwitch(Diagram):
     ):
         super().__init__()
         builder = DiagramBuilder()
-        trigger = builder.AddNamedSystem(
-            "recovery_trigger",
-            RecoveryTrigger(
-                threshold=threshold,
-                persistence_s=persistence_s,
-                initial_uncertainty=initial_uncertainty,
-                period_s=period_s,
-                offset_s=offset_s,
-            ),
+        trigger = RecoveryTrigger(
+            threshold=threshold,
+            persistence_s=persistence_s,
+            initial_uncertainty=initial_uncertainty,
+            period_s=period_s,
+            offset_s=offset_s,
         )
-        planner = self.step_planner = builder.AddNamedSystem(
-            "recovery_step_planner",
-            RecoveryStepPlanner(
-                kinematics,
-                parameters,
-                period_s=period_s,
-                offset_s=2 * offset_s,
-                horizon=horizon,
-                num_outlook=num_outlook,
-            ),
+        planner = self.step_planner = RecoveryStepPlanner(
+            kinematics,
+            parameters,
+            period_s=period_s,
+            offset_s=2 * offset_s,
+            horizon=horizon,
+            num_outlook=num_outlook,
         )
+        builder.AddNamedSystem("recovery_trigger", trigger)
+        builder.AddNamedSystem("recovery_step_planner", planner)
         active, done = trigger.GetOutputPort("recovery_active"), "recovery_done"
         builder.Connect(active, planner.GetInputPort("recovery_active"))
         builder.Connect(planner.GetOutputPort(done), trigger.GetInputPort(done))

@@ -22,14 +22,10 @@ class RecoveryTrigger(LeafSystem):
         output_ports: [port_selector: abstract, recovery_active: 1]
 
     The trigger latches: once active it stays active until ``recovery_done`` is 1. A probability
-    that is not finite activates it. ``belief`` tells a low probability from one that is 0 because
-    the belief is "don't know", as for an instant after an impact: then the probability must have
-    been below Γ_thre for ``persistence_s``. ``port_selector`` drives a PortSwitch whose ports were
-    declared ``nominal`` first, ``recovery`` second.
-
-    Args:
-        threshold: Γ_thre in [0, 1]; the paper's value is 0.6, of the belief's first entry.
-        initial_uncertainty: μ_ini of the assessment, which says what is "don't know".
+    that is not finite activates it. Where ``belief`` is "don't know" by the assessment's μ_ini,
+    ``initial_uncertainty``, as for an instant after an impact, the probability must have been below
+    Γ_thre for ``persistence_s``. ``port_selector`` drives a PortSwitch whose ports were declared
+    ``nominal`` first, ``recovery`` second.
     """
 
     def __init__(
@@ -42,11 +38,8 @@ class RecoveryTrigger(LeafSystem):
         offset_s: float = 0.0,
     ):
         super().__init__()
-        if not (0 <= threshold <= 1 and 0 <= initial_uncertainty <= 1):
-            raise ValueError(
-                "recovery trigger: threshold and initial_uncertainty must be in [0, 1]; got "
-                f"{threshold}, {initial_uncertainty}"
-            )
+        if not 0 <= threshold <= 1:
+            raise ValueError(f"recovery trigger: threshold must be in [0, 1]; got {threshold}")
         check_times("recovery trigger", or_zero=["persistence_s"], persistence_s=persistence_s)
         declare_update(self, self._update, None, period_s, offset_s)
         self.threshold = threshold

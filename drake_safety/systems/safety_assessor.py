@@ -40,11 +40,9 @@ class SafetyAssessor(LeafSystem):
     - ``learned`` has beliefs, correction and novelty, with empty beliefs during an alarm, for a
       :class:`~drake_safety.diagrams.walking.command_guard.CommandGuard`.
 
-    While one of ``margins``, those of the measured state, is negative or not finite, no belief is
-    safe: its mass for "safe" counts as unsafe by a constraint that is not finite, else by the most
-    violated one. What feedback changes (beliefs, correction and novelty) are parameters of the
-    Context, see :meth:`adopt`. The embedding is immutable.
-
+    While one of the measured state's ``margins`` is negative or not finite, the belief's mass for
+    "safe" counts as unsafe by a constraint that is not finite, else by the most violated one.
+    Beliefs, correction and novelty are parameters of the Context, see :meth:`adopt`.
     """
 
     def __init__(
@@ -62,8 +60,8 @@ class SafetyAssessor(LeafSystem):
         # A diagram without features has no port to connect.
         self.reads_features = assessment.uses_features and bool(info.feature_names)
         n_c = len(info.constraint_names)
-        beliefs = np.asarray(assessment.beliefs_, dtype=float).ravel()
-        self._beliefs = self.DeclareNumericParameter(BasicVector(beliefs))
+        beliefs = BasicVector(np.asarray(assessment.beliefs_, dtype=float).ravel())
+        self._beliefs = self.DeclareNumericParameter(beliefs)
         corrections = assessment.correction_, assessment.novelty_
         self._corrections = self.DeclareAbstractParameter(Value(corrections))
         self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
@@ -97,10 +95,6 @@ class SafetyAssessor(LeafSystem):
             "learned", lambda: Value[object]({}), self._calc_learned, learned_from
         )
 
-    def get_beliefs(self, context: Context) -> np.ndarray:
-        """Returns the beliefs in a Context, shaped as the assessment's ``beliefs_``."""
-        return context.get_numeric_parameter(self._beliefs).get_value().reshape(self._shape)
-
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
         """Takes over what an assessment adapted from this system's own has learned."""
         own, other = self._assessment.embedding_, adapted.embedding_
@@ -118,7 +112,7 @@ class SafetyAssessor(LeafSystem):
 
     def _learned(self, context: Context) -> dict[str, Any]:
         correction, novelty = context.get_abstract_parameter(self._corrections).get_value()
-        beliefs = self.get_beliefs(context)
+        beliefs = context.get_numeric_parameter(self._beliefs).get_value().reshape(self._shape)
         return {"beliefs": beliefs, "correction": correction, "novelty": novelty}
 
     def _calc_learned(self, context: Context, output: Value) -> None:

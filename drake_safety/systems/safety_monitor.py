@@ -46,8 +46,8 @@ class SafetyMonitor(LeafSystem):
         input_ports: [plant_state: n_q + n_v]
         output_ports: [margins: n_c, safe: 1]
 
-    Both outputs are direct functions of the state. ``safe`` is 1 while every margin is finite and
-    not negative. The margins of a state that is not finite are minus infinity.
+    ``safe`` is 1 while every margin is finite and not negative. The margins of a state that is not
+    finite are minus infinity.
     """
 
     def __init__(self, safe_set: SafeSet, num_positions: int, num_velocities: int):

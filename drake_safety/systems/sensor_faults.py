@@ -23,12 +23,8 @@ class SensorFaults(LeafSystem):
         input_ports: [input: n]
         output_ports: [output: n]
 
-    Without faults, and before they start, the output has the input's bits. Delays and ``freeze``
-    hold samples, taken at multiples of the period: a delay's output is the input of ``value /
-    period_s`` samples ago, or the first sample until that is so old.
-
-    Args:
-        period_s: Sampling period of faults that hold samples [s].
+    Delays and ``freeze`` hold samples, taken every ``period_s`` [s]: a delay's output is the input
+    of ``value / period_s`` samples ago, or the first sample until that is so old.
     """
 
     def __init__(
@@ -57,10 +53,8 @@ class SensorFaults(LeafSystem):
             return int(fault.kind == "freeze")
         periods = (fault.value or 0.0) / self._period_s
         if abs(periods - round(periods)) > 1e-6:  # Between samples nothing is known of the signal.
-            raise ValueError(
-                f"sensor faults: a delay must be a multiple of the period {self._period_s:g} s; "
-                f"got {fault.value:g}"
-            )
+            period = f"the period {self._period_s:g} s; got {fault.value:g}"
+            raise ValueError(f"sensor faults: a delay must be a multiple of {period}")
         return round(periods)
 
     def _held(self, context: Context, index: int) -> np.ndarray:
@@ -70,12 +64,11 @@ class SensorFaults(LeafSystem):
         """The input, and the signal after each fault."""
         signals = [self._input.Eval(context)]
         for i, (fault, entries) in enumerate(self._faults):
-            signal = signals[-1]
+            signals.append(signals[-1].copy())
             elapsed_s = context.get_time() - fault.start_s
             if elapsed_s >= -_TOLERANCE_S:
-                signal = signal.copy()
-                signal[entries] = self._faulty(context, i, signal[entries], max(elapsed_s, 0.0))
-            signals.append(signal)
+                x = signals[-1][entries]
+                signals[-1][entries] = self._faulty(context, i, x, max(elapsed_s, 0.0))
         return signals
 
     def _faulty(self, context: Context, index: int, x: np.ndarray, elapsed_s: float) -> np.ndarray:

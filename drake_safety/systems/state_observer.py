@@ -27,9 +27,8 @@ class StateObserver(LeafSystem):
         input_ports: [plant_state: n_q + n_v, noise: 2 n_v (optional)]
         output_ports: [measured_plant_state: n_q + n_v, state: n_s, output: n_z]
 
-    Every output is a direct function of the inputs. Without the ``noise`` input the measurement is
-    exact. State and output of a measurement that is not finite, or without an orientation, are NaN;
-    the base's position is as measured.
+    State and output of a measurement that is not finite, or without an orientation, are NaN; the
+    base's position is as measured.
 
     Args:
         noise: Standard deviations that scale the standard normal ``noise`` input.
@@ -53,7 +52,6 @@ class StateObserver(LeafSystem):
         self._hand = None if hand is None else kinematics.robot.reaching_frame(hand)
         self._kinematics = kinematics
         self._noise = noise or ObservationNoise()
-        self._is_exact = self._noise.position == 0 and self._noise.velocity == 0
         n_x, self._n_q = kinematics.num_states, kinematics.num_positions
         self.state_names = (walking_state_names if is_walking else state_names)(kinematics)
         self.output_names = [f"{'base' if hand is None else 'hand'}_{axis}" for axis in "xyz"]
@@ -68,11 +66,11 @@ class StateObserver(LeafSystem):
         self.DeclareVectorOutputPort("output", 3, self._calc_output)
 
     def _calc_measured(self, context: Context, output: BasicVector) -> None:
-        state = self._state_port.Eval(context)
-        is_noisy = not self._is_exact and self._noise_port.HasValue(context)
+        state, noise = self._state_port.Eval(context), self._noise
         q, v = np.split(state, [self._n_q])
+        is_noisy = (noise.position or noise.velocity) and self._noise_port.HasValue(context)
         if is_noisy and is_state(q, v):
-            state = np.concatenate(add_noise(q, v, self._noise_port.Eval(context), self._noise))
+            state = np.concatenate(add_noise(q, v, self._noise_port.Eval(context), noise))
         output.SetFromVector(state)
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:

@@ -85,11 +85,6 @@ class TrajectoryPlanner(LeafSystem):
         plan: PiecewisePolynomial | None = None,
     ):
         super().__init__()
-        if not (horizon >= 1 and num_outlook >= 2):
-            raise ValueError(
-                f"planner: horizon must be positive, and num_outlook at least 2; got {horizon}, "
-                f"{num_outlook}"
-            )
         outlook_s = step_s * (horizon - 1) if outlook_s is None else outlook_s
         check_times("planner", or_zero=["outlook_s"], step_s=step_s, outlook_s=outlook_s)
         plan_and_rate = (None, None) if plan is None else self._with_rate(plan)
@@ -136,11 +131,8 @@ class TrajectoryPlanner(LeafSystem):
 
     @staticmethod
     def _with_rate(plan: PiecewisePolynomial) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
-        if (plan.rows(), plan.cols()) != (3, 1):
-            raise ValueError(
-                "planner: the plan must have 3 rows and one column; got "
-                f"{plan.rows()} x {plan.cols()}"
-            )
+        if (size := (plan.rows(), plan.cols())) != (3, 1):
+            raise ValueError(f"planner: the plan must have 3 rows and one column; got {size}")
         return plan, plan.MakeDerivative()
 
     def _plan_and_rate(self, context: Context) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:

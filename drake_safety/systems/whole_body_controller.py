@@ -29,11 +29,9 @@ class WholeBodyController(LeafSystem):
         output_ports: [actuation: n_j, solver_status: 1, num_failures: 1]
 
     ``desired_output`` is the set point of the hand in the world [m]; the other references are those
-    of :meth:`set_reference`. The command is a discrete state.
-
-    ``solver_status`` is 0 if the last program was solved, negative if it was not (daqp's exit
-    flag), and ``NOT_FINITE`` if its inputs were not finite. The last command is then held,
-    initially zero torque. ``num_failures`` counts these updates since the initialisation.
+    of :meth:`set_reference`. ``solver_status`` is 0 if the last program was solved, negative if it
+    was not (daqp's exit flag), and ``NOT_FINITE`` if its inputs were not finite. The last command
+    is then held, initially zero torque. ``num_failures`` counts these updates.
 
     Args:
         hand: Name of the reaching frame that follows ``desired_output``.
@@ -52,19 +50,17 @@ class WholeBodyController(LeafSystem):
         offset_s: float = 0.0,
     ):
         super().__init__()
-        n_j = kinematics.num_joints
-        matrix = np.eye(n_j) if actuation_matrix is None else np.array(actuation_matrix, float)
         self.model = WholeBodyModel(kinematics, hand)
-        self._kinematics = kinematics
-        self._matrix = matrix
+        self._matrix = np.eye(kinematics.num_joints)
+        if actuation_matrix is not None:
+            self._matrix = np.array(actuation_matrix, dtype=float)
         self._n_q = kinematics.num_positions
-        # Looking up ports by name in every update would cost more than evaluating them.
         self._state_port = self.DeclareVectorInputPort("plant_state", kinematics.num_states)
         self._desired_port = self.DeclareVectorInputPort("desired_output", 3)
         self._rate_port = self.DeclareVectorInputPort("desired_output_rate", 3)
         standing = self.model.reference(kinematics.standing_positions())
         self._reference_index = self.DeclareAbstractParameter(Value(standing))
-        self._actuation = self.DeclareDiscreteState(len(matrix))  # Torques of the actuators.
+        self._actuation = self.DeclareDiscreteState(len(self._matrix))  # Torques of the actuators.
         self._status = self.DeclareDiscreteState(1)
         self._num_failures = self.DeclareDiscreteState(1)
         declare_update(self, self._update, self._initialize, period_s, offset_s)
@@ -78,17 +74,13 @@ class WholeBodyController(LeafSystem):
         parameter = context.get_mutable_abstract_parameter(self._reference_index)
         parameter.set_value(copy.deepcopy(reference))
 
-    def _reference(self, context: Context) -> WholeBodyReference:
-        reference = context.get_abstract_parameter(self._reference_index).get_value()
-        position, rate = self._desired_port.Eval(context), self._rate_port.Eval(context)
-        return replace(reference, reaching=PointReference(position=position, rate=rate))
-
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = self._state_port.Eval(context)
+        q, v = np.split(self._state_port.Eval(context), [self._n_q])
+        position, rate = self._desired_port.Eval(context), self._rate_port.Eval(context)
+        hand = PointReference(position=position, rate=rate)
+        reference = context.get_abstract_parameter(self._reference_index).get_value()
         try:
-            qp = build_qp(
-                self.model, state[: self._n_q], state[self._n_q :], self._reference(context)
-            )
+            qp = build_qp(self.model, q, v, replace(reference, reaching=hand))
         except NotFiniteError:
             status = NOT_FINITE
         else:
