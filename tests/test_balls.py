@@ -95,7 +95,7 @@ def test_a_parked_ball_lies_still_on_the_ground_far_away():
 
 def test_an_impossible_flight_is_refused_and_the_ball_parked():
     bench = Bench(height=0.45)
-    with pytest.raises(ValueError, match=r"line of flight of Throw\(.*height_m=3.0.* misses"):
+    with pytest.raises(ValueError, match=r"ball of Throw\(.*height_m=3.0.* misses"):
         bench.ball.throw(bench.context, Throw(height_m=3.0), 0.1)
     assert np.linalg.norm(bench.position()[:2]) > 10
     # It would begin underground.

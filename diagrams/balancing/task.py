@@ -13,7 +13,7 @@ from drake_safety.diagrams.balancing.parameters import BalancingParameters
 from drake_safety.diagrams.balancing.sampling import calm_start, undisturbed_start
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.plants.balls import Throw
-from drake_safety.plants.physics import ENGINES_WITH_BALLS, Scene
+from drake_safety.plants.physics import Scene
 from drake_safety.simulation.closed_loop import Purpose
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
@@ -113,7 +113,7 @@ class Balancing(LeggedLoop):
     def options_for(cls, purpose: Purpose, scenario: Scenario, variation: str) -> dict[str, Any]:
         """Removes the ball for the paper's mode, or if not both engines of a pair support it."""
         # "We also add a random offset to the initial state to simulate the disturbances" (paper).
-        is_without_ball = scenario.variation(variation).engine not in ENGINES_WITH_BALLS
+        is_without_ball = scenario.variation(variation).engine != "drake"
         if purpose == "paper" or (purpose == "pairs" and is_without_ball):
             return {"ball": False}
         return {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,18 +24,16 @@ class GoalVerdict:
 
     goal: np.ndarray
     """In the world, (3,) [m]."""
-    belief: np.ndarray
+    belief: np.ndarray = field(default_factory=lambda: np.array(EMPTY, dtype=float))
     """(safe, unsafe, don't know), (3,); its first entry is the paper's Γ."""
-    probability: float
+    probability: float = math.nan
     """The probability of staying safe; NaN outside the region sampled in training."""
     threshold: float
-    """Lowest probability of a safe goal."""
     constraint_names: tuple[str, ...]
     cause_probability: np.ndarray
     predicted_margins: np.ndarray
     """Smallest margin predicted for each constraint [m, rad], (n_c,), or NaN."""
-    margin_unit: float = 1.0
-    """Scale by which margins are compared [m, rad]."""
+    margin_unit: float = 1.0  # Scale by which margins are compared [m, rad].
     reason: str = ""
     """Why the verdict is "don't know"; "" otherwise."""
 
@@ -83,8 +81,7 @@ def assess_goal(
     A goal outside the region sampled in training is "don't know". So is a probability from
     ``unsafe_below``, the threshold by default, to the threshold.
     """
-    goal = checked_goal(goal)
-    with_goals = require(loop, HasGoals)
+    goal, with_goals = checked_goal(goal), require(loop, HasGoals)
     box, words = with_goals.target_box, goal_words(with_goals)
     if is_in_box(goal, box):
         return assess_goals(
@@ -94,15 +91,13 @@ def assess_goal(
     entries = zip(words.axes, *box.tolist(), strict=True)
     region = ", ".join(f"{axis} {low:g}…{high:g}" for axis, low, high in entries)
     region += " m" if words.is_point else ""
-    names = tuple(loop.constraint_names)
+    margins = np.full(len(loop.constraint_names), np.nan)
     return GoalVerdict(
         goal=goal,
-        belief=np.array(EMPTY, dtype=float),
-        probability=math.nan,
         threshold=threshold,
-        constraint_names=names,
-        cause_probability=np.zeros(len(names)),
-        predicted_margins=np.full(len(names), np.nan),
+        constraint_names=tuple(loop.constraint_names),
+        cause_probability=np.zeros_like(margins),
+        predicted_margins=margins,
         reason=f"the {words.goal} {place} the region sampled in training, {region}",
     )
 
@@ -119,13 +114,11 @@ def assess_goals(
     if len(goals) == 0:
         return []
     unsafe_below = threshold if unsafe_below is None else unsafe_below
-    noun = goal_words(require(loop, HasGoals)).goal
-    inputs = goal_inputs(loop, goals)
+    noun, inputs = goal_words(require(loop, HasGoals)).goal, goal_inputs(loop, goals)
     prediction = assessment.predict(*inputs)
     has_no_data = is_unknown(prediction.belief, assessment.parameters.initial_uncertainty)
 
     def reason(i: int) -> str:
-        """Why goal i is not known; "" if it is."""
         probability = prediction.probability[i]
         if prediction.novelty[i] > 1.0:
             name, deviation = assessment.strangest_input(*(part[i] for part in inputs))

@@ -38,7 +38,7 @@ def nearest_accepted_goal(
     num_candidates: int = 64,
     resolution_m: float = 1e-3,
 ) -> GoalVerdict | None:
-    """Finds an accepted goal near a given one, with a reserve; None if there is none.
+    """Finds an accepted goal near a given one, (3,) [m], with a reserve; None if there is none.
 
     With reserve: probability ≥ threshold + reserve (p - threshold), where p is the largest
     probability: 1, or 1 - mu_ini without heads, as in the paper's mode.
@@ -46,10 +46,8 @@ def nearest_accepted_goal(
     Descent along the gradient of the safety head's logit finds an accepted goal with few
     evaluations, but often not the nearest one. It bounds the radius of a search in all directions.
     If it finds nothing, or the maps have no safety head, the search covers the whole region. All
-    candidates lie on a grid of ``resolution_m``, so that rounding does not change a verdict. The
-    goal, (3,) [m] in the world, may lie outside the region sampled in training.
+    candidates lie on a grid of ``resolution_m``, so that rounding does not change a verdict.
     """
-    # Without heads the probability is b_safe.
     unknown = assessment.parameters.initial_uncertainty if assessment.base_logit_ is None else 0.0
     stricter = threshold + reserve * max(1.0 - unknown - threshold, 0.0)
     goal = checked_goal(goal)
@@ -75,29 +73,23 @@ class _Search:
 
     def accepted(self, candidates: np.ndarray) -> GoalVerdict | None:
         """The nearest candidate (N, 3) [m] that is accepted, if any."""
-        points = np.unique(_on_grid(candidates, self.resolution_m), axis=0)
+        # A multiple of the spacing differs in its last bits from the same number read from a text.
+        on_grid = np.round(np.round(candidates / self.resolution_m) * self.resolution_m, 9)
+        points = np.unique(on_grid, axis=0)
         inside = points[np.all((points >= self.box[0]) & (points <= self.box[1]), axis=1)]
         verdicts = assess_goals(self.loop, self.assessment, inside, threshold=self.threshold)
         return self.nearest(verdict for verdict in verdicts if verdict.is_accepted)
 
     def nearest(self, verdicts: Iterable[GoalVerdict | None]) -> GoalVerdict | None:
-        """The nearest verdict, if any."""
-        return min(
-            filter(None, verdicts), key=lambda verdict: self.distance(verdict.goal), default=None
-        )
+        known = filter(None, verdicts)
+        return min(known, key=lambda verdict: self.distance(verdict.goal), default=None)
 
     def distance(self, point: np.ndarray) -> float:
-        """Distance of a point to the goal [m]."""
         return float(np.linalg.norm(point - self.goal))
 
     def descend(self) -> GoalVerdict | None:
-        """Moves a refused goal along the gradient to an accepted one.
-
-        Each step goes to the point nearest to the goal on the plane where the linearised logit has
-        the value aimed at, which falls until Γ accepts the goal.
-        """
-        goal, box = self.goal, self.box
-        best: GoalVerdict | None = None
+        """Moves a refused goal along the gradient to an accepted one."""
+        goal, box, best = self.goal, self.box, None
         bound = 1.0 / (1.0 + math.exp(-_LARGEST_LOGIT))
         share = min(max(self.threshold, 1.0 - bound), bound)
         aim = math.log((1.0 - share) / share)
@@ -115,6 +107,7 @@ class _Search:
             steepness = float(slope @ slope)
             if steepness < 1e-12:
                 break
+            # The nearest point on the plane where the linearised logit has the value aimed at.
             ahead = goal + slope * (slope @ (point - goal) - (logit[0] - aim)) / steepness
             step = np.clip(ahead, *box) - point
             length = float(np.linalg.norm(step))
@@ -126,11 +119,7 @@ class _Search:
     def search(
         self, known: GoalVerdict | None, rng: np.random.Generator, num_candidates: int
     ) -> GoalVerdict | None:
-        """Searches the nearest accepted goal in all directions.
-
-        Candidates fill growing balls about the goal until one is accepted. Each round of refinement
-        then bisects towards the goal, and draws candidates about the best and in its ball.
-        """
+        """Searches growing balls about the goal, then refines the best candidate in rounds."""
         goal, box = self.goal, self.box
         centre = np.clip(goal, *box)
         best = self.accepted(centre[None])
@@ -145,8 +134,8 @@ class _Search:
         best = self.nearest((best, known))
         if best is None:
             best = self.accepted(rng.uniform(box[0], box[1], (_LAST_CHANCE * num_candidates, 3)))
-        if best is None:
-            return None
+            if best is None:
+                return None
         for _ in range(num_rounds):
             best = self.bisect(best)
             distance = self.distance(best.goal)
@@ -156,9 +145,7 @@ class _Search:
             ball = goal + distance * _in_unit_ball(rng, num_candidates - num_candidates // 2)
             candidates = np.clip(np.concatenate([about, ball]), *box)
             is_nearer = np.linalg.norm(candidates - goal, axis=1) < distance
-            nearer = self.accepted(candidates[is_nearer])
-            if nearer is not None and self.distance(nearer.goal) < distance:
-                best = nearer
+            best = self.nearest((best, self.accepted(candidates[is_nearer]))) or best
         return best
 
     def bisect(self, best: GoalVerdict) -> GoalVerdict:
@@ -174,12 +161,6 @@ class _Search:
             else:
                 break
         return best
-
-
-def _on_grid(points: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Rounds points to the grid of candidates."""
-    # A multiple of the spacing differs in its last bits from the same number read from a text.
-    return np.round(np.round(points / resolution_m) * resolution_m, 9)
 
 
 def _in_unit_ball(rng: np.random.Generator, num_points: int) -> np.ndarray:

@@ -40,9 +40,7 @@ class Throw:
 
 def add_ball(plant: MultibodyPlant) -> ModelInstanceIndex:
     """Adds a ball to a plant that is not finalised."""
-    ball = "package://drake_safety_models/scenes/ball.sdf"
-    (instance,) = package_parser(plant).AddModels(url=ball)
-    return instance
+    return package_parser(plant).AddModels(url="package://drake_safety_models/scenes/ball.sdf")[0]
 
 
 class Ball:
@@ -94,16 +92,13 @@ class Ball:
             )
             if not distance < _TOUCH_M:
                 p = p + distance * direction
-        if not distance < _TOUCH_M:
-            self.park(context)
-            raise ValueError(f"throw: the line of flight of {throw} misses the robot")
         velocity = throw.speed_m_s * direction - _GRAVITY_W * lead_s
         start = p - velocity * lead_s - 0.5 * _GRAVITY_W * lead_s**2
-        if start[2] < self.radius_m:
+        is_hit = distance < _TOUCH_M
+        if not is_hit or start[2] < self.radius_m:
             self.park(context)
-            raise ValueError(
-                f"throw: a ball that arrives horizontally at {p[2]:.3f} m cannot fly for {lead_s} s"
-            )
+            fault = f"cannot fly for {lead_s} s to {p[2]:.3f} m" if is_hit else "misses the robot"
+            raise ValueError(f"throw: the ball of {throw} {fault}")
         self._plant.SetFreeBodyPose(context, self._body, RigidTransform(start))
         self._plant.SetFreeBodySpatialVelocity(
             context, self._body, SpatialVelocity(np.zeros(3), velocity)

@@ -58,21 +58,16 @@ def build_model(
     time_step_s: float,
     servos: bool,
 ) -> tuple[mujoco.MjModel, list[int]]:
-    """Compiles a robot and its scene.
+    """Compiles a robot and its scene; returns the model, and each control's place in the command.
 
     MuJoCo reads masses, inertias, joint frames, axes and stops from the URDF. Actuators, effort
     limits, collision shapes, friction coefficients and collision filters are those of the Drake
     plant. Other contact parameters are MuJoCo's defaults, with an elliptic friction cone.
-
-    Returns the model, and the index of each control in the command: joint positions and velocities
-    with servos, joint torques without.
     """
     mujoco = import_mujoco()
     path = model_file(robot.urdf, robot.source_dir, robot.requires)
     if path.suffix != ".urdf":
-        raise ValueError(
-            f"robot '{robot.name}': engine 'mujoco' reads models from URDF files; got '{path}'"
-        )
+        raise ValueError(f"robot '{robot.name}': engine 'mujoco' reads URDF files; got '{path}'")
     spec = mujoco.MjSpec.from_string(_mechanics(path.read_text(encoding="utf-8")))
     # Keeps the names of welded links, among which feet and hands may be.
     spec.compiler.fusestatic = False
@@ -82,17 +77,23 @@ def build_model(
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     # By default a failed simulation is reset without an error.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    roots = [body.name for body in spec.worldbody.bodies]
-    if robot.base not in roots:
-        raise ValueError(
-            f"robot '{robot.name}': engine 'mujoco' expects base '{robot.base}' to be the root of "
-            f"the model; roots are {roots}"
-        )
     spec.body(robot.base).add_freejoint()
     commands = _add_actuators(spec, plant, robot, variation, servos)
     _add_geometries(spec, plant, scene_graph, robot)
-    if variation.payload is not None:
-        _add_payload(spec, robot, variation)
+    if payload := variation.payload:
+        name = payload.body or robot.base
+        if (carrier := spec.body(name)) is None:
+            raise ValueError(f"robot '{robot.name}' has no body '{name}' for the payload")
+        # All masses are scaled after compiling; this cancels the payload's scale.
+        mass_kg = payload.mass_kg / variation.mass_scale
+        carrier.add_body(
+            name="payload",
+            pos=payload.position_m,
+            ipos=[0.0, 0.0, 0.0],
+            mass=mass_kg,
+            inertia=[0.4 * mass_kg * PAYLOAD_RADIUS_M**2] * 3,
+            explicitinertial=True,
+        )
     model = spec.compile()
     if variation.mass_scale != 1.0:
         model.body_mass *= variation.mass_scale
@@ -129,12 +130,10 @@ def _add_actuators(
         actuator = plant.get_joint_actuator(index)
         limits.setdefault(actuator.joint().name(), actuator.effort_limit())
     names = servo_joints(plant, robot)
-    commands = []
+    commands, kind_of_target = [], mujoco.mjtTrn.mjTRN_JOINT
 
     def add(kind: str, name: str, gain: float, bias: list[float], command: int) -> None:
-        actuator = spec.add_actuator(
-            name=f"{name}_{kind}", target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT
-        )
+        actuator = spec.add_actuator(name=f"{name}_{kind}", target=name, trntype=kind_of_target)
         actuator.gainprm[0] = gain
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         actuator.biasprm[:3] = bias
@@ -206,22 +205,3 @@ def _add_geometries(
             spec.add_exclude(bodyname1=name, bodyname2=other)
         elif any(filtered):
             raise ValueError(f"engine 'mujoco' cannot filter only some of '{name}' and '{other}'")
-
-
-def _add_payload(spec: mujoco.MjSpec, robot: RobotModel, variation: PlantVariation) -> None:
-    """Welds the variation's payload to its body."""
-    payload: Any = variation.payload
-    name = payload.body or robot.base
-    carrier = spec.body(name)
-    if carrier is None:
-        raise ValueError(f"robot '{robot.name}' has no body '{name}' for the payload")
-    # All masses are scaled after compiling; this cancels the payload's scale.
-    mass_kg = payload.mass_kg / variation.mass_scale
-    carrier.add_body(
-        name="payload",
-        pos=payload.position_m,
-        ipos=[0.0, 0.0, 0.0],
-        mass=mass_kg,
-        inertia=[0.4 * mass_kg * PAYLOAD_RADIUS_M**2] * 3,
-        explicitinertial=True,
-    )

@@ -29,13 +29,10 @@ class MujocoPlant(LeafSystem):
         input_ports: [command, applied_spatial_force (optional)]
         output_ports: [state, positions]
 
-    ``command`` has joint torques, or with ``servos`` the desired joint state ``[q; v]`` of
-    robot.yaml's servos, in the order of ``joint_names``. The other ports are those of a
-    MultibodyPlant.
-
-    The discrete state is MuJoCo's ``[qpos, qvel, qacc_warmstart]``, including the solver's warm
-    start, so that steps are deterministic. MuJoCo's free joint has the position before the
-    quaternion, and the origin's velocity in the world before the angular velocity in the *body*.
+    ``command`` has joint torques, or with ``servos`` the desired joint state ``[q; v]``, in the
+    order of ``joint_names``. The discrete state is MuJoCo's ``[qpos, qvel, qacc_warmstart]``, with
+    the solver's warm start, so that steps are deterministic. MuJoCo's free joint has the position
+    before the quaternion, and the origin's world velocity before the *body's* angular velocity.
     """
 
     def __init__(
@@ -118,10 +115,7 @@ class MujocoPlant(LeafSystem):
         command: np.ndarray,
         forces: Sequence[ExternallyAppliedSpatialForce] = (),
     ) -> np.ndarray:
-        """Computes MuJoCo's next state, or raises a `DivergenceError`.
-
-        Forces act during the step on bodies of the Drake plant.
-        """
+        """MuJoCo's next state, with forces on bodies of the Drake plant; or a `DivergenceError`."""
         if not (np.isfinite(state).all() and np.isfinite(command).all()):
             raise DivergenceError(f"robot '{self._robot.name}': MuJoCo cannot step from NaN")
         mujoco, model, scratch = self._mujoco, self.model, self._scratch.value
@@ -133,17 +127,12 @@ class MujocoPlant(LeafSystem):
             mujoco.mj_kinematics(model, scratch)
             mujoco.mj_comPos(model, scratch)
         for force in forces:
-            body = self._plant.get_body(force.body_index).name()
-            index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)
-            if index < 0:
-                raise ValueError(f"robot '{self._robot.name}': MuJoCo has no body '{body}' to push")
+            index = model.body(self._plant.get_body(force.body_index).name()).id
             point = scratch.xpos[index] + scratch.xmat[index].reshape(3, 3) @ force.p_BoBq_B
             f, tau = force.F_Bq_W.translational(), force.F_Bq_W.rotational()
             mujoco.mj_applyFT(model, scratch, f, tau, point, index, scratch.qfrc_applied)
         mujoco.mj_step(model, scratch)
-        kinds = (
-            getattr(mujoco.mjtWarning, f"mjWARN_BAD{part}") for part in ("QPOS", "QVEL", "QACC")
-        )
+        kinds = [getattr(mujoco.mjtWarning, f"mjWARN_BADQ{part}") for part in ("POS", "VEL", "ACC")]
         if any(scratch.warning[int(kind)].number for kind in kinds):
             mujoco.mj_resetData(model, scratch)
             raise DivergenceError(f"robot '{self._robot.name}': MuJoCo's simulation is unstable")
@@ -151,7 +140,7 @@ class MujocoPlant(LeafSystem):
 
     def set_state(self, context: Context, plant_state: np.ndarray) -> None:
         """Sets the state in this system's Context to Drake's ``[q; v]``, (n_q + n_v,)."""
-        context.SetDiscreteState(self.state_from(np.asarray(plant_state, dtype=float)))
+        context.SetDiscreteState(self.state_from(plant_state))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = context.get_discrete_state_vector().get_value()

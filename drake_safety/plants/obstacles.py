@@ -8,7 +8,6 @@ import numpy as np
 from pydantic import FiniteFloat
 from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context, DiagramBuilder
@@ -33,30 +32,25 @@ class Obstacle:
 
 def add_obstacles(plant: MultibodyPlant, obstacles: Iterable[Obstacle]) -> list[ModelInstanceIndex]:
     """Welds obstacles to the world of a plant that is not finalised; returns their models."""
-    parser = package_parser(plant)
-    return [_add_obstacle(plant, parser, obstacle) for obstacle in obstacles]
-
-
-def _add_obstacle(plant: MultibodyPlant, parser: Parser, obstacle: Obstacle) -> ModelInstanceIndex:
-    who, path = f"obstacle '{obstacle.model}'", model_file(obstacle.model)
-    if not (path.is_absolute() and path.is_file()):
-        raise ValueError(
-            f"{who}: model must be a package:// URL or the absolute path of an existing file"
-        )
-    check_meshes(path)
-    try:
-        instance, *others = parser.AddModels(str(path))
-    except RuntimeError as error:
-        raise ValueError(f"{who}: {error}") from error
-    joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
-    held = {joint.child_body().index() for joint in joints}
-    roots = [i for i in plant.GetBodyIndices(instance) if i not in held]
-    if others or len(roots) != 1 or any(joint.num_velocities() for joint in joints):
-        raise ValueError(f"{who}: expected one model with one root link, without moving joints")
-    R_WO = RotationMatrix.MakeZRotation(obstacle.yaw_rad)
-    X_WO = RigidTransform(R_WO, obstacle.position)
-    plant.WeldFrames(plant.world_frame(), plant.get_body(roots[0]).body_frame(), X_WO)
-    return instance
+    parser, instances = package_parser(plant), []
+    for obstacle in obstacles:
+        who, path = f"obstacle '{obstacle.model}'", model_file(obstacle.model)
+        if not (path.is_absolute() and path.is_file()):
+            raise ValueError(f"{who}: model must be a package:// URL or an absolute path of a file")
+        check_meshes(path)
+        try:
+            instance, *others = parser.AddModels(str(path))
+        except RuntimeError as error:
+            raise ValueError(f"{who}: {error}") from error
+        joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
+        held = {joint.child_body().index() for joint in joints}
+        roots = [i for i in plant.GetBodyIndices(instance) if i not in held]
+        if others or len(roots) != 1 or any(joint.num_velocities() for joint in joints):
+            raise ValueError(f"{who}: expected one model with one root link, without moving joints")
+        X_WO = RigidTransform(RotationMatrix.MakeZRotation(obstacle.yaw_rad), obstacle.position)
+        plant.WeldFrames(plant.world_frame(), plant.get_body(roots[0]).body_frame(), X_WO)
+        instances.append(instance)
+    return instances
 
 
 def collision_geometries(
@@ -74,11 +68,8 @@ def collision_geometries(
 def arm_geometries(plant: MultibodyPlant, robot: RobotModel) -> list[GeometryId]:
     """Returns the collision geometries of all bodies moved by joints of reaching frames."""
     instance = plant.GetModelInstanceByName(robot.name)
-    joints = [
-        plant.GetJointByName(name, instance).index()
-        for frame in robot.reaching_frames.values()
-        for name in frame.joints
-    ]
+    names = [name for frame in robot.reaching_frames.values() for name in frame.joints]
+    joints = [plant.GetJointByName(name, instance).index() for name in names]
     bodies = plant.GetBodiesKinematicallyAffectedBy(joints)
     return [g for b in bodies for g in plant.GetCollisionGeometriesForBody(plant.get_body(b))]
 
@@ -94,11 +85,10 @@ def filter_collisions(
     everything = collision_geometries(plant, [plant.GetModelInstanceByName(robot.name)])
     rest = [geometry for geometry in everything if geometry not in set(arms)]
     ground = plant.GetCollisionGeometriesForBody(plant.world_body())
+    others = collision_geometries(plant, obstacles)
     declaration = CollisionFilterDeclaration()
     declaration.ExcludeWithin(GeometrySet(everything))
-    declaration.ExcludeBetween(
-        GeometrySet(rest), GeometrySet(collision_geometries(plant, obstacles))
-    )
+    declaration.ExcludeBetween(GeometrySet(rest), GeometrySet(others))
     declaration.ExcludeBetween(GeometrySet(arms), GeometrySet(ground))
     scene_graph.collision_filter_manager().Apply(declaration)
 
@@ -130,10 +120,7 @@ class Clearance:
         self._scratch = Scratch(lambda: self._contexts_of(diagram.CreateDefaultContext()))
         self._obstacles = set(collision_geometries(self._plant, instances))
         if self._obstacles and not arm_geometries(self._plant, robot):
-            raise ValueError(
-                f"robot '{robot.name}': its arms have no collision geometry, so their distance to "
-                "obstacles is unknown"
-            )
+            raise ValueError(f"robot '{robot.name}': its arms have no collision geometry")
         self.range_m = range_m
 
     def _contexts_of(self, root: Context) -> tuple[Context, Context, Context]:
@@ -158,9 +145,8 @@ class Clearance:
         """Distance of spheres at p_WP, (N, 3) [m], to the nearest obstacle, (N,) [m]."""
         query, range_m = self._query_port.Eval(self._scratch.value[2]), self.range_m + radius_m
         distances = np.full(len(p_WP), range_m)
-        if self._obstacles:
-            for i, p in enumerate(p_WP):
-                for near in query.ComputeSignedDistanceToPoint(p, range_m):
-                    if near.id_G in self._obstacles:
-                        distances[i] = min(distances[i], near.distance)
+        for i, p in enumerate(p_WP if self._obstacles else ()):
+            for near in query.ComputeSignedDistanceToPoint(p, range_m):
+                if near.id_G in self._obstacles:
+                    distances[i] = min(distances[i], near.distance)
         return distances - radius_m

@@ -1,7 +1,6 @@
 """The plant of a diagram, with the same interface for every physics engine.
 
-The task defines the scene, the plant variation the engine. With another engine than Drake's, a
-Drake plant still describes bodies, joints and shapes, for rendering and geometry poses.
+With MuJoCo, a Drake plant still describes bodies, joints and shapes, for rendering.
 """
 
 from __future__ import annotations
@@ -55,7 +54,6 @@ class Scene:
     decorations: Sequence[Obstacle] = ()
     """Models without collision geometry."""
     has_ball: bool = False
-    """Whether the scene has a ball to throw."""
 
 
 class DrakePhysics:
@@ -158,8 +156,6 @@ class MujocoPhysics:
 
 
 Physics = DrakePhysics | MujocoPhysics
-ENGINES_WITH_BALLS = ("drake",)
-"""Engines that can simulate a thrown ball."""
 
 
 def add_physics(
@@ -183,9 +179,7 @@ def add_physics(
         instance, ball = _add_robot_and_scene(plant, scene_graph, robot, variation, scene, servos)
         return DrakePhysics(plant, scene_graph, instance, robot, variation, ball)
     if scene.has_ball:
-        raise ValueError(
-            "engine 'mujoco' has no ball to throw: pass ball=False, or set the share of pushes to 0"
-        )
+        raise ValueError("engine 'mujoco' has no ball to throw: pass ball=False")
     if variation.shift is not None:
         raise ValueError("engine 'mujoco' has no shifts; simulate them by engine 'drake'")
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
@@ -216,15 +210,12 @@ def _add_holes(
 ) -> None:
     """Lowers the ground under some feet."""
     if unknown := [name for name in depths_m if name not in robot.feet]:
-        raise ValueError(
-            f"robot '{robot.name}' has no foot '{unknown[0]}' for a hole; it has {list(robot.feet)}"
-        )
-    world, material, holes = plant.world_body(), CoulombFriction(friction, friction), {}
+        raise ValueError(f"robot '{robot.name}' has no feet {unknown} for holes")
+    material, holes = CoulombFriction(friction, friction), {}
     for name, depth_m in depths_m.items():
-        X_WH = RigidTransform([0.0, 0.0, -depth_m])
-        holes[robot.feet[name].body] = plant.RegisterCollisionGeometry(
-            world, X_WH, HalfSpace(), f"hole_{name}", material
-        )
+        hole = RigidTransform([0.0, 0.0, -depth_m]), HalfSpace(), f"hole_{name}", material
+        body = robot.feet[name].body
+        holes[body] = plant.RegisterCollisionGeometry(plant.world_body(), *hole)
     # After the registrations, which invalidate earlier lists of identifiers.
     everything = plant.GetCollisionGeometriesForBody(plant.world_body())
     ground = [geometry for geometry in everything if geometry not in holes.values()]
@@ -269,14 +260,8 @@ def _add_robot_and_scene(
     decorations = add_obstacles(plant, scene.decorations)
     plant.Finalize()
     require_motors(plant, robot)
-    if touchable := [
-        decoration.model
-        for decoration, model in zip(scene.decorations, decorations, strict=True)
-        if collision_geometries(plant, [model])
-    ]:
-        raise ValueError(
-            f"decorations {touchable} have collision geometry; list them under 'obstacles'"
-        )
+    if collision_geometries(plant, decorations):
+        raise ValueError("decorations with collision geometry belong under 'obstacles'")
     if scene.obstacles is not None:
         filter_collisions(plant, scene_graph, robot, obstacles)
     return instance, ball
