@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 SHOWN_FORMATS = (".gltf", ".obj", ".vtk")
 """Formats that Drake renders."""
 CACHE_VARIABLE = "DRAKE_SAFETY_CACHE"
-"""Environment variable with the cache's folder."""
 _TRANSPARENCY = re.compile(r"^\s*Tr\s+(\d+\.?\d*)\s*$", re.MULTILINE)  # In an MTL file.
 _BARE_FACE = re.compile(r"^\s*f\s(?:.*\s)?-?\d+(?:/-?\d*)?(?=\s|$)", re.MULTILINE)
 """A corner without a normal in an OBJ file, which Drake's renderer refuses."""
@@ -70,13 +69,13 @@ def _obj_fault(content: bytes) -> str:
     points = [line[1:4] for line in lines if line[:1] == [b"v"]]
     faces = (line[1:] for line in lines if line[:1] == [b"f"])
     corners = [corner.split(b"/")[0] for face in faces for corner in face]
-    index = np.array(corners or [b"0"], dtype=float)
     if not np.isfinite(np.array(points, dtype=float)).all():
         return "has a vertex that is not three finite numbers"
+    index = np.array(corners, dtype=float)
     wrong = index[(index == 0) | (np.abs(index) > len(points))]
-    if not corners:
-        return "has no faces"
-    return f"has {len(points)} vertices and a face of vertex {wrong[0]:.0f}" if len(wrong) else ""
+    if len(wrong):
+        return f"has {len(points)} vertices and a face of vertex {wrong[0]:.0f}"
+    return "" if corners else "has no faces"
 
 
 def _gltf_fault(content: bytes) -> str:
@@ -119,17 +118,11 @@ def shown_mesh(path: Path, rgba: str = "") -> Path:
         return path
     if not path.is_file():
         raise ValueError(f"mesh '{path}' does not exist")
-    digest = _digest(path, path.stat().st_mtime_ns, rgba)
+    digest = hashlib.sha256(_VERSION + rgba.encode() + path.read_bytes()).hexdigest()
     target = cache_folder() / "meshes" / f"{path.stem}-{digest[:16]}.gltf"
     if not target.is_file():
         write_file(target, _to_gltf(path, rgba))  # Other processes may read the cache.
     return target
-
-
-@lru_cache(maxsize=1024)
-def _digest(path: Path, changed_ns: int, rgba: str) -> str:
-    del changed_ns  # Part of the cache key only.
-    return hashlib.sha256(_VERSION + rgba.encode() + path.read_bytes()).hexdigest()
 
 
 def mesh_points(path: Path) -> np.ndarray:
@@ -193,11 +186,10 @@ def _to_gltf(path: Path, rgba: str) -> bytes:
     if path.suffix.lower() in (".stl", ".obj") and not is_coloured:
         colour = [float(value) for value in rgba.split()] or _GREY
         for mesh in scene.geometry.values():
-            mesh.visual = trimesh.visual.TextureVisuals(
-                material=trimesh.visual.material.PBRMaterial(
-                    baseColorFactor=colour, metallicFactor=0.0, roughnessFactor=0.8
-                )
+            material = trimesh.visual.material.PBRMaterial(
+                baseColorFactor=colour, metallicFactor=0.0, roughnessFactor=0.8
             )
+            mesh.visual = trimesh.visual.TextureVisuals(material=material)
     # In glTF the y axis points up; Drake rotates it back to z.
     scene.apply_transform(_X_ZY.T)
     export = trimesh.exchange.gltf.export_gltf

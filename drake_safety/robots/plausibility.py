@@ -47,19 +47,14 @@ def odd_inertias(plant: MultibodyPlant, context: Context, instance: ModelInstanc
         radius = math.sqrt(max(*G_BBcm.CalcPrincipalMomentsOfInertia(), 0.0))
         is_large = radius > size and mass * radius**2 > _MATTERS * total * size**2
         if is_large or (radius < _POINT * size and mass > 0.01 * total):
-            odd.append(
-                f"'{body.name()}' {mass * radius**2:.3g} kg·m² at {mass:.3g} kg, a radius of "
-                f"gyration of {radius:.2g} m"
-            )
+            what = f"{mass * radius**2:.3g} kg·m² at {mass:.3g} kg"
+            odd.append(f"'{body.name()}' {what}, a radius of gyration of {radius:.2g} m")
         if away > 2 * size:
             remarks.append(f"the centre of mass of link '{body.name()}' is {away:.3g} m from it")
     if odd:
         few = "; ".join(odd[:_NUM_LISTED]) + " ..." * (len(odd) > _NUM_LISTED)
-        remarks.insert(
-            0,
-            f"{len(odd)} links have inertias that no body of a robot of {size:.2g} m has (kg·mm² "
-            f"or g·mm² instead of kg·m²?): {few}",
-        )
+        what = f"inertias that no body of a robot of {size:.2g} m has (kg·mm² instead of kg·m²?)"
+        remarks.insert(0, f"{len(odd)} links have {what}: {few}")
     if not _AIR_KG_M3 < total / size**3 < _LEAD_KG_M3:
         remarks.append(f"no robot of {size:.2g} m has {total:.3g} kg (grams or tonnes?)")
     return "; ".join(remarks)
@@ -75,13 +70,10 @@ def odd_limits(
     size, mass = extent(plant, context, instance), plant.CalcTotalMass(context, [instance])
     odd = dict[str, str]()
     for joint in map(plant.get_joint, plant.GetJointIndices(instance)):
-        if joint.num_velocities() != 1:
-            continue
-        name, unit = joint.name(), effort_unit(joint)
+        unit, effort = effort_unit(joint), efforts.get(joint.name(), math.inf)
         most = (_MOST_FORCE if unit == "N" else _MOST_TORQUE * size) * GRAVITY_M_S2 * mass
-        effort = efforts.get(name, math.inf)
-        if most < effort < math.inf:
-            odd[name] = f"{effort:g} {unit}, at most {most:.3g} expected"
+        if joint.num_velocities() == 1 and most < effort < math.inf:
+            odd[joint.name()] = f"{effort:g} {unit}, at most {most:.3g} expected"
     few = listed(dict([*odd.items()][:_NUM_LISTED])) + " ..." * (len(odd) > _NUM_LISTED)
     what = f"limits that no motor of a robot of {mass:.3g} kg and {size:.2g} m has (placeholders?)"
     return set(odd), f"{len(odd)} joints have {what}: {few}" if odd else ""
