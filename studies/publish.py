@@ -10,6 +10,7 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections.abc import Mapping
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -117,7 +118,7 @@ def ship(
     with open_stages() as stages:
         results.entries |= {
             "calibrations": {
-                mode: [calibration.to_json() for calibration in one.calibrations_.values()]
+                mode: [asdict(calibration) for calibration in one.calibrations_.values()]
                 for mode, one in learned.items()
             },
             _VERDICTS: first_verdicts(

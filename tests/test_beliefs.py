@@ -47,8 +47,8 @@ def test_fusion_is_the_printed_products_and_ignores_empty_beliefs_and_the_order(
         ([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.0, 0.999, 0.001]], [0.75, 0.25, 0.0]),
         # A nearly certain one does not overflow.
         ([[1.0, 0.0, 1e-300], [0.0, 0.5, 0.5]], [1.0, 0.0, 0.0]),
-        (empty(0, 2), empty((), 2)),
-        (empty(4), EMPTY),
+        (empty((0,), 2), empty((), 2)),
+        (empty((4,)), EMPTY),
     ],
 )
 def test_fused_beliefs_worked_by_hand(beliefs, expected):

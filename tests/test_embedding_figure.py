@@ -22,9 +22,11 @@ class StandIn:
         self.grid_ = Grid(resolution=6, cell_length=0.1)
         segments = split(episodes, stride=1, discount=0.99)
         points = segments.state[None, :, :2]
-        self.training_ = TrainingScores(points=points, score=segments.score, cause=segments.cause)
         masses = from_scores(segments.score, 0.3, segments.cause, 2)
         cells = self.grid_.locate(points[0])
+        count = np.bincount(cells[cells >= 0], minlength=36)[None]
+        scores = {"score": segments.score, "cause": segments.cause, "count": count}
+        self.training_ = TrainingScores(points=points, **scores)
         self.beliefs_ = fuse_cells(masses, cells, num_cells=36, min_count=5)[None]
 
     def predict(self, state, desired_preview, features):

@@ -99,7 +99,7 @@ CASES = {
     AssessmentParameters: {
         "discount: .nan": "'discount' must be .*; got nan",
         "hidden_sizes: [0]": r"'hidden_sizes\.0' must be greater .* 1; got 0",
-        "shortest_segment: 11": "shortest_segment must not exceed horizon 10",
+        "shortest_segment: 11": "shortest_segment 11 exceeds the horizon",
         "adaptation: {update_interval: 0}": "update_interval' must be gr",
     },
     Calibration: {"kind: walk": "'kind' must be 'plan' or 'motion'; got 'walk'"},

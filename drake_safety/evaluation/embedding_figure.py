@@ -33,7 +33,8 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
     It shows the first map of an ensemble, and causes if two of them have 5 % of what is unsafe.
     """
     cells, grid = assessment.beliefs_[0], assessment.grid_
-    count = assessment.training_.counts(grid)[0]
+    assert assessment.training_.count is not None
+    count = assessment.training_.count[0]
     unsafe = (count[:, None] * cells[:, 3:]).sum(axis=0)  # By cause; see `learning.beliefs`.
     has_causes = (unsafe >= _LEAST_CAUSE * unsafe.sum()).sum() > 1
     with style.drawing_style():

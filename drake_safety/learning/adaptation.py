@@ -74,10 +74,7 @@ class DiscrepancyFunction:
         self._process: Any = process.fit(points, difference)
 
     def predict(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predicts the mean m, clipped to [0, 1], and sigma without noise at points (M, 2).
-
-        Where a point is not finite, they are the prior's 0 and 1.
-        """
+        """Predicts m in [0, 1] and sigma without noise, (M,) each; 0 and 1 where not finite."""
         mean, deviation = np.zeros(len(points)), np.ones(len(points))
         rows = np.flatnonzero(np.isfinite(points).all(axis=1))
         for start in range(0, len(rows), _CHUNK):

@@ -70,37 +70,23 @@ class SafetyAssessment:
     the maps learn safety and future margins beside t-SNE's points from every start row, Γ is
     interpolated bilinearly between cell centres, and it is the mean of an ensemble of maps, each
     with its own grid. The "paper" mode is the literal reading, for comparison.
-
-    Attributes:
-        info_: Metadata of the training episodes.
-        columns_: The columns of x.
-        embedding_: The maps Psi.
-        detector_: A monitor's detector of a changed plant or sensor.
-        beliefs_: The beliefs of every map's cells, (K, R*R, 3 + n_c).
-        training_: Scores of training segments, from which adaptation starts.
-        base_logit_: The logit of the maps' heads and the trees; None in the paper's mode.
-        trees_: The trees beside the maps; None where none are learned.
-        fall_logit_: The logit of a fall, of `fit_falls`; None before.
-        correction_: What feedback adds to the base logit; initially zero.
-        used_: Episodes of training, calibration and adaptation; evaluation needs others.
-        calibrations_: Calibrations by kind for these maps and `beliefs_`; initially empty.
     """
 
-    info_: EpisodesInfo
+    info_: EpisodesInfo  # Of the training episodes.
     grid_: Grid
     columns_: InputColumns
     embedding_: Embedding
     detector_: ChangeDetector
-    beliefs_: np.ndarray
-    training_: TrainingScores
+    beliefs_: np.ndarray  # Of every map's cells, (K, R*R, 3 + n_c).
+    training_: TrainingScores  # Of training segments, from which adaptation starts.
     novelty_: Novelty
-    base_logit_: BaseLogit | None
+    base_logit_: BaseLogit | None  # None in the paper's mode.
     trees_: Trees | None
-    fall_logit_: FallLogit | None
-    correction_: Correction
+    fall_logit_: FallLogit | None  # Of `fit_falls`.
+    correction_: Correction  # What feedback adds to the base logit.
     adaptation_: Adaptation | None
-    used_: list[UsedEpisodes]
-    calibrations_: dict[str, Calibration]
+    used_: list[UsedEpisodes]  # Evaluation needs other episodes.
+    calibrations_: dict[str, Calibration]  # By kind.
 
     def __init__(self, parameters: AssessmentParameters | None = None):
         # A copy, so that later changes of a scenario do not change a trained assessment.
@@ -138,11 +124,9 @@ class SafetyAssessment:
     ) -> SafetyAssessment:
         """Learns embedding and beliefs from nominal episodes.
 
-        Args:
-            progress: Called with a stage, the percentage done and 100; True shows it.
-            detector: A detector that has learned undisturbed motion.
-            motions: Long undisturbed motions of the same diagram, from which else the detector is
-                learned; by default the episodes, whose motion rarely suffices for its limits.
+        Without a detector it learns one from long undisturbed motions of the same diagram; without
+        them from the episodes, whose motion rarely suffices for its limits. `progress` is called
+        with a stage, the percentage done and 100; True shows it.
         """
         require_extra("train", "SafetyAssessment.fit")
         self.parameters.check()
@@ -210,9 +194,8 @@ class SafetyAssessment:
     def fit_falls(self, episodes: Episodes, features: Sequence[str]) -> SafetyAssessment:
         """Fits the probability of a fall to episodes that go on after they leave the safe set.
 
-        Args:
-            episodes: Episodes of unused seeds whose unsafe end is a fall.
-            features: Features that it reads beside predicted margins and base logit.
+        Their seeds are unused and their unsafe end is a fall; `features` are read beside predicted
+        margins and base logit.
         """
         require_extra("train", "SafetyAssessment.fit_falls", "sklearn")
         model, names = self.model, self.columns_.names
@@ -247,9 +230,8 @@ class SafetyAssessment:
         sharpened, base logit and training scores are recalibrated. Every adaptation starts from the
         nominal episodes, as F is not associative: pass all feedback, not only the new pairs.
 
-        Args:
-            motions: Motion of the actual robot that the monitor is to know as well, or its rows
-                (state, desired preview, features), (K, n) each, as far apart as in its training.
+        `motions` of the actual robot, which the monitor is to know as well, may be rows (state,
+        desired preview, features), (K, n) each, as far apart as in its training.
         """
         require_extra("train", "SafetyAssessment.adapt", "sklearn")
         model, columns, parameters = self.model, self.columns_, self.parameters
@@ -263,8 +245,10 @@ class SafetyAssessment:
         rows = [pair.rows for pair in feedback]
         x = np.concatenate([columns.of(r.state, r.desired_preview, r.features) for r in rows])
         adapted.novelty_ = self.novelty_.with_feedback(x, parameters.novelty_rate)
+        if isinstance(motions, Episodes):
+            motions = self._monitored_rows(motions)
         if motions is not None:
-            adapted.detector_ = self._detector_with(motions)
+            adapted.detector_ = self.detector_.with_motions(motions)
         # The thresholds' promises hold for the old beliefs only.
         adapted.calibrations_ = {}
         adapted._replace_used("adaptation", used)
@@ -286,9 +270,7 @@ class SafetyAssessment:
         )
         return adapted
 
-    def _detector_with(self, motions: Episodes | Sequence[np.ndarray]) -> ChangeDetector:
-        if not isinstance(motions, Episodes):
-            return self.detector_.with_motions(motions)
+    def _monitored_rows(self, motions: Episodes) -> list[np.ndarray]:
         step_s, trained_step_s = motions.info.step_s, self.detector_.step_s
         stride = round(trained_step_s / step_s)
         if not math.isclose(stride * step_s, trained_step_s):
@@ -296,7 +278,7 @@ class SafetyAssessment:
                 f"{self._who}: rows of the motions are {step_s} s apart, which does not divide the "
                 f"{trained_step_s} s of the monitor's training"
             )
-        return self.detector_.with_motions([rows[::stride] for rows in usual_rows(motions)])
+        return [rows[::stride] for rows in usual_rows(motions)]
 
     def _replace_used(self, purpose: str, used: Sequence[UsedEpisodes]) -> None:
         self.used_ = [*(kept for kept in self.used_ if kept.purpose != purpose), *used]
@@ -343,7 +325,7 @@ class SafetyAssessment:
         Args:
             state: Measured states, (N, n_s).
             desired_preview: Desired outputs over the horizon, row-major in time, (N, H*n_z).
-            features: Features, (N, n_f); ignored in the paper's mode.
+            features: (N, n_f); ignored in the paper's mode.
             **learned: `beliefs`, `correction` or `novelty` in place of the assessment's own.
         """
         return self._predict(self._checked_inputs(2, state, desired_preview, features), **learned)
@@ -383,10 +365,7 @@ class SafetyAssessment:
     def strangest_input(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> tuple[str, float]:
-        """Returns the entry of x that contradicts the others most, and by how much.
-
-        The difference is in standard deviations of training.
-        """
+        """Returns the entry of x that contradicts the others most, and by how much [std dev]."""
         difference = self.novelty_.contradictions(self.inputs_of(state, desired_preview, features))
         column = int(np.argmax(np.abs(difference)))
         return self.columns_.names[column], float(difference[column])

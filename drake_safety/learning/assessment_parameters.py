@@ -18,8 +18,7 @@ from drake_safety.files.schema import (
 from drake_safety.learning.distance import Backend
 
 Widths = Annotated[list[Annotated[int, Field(ge=1, le=10_000)]], Field(min_length=1)]
-MOST_SAMPLES = 10_000
-"""Largest horizon, for which names and previews are made."""
+MOST_SAMPLES = 10_000  # Largest horizon, for which names and previews are made.
 
 
 @schema(kw_only=True)
@@ -47,8 +46,7 @@ class AdaptationParameters:
 class PaperReading:
     """What the paper leaves open about its segments, its input x and its map Psi.
 
-    The defaults are the readings with the highest held-out accuracy on the robots, see
-    docs/paper.md.
+    The defaults have the highest held-out accuracy on the robots, see docs/paper.md.
 
     Attributes:
         stride: Samples between the starts of segments; 0 means H, segments that do not overlap.
@@ -82,14 +80,13 @@ class AssessmentParameters:
         min_count: k_min, beliefs below which a cell stays empty.
         resolution: Number of cells per side of the grid.
         cell_length: Side of a cell.
-        distance_backend: Implementation of dynamic time warping: "dtaidistance", or "tslearn",
-            which gives the same values in about twenty times the time.
+        distance_backend: "dtaidistance", or "tslearn", with the same values in twenty times the
+            time.
         perplexity: Effective number of neighbours in t-SNE.
         candidates_per_neighbour: Segments among which each of t-SNE's neighbours is sought, those
             with the smallest bounds of Omega; 0 for all segments, with the cost N².
         exaggeration: Factor of t-SNE's attraction after its early phase; 1 is plain t-SNE.
-        novelty_rate: Share of safe episodes, and of first inputs of all, in which an input may
-            exceed a limit of novelty, see `novelty.Novelty`.
+        novelty_rate: Share of episodes in which an input may exceed a limit of novelty.
         novelty_range: Largest distance of a known input's column from the centre of its range in
             training [half widths]; larger for a robot that sags more than training's rows do.
         seed: Seed of t-SNE and of the maps.
@@ -103,12 +100,11 @@ class AssessmentParameters:
         dropout: Dropout rate (sharpened).
         margin_unit: Margin that counts as one in the Huber loss [m] (sharpened).
         margin_range: Range margins are clipped to, [lowest, highest] [m] (sharpened).
-        first_row_weight: Weight of an episode's first segment relative to the others, for verdicts
-            at planning time (sharpened).
+        first_row_weight: Weight of an episode's first segment, for verdicts on plans (sharpened).
         shortest_segment: Least number of samples of a safe episode's segment, for episodes that end
             at rest; 0 means the whole horizon (sharpened).
-        raw_input_scale: Spread of state and preview as a map's inputs, where features have spread
-            one (sharpened). A small scale prevents overfitting to them if the features suffice.
+        raw_input_scale: Spread of state and preview as inputs, where features have spread one; a
+            small one prevents overfitting to them if the features suffice (sharpened).
         feature_unit: Features enter a second time as asinh(f / feature_unit), which resolves
             margins near zero [unit of the features]; 0 disables it (sharpened).
     """
@@ -147,10 +143,7 @@ class AssessmentParameters:
 
     def __post_init__(self) -> None:
         if self.shortest_segment > self.horizon:
-            raise ValueError(
-                f"shortest_segment must not exceed horizon {self.horizon}; got "
-                f"{self.shortest_segment}"
-            )
+            raise ValueError(f"shortest_segment {self.shortest_segment} exceeds the horizon")
 
     def check(self) -> None:
         """Checks all values, which may have been set since the construction."""

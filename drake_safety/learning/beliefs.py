@@ -8,18 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 
-SAFE, UNSAFE, UNCERTAINTY = 0, 1, 2
-"""Columns of a belief; the columns from 3 on split `UNSAFE` by cause."""
-
-EMPTY = np.array([0.0, 0.0, 1.0])
-"""The empty belief B_0 = (0, 0, 1): no safety estimate can be made."""
+SAFE, UNSAFE, UNCERTAINTY = 0, 1, 2  # Columns; those from 3 on split `UNSAFE` by cause.
+EMPTY = np.array([0.0, 0.0, 1.0])  # B_0: no safety estimate can be made.
 EMPTY.setflags(write=False)
 
 
-def empty(shape: int | tuple[int, ...], num_causes: int = 0) -> np.ndarray:
+def empty(shape: tuple[int, ...], num_causes: int = 0) -> np.ndarray:
     """Empty beliefs, (*shape, 3 + num_causes)."""
-    leading = (shape,) if isinstance(shape, int) else shape
-    beliefs = np.zeros((*leading, 3 + num_causes))
+    beliefs = np.zeros((*shape, 3 + num_causes))
     beliefs[..., UNCERTAINTY] = 1.0
     return beliefs
 
@@ -37,11 +33,9 @@ def from_scores(
     cause: np.ndarray | None = None,
     num_causes: int = 0,
 ) -> np.ndarray:
-    """Converts unsafety scores lambda (N,) to beliefs, (N, 3 + n_c).
+    """Converts unsafety scores lambda (N,) and mu, scalar or (N,), to beliefs, (N, 3 + n_c).
 
-    Args:
-        uncertainty: mu in [0, 1], scalar or (N,).
-        cause: Column of the constraint that each unsafe mass is assigned to, -1 for none, (N,).
+    `cause` is the column of the constraint that each unsafe mass is assigned to, -1 for none.
     """
     score = np.asarray(score, dtype=float)
     uncertainty = np.broadcast_to(np.asarray(uncertainty, dtype=float), score.shape)
@@ -85,10 +79,9 @@ def fuse_cells(
     min_count: int,
     multiplicity: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Fuses the beliefs in every grid cell jointly, (V, 3 + n_c).
+    """Fuses the beliefs (N, 3 + n_c) in every grid cell jointly, (V, 3 + n_c).
 
     Args:
-        beliefs: Beliefs, (N, 3 + n_c).
         cells: Cell of each belief, -1 for outside, (N,).
         min_count: k_min, the number of beliefs below which a cell stays empty.
         multiplicity: Number of equal beliefs that each stands for, (N,); one by default.
@@ -109,7 +102,7 @@ def fuse_cells(
     weight = times * (1.0 - uncertainty) * ratio
     total = np.bincount(cells, weights=weight, minlength=num_cells)
 
-    fused = empty(num_cells, num_columns - 3)
+    fused = empty((num_cells,), num_columns - 3)
     # Eq. (compute_prior_estmate_bba): k_v >= k_min as in the equation; the paper's text has >.
     is_filled = (count >= min_count) & (total > 0.0)
     divisor = np.where(is_filled, total, 1.0)
@@ -127,18 +120,12 @@ def fuse_cells(
 
 
 def average_cells(beliefs: np.ndarray, cells: np.ndarray, uncertainty: np.ndarray) -> np.ndarray:
-    """Applies G: averages the certain beliefs in every grid cell and sets the cell's uncertainty.
-
-    Args:
-        beliefs: Beliefs, mu = 0, (N, 3 + n_c).
-        cells: Cell of each belief, -1 for outside, (N,).
-        uncertainty: mu of each cell, (V,).
-    """
+    """Applies G: averages the certain beliefs in every grid cell, and sets its uncertainty (V,)."""
     num_cells, num_columns = len(uncertainty), beliefs.shape[1]
     is_inside = cells >= 0
     beliefs, cells = beliefs[is_inside], cells[is_inside]
     count = np.bincount(cells, minlength=num_cells)
-    averaged = empty(num_cells, num_columns - 3)
+    averaged = empty((num_cells,), num_columns - 3)
     is_filled = count > 0
     known = (1.0 - uncertainty[is_filled]) / count[is_filled]
     for column in range(num_columns):

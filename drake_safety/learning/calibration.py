@@ -12,8 +12,7 @@ Both rules use one class alone and hold for any share of unsafe episodes.
 """
 
 import math
-from dataclasses import asdict
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -22,7 +21,6 @@ from drake_safety.files.schema import Share, schema
 from drake_safety.learning.segments import Segments, floats
 
 SAFE, UNSAFE, UNKNOWN = "safe", "unsafe", "don't know"
-"""The verdicts."""
 Kind = Literal["plan", "motion"]
 """Score of an episode: that of its first row, at planning time, or that of its worst row."""
 PLAN: Kind = "plan"
@@ -40,19 +38,13 @@ class Calibration:
     """Two thresholds of the probability, and their promised rates.
 
     The verdict is "safe" for a probability of at least `threshold`, "unsafe" for one below
-    `unsafe_below`, and "don't know" in between.
-
-    Attributes:
-        miss_rate: Promised share of unsafe episodes with the verdict "safe".
-        false_alarm_rate: Promised share of safe episodes with the verdict "unsafe".
-        confidence: Confidence of both rates for this calibration set; None for rates on average.
-        variation: The plant of the episodes, for which alone the rates are promised.
+    `unsafe_below`, and "don't know" in between. The rates are promised for the plant `variation`.
     """
 
     kind: Kind
-    miss_rate: Share
-    false_alarm_rate: Share
-    confidence: Share | None
+    miss_rate: Share  # Promised share of unsafe episodes with the verdict "safe".
+    false_alarm_rate: Share  # Promised share of safe episodes with the verdict "unsafe".
+    confidence: Share | None  # For this calibration set; None for rates on average.
     threshold: _Threshold
     unsafe_below: _Threshold
     num_unsafe: _Number
@@ -81,8 +73,8 @@ class Calibration:
     @property
     def origin(self) -> str:
         """Where the thresholds come from, in words."""
-        num_episodes = self.num_unsafe + self.num_safe
-        return f"calibrated on {num_episodes} episodes for a promised miss rate: {self.promise}"
+        number = self.num_unsafe + self.num_safe
+        return f"calibrated on {number} episodes for a promised miss rate: {self.promise}"
 
     def verdicts(self, safety_probability: np.ndarray) -> np.ndarray:
         """Returns the verdicts for probabilities (N,) as strings; "don't know" for NaN."""
@@ -91,10 +83,6 @@ class Calibration:
         verdicts[probability >= self.threshold] = SAFE
         verdicts[probability < self.unsafe_below] = UNSAFE
         return verdicts
-
-    def to_json(self) -> dict[str, Any]:
-        """Returns the fields as JSON values."""
-        return asdict(self)
 
 
 def calibrate(
@@ -109,11 +97,9 @@ def calibrate(
     scenario_hash: str = "",
     variation: str = "nominal",
 ) -> Calibration:
-    """Chooses both thresholds on episodes that were not used for training.
+    """Chooses both thresholds on episodes that were not used for training, by scores (N,).
 
-    Args:
-        unsafe_score: 1 - probability of each episode, (N,); NaN counts as most unsafe.
-        is_unsafe: Whether each episode ended unsafely, (N,).
+    A score is 1 - probability; NaN counts as most unsafe.
     """
     score, label = _checked(unsafe_score, is_unsafe)
     above = score_threshold(score, label, miss_rate, confidence=confidence)
@@ -145,10 +131,9 @@ def score_threshold(
     confidence: float | None = None,
     whose: str = "unsafe",
 ) -> float:
-    """Returns the highest score with the verdict "safe".
+    """Returns the highest score with the verdict "safe", between the k-th and the next lower one.
 
-    It is the midpoint between the k-th lowest unsafe score and the next lower score of either
-    label; without a lower score, just below the k-th lowest.
+    The k-th lowest is of the unsafe scores, the next lower one of either label.
     """
     score, label = _checked(unsafe_score, is_unsafe)
     if not np.isfinite(score).any():
@@ -202,8 +187,7 @@ def episode_scores(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reduces unsafe scores of segments (N,), from every row, to score and label of each episode.
 
-    A plan is assessed once, by its first row. A motion is monitored and unsafe as soon as one row
-    is, so its score is the largest of all rows.
+    A plan is assessed by its first row. A motion is unsafe as soon as one of its rows is.
     """
     if kind not in KINDS:
         raise ValueError(f"calibration: unknown kind '{kind}'; the kinds are {list(KINDS)}")
@@ -227,6 +211,6 @@ def _checked(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> tuple[np.ndarra
 
 
 def check_share(name: str, value: float) -> None:
-    """Raises a ValueError unless a rate or confidence is between 0 and 1."""
+    """Checks that a rate or confidence is between 0 and 1."""
     if not 0.0 < value < 1.0:
         raise ValueError(f"calibration: {name} is {value}, expected a value in (0, 1)")

@@ -32,13 +32,8 @@ def likely_cause(
 ) -> str:
     """Returns the constraint that is most likely to be violated first; "" without evidence.
 
-    With predicted margins, it is the constraint with the smallest relative margin; otherwise, as in
-    the paper's mode, the one with the largest unsafe mass.
-
-    Args:
-        cause_probability: b_unsafe split by constraint, (n_c,).
-        predicted_margins: Predicted margins [m, rad], (n_c,); NaN where there are none.
-        margin_unit: Unit of the margins [m, rad], scalar or (n_c,).
+    By predicted margins [m, rad], it is that with the smallest in units of `margin_unit`; without
+    them, as in the paper's mode, that with the largest part of b_unsafe.
     """
     relative = np.asarray(predicted_margins, dtype=float) / margin_unit
     is_known = np.isfinite(relative)

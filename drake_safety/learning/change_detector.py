@@ -17,18 +17,14 @@ from drake_safety.learning.state_predictor import StatePredictor
 
 TIME_CONSTANTS_S = (0.1, 0.5, 2.0)
 """Memories of the charts."""
-FALSE_ALARMS_PER_HOUR = 0.1
-"""Rate to which the limits are extrapolated: one in ten hours of nominal motion."""
+FALSE_ALARMS_PER_HOUR = 0.1  # To which the limits are extrapolated.
 LEAST_MOTION_S = 360.0
 """Motion for limits, of the nominal plant and of an actual robot; below it they are not learned."""
-MOST_PREDICTOR_S = 3600.0
-"""Longest motion for the prediction; the rest is for the limits."""
-LEAST_JUDGED = 0.5
-"""Share of inputs that can be judged, below which there is an alarm."""
+MOST_PREDICTOR_S = 3600.0  # Longest motion for the prediction; the rest is for the limits.
+LEAST_JUDGED = 0.5  # Share of inputs that can be judged, below which there is an alarm.
 RECOVERED_LEVEL, RECOVERY_S = 0.7, 5.0
 """Every level must be below the first for a time before an alarm ends [s]."""
-NUM_PREVIEWED = 2
-"""Samples of the desired preview that the predictor sees: the one of now and the next."""
+NUM_PREVIEWED = 2  # Samples of the desired preview that the predictor sees.
 _CLIP = 6.0  # Of an innovation, in standard deviations, so that one impact is no lasting change.
 _BEFORE_LEAVING_S = 0.5  # Left out of a motion that leaves the safe set.
 _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
@@ -61,28 +57,18 @@ class ChangeDetector:
     the predictor has not learned, extrapolated to a rate of false alarms by the exponential tail of
     the maxima of blocks (peaks over threshold; Coles 2001, section 4), first of each chart and then
     of the levels. Nothing is learned from failures.
-
-    Attributes:
-        columns: Entries of (state, desired preview, features) that are its inputs, (n_u,).
-        watched: States that it predicts, (n_w,).
-        deviation: Standard deviations of the innovations, (n_w,).
-        limits: Of the charts, (6, n_w): of the means, then of the squares.
-        alarm_level: 1, or infinite where there was too little motion for limits.
-        longest_repeat: Longest known run of repeated inputs.
-        motion_s: Duration of the motion for the limits, or of an adapted detector's motion [s].
-        nominal: The detector before it was adapted to an actual robot; None if it was not.
     """
 
     predictor: StatePredictor
-    columns: np.ndarray
-    watched: np.ndarray
-    deviation: np.ndarray
-    limits: np.ndarray
-    alarm_level: float
-    longest_repeat: int
+    columns: np.ndarray  # Of (state, desired preview, features): the inputs, (n_u,).
+    watched: np.ndarray  # States that it predicts, (n_w,).
+    deviation: np.ndarray  # Standard deviations of the innovations, (n_w,).
+    limits: np.ndarray  # Of the charts of the means, then of the squares, (6, n_w).
+    alarm_level: float  # 1, or infinite where there was too little motion for limits.
+    longest_repeat: int  # Longest known run of repeated inputs.
     step_s: float
-    motion_s: float
-    nominal: ChangeDetector | None = None
+    motion_s: float  # Of the motion for the limits; of an actual robot's, if adapted to it.
+    nominal: ChangeDetector | None = None  # Before it was adapted to an actual robot.
 
     def __deepcopy__(self, memo: object) -> ChangeDetector:
         return self
@@ -116,13 +102,7 @@ class ChangeDetector:
     ) -> ChangeDetector:
         """Learns a prediction from half of the motions, at most an hour; limits from the rest.
 
-        Limits from the errors of other predictions, as in cross-validation, would not see what this
-        one gets wrong.
-
-        Args:
-            motions: Undisturbed motions, such as those of `run_motions`.
-            progress: Called with the fraction done.
-            episodes: Nominal episodes, which may be less calm; the safe ones belong to the motions.
+        Of `episodes`, which may be less calm than the undisturbed motions, the safe ones are added.
         """
         require_extra("train", "ChangeDetector.fit", "torch")
         info = motions.info
@@ -138,7 +118,7 @@ class ChangeDetector:
                 raise ValueError(
                     f"ChangeDetector: motions and episodes differ in {what}: {expected} and {other}"
                 )
-        every = [*usual_rows(motions), *safe_rows(episodes or [])]
+        every = [*usual_rows(motions), *_safe_rows(episodes or [])]
         inputs, states = _split_rows(every, columns, watched)
         if len(inputs) < 2:
             raise ValueError(f"ChangeDetector: {len(inputs)} motions have three rows, not two")
@@ -164,7 +144,7 @@ class ChangeDetector:
 
     def describe_alarms(self, episodes: Episodes) -> tuple[str, bool]:
         """Says how many safe episodes have an alarm, and whether these are few."""
-        safe = safe_rows(episodes)
+        safe = _safe_rows(episodes)
         alarms = sum(bool(self.watch([rows])[1]) for rows in safe)
         text = f"monitor: alarms in {alarms} of {len(safe)} safe episodes"
         if alarms > _MOST_ALARMS * len(safe):
@@ -228,12 +208,10 @@ class ChangeDetector:
         repeats: float | np.ndarray = 0.0,
         judged: float | np.ndarray = 1.0,
     ) -> np.ndarray:
-        """Largest chart of each state, in units of its limit, (..., n_w).
+        """Largest chart (..., 6, n_w) of each state, in units of its limit, (..., n_w).
 
-        Args:
-            charts: Their values, (..., 6, n_w).
-            repeats: Length of the run of repeated inputs, which concerns all states, (..., 1).
-            judged: Share of inputs that could be judged, which concerns all states, (..., 1).
+        The length of the run of repeated inputs and the share of inputs that could be judged,
+        (..., 1), concern all states.
         """
         levels = (_sizes(charts) / self.limits).max(axis=-2)
         blind = (1.0 - judged) / (1.0 - LEAST_JUDGED)
@@ -247,8 +225,7 @@ class ChangeDetector:
         Between motions the charts keep their values. A row that is not finite, and the two after
         it, are not judged. Causes need the names of the watched states.
         """
-        # Of no row, then of each judged one.
-        errors, repeats = [np.zeros((0, len(self.watched)))], [np.zeros(1)]
+        errors, repeats = [np.zeros((0, len(self.watched)))], [np.zeros(1)]  # First, of no row.
         lost, judged = [], []
         for rows in motions:
             x, states, row = rows[:, self.columns], rows[:, self.watched], np.arange(len(rows))
@@ -312,10 +289,7 @@ class ChangeDetector:
     def cause(
         self, charts: np.ndarray, repeats: float, state_names: Sequence[str], judged: float = 1.0
     ) -> str:
-        """Says in which watched state an alarm with charts (6, n_w) shows, and of what kind it is.
-
-        `judged` is the share of inputs that could be judged.
-        """
+        """Says in which watched state charts (6, n_w) show an alarm, and of what kind it is."""
         if judged < LEAST_JUDGED:
             return "blind: most inputs are not finite, or follow one that is not"
         if repeats > self.longest_repeat:
@@ -398,7 +372,7 @@ def _smoothed(values: np.ndarray, rate: float) -> np.ndarray:
     return np.asarray(lfilter([rate], [1.0, rate - 1.0], values, axis=0))
 
 
-def safe_rows(episodes: Iterable[Episode]) -> list[np.ndarray]:
+def _safe_rows(episodes: Iterable[Episode]) -> list[np.ndarray]:
     """Rows of safe episodes (K, n) whose future is undisturbed."""
     return [rows_of(episode)[episode.first_step :] for episode in episodes if episode.is_safe]
 

@@ -29,17 +29,11 @@ _KEPT_VARIANCE = 0.999
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NeighbourGraph:
-    """The nearest neighbours of each segment under Omega, nearest first, itself excluded.
+    """The k nearest neighbours of each segment under Omega, nearest first, itself excluded."""
 
-    Attributes:
-        indices: Neighbours, (N, k).
-        distances: Omega to each neighbour, (N, k), dimensionless.
-        max_dtw: w_max, the largest DTW distance over all pairs [squared unit of the errors].
-    """
-
-    indices: np.ndarray
-    distances: np.ndarray
-    max_dtw: float
+    indices: np.ndarray  # (N, k)
+    distances: np.ndarray  # Omega to each neighbour, (N, k), dimensionless.
+    max_dtw: float  # w_max, the largest DTW of all pairs [squared unit of the errors].
 
 
 def neighbour_graph(
@@ -61,8 +55,8 @@ def neighbour_graph(
         score: Unsafety scores lambda, (N,).
         score_weight: delta, the weight of a score difference.
         num_neighbours: k, below N.
-        num_candidates: Segments with the smallest bounds of Omega among which the neighbours of a
-            segment are sought, at least k; None for all others, with the cost N².
+        num_candidates: Segments with the smallest bounds of Omega among which neighbours are
+            sought, at least k; None for all others, with the cost N².
         backend: "dtaidistance", or "tslearn", which ignores the bounds.
     """
     from scipy.spatial import cKDTree

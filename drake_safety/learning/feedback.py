@@ -24,8 +24,7 @@ from drake_safety.learning.segments import (
     unsafety_score,
 )
 
-START_TOLERANCE = 1e-2
-"""Tolerance of a twin's first true state: logged positions are not exact."""
+START_TOLERANCE = 1e-2  # Of a twin's first true state: logged positions are not exact.
 _SAME_TASK = (
     *("scenario", "step_s", "horizon", "preview_stride"),
     *("state_names", "output_names", "feature_names"),

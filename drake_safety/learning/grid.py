@@ -10,11 +10,8 @@ import numpy as np
 
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 
-OUTSIDE = -1
-"""Cell of a point outside the grid, and of NaN."""
-
-_FILL = 1.1
-"""Ratio of the grid's half width to the largest coordinate of the points it is scaled for."""
+OUTSIDE = -1  # Cell of a point outside the grid, and of NaN.
+_FILL = 1.1  # Ratio of the grid's half width to the largest coordinate of scaled points.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,15 +85,9 @@ class Grid:
     def interpolate(self, points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Interpolates values of the cells bilinearly between the cells' centres.
 
-        Between the outermost centres and the grid's edge only the nearest existing centres count.
-        A point has the same bits whatever the others are.
-
-        Args:
-            points: (K, N, 2).
-            values: Values of every cell of K grids, (K, R*R, C).
-
-        Returns:
-            The values (K, N, C), zero outside the grid, and whether points are inside, (K, N).
+        Of points (K, N, 2) and values of every cell of K grids, (K, R*R, C), it gives the values
+        (K, N, C), zero outside the grid, and whether points are inside, (K, N). A point has the
+        same bits whatever the others are.
         """
         last = self.resolution - 1.0
         position = points / self.cell_length

@@ -10,21 +10,16 @@ from drake_safety.learning.assessment_parameters import AssessmentParameters
 
 @dataclass(frozen=True, kw_only=True)
 class ModeSettings:
-    """The settings that differ between the modes; those not listed are explained by the parameters.
+    """The settings that differ between the modes; most are explained by the parameters.
 
-    Attributes:
-        is_paper: Whether the mode is the paper's: x has no features, nominal states are without
-            noise, a map reproduces t-SNE's points and no more, and beliefs are not interpolated.
-        stride: Rows between the starts of segments.
-        shortest: Least number of samples of a safe episode's segment.
-        target_stride: Rows between the starts of an episode's segments that t-SNE embeds.
-        num_maps: K.
+    In the paper's mode x has no features, nominal states are without noise, a map reproduces
+    t-SNE's points and no more, and beliefs are not interpolated.
     """
 
     is_paper: bool
-    stride: int
-    shortest: int
-    target_stride: int
+    stride: int  # Rows between the starts of segments.
+    shortest: int  # Least number of samples of a safe episode's segment.
+    target_stride: int  # Rows between the starts of an episode's segments that t-SNE embeds.
     num_maps: int
     hidden_sizes: Sequence[int]
     dropout: float

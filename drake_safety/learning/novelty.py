@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-NUM_QUADRATIC = 3
-"""Distances that are quadratic forms."""
+NUM_QUADRATIC = 3  # Distances that are quadratic forms.
 _NUM_FOLDS = 5  # Of the episodes, so that every distance is from the inputs of other episodes.
 _SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column]; constant ones would be divided by zero.
 # Variances of the standardised inputs along an axis:
@@ -73,11 +72,8 @@ class Distances:
 
     Axes with less than the bound v share it: Σ (aᵢ·z)²/max(vᵢ, v) = |z|²/v - Σ (aᵢ·z)² (1/v - 1/vᵢ)
     over the axes with vᵢ > v, of a standardised offset z. That takes a third of the products.
-
-    Attributes:
-        mean: Mean of the known inputs, (n_x,).
-        axes: Axes along which offsets from it are projected, (n_x, m).
-        terms: Weights of the squares of an offset's entries and of its projections, (n_x + m, 3).
+    `terms` weigh the squares of an offset's entries and of its projections on `axes` (n_x, m),
+    (n_x + m, 3).
     """
 
     def __init__(self, known: Moments, plan: slice):
@@ -136,15 +132,10 @@ class Novelty:
     centre: one entry far from all that training had is novel even where the sum over many others
     hides it. The object is immutable.
 
-    Attributes:
-        centre: Centre of each column's range, (n_x,).
-        inverse_half_width: One over half of its width, with a lower bound, (n_x,).
-
     Args:
         limits: Largest distances of a known input: of all of it, along redundancies, of the plan,
             and from the centre of the range, (4,).
-        feedback: Moments of an actual robot's inputs, which are known as well; None before
-            adaptation.
+        feedback: Moments of an actual robot's inputs, which are known as well.
     """
 
     def __init__(
@@ -157,8 +148,7 @@ class Novelty:
         half_width = 0.5 * (known.largest - known.least)
         self.centre = known.least + half_width
         self.inverse_half_width = 1.0 / np.maximum(half_width, _LEAST_HALF_WIDTH)
-        # Without other episodes to choose them from, the limits are infinite: nothing is novel that
-        # is finite.
+        # Without other episodes to choose them from, the limits are infinite.
         self.inverse_limits = 1.0 / np.square(self.limits)
         self._shares = self.quadratic.terms * self.inverse_limits[:NUM_QUADRATIC]
         self._range_share = self.inverse_half_width / self.limits[-1]
@@ -218,15 +208,11 @@ class Novelty:
         """
         own: dict[str, Any] = dict(training=self.training, limits=self.limits, plan=self.plan)
         alone = Novelty(**own)
-        return (
-            alone if np.mean(alone.of(x) > 1.0) <= rate else Novelty(**own, feedback=Moments.of(x))
-        )
+        is_enough = np.mean(alone.of(x) > 1.0) <= rate
+        return alone if is_enough else Novelty(**own, feedback=Moments.of(x))
 
     def distances(self, x: np.ndarray) -> np.ndarray:
-        """Returns the distances of inputs (N, n_x) in the order of `limits`, (N, 4).
-
-        An input that is not finite has infinite ones.
-        """
+        """Distances of inputs (N, n_x) in the order of `limits`, (N, 4); infinite if not finite."""
         with np.errstate(invalid="ignore", over="ignore"):
             # Rounding may make a small square negative.
             quadratic = np.sqrt(np.maximum(self.quadratic.squared(x, self.quadratic.terms), 0.0))
@@ -240,7 +226,7 @@ class Novelty:
     def of(self, x: np.ndarray) -> np.ndarray:
         """Returns the largest distance of inputs (N, n_x) in units of its limit, (N,).
 
-        An input is novel above 1; that of an input that is not finite is infinite.
+        An input is novel above 1, and one that is not finite infinitely far.
         """
         with np.errstate(invalid="ignore", over="ignore"):
             largest = np.maximum.reduce(self.quadratic.squared(x, self._shares), axis=1)
@@ -250,9 +236,6 @@ class Novelty:
             return np.fmin(np.sqrt(np.maximum(largest, 0.0)), np.inf)
 
     def contradictions(self, x: np.ndarray) -> np.ndarray:
-        """Returns how far each column is from what the other columns say, (n_x,).
-
-        The unit is the standard deviation of that prediction by linear regression.
-        """
+        """Errors of each column's linear regression on the others [standard deviation], (n_x,)."""
         precision = self.quadratic.precision()
         return precision @ (x - self.quadratic.mean) / np.sqrt(np.diag(precision))

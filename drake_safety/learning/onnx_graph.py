@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     import onnx
 
 
-SCHEMA_VERSION = 1
-"""Version of the graph's ports and of its metadata."""
+SCHEMA_VERSION = 1  # Of the graph's ports and of its metadata.
 OPSET = 17
 _IR_VERSION = 8  # That of the opset's time, so that old runtimes read the file.
 _DESCRIPTIONS = {
@@ -70,11 +69,7 @@ class _Graph:
     def node(
         self, operator: str, *inputs: Any, output: str | None = None, **attributes: Any
     ) -> _Value:
-        """Adds a node and returns its output.
-
-        Inputs that are no values become constants: a number of double precision, a list of integers
-        of indices, an array of its own type.
-        """
+        """Adds a node and returns its output; inputs that are no values become constants."""
         from onnx import helper, numpy_helper
 
         names = []
@@ -131,10 +126,7 @@ class _Value:
 
 
 def write(path: Path, assessment: Any) -> None:
-    """Writes `SafetyAssessment.predict` as one ONNX file, atomically.
-
-    The same assessment gives the same bytes.
-    """
+    """Writes `SafetyAssessment.predict` as one ONNX file, atomically and with the same bytes."""
     require_extra("onnx", f"export to '{path}'")
     import onnx
 
@@ -298,10 +290,7 @@ def _novelty(x: _Value, novelty: Novelty) -> _Value:
 
 
 def _cell_weights(y: _Value, grid: Grid) -> tuple[_Value, _Value]:
-    """Weights of the R cells along each axis at y, (K, N, 2, R); 1 inside the grid, (K, N, 1).
-
-    One or two weights of an axis are not zero; all of them are outside the grid.
-    """
+    """Weights of the R cells along each axis at y, (K, N, 2, R); 1 inside the grid, (K, N, 1)."""
     resolution = float(grid.resolution)
     position = (y + grid.half_width) / grid.cell_length
     # False for NaN.
@@ -335,11 +324,7 @@ def _heads(logit: _Value, margins: _Value, base_logit: BaseLogit) -> _Value:
 
 
 def _trees(x: _Value, trees: Trees) -> _Value:
-    """The clipped logit of the trees, (N, 1).
-
-    As `Trees.evaluate`, with counts of the nodes that exclude a leaf: the first leaf without any is
-    the first of the smallest count.
-    """
+    """The clipped logit of the trees, (N, 1), from counts of the nodes that exclude a leaf."""
     arrays = trees.arrays
     num_trees, num_leaves = arrays["value"].shape
     # Trees first: (T, M) and (T, M, M + 1).

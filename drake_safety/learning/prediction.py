@@ -17,10 +17,8 @@ from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 from drake_safety.learning.trees import Trees
 
-LOGIT_LIMIT = 8.0
-"""Heads' logits are clipped to this magnitude."""
-SHIFT_LIMIT = 100.0
-"""Largest shift of the base logit, which keeps exp from overflowing."""
+LOGIT_LIMIT = 8.0  # Largest magnitude of the heads' logits.
+SHIFT_LIMIT = 100.0  # Largest shift of the base logit, which keeps exp from overflowing.
 
 
 @dataclass(kw_only=True, eq=False)
@@ -29,16 +27,15 @@ class Prediction:
 
     Attributes:
         belief: (b_safe, b_unsafe, mu), (N, 3); empty for novel inputs. b_safe is the paper's Γ.
-        probability: Probability of staying safe, (N,), from the corrected base logit; b_safe in the
-            paper's mode. 0 where the belief is "don't know".
+        probability: Probability of staying safe, (N,); b_safe in the paper's mode, 0 where the
+            belief is "don't know".
         cause_probability: b_unsafe split by the violated constraint, (N, n_c).
         embedding: y of the first map, (N, 2); NaN for inputs that are not finite.
-        predicted_margins: Smallest margin of each constraint until the episode's end [unit of the
-            margins], (N, n_c); NaN for inputs that are not finite and in the paper's mode.
-        novelty: Distance of x from the training inputs, (N,); novel above 1, infinite for inputs
-            that are not finite.
-        fall_probability: Probability of a fall until the episode's end or soon after it left the
-            safe set, (N,); 1 for inputs that are not finite, NaN without a `FallLogit`.
+        predicted_margins: Smallest margin of each constraint until the episode's end, (N, n_c); NaN
+            for inputs that are not finite and in the paper's mode.
+        novelty: Distance of x from the training inputs, (N,); novel above 1.
+        fall_probability: Probability of a fall, (N,); 1 for inputs that are not finite, NaN without
+            a `FallLogit`.
     """
 
     belief: np.ndarray
@@ -84,8 +81,7 @@ class BaseLogit:
     logit of the trees.
 
     Departure: the paper judges by the map alone. Boosted trees, taught by the ends of the motions,
-    and maps, taught by margins too, err on different inputs. Belief, cause and gradient are the
-    maps'.
+    and maps, taught by margins too, err on different inputs.
     """
 
     margin_unit: Positive
@@ -103,10 +99,7 @@ class BaseLogit:
     def heads(
         self, maps: EmbeddingOutput, margins: np.ndarray, trees_logit: np.ndarray | None = None
     ) -> np.ndarray:
-        """Returns z, -m / margin_unit and, with trees, t of all inputs, (N, 2) or (N, 3).
-
-        `margins` is the mean of the maps', (N, n_c).
-        """
+        """Returns z, -m / margin_unit and, with trees, t, (N, 2) or (N, 3); m is of `margins`."""
         heads = np.empty((len(margins), 2 if trees_logit is None else 3))
         heads[:, 0] = mean_of_maps(_clip(maps.unsafe_logit, -LOGIT_LIMIT, LOGIT_LIMIT))
         smallest = np.minimum.reduce(margins, axis=1)
@@ -123,21 +116,12 @@ class BaseLogit:
 
 @dataclass(eq=False, slots=True)
 class Correction:
-    """Correction of the base logit by feedback.
+    """Correction of the base logit by feedback."""
 
-    Attributes:
-        change: Changes of the offset and of the slopes of the heads, (3,), or (4,) with trees.
-        hidden: Weights of the activations of the maps' last hidden layer, and a constant, (K,
-            num_activations + 1).
-        hidden_range: Range in feedback of the sum of the hidden layer's terms, to which it is
-            clipped, (2,).
-        guard: 1 in cells of each map where the base logit must not fall, else 0, (K, R*R).
-    """
-
-    change: np.ndarray
-    hidden: np.ndarray
-    hidden_range: np.ndarray
-    guard: np.ndarray
+    change: np.ndarray  # Of the offset and of the slopes of the heads, (3,), or (4,) with trees.
+    hidden: np.ndarray  # Weights of the last hidden layer, and a constant, (K, n + 1).
+    hidden_range: np.ndarray  # To which the sum of their terms is clipped: that in feedback, (2,).
+    guard: np.ndarray  # 1 in cells where the base logit must not fall, else 0, (K, R*R).
 
     @classmethod
     def none(cls, embedding: Embedding, grid: Grid, trees: Trees | None) -> Correction:
@@ -168,29 +152,17 @@ class Correction:
 
 
 class Evaluation(NamedTuple):
-    """What maps and trees say of N inputs.
-
-    Attributes:
-        maps: Outputs of the K maps.
-        margins: Mean of the maps' predicted margins, (N, n_c); NaN without heads.
-        heads: Inputs of the base logit, see `BaseLogit.heads`; None without heads.
-        logit: The base logit before its correction, (N,); None without heads.
-    """
+    """What maps and trees say of N inputs; heads and logit are None for maps without heads."""
 
     maps: EmbeddingOutput
-    margins: np.ndarray
-    heads: np.ndarray | None
-    logit: np.ndarray | None
+    margins: np.ndarray  # Mean of the maps' predicted margins, (N, n_c); NaN without heads.
+    heads: np.ndarray | None  # Of `BaseLogit.heads`.
+    logit: np.ndarray | None  # Before its correction, (N,).
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """All that a prediction is made from; the attributes are those of `SafetyAssessment`.
-
-    Attributes:
-        beliefs: Beliefs of the cells, (K, R*R, 3 + n_c).
-        initial_uncertainty: mu_ini, the uncertainty of a filled cell.
-    """
+    """All that a prediction is made from; the attributes are those of `SafetyAssessment`."""
 
     embedding: Embedding
     grid: Grid
@@ -208,11 +180,10 @@ class Model:
         return self.beliefs.shape[2] - 3
 
     @property
-    def shapes(self) -> tuple[tuple[int, ...], ...]:
+    def shapes(self) -> list[tuple[int, ...]]:
         """Shapes of the beliefs and of the correction's arrays."""
-        change = self.correction
-        arrays = (self.beliefs, change.change, change.hidden, change.hidden_range, change.guard)
-        return tuple(array.shape for array in arrays)
+        c = self.correction
+        return [a.shape for a in (self.beliefs, c.change, c.hidden, c.hidden_range, c.guard)]
 
     def evaluate(self, x: np.ndarray) -> Evaluation:
         """Evaluates maps, trees and base logit at inputs (N, n_x)."""
@@ -290,7 +261,7 @@ def is_unknown(belief: np.ndarray, initial_uncertainty: float) -> np.ndarray:
 
 
 def unknown_above(initial_uncertainty: float) -> float:
-    """Returns the uncertainty above which a belief is "don't know", with room for rounding."""
+    """The uncertainty above which a belief is "don't know", with room for rounding."""
     return 0.5 * (1.0 + initial_uncertainty) - 1e-9
 
 

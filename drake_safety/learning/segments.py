@@ -46,38 +46,25 @@ def installed_versions(*packages: str) -> dict[str, str]:
 
 @dataclass(kw_only=True)
 class EpisodesInfo:
-    """Metadata that all episodes of a set share.
-
-    Attributes:
-        scenario_hash: SHA-256 of everything that determines a rollout, robot files included.
-        variation: The simulated plant variation, e.g. "nominal" or "actual".
-        step_s: Time between two rows of an episode [s].
-        horizon: The safety assessment horizon H [samples of the preview].
-        constraint_names: The n_c safety constraints: columns of `margins` and possible causes.
-        num_steps: T, rows after the first one of a complete episode; 0 if unknown.
-        preview_stride: Rows between two of the H samples of a preview or a segment.
-        monitored_states: States that a `ChangeDetector` predicts; None for all of them.
-        monitored_features: Features by which it predicts them; None for all of them.
-        until: The only constraint whose violation ends an episode; empty for every one.
-    """
+    """Metadata that all episodes of a set share."""
 
     scenario: str
-    scenario_hash: str
-    variation: str
+    scenario_hash: str  # SHA-256 of everything that determines a rollout, robot files included.
+    variation: str  # The simulated plant, such as "nominal" or "actual".
     seed: int
-    step_s: float
-    horizon: int
-    constraint_names: list[str]
+    step_s: float  # Time between two rows of an episode.
+    horizon: int  # H, samples of the preview.
+    constraint_names: list[str]  # The n_c columns of `margins`, and possible causes.
     state_names: list[str]
     output_names: list[str]
     feature_names: list[str]
     versions: dict[str, str]
-    num_steps: int = 0
-    preview_stride: int = 1
-    monitored_states: list[str] | None = None
-    monitored_features: list[str] | None = None
+    num_steps: int = 0  # T, rows after the first one of a complete episode; 0 if unknown.
+    preview_stride: int = 1  # Rows between two of the H samples of a preview or a segment.
+    monitored_states: list[str] | None = None  # That a `ChangeDetector` predicts; None for all.
+    monitored_features: list[str] | None = None  # By which it predicts them; None for all.
     robot: str = ""
-    until: str = ""
+    until: str = ""  # The only constraint whose violation ends an episode; empty for every one.
 
     def __post_init__(self) -> None:
         is_known = 1 <= self.horizon <= MOST_SAMPLES and self.preview_stride >= 1
@@ -125,33 +112,20 @@ class Episode:
     """One closed-loop rollout, sampled at rows 0..K; row r is at time r * step_s.
 
     The last row is the sample at t = T or at the instant when the safe set was left.
-
-    Attributes:
-        time_s: Time [s], (K+1,).
-        state: Measured state, with observation noise, (K+1, n_s).
-        true_state: State without observation noise, (K+1, n_s).
-        output: Measured output z [m], (K+1, n_z).
-        desired_output: Desired output z* [m], (K+1, n_z).
-        desired_preview: The next H desired outputs, row-major in time, (K+1, H*n_z).
-        features: Measured features, (K+1, n_f).
-        margins: Signed distance to each safety constraint, negative where violated, (K+1, n_c).
-        is_safe: Whether the whole rollout stayed in the safe set.
-        cause: "" when safe, else the name of the violated constraint, or "diverged".
-        first_step: First row with an undisturbed future; earlier rows are not used for training.
     """
 
     index: int
-    time_s: np.ndarray
-    state: np.ndarray
-    true_state: np.ndarray
-    output: np.ndarray
-    desired_output: np.ndarray
-    desired_preview: np.ndarray
-    features: np.ndarray
-    margins: np.ndarray
-    is_safe: bool
-    cause: str
-    first_step: int = 0
+    time_s: np.ndarray  # (K+1,)
+    state: np.ndarray  # Measured, with noise, (K+1, n_s).
+    true_state: np.ndarray  # Without noise, (K+1, n_s).
+    output: np.ndarray  # Measured output z [m], (K+1, n_z).
+    desired_output: np.ndarray  # Desired output z* [m], (K+1, n_z).
+    desired_preview: np.ndarray  # The next H desired outputs, row-major in time, (K+1, H*n_z).
+    features: np.ndarray  # Measured, (K+1, n_f).
+    margins: np.ndarray  # Distance to each constraint, negative where violated, (K+1, n_c).
+    is_safe: bool  # Whether the whole rollout stayed in the safe set.
+    cause: str  # "" when safe, else the name of the violated constraint, or "diverged".
+    first_step: int = 0  # First row with an undisturbed future; earlier ones are not learned.
     num_controller_failures: int = 0
 
     def __post_init__(self) -> None:
@@ -259,35 +233,25 @@ def unsafety_score(
 
 @dataclass(kw_only=True, eq=False)
 class Segments:
-    """Segments of episodes, each at most H steps long, as training data of an assessment.
+    """N segments of episodes, each at most H samples long, as training data of an assessment.
 
-    Attributes:
-        episode: Position of the episode in its set, (N,).
-        start_row: Row of the episode at which the segment starts, (N,); state, preview and features
-            are those of that row.
-        is_first: Whether the segment starts at its episode's `first_step`, (N,).
-        remaining_steps: Rows until the episode ends, (N,).
-        score: Unsafety score lambda, (N,).
-        cause: Column of the constraint that ended the episode, -1 when safe, (N,).
-        future_margins: Smallest margins from the start to the episode's end, (N, n_c).
-        error: Tracking errors z* - z [m], the last one repeated at the end, (N, H, n_z).
-        length: Number of recorded samples of `error`, (N,): H, or less at an episode's end.
+    State, preview and features are those of the row at which a segment starts.
     """
 
-    episode: np.ndarray
+    episode: np.ndarray  # Position of the episode in its set.
     start_row: np.ndarray
-    is_first: np.ndarray
-    remaining_steps: np.ndarray
+    is_first: np.ndarray  # Whether the segment starts at its episode's `first_step`.
+    remaining_steps: np.ndarray  # Rows until the episode ends.
     is_unsafe: np.ndarray
-    score: np.ndarray
-    cause: np.ndarray
+    score: np.ndarray  # Unsafety score lambda.
+    cause: np.ndarray  # Column of the constraint that ended the episode, -1 when safe.
     state: np.ndarray
     true_state: np.ndarray
     desired_preview: np.ndarray
     features: np.ndarray
-    future_margins: np.ndarray
-    error: np.ndarray
-    length: np.ndarray
+    future_margins: np.ndarray  # Smallest from the start to the episode's end, (N, n_c).
+    error: np.ndarray  # Tracking errors z* - z [m], the last one repeated, (N, H, n_z).
+    length: np.ndarray  # Recorded samples of `error`: H, or less at an episode's end.
 
     def __len__(self) -> int:
         return len(self.score)
@@ -314,13 +278,9 @@ def split(
     """Splits episodes into segments of H samples, ``preview_stride`` rows apart.
 
     Segments start where at least ``shortest`` samples of a complete episode are left, for both
-    labels, so that a start row carries no information about the label. Segments that reach beyond
-    the end are cut short and keep the terminal sample. Diverged episodes are skipped.
-
-    Args:
-        stride: Rows between two starts; `stride=H` is the paper's split.
-        discount: gamma of the unsafety score.
-        shortest: Least number of samples left of a complete episode; H by default.
+    labels, so that a start row carries no information about the label; H by default. Segments that
+    reach beyond the end are cut short and keep the terminal sample. Diverged episodes are skipped.
+    `stride` is the number of rows between two starts.
     """
     horizon, sample = episodes.info.horizon, episodes.info.preview_stride
     shortest = horizon if shortest is None else shortest

@@ -12,7 +12,6 @@ from drake_safety.files.progress import ignore
 from drake_safety.learning.maps import one_torch_thread
 
 HIDDEN_SIZES = (256, 256)
-"""Units of the hidden layers."""
 _SMALLEST_SPREAD = 1e-4  # Of a column [unit of the column]; constant ones would be divided by zero.
 _LARGEST_INPUT = 10.0  # In standard deviations.
 _OUTSIDE = 0.005  # Share of training below and above the usual range of an input.
@@ -102,7 +101,7 @@ class StatePredictor:
         return hidden @ w["output.weight"] + (z @ w["linear.weight"] + w["linear.bias"])
 
     def errors(self, inputs: np.ndarray, states: np.ndarray) -> np.ndarray:
-        """Errors of the predicted states of a motion from the third row on, (K - 2, n_w)."""
+        """Errors of a motion's predicted states from the third row on, (K - 2, n_w)."""
         divisor = self._divisor(self._standardised(inputs[1:-1]))
         return self._residuals(inputs, states) / divisor[:, None]
 

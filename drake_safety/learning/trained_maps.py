@@ -10,9 +10,7 @@ import numpy as np
 
 from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
 
-INPUT_LIMIT = 1e15
-"""Magnitude from which on an entry of an input counts as not finite."""
-
+INPUT_LIMIT = 1e15  # Magnitude from which on an entry of an input counts as not finite.
 _CHUNK = 8192
 
 
@@ -38,7 +36,6 @@ class Embedding:
     (K, hidden, 1) and "safety.1.bias". Standardisation is folded into them.
 
     Attributes:
-        num_margins: n_c, the number of predicted margins; 0 without heads.
         input_range: Range to which each column of inputs is clipped, (2, n_x); may be infinite.
         centre: What is subtracted from inputs before they are multiplied, (n_x,).
         centred_bias: Bias of the first layer for these inputs, (K, out).
@@ -66,19 +63,17 @@ class Embedding:
         unlimited = np.tile([[-np.inf], [np.inf]], self.num_inputs)
         limits = unlimited if input_range is None else input_range
         self.input_range = np.array(limits, dtype=np.float32)
-        if self.input_range.shape != unlimited.shape:
-            raise ValueError(f"Embedding: the range of inputs has the shape {np.shape(limits)}")
         self.input_range.setflags(write=False)
         self._prepare()
 
     def _prepare(self) -> None:
         """Sets what `evaluate` multiplies, each with an axis for the rows of x."""
         (weight, bias), *others = self._layers
-        # A column's spread may be a thousandth of its values, which single precision would lose.
         self.centre = np.zeros(self.num_inputs)
         self._range = self.input_range.astype(float)
         self._is_clipping = bool(np.isfinite(self._range).any())
         if np.isfinite(self.input_range).all():
+            # A spread may be a thousandth of the values, which single precision would lose.
             self.centre = self.input_range.mean(axis=0, dtype=float)
             bias = (bias + (self.centre @ weight.astype(float))[:, None]).astype(np.float32)
         self.centred_bias = bias[:, 0]

@@ -17,26 +17,15 @@ _KEPT_IN_CELL = 500
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainingScores:
-    """Embedded training segments, from which the cells' beliefs are computed.
+    """N embedded training segments, from which the cells' beliefs are computed."""
 
-    Attributes:
-        points: Psi(x), (K, N, 2).
-        score: lambda, (N,).
-        cause: Column of the constraint that ended the episode, -1 when safe, (N,).
-        heads: Inputs of the base logit, see `BaseLogit.heads`; None for maps without heads.
-        nearest: Column of the constraint with the smallest predicted margin, (N,).
-        multiplicity: Number of segments that each stands for, (N,); None for one each.
-        count: Number of all training segments in every map's cells, (K, R*R); None if none of them
-            was left out.
-    """
-
-    points: np.ndarray
-    score: np.ndarray
-    cause: np.ndarray
-    heads: np.ndarray | None = None
-    nearest: np.ndarray | None = None
-    multiplicity: np.ndarray | None = None
-    count: np.ndarray | None = None
+    points: np.ndarray  # Psi(x), (K, N, 2).
+    score: np.ndarray  # lambda
+    cause: np.ndarray  # Column of the constraint that ended the episode, -1 when safe.
+    heads: np.ndarray | None = None  # Of `BaseLogit.heads`.
+    nearest: np.ndarray | None = None  # Column of the smallest predicted margin.
+    multiplicity: np.ndarray | None = None  # Segments that each stands for; None for one each.
+    count: np.ndarray | None = None  # Of all segments in the cells, if some were left out.
 
     @classmethod
     def of(cls, segments: Segments, evaluation: Evaluation) -> TrainingScores:
@@ -58,15 +47,6 @@ class TrainingScores:
         """Number of segments that each stands for, (N,)."""
         return np.ones(len(self.score)) if self.multiplicity is None else self.multiplicity
 
-    def counts(self, grid: Grid) -> np.ndarray:
-        """Counts all training segments in every map's cells, (K, R*R)."""
-        if self.count is not None:
-            return self.count
-        located = [grid.locate(points) for points in self.points]
-        return np.stack(
-            [np.bincount(cells[cells >= 0], minlength=grid.num_cells) for cells in located]
-        )
-
     def thinned(self, grid: Grid, seed: int) -> TrainingScores:
         """Draws segments of crowded cells, so that a file does not grow with the number of all.
 
@@ -74,11 +54,12 @@ class TrainingScores:
         and c = 500; with several maps, the largest p. It then stands for 1 / p segments, so that
         sums over cells keep their expectations (Horvitz and Thompson, 1952).
         """
-        probability, count = np.zeros(len(self.score)), self.counts(grid)
-        for points, member_count in zip(self.points, count, strict=True):
+        probability, count = np.zeros(len(self.score)), []
+        for points in self.points:
             cells = grid.locate(points)
+            count.append(np.bincount(cells[cells >= 0], minlength=grid.num_cells))
             # A point outside the grid is in no cell.
-            own = np.where(cells >= 0, _KEPT_IN_CELL / np.maximum(member_count[cells], 1), 0.0)
+            own = np.where(cells >= 0, _KEPT_IN_CELL / np.maximum(count[-1][cells], 1), 0.0)
             probability = np.maximum(probability, np.minimum(own, 1.0))
         kept = np.random.default_rng(seed).random(len(self.score)) < probability
         return replace(
@@ -89,7 +70,7 @@ class TrainingScores:
             heads=None if self.heads is None else self.heads[kept],
             nearest=None if self.nearest is None else self.nearest[kept],
             multiplicity=_single(1.0 / probability[kept]),
-            count=count,
+            count=np.stack(count),
         )
 
 
@@ -111,14 +92,12 @@ def prior_beliefs(
     beliefs = []
     for points, mu in zip(training.points, uncertainty, strict=True):
         masses = belief_masses.from_scores(training.score, mu, training.cause, num_causes)
-        beliefs.append(
-            belief_masses.fuse_cells(
-                masses,
-                # L(x) is the cell of Psi(x), not of the segment's point in t-SNE.
-                grid.locate(points),
-                num_cells=grid.num_cells,
-                min_count=parameters.min_count,
-                multiplicity=training.times,
-            )
+        fused = belief_masses.fuse_cells(
+            masses,
+            grid.locate(points),  # L(x) is the cell of Psi(x), not of its point in t-SNE.
+            num_cells=grid.num_cells,
+            min_count=parameters.min_count,
+            multiplicity=training.times,
         )
+        beliefs.append(fused)
     return np.stack(beliefs)
