@@ -137,6 +137,14 @@ def test_hidden_layer_adds_no_more_far_away_than_at_feedback(adapted_worse):
 
 
 @pytest.mark.train
+@pytest.mark.parametrize(("offset", "expected"), [(1e5, 0.0), (-1e5, 1.0)])
+def test_correction_of_any_size_gives_probability(sharpened, offset, expected):
+    extreme = replace(sharpened.correction_, change=np.array([offset, 0.0, 0.0, 0.0]))
+    probability = sharpened.predict(*inputs(worse()[0].rows), correction=extreme).probability
+    assert probability[0] == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.train
 def test_monitor_knows_motions_given_to_adaptation(sharpened, adapted_worse):
     def learned(motions):
         weights = sharpened.adapt(worse(3), motions=motions).detector_.predictor.weights

@@ -1,12 +1,20 @@
 """Files are complete or not there, also when other processes write them."""
 
 import errno
+import os
 from pathlib import Path
 
 import pytest
 
 from drake_safety.evaluation.figure_style import new_figure, save
 from drake_safety.files.atomic import replacing, write_file
+
+
+def test_file_that_another_process_is_writing_stays(tmp_path):
+    other = tmp_path / f".a.json.{os.getppid()}.tmp"
+    other.write_text("half")
+    write_file(tmp_path / "a.json", "whole")
+    assert other.read_text() == "half"
 
 
 def test_file_that_is_not_finished_leaves_the_earlier_one(tmp_path):

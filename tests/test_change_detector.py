@@ -55,6 +55,13 @@ def test_changed_plant_or_sensor_is_noticed(change, within_s):
     assert worst(motion(within_s, 3, **change)).max() > 1.0
 
 
+def test_one_impact_is_no_lasting_change():
+    rows = motion(20.0, 4)
+    rows[200, 1] += 5.0
+    alarms = np.flatnonzero(worst(rows) > 1.0)
+    assert 200 <= alarms.min() <= alarms.max() < 200 + 3.0 / STEP_S
+
+
 def test_frozen_input_is_noticed_after_few_repeats():
     rows = motion(20.0, 5)
     rows[215:] = rows[215]
@@ -167,6 +174,14 @@ def test_motions_of_another_diagram_and_unknown_names_are_refused(change, messag
     motions = recorded([motion(3.0, 0), motion(3.0, 1)], replace(INFO, **change))
     with pytest.raises(ValueError, match=message):
         SafetyAssessment().fit(lively(0, 3), motions=motions)
+
+
+def test_fit_warns_of_a_monitor_that_never_alarms(monkeypatch, caplog):
+    monkeypatch.setattr(SafetyAssessment, "_learned", lambda *given: {})
+    SafetyAssessment().fit(lively(0, 3), detector=learned())
+    assert "never alarms" not in caplog.text
+    SafetyAssessment().fit(lively(0, 3))
+    assert "6 are needed: it reports levels and never alarms" in caplog.text
 
 
 def test_motion_counts_from_its_first_step_until_shortly_before_it_leaves():

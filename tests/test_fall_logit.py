@@ -6,6 +6,7 @@ import pytest
 
 from drake_safety.evaluation.metrics import area_under_curve
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.fall_logit import FallLogit
 from drake_safety.learning.segments import DIVERGED, Episodes
 from lip_assessments import quick_assessment
 from lip_episodes import make_episodes
@@ -81,3 +82,12 @@ def test_diverged_simulation_and_fallen_robot_teach_nothing(fitted):
     odd = replace(episodes[0], index=999, is_safe=False, cause=DIVERGED)
     more = Episodes(episodes.info, [*episodes, odd])
     assert copy.copy(fitted).fit_falls(more, []).fall_logit_ == expected
+
+
+def test_weights_are_those_of_inputs_with_units():
+    rng = np.random.default_rng(0)
+    inputs = [rng.normal(size=(20, 3)) * [1e-3, 1.0, 50.0] for _ in range(200)]
+    logit = FallLogit.fit(inputs, [rows[:, 2].mean() > 0.0 for rows in inputs], [0])
+    margins, unsafe_logit, column = np.split(inputs[0], 3, axis=1)
+    expected = inputs[0] @ logit.weights + logit.offset
+    np.testing.assert_allclose(logit.of(margins, unsafe_logit[:, 0], column), expected, atol=1e-12)

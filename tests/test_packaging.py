@@ -189,6 +189,15 @@ def test_a_command_names_its_extra_before_it_does_anything(
     assert not folder.exists()
 
 
+def test_the_sdist_holds_what_is_needed_to_build_and_test(sdist):
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    top = "pyproject.toml LICENSE README.md constraints.txt lowest.txt Makefile"
+    assert {*top.split(), ".ci/build_backend.py", ".ci/shadow.py", *SHIPPED} <= names
+    for folder in ("tests", "studies", "assessments", "examples"):
+        assert {f"{folder}/{name}" for name in files_under(ROOT / folder)} <= names
+
+
 def test_a_folder_that_hides_an_editable_install_is_named(sdist, tmp_path):
     with tarfile.open(sdist) as archive:
         archive.extractall(tmp_path / "unpacked", filter="data")
@@ -215,6 +224,13 @@ def test_every_file_of_the_library_and_of_the_folders_beside_it_is_in_the_wheel_
     expected |= {f"drake_safety/{name}" for name in SHIPPED}
     assert names - metadata == expected
     assert any(name.endswith("/licenses/LICENSE") for name in metadata)
+
+
+def test_no_dependency_names_an_index_or_an_address():
+    listed = sum(PROJECT["optional-dependencies"].values(), PROJECT["dependencies"])
+    pinned = pins("constraints.txt") + pins("lowest.txt")
+    assert not [line for line in listed + pinned if "://" in line or line.startswith("-")]
+    assert all(line.count("==") == 1 for line in pinned)
 
 
 def test_every_lower_bound_of_what_users_install_is_a_version_that_is_tested():

@@ -76,6 +76,12 @@ def test_more_danger_never_counts_as_less():
     np.testing.assert_allclose(change[1:], -np.array(LOGIT.slopes))
 
 
+def test_the_change_stays_finite_however_large_the_gap():
+    heads, every = np.full((4000, 2), -4.0), np.ones(4000, dtype=bool)
+    change, *_ = fitted_change(labelled(heads, every), labelled(heads, ~every), LOGIT)
+    assert np.isfinite(change).all() and change[0] + heads[0] @ change[1:] > 8.0
+
+
 def test_an_episode_counts_by_its_first_row_and_by_all_of_them_together():
     np.testing.assert_allclose(row_weights(np.array([2, 1, 4])), [2, 1, 3, 1.5, *[0.5] * 3])
 

@@ -1,9 +1,12 @@
 import dataclasses
+import inspect
 from itertools import combinations
 
 import pytest
+import typer
 
 from drake_safety import __version__
+from drake_safety.cli import adapt, calibrate, evaluate, gate, play, prepare, run, train
 from drake_safety.evaluation.episode_study import evaluate_episodes
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning import seeds
@@ -13,6 +16,7 @@ from drake_safety.learning.seeds import NOT_DRAWN, RELEASE, UsedEpisodes, check_
 from drake_safety.learning.segments import Episodes
 from lip_assessments import calibration, quick_assessment, quick_episodes
 from lip_episodes import make_episodes
+from studies.__main__ import app as studies
 
 BLOCKS = [block for block in vars(seeds).values() if isinstance(block, seeds.SeedBlock)]
 
@@ -53,6 +57,22 @@ def test_the_seeds_of_a_release_are_far_from_those_of_development():
         assert use_of(block.first + RELEASE) == f"release {__version__.removesuffix('.dev0')}"
         assert block.first_beside(seeds.SHIFTS.first) == block.first
         assert block.first_beside(seeds.SHIFTS.first + RELEASE) == block.first + RELEASE
+
+
+def test_every_command_takes_its_default_seed_from_the_table():
+    shown = dict.fromkeys((run.run, play.play, prepare.check), seeds.DEMONSTRATION.first)
+    blocks = {train.train: seeds.TRAINING, calibrate.calibrate: seeds.CALIBRATION}
+    blocks |= {adapt.adapt: seeds.ADAPTATION, gate.gate: seeds.GATE}
+    expected = shown | {command: block.first for command, block in blocks.items()}
+    expected[evaluate.evaluate] = None  # That of what it evaluates.
+    for command, seed in expected.items():
+        assert inspect.signature(command).parameters["seed"].default == seed
+
+
+def test_every_study_with_seeds_has_those_of_the_release():
+    for name, command in typer.main.get_command(studies).commands.items():
+        options = {parameter.name for parameter in command.params}
+        assert ("seed" in options or name == "walking") == ("release" in options), name
 
 
 def test_a_used_seed_is_refused_with_what_it_was_used_for_and_one_that_is_free():

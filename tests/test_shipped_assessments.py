@@ -13,7 +13,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.scenario import load_scenario
-from shuttle_task import train_shuttle
+from shuttle_task import SCENARIO, train_shuttle
 from studies.documents import CARD_FILE, EVALUATION_FILE, card_text
 from studies.publish import NUM_EPISODES, check_shipped
 
@@ -99,7 +99,10 @@ def test_a_shipment_holds_the_run_s_files_and_what_is_known_of_them(run, shipped
 
 
 @pytest.mark.slow
-def test_another_file_in_its_place_is_noticed(run, package, scenario):
+def test_another_file_or_scenario_in_its_place_is_noticed(run, package, scenario, tmp_path):
+    (tmp_path / f"{NAME}.yaml").write_text(SCENARIO.replace("duration_s: 0.8", "duration_s: 1.2"))
+    with pytest.raises(ValueError, match=r"has the hash \w+, '.*' is of \w+: train"):
+        check_shipped(package / NAME, load_scenario(tmp_path / f"{NAME}.yaml"), num_workers=1)
     file = assessment_file(package / NAME, "sharpened")
     other = SafetyAssessment.load(file)
     other.parameters.epochs, thresholds = 1, other.calibrations_
