@@ -9,7 +9,7 @@ import numpy as np
 from drake_safety.evaluation.metrics import Estimate, proportion, segment_estimates, threshold_at
 from drake_safety.evaluation.results import Key
 from drake_safety.evaluation.scorers import Scorer
-from drake_safety.learning.calibration import episodes_needed, least_miss_rate, score_threshold
+from drake_safety.learning.calibration import episodes_needed, score_threshold
 from drake_safety.learning.seeds import check_unused
 from drake_safety.learning.segments import DIVERGED, Episodes, Segments, split
 
@@ -89,4 +89,4 @@ def promised_miss_rate(is_unsafe: np.ndarray) -> float:
             f"thresholds: 0 of {len(is_unsafe)} calibration plans are unsafe; it takes "
             f"{episodes_needed(wanted)} to promise an unsafe recall of {PROMISED_UNSAFE_RECALL:g}"
         )
-    return max(least_miss_rate(num_unsafe), wanted)
+    return max(1.0 / (num_unsafe + 1), wanted)

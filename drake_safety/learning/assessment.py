@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from drake_safety.extras import require_extra
 from drake_safety.files.progress import StageProgress, shown, stage_of
@@ -131,8 +132,6 @@ class SafetyAssessment:
         require_extra("train", "SafetyAssessment.fit")
         self.parameters.check()
         episodes.warn()
-        from threadpoolctl import threadpool_limits
-
         # The order of sums depends on the number of threads, and the last bits with it.
         with (
             threadpool_limits(1, user_api="blas"),
@@ -175,7 +174,6 @@ class SafetyAssessment:
             novelty=novelty,
             base_logit=base_logit,
             trees=trees,
-            fall_logit=None,
             initial_uncertainty=parameters.initial_uncertainty,
         )
         training = TrainingScores.of(segments, model.evaluate(columns.of_rows(segments)))
@@ -343,7 +341,6 @@ class SafetyAssessment:
 
     def predict_rows(self, rows: Episode | Segments, variation: str = "nominal") -> Prediction:
         """Assesses recorded rows of a plant; see `InputColumns.of_rows`."""
-        self._check_fitted()
         return self._predict(self.columns_.of_rows(rows, variation))
 
     @one_blas_thread
@@ -390,7 +387,6 @@ class SafetyAssessment:
         """Writes `predict` as it is now as one ONNX graph, atomically; see docs/export.md."""
         from drake_safety.learning import onnx_graph
 
-        self._check_fitted()
         onnx_graph.write(Path(path), self)
 
     @classmethod

@@ -177,11 +177,6 @@ def episodes_needed(miss_rate: float, *, confidence: float | None = None) -> int
     return math.ceil(math.log1p(-confidence) / math.log1p(-miss_rate) - 1e-9)
 
 
-def least_miss_rate(num_unsafe: int) -> float:
-    """Returns the lowest miss rate that n unsafe episodes can promise on average."""
-    return 1.0 / (num_unsafe + 1)
-
-
 def episode_scores(
     segments: Segments, unsafe_score: np.ndarray, kind: str
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -15,15 +15,12 @@ from drake_safety.files.progress import ignore
 from drake_safety.learning.segments import Episode, Episodes
 from drake_safety.learning.state_predictor import StatePredictor
 
-TIME_CONSTANTS_S = (0.1, 0.5, 2.0)
-"""Memories of the charts."""
+TIME_CONSTANTS_S = (0.1, 0.5, 2.0)  # Memories of the charts.
 FALSE_ALARMS_PER_HOUR = 0.1  # To which the limits are extrapolated.
-LEAST_MOTION_S = 360.0
-"""Motion for limits, of the nominal plant and of an actual robot; below it they are not learned."""
+LEAST_MOTION_S = 360.0  # Below it limits are not learned, of the nominal plant or an actual robot.
 MOST_PREDICTOR_S = 3600.0  # Longest motion for the prediction; the rest is for the limits.
 LEAST_JUDGED = 0.5  # Share of inputs that can be judged, below which there is an alarm.
-RECOVERED_LEVEL, RECOVERY_S = 0.7, 5.0
-"""Every level must be below the first for a time before an alarm ends [s]."""
+RECOVERED_LEVEL, RECOVERY_S = 0.7, 5.0  # Levels are below it for this time before an alarm ends.
 NUM_PREVIEWED = 2  # Samples of the desired preview that the predictor sees.
 _CLIP = 6.0  # Of an innovation, in standard deviations, so that one impact is no lasting change.
 _BEFORE_LEAVING_S = 0.5  # Left out of a motion that leaves the safe set.
@@ -34,8 +31,8 @@ _LEAST_LIMIT = 0.3  # Of a chart, in standard deviations of its value for white 
 _MOST_ALARMS = 0.1  # Share of safe episodes, above which the monitor does not know their motion.
 _FREE_REPEATS = 3  # Beyond the longest run of repeated inputs in training.
 _SETTINGS = ("alarm_level", "longest_repeat", "step_s", "motion_s")
+# Arrays in which an adapted detector differs from the nominal one.
 _ADAPTED = ("deviation", "limits", "settings", "predictor.linear.weight", "predictor.linear.bias")
-"""Arrays in which an adapted detector differs from the nominal one."""
 _SIDES = {"x": ("forward", "backward"), "y": ("to the left", "to the right"), "z": ("up", "down")}
 
 
@@ -80,14 +77,15 @@ class ChangeDetector:
 
     def describe(self) -> str:
         """What the limits were learned from, and what they promise."""
-        nominal, needed = self.nominal or self, f"{LEAST_MOTION_S / 60.0:.0f} are needed"
-        learned = f"monitor: {_minutes(nominal.motion_s)} of motion for its limits"
+        needed = f"{LEAST_MOTION_S / 60.0:.0f} are needed"
+        minutes, own_minutes = (int(d.motion_s / 60.0) for d in (self.nominal or self, self))
+        learned = f"monitor: {minutes} min of motion for its limits"
         promise = f"extrapolated to one false alarm in {1 / FALSE_ALARMS_PER_HOUR:.0f} h"
         if not math.isfinite(self.alarm_level):
             return f"{learned}, {needed}: it reports levels and never alarms"
         if self.nominal is None:
             return f"{learned}, {promise}"
-        own = f"{learned}; {_minutes(self.motion_s)} of an actual robot's correct its prediction"
+        own = f"{learned}; {own_minutes} min of an actual robot's correct its prediction"
         if self.motion_s < LEAST_MOTION_S:
             return f"{own}, {needed} to widen limits: no rate of false alarms is promised on it"
         return f"{own} and widen limits, {promise}"
@@ -176,14 +174,10 @@ class ChangeDetector:
         for i, fold in enumerate(folds):
             others = [block for other in folds[:i] + folds[i + 1 :] for block in other]
             levels.append((np.concatenate(fold) / tails(others or fold)).max(axis=(1, 2)))
-        limit = _tail_limit(np.concatenate(levels), probability)
-        return replace(
-            self,
-            deviation=deviation,
-            limits=limit * tails(blocks),
-            alarm_level=1.0 if motion_s >= LEAST_MOTION_S else math.inf,
-            motion_s=motion_s,
-        )
+        limits = _tail_limit(np.concatenate(levels), probability) * tails(blocks)
+        alarm_level = 1.0 if motion_s >= LEAST_MOTION_S else math.inf
+        changed = {"deviation": deviation, "limits": limits, "alarm_level": alarm_level}
+        return replace(self, motion_s=motion_s, **changed)
 
     def _charts(self, innovations: np.ndarray) -> np.ndarray:
         """The charts, signed, after each of consecutive innovations (K, n_w), (K, 6, n_w)."""
@@ -223,7 +217,7 @@ class ChangeDetector:
         """Levels at each row of consecutive motions (K, n), (sum of K, n_w), and the alarms.
 
         Between motions the charts keep their values. A row that is not finite, and the two after
-        it, are not judged. Causes need the names of the watched states.
+        it, are not judged.
         """
         errors, repeats = [np.zeros((0, len(self.watched)))], [np.zeros(1)]  # First, of no row.
         lost, judged = [], []
@@ -276,12 +270,11 @@ class ChangeDetector:
         predictor = nominal.predictor.corrected(inputs, states)
         corrected = replace(nominal, predictor=predictor, nominal=nominal)
         limited = corrected._limited(inputs, states)
-        corrected = replace(corrected, motion_s=limited.motion_s)
         if limited.motion_s < LEAST_MOTION_S:
-            return corrected
+            return replace(corrected, motion_s=limited.motion_s)
         return replace(
-            corrected,
-            deviation=limited.deviation,
+            limited,
+            alarm_level=nominal.alarm_level,
             limits=np.maximum(limited.limits, nominal.limits),
             longest_repeat=max(nominal.longest_repeat, _free_repeats(inputs)),
         )
@@ -327,7 +320,7 @@ class ChangeDetector:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ChangeDetector:
         """Makes the detector of arrays written by `arrays`."""
-        alarm_level, longest_repeat, step_s, motion_s = arrays["settings"].tolist()
+        settings: dict[str, Any] = dict(zip(_SETTINGS, arrays["settings"].tolist(), strict=True))
         own = {k: v for k, v in arrays.items() if not k.startswith("nominal.")}
         adapted = {k.removeprefix("nominal."): v for k, v in arrays.items() if k not in own}
         nominal = cls.from_arrays(own | adapted) if adapted else None
@@ -339,10 +332,7 @@ class ChangeDetector:
             watched=arrays["watched"].astype(int),
             deviation=arrays["deviation"].astype(float),
             limits=arrays["limits"].astype(float),
-            alarm_level=alarm_level,
-            longest_repeat=int(longest_repeat),
-            step_s=step_s,
-            motion_s=motion_s,
+            **settings,
         )
 
 
@@ -431,7 +421,3 @@ def _repeats(x: np.ndarray) -> np.ndarray:
 def _free_repeats(inputs: Sequence[np.ndarray]) -> int:
     """Length of a run of repeated inputs that is no alarm after motions (K, n_u)."""
     return int(max(_repeats(x).max(initial=0.0) for x in inputs)) + _FREE_REPEATS
-
-
-def _minutes(duration_s: float) -> str:
-    return f"{math.floor(duration_s / 60.0)} min"

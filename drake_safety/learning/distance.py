@@ -68,7 +68,6 @@ def neighbour_graph(
     # Each with its last counted sample repeated, flattened, (N, H*n_z).
     steps = np.minimum(np.arange(error.shape[1]), np.asarray(length)[:, None] - 1)
     held = np.take_along_axis(error, steps[:, :, None], axis=1).reshape(num_segments, -1)
-    # `_dtw` and bounds are roots of the sums of squares.
     dtw = partial(_dtw, series, backend=backend)
     largest = _max_dtw(held, dtw)
     scale = largest**-2.0 if largest > 0.0 else 0.0

@@ -90,7 +90,6 @@ class Distances:
         ]
         self.mean = known.mean
         self.axes = np.concatenate(parts, axis=1) / known.scale[:, None]
-        # The distances are sums of squares of the offset's entries and of those along the axes.
         start, squared_scale = len(axes), known.scale**2
         self.terms = np.zeros((start + self.axes.shape[1], NUM_QUADRATIC))
         self.terms[:start, 0] = 1.0 / (_LEAST_VARIANCE * squared_scale)
@@ -130,12 +129,8 @@ class Novelty:
     novel though every entry is within its range. (In process monitoring they are T^2 and SPE.) The
     third is that of the plan alone. The range is that of every column, in half widths from its
     centre: one entry far from all that training had is novel even where the sum over many others
-    hides it. The object is immutable.
-
-    Args:
-        limits: Largest distances of a known input: of all of it, along redundancies, of the plan,
-            and from the centre of the range, (4,).
-        feedback: Moments of an actual robot's inputs, which are known as well.
+    hides it. `limits` are the largest of the four for a known input, in this order; the moments of
+    `feedback`, an actual robot's inputs, are known as well.
     """
 
     def __init__(

@@ -19,7 +19,6 @@ from drake_safety.learning.novelty import NUM_QUADRATIC, Novelty
 from drake_safety.learning.prediction import (
     LOGIT_LIMIT,
     SHIFT_LIMIT,
-    BaseLogit,
     Correction,
     Model,
     unknown_above,
@@ -45,18 +44,13 @@ _DESCRIPTIONS = {
     "predicted_margins": "Smallest margin of each constraint until the motion's end; negative is "
     "violated; NaN for maps that predict none.",
     "novelty": "Distance from the training inputs; novel above 1.",
+    "embedding": "Place of the input in the first map.",
     "fall_probability": "Probability of a fall; 1 for inputs that are not finite, NaN if it was "
     "not learned.",
-    "embedding": "Place of the input in the first map.",
 }
-_OUTPUTS = (
-    *("belief", "safety_probability", "cause_probability", "predicted_margins"),
-    *("novelty", "embedding", "fall_probability"),
-)
-_UNITS = (
-    "those of the recorded ports: SI and radians (m, m/s, rad, rad/s, N, N·m) in the tasks of "
-    "drake_safety"
-)
+_OUTPUTS = list(_DESCRIPTIONS)[3:]
+_UNITS = "those of the recorded ports: SI and radians (m, m/s, rad, rad/s, N, N·m) in the tasks of "
+_UNITS += "drake_safety"
 
 
 class _Graph:
@@ -192,9 +186,15 @@ def _add_prediction(graph: _Graph, model: Model, ports: Iterable[str], feature_u
     """Adds `Model.predict`; the outputs have the names of the ports."""
     base_logit, correction, embedding = model.base_logit, model.correction, model.embedding
     num_causes = model.num_causes
-    x = _inputs(graph, ports, feature_unit)
-    # False for NaN.
-    is_small = x.Abs().Less(INPUT_LIMIT).double()
+    parts = [_Value(graph, name) for name in ports]
+    if "features" in ports and feature_unit:
+        # Runtimes have no asinh of double precision.
+        u = parts[-1] / feature_unit
+        root = (u * u + 1.0).Sqrt()
+        size = (u.Abs() + root).Log()
+        parts.append(u.Sign() * size)
+    x = graph.node("Concat", *parts, axis=1, output="x")
+    is_small = x.Abs().Less(INPUT_LIMIT).double()  # False for NaN.
     is_usable = is_small.ReduceMin(axes=[1], keepdims=1).Greater(0.5)
     usable = is_usable.Where(x, 0.0)
     y, head, activations = _maps(usable, embedding)
@@ -215,7 +215,9 @@ def _add_prediction(graph: _Graph, model: Model, ports: Iterable[str], feature_u
     safe, uncertainty = (masses.part(i, i + 1, axis=1) for i in (SAFE, UNCERTAINTY))
     probability, fall = safe, None
     if base_logit is not None and head is not None:
-        heads = _heads(*head, base_logit)
+        z = head[0].Clip(-LOGIT_LIMIT, LOGIT_LIMIT).ReduceMean(axes=[0], keepdims=0)
+        smallest = head[1].ReduceMin(axes=[1], keepdims=1).Clip(*base_logit.margin_range)
+        heads = z.Concat(smallest / -base_logit.margin_unit, axis=1)
         if model.trees is not None:
             heads = heads.Concat(_trees(usable, model.trees), axis=1)
         slopes = np.array(base_logit.slopes[: 2 if model.trees is None else 3], dtype=float)
@@ -236,18 +238,6 @@ def _add_prediction(graph: _Graph, model: Model, ports: Iterable[str], feature_u
     # Without it, NaN of N rows.
     fall = safe * np.nan if fall is None else is_usable.Where(fall, 1.0)
     fall.Squeeze([1], output="fall_probability")
-
-
-def _inputs(graph: _Graph, ports: Iterable[str], feature_unit: float) -> _Value:
-    """x, (N, n_x)."""
-    parts = [_Value(graph, name) for name in ports]
-    if "features" in ports and feature_unit:
-        # Runtimes have no asinh of double precision.
-        u = parts[-1] / feature_unit
-        root = (u * u + 1.0).Sqrt()
-        size = (u.Abs() + root).Log()
-        parts.append(u.Sign() * size)
-    return graph.node("Concat", *parts, axis=1, output="x")
 
 
 def _maps(x: _Value, embedding: Embedding) -> tuple[_Value, tuple[_Value, _Value] | None, _Value]:
@@ -293,7 +283,6 @@ def _cell_weights(y: _Value, grid: Grid) -> tuple[_Value, _Value]:
     """Weights of the R cells along each axis at y, (K, N, 2, R); 1 inside the grid, (K, N, 1)."""
     resolution = float(grid.resolution)
     position = (y + grid.half_width) / grid.cell_length
-    # False for NaN.
     is_within = position.GreaterOrEqual(0.0).And(position.Less(resolution))
     inside = is_within.double().ReduceMin(axes=[2], keepdims=1)
     position = inside.Greater(0.0).Where(position, 0.0)
@@ -314,13 +303,6 @@ def _read_grid(weights: _Value, values: np.ndarray) -> _Value:
     along = first @ values.reshape(num_members, 1, resolution, -1)
     along = along.Reshape([0, 0, resolution, num_columns])
     return (second @ along).ReduceSum([0, 2], keepdims=0)
-
-
-def _heads(logit: _Value, margins: _Value, base_logit: BaseLogit) -> _Value:
-    """z and -m / margin_unit, (N, 2)."""
-    z = logit.Clip(-LOGIT_LIMIT, LOGIT_LIMIT).ReduceMean(axes=[0], keepdims=0)
-    smallest = margins.ReduceMin(axes=[1], keepdims=1).Clip(*base_logit.margin_range)
-    return z.Concat(smallest / -base_logit.margin_unit, axis=1)
 
 
 def _trees(x: _Value, trees: Trees) -> _Value:
@@ -345,8 +327,7 @@ def _shift(heads: _Value, activations: _Value, guard: _Value, correction: Correc
     shift = heads @ correction.change[1:, None] + correction.change[0]
     if hidden.any():
         added = (activations.double() @ hidden[:, :-1, None]).ReduceSum([0], keepdims=0)
-        added = (added + hidden[:, -1].sum()).Clip(*correction.hidden_range)
-        shift = shift + added
+        shift = shift + (added + hidden[:, -1].sum()).Clip(*correction.hidden_range)
     shift = shift.Clip(-SHIFT_LIMIT, SHIFT_LIMIT)
     lessened = (1.0 - guard) * shift
     return shift.Less(0.0).Where(lessened, shift)

@@ -171,8 +171,8 @@ class Model:
     novelty: Novelty
     base_logit: BaseLogit | None
     trees: Trees | None
-    fall_logit: FallLogit | None
     initial_uncertainty: float
+    fall_logit: FallLogit | None = None
 
     @property
     def num_causes(self) -> int:

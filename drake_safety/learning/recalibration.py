@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -16,8 +15,8 @@ from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.prediction import BaseLogit, Correction, Model, hidden_sum, sigmoid
 from drake_safety.learning.training_scores import TrainingScores
 
+# Prior standard deviations of the changes of offset, slopes and hidden layer's contribution.
 OFFSET_STD, SLOPE_STD, HIDDEN_STD = 2.0, 0.5, 1.0
-"""Prior standard deviations of the changes of offset, slopes and hidden layer's contribution."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,20 +45,18 @@ def _labelled(
     actual = [(pair.rows.state, pair.rows.desired_preview, pair.rows.features) for pair in feedback]
     twins = [pair.twin.first_inputs for pair in feedback]
 
-    def labelled(x: np.ndarray, is_unsafe: np.ndarray, weight: np.ndarray) -> LabelledHeads:
+    def labelled(x: np.ndarray, **labels: np.ndarray) -> LabelledHeads:
         heads, activations = model.evaluate(x).heads, model.embedding.activations(x)
         assert heads is not None
-        return LabelledHeads(
-            heads=heads, activations=activations, is_unsafe=is_unsafe, weight=weight
-        )
+        return LabelledHeads(heads=heads, activations=activations, **labels)
 
     x = columns.of(*map(np.concatenate, zip(*actual, strict=True)))
     is_unsafe = np.repeat([not pair.actual.is_safe for pair in feedback], num_rows)
     x_twins = columns.of(*map(np.stack, zip(*twins, strict=True)))
     twin_is_unsafe = np.array([not pair.twin.is_safe for pair in feedback])
     return (
-        labelled(x, is_unsafe, row_weights(num_rows)),
-        labelled(x_twins, twin_is_unsafe, np.ones(len(feedback))),
+        labelled(x, is_unsafe=is_unsafe, weight=row_weights(num_rows)),
+        labelled(x_twins, is_unsafe=twin_is_unsafe, weight=np.ones(len(feedback))),
     )
 
 
@@ -104,8 +101,7 @@ def fitted_change(
 
     bounds: list[tuple[float | None, None]] = [(None, None)] * phi.shape[1]
     bounds[1 : 1 + num_heads] = [(-slope, None) for slope in base_logit.slopes[:num_heads]]
-    options: dict[str, Any] = {"ftol": 1e-13, "gtol": 1e-7, "maxiter": 2000, "maxcor": 30}
-    options["maxfun"] = 4000
+    options = {"ftol": 1e-13, "gtol": 1e-7, "maxiter": 2000, "maxcor": 30, "maxfun": 4000}
     start = np.zeros(phi.shape[1])
     w = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     weights = w[1 + num_heads :].reshape(num_members, num_activations) / unit

@@ -13,12 +13,10 @@ from typing import NamedTuple
 
 from drake_safety.learning.segments import EpisodesInfo
 
-NOT_DRAWN = -1
-"""Seed of recorded episodes, whose starts no other set shares."""
+NOT_DRAWN = -1  # Seed of recorded episodes, whose starts no other set shares.
 _SPAN = 20_000_000  # More than the seeds of development.
 _RELEASES = {"0.1.0": _SPAN}  # Added for a version's figures; a span a version.
-RELEASE = max(_RELEASES.values())
-"""Added to a seed for the figures of the newest version."""
+RELEASE = max(_RELEASES.values())  # Of the newest version.
 
 
 class SeedBlock(NamedTuple):
@@ -38,31 +36,24 @@ class SeedBlock(NamedTuple):
 
 
 TRAINING = SeedBlock(0, ("training",))
+# Thresholds are chosen on other episodes, throws and pushes than the evaluated ones.
 EVALUATION = SeedBlock(
     1_000_000, ("evaluation", "disturbances", "disturbance thresholds", "thresholds")
 )
-"""Thresholds are chosen on other episodes, throws and pushes than the evaluated ones."""
 CALIBRATION = SeedBlock(2_000_000, ("calibration",))
 PLANNING = SeedBlock(3_000_000, ("planning",))
+# Nominal twins have the seed of their actual episodes.
 ADAPTATION = SeedBlock(4_000_000, ("adaptation", "evaluation of the adaptation"))
-"""Nominal twins have the seed of their actual episodes."""
-DEMONSTRATION = SeedBlock(7_000_000, ("demonstration",))
-"""For `run`, `play` and `check`."""
-SHIFTS = SeedBlock(8_000_000, ("shifts",))
-"""Conditions that training does not have."""
-MOTION = SeedBlock(9_000_000, ("motion", "motion of the actual robot"))
-"""Undisturbed motion, of which a monitor learns what is usual."""
-FRESH_MOTION = SeedBlock(9_100_000, ("fresh motion",))
-"""Undisturbed motion that shows how often the monitor alarms."""
 WALKING = SeedBlock(6_000_000, ("calibration", "tour", "push", "command"))
-"""Motions of walking robots; of the first, velocities are compared between engines."""
+DEMONSTRATION = SeedBlock(7_000_000, ("demonstration",))  # For `run`, `play` and `check`.
+SHIFTS = SeedBlock(8_000_000, ("shifts",))  # Conditions that training does not have.
+# Undisturbed motion, from which a monitor learns; fresh one shows how often it alarms.
+MOTION = SeedBlock(9_000_000, ("motion", "motion of the actual robot"))
+FRESH_MOTION = SeedBlock(9_100_000, ("fresh motion",))
 ANOMALIES = SeedBlock(10_000_000, ("unperturbed", "perturbed", "thresholds"))
-"""Motion with and without an anomaly, and that for thresholds."""
 GATE = SeedBlock(11_000_000, ("pairs of two loops",))
-"""Both loops of a pair draw from the same generator."""
 RATE = SeedBlock(12_000_000, ("failure rate",))
-FALLS = SeedBlock(13_000_000, ("falls",))
-"""Episodes that go on after they leave the safe set."""
+FALLS = SeedBlock(13_000_000, ("falls",))  # Episodes that go on outside the safe set.
 
 
 def use_of(seed: int) -> str:

@@ -14,15 +14,13 @@ import numpy as np
 from drake_safety.learning.assessment_parameters import MOST_SAMPLES, AssessmentParameters
 from drake_safety.learning.mode_settings import mode_settings
 
+# Arrays that an episode holds per row, besides its time.
 RECORDED = (
     *("state", "true_state", "output", "desired_output"),
     *("desired_preview", "features", "margins"),
 )
-"""Arrays that an episode holds per row, besides its time."""
-LARGEST = 1e12
-"""Any quantity in SI units is smaller; a larger one is an error of a log, or a divergence."""
-DIVERGED = "diverged"
-"""Cause of an episode whose simulation failed; it has no safety label."""
+LARGEST = 1e12  # Any quantity in SI units is smaller, but for errors of a log and divergences.
+DIVERGED = "diverged"  # Cause of an episode whose simulation failed; it has no safety label.
 _LOGGER = logging.getLogger("drake_safety")
 _FEW = 1.0  # Percentage of starts outside the safe set without a warning.
 
