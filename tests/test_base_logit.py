@@ -7,7 +7,7 @@ from drake_safety.learning import maps
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.maps import fitted_base_logit, held_out_segments
-from drake_safety.learning.prediction import BaseLogit, sigmoid
+from drake_safety.learning.prediction import sigmoid
 from drake_safety.learning.segments import training_segments
 from drake_safety.learning.trained_maps import EmbeddingOutput
 from lip_episodes import make_episodes
@@ -97,21 +97,3 @@ def test_trees_have_their_slope_beside_the_heads(segments):
     assert ratio == pytest.approx(2.0 * found.trees_slope / found.safety_slope, rel=1e-2)
     # What says the opposite counts for nothing.
     assert fitted(output, segments, actual, trees_logit=-trees).trees_slope == 0.0
-
-
-def test_logit_is_that_of_mean_head_and_smallest_mean_margin_and_limited():
-    logit = BaseLogit(
-        margin_unit=0.02,
-        margin_range=(-0.03, 0.1),
-        offset=-0.2,
-        safety_slope=0.8,
-        margin_slope=1.3,
-        trees_slope=0.5,
-    )
-    margins = np.array([[[0.02, 0.5]], [[0.04, 0.5]]])
-    output = outputs(np.array([[1.0], [9.0]]), margins)
-    heads = logit.heads(output, margins.mean(axis=0), np.array([20.0]))
-    expected = -0.2 + 0.8 * np.mean([1.0, 8.0]) - 1.3 * 0.03 / 0.02
-    assert logit.of_heads(heads[:, :2])[0] == pytest.approx(expected)
-    assert logit.of_heads(heads)[0] == pytest.approx(expected + 0.5 * 8.0)
-    assert dataclasses.replace(logit, safety_slope=10.0).of_heads(heads)[0] == 8.0

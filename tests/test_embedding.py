@@ -13,13 +13,8 @@ from lip_episodes import make_episodes
 
 pytestmark = pytest.mark.train
 
-SETTINGS = AssessmentParameters(
-    hidden_sizes=[32, 32],
-    dropout=0.0,
-    epochs=30,
-    batch_size=64,
-    learning_rate=5e-3,
-)
+OPTIONS = {"hidden_sizes": [32, 32], "dropout": 0.0, "epochs": 30}
+SETTINGS = AssessmentParameters(batch_size=64, learning_rate=5e-3, **OPTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +30,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def embedding(data):
-    members = [train_map(data, SETTINGS, seed=seed) for seed in (0, 1)]
-    return stack_members(members)
+    return stack_members([train_map(data, SETTINGS, seed=seed) for seed in (0, 1)])
 
 
 def test_tsne_puts_neighbours_near_each_other_the_same_for_a_seed():
@@ -56,20 +50,11 @@ def test_tsne_puts_neighbours_near_each_other_the_same_for_a_seed():
 
 
 def test_papers_map_reproduces_its_targets_also_where_it_has_none(data):
-    reading = PaperReading(hidden_sizes=[32, 32], dropout=0.0, epochs=30, standardized=True)
+    reading = PaperReading(standardized=True, **OPTIONS)
     trained = train_map(data, replace(SETTINGS, mode="paper", paper=reading), seed=0)
     expected = np.column_stack([20.0 * data.x[:, 0], 2.0 * (data.x[:, 1] - 5.0)])
     error = np.linalg.norm(stack_members([trained]).embed(data.x)[0] - expected, axis=1)
     assert np.median(error[~data.has_target]) < 0.1 * expected.std()
-
-
-def test_map_predicts_safety_and_margins_in_their_own_unit(data, embedding):
-    output = embedding.evaluate(data.x)
-    is_clear = np.abs(data.x[:, 0] - 0.5) > 0.2
-    clipped = np.clip(data.margins[:, 0], *SETTINGS.margin_range)
-    for logit, margins in zip(output.unsafe_logit, output.margins, strict=True):
-        assert ((logit > 0.0) == data.is_unsafe)[is_clear].mean() > 0.98
-        assert np.median(np.abs(margins[:, 0] - clipped)) < 0.003
 
 
 def test_training_gives_the_same_weights_for_a_seed_and_leaves_torchs_state_alone(data):
@@ -82,15 +67,6 @@ def test_training_gives_the_same_weights_for_a_seed_and_leaves_torchs_state_alon
     assert num_threads == torch.get_num_threads()
     for name in first:
         np.testing.assert_array_equal(first[name], again[name])
-
-
-def test_row_that_is_not_finite_gives_nan_and_leaves_the_others_alone(data, embedding):
-    x = data.x[:4].copy()
-    x[1, 2], x[2, 0] = np.nan, np.inf
-    output = embedding.evaluate(x)
-    assert np.all(np.isnan(output.embedding[:, 1:3]))
-    assert np.all(np.isnan(output.unsafe_logit[:, 1:3]))
-    np.testing.assert_array_equal(output.embedding[:, ::3], embedding.embed(data.x[:4])[:, ::3])
 
 
 def test_input_beyond_the_range_is_clipped_to_its_edge(embedding):
@@ -110,13 +86,8 @@ def test_input_beyond_the_range_is_clipped_to_its_edge(embedding):
     np.testing.assert_array_equal(gradient, expected)
 
 
-@pytest.mark.parametrize(
-    ("ask", "message"),
-    [
-        (lambda e: e.weights["output.bias"].fill(0.0), "read-only"),
-        (lambda e: e.evaluate(np.zeros((2, 3))), r"inputs have shape \(2, 3\), expected \(N, 4\)"),
-    ],
-)
-def test_what_does_not_fit_the_maps_is_refused(embedding, ask, message):
-    with pytest.raises(ValueError, match=message):
-        ask(embedding)
+def test_what_does_not_fit_the_maps_is_refused(embedding):
+    with pytest.raises(ValueError, match="read-only"):
+        embedding.weights["output.bias"].fill(0.0)
+    with pytest.raises(ValueError, match=r"inputs have shape \(2, 3\), expected \(N, 4\)"):
+        embedding.evaluate(np.zeros((2, 3)))

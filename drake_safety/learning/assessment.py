@@ -387,6 +387,7 @@ class SafetyAssessment:
         """Writes `predict` as it is now as one ONNX graph, atomically; see docs/export.md."""
         from drake_safety.learning import onnx_graph
 
+        self._check_fitted()
         onnx_graph.write(Path(path), self)
 
     @classmethod
