@@ -14,15 +14,9 @@ from drake_safety.learning.maps import MapData
 from drake_safety.learning.segments import Episodes, split
 from lip_episodes import make_episodes
 
-QUICK = {
-    "perplexity": 15.0,
-    "epochs": 12,
-    "hidden_sizes": [32, 32],
-    "ensemble_size": 2,
-    "batch_size": 256,
-    "score_weight": 0.1,
-    "paper": PaperReading(epochs=12, hidden_sizes=[48, 48], dropout=0.1),
-}
+QUICK = {"perplexity": 15.0, "epochs": 12, "hidden_sizes": [32, 32], "ensemble_size": 2}
+QUICK |= {"batch_size": 256, "score_weight": 0.1}
+QUICK |= {"paper": PaperReading(epochs=12, hidden_sizes=[48, 48], dropout=0.1)}
 NUM_PAIRS = 40
 
 

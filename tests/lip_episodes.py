@@ -18,13 +18,8 @@ _SUBSTEPS = 8
 
 def make_episodes(num_episodes: int, *, seed: int = 0, noise: float = 0.0) -> Episodes:
     """Rolls out `num_episodes` pendulums."""
-    draws = [
-        np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i,))).normal(
-            size=(NUM_STEPS + 2, 24)
-        )
-        for i in range(num_episodes)
-    ]
-    normal = np.stack(draws)
+    seeds = [np.random.SeedSequence(seed, spawn_key=(i,)) for i in range(num_episodes)]
+    normal = np.stack([np.random.default_rng(s).normal(size=(NUM_STEPS + 2, 24)) for s in seeds])
     start = np.clip(normal[:, 0, :3] * [0.05, 0.03, 0.03], -0.15, 0.15) + [0.0, 0.0, 0.42]
     velocity = normal[:, 0, 3:6] * [0.45, 0.30, 0.25]
     target = np.clip(normal[:, 0, 6:9] * [0.10, 0.06, 0.03], -0.2, 0.2) + [0.0, 0.0, 0.42]
@@ -41,9 +36,8 @@ def make_episodes(num_episodes: int, *, seed: int = 0, noise: float = 0.0) -> Ep
         gust = 0.05 * normal[:, k + 1, :3]
         for _ in range(_SUBSTEPS):
             capture = p[:, :2] + v[:, :2] / _OMEGA
-            pressure = np.clip(
-                capture + 1.5 * (capture - desired[:, k, :2]), -SUPPORT * 0.75, SUPPORT * 0.75
-            )
+            pressure = capture + 1.5 * (capture - desired[:, k, :2])
+            pressure = np.clip(pressure, -SUPPORT * 0.75, SUPPORT * 0.75)
             horizontal = _OMEGA**2 * (p[:, :2] - pressure)
             vertical = np.clip(80.0 * (desired[:, k, 2] - p[:, 2]) - 12.0 * v[:, 2], -4.0, 4.0)
             v = v + dt * (np.column_stack([horizontal, vertical]) + gust)
@@ -72,7 +66,6 @@ def make_episodes(num_episodes: int, *, seed: int = 0, noise: float = 0.0) -> Ep
                 margins=margins[rows],
                 is_safe=is_safe,
                 cause="" if is_safe else ("support", "height")[int(np.argmin(margins[last]))],
-                first_step=0,
             )
         )
     info = EpisodesInfo(

@@ -19,12 +19,8 @@ def test_an_alarm_ends_after_five_seconds_of_low_levels():
     largest = levels.max(axis=1)
     size = round(RECOVERY_S / STEP_S)
     assert alarm.begin == int(np.argmax(largest > 1.0))
-    ends = [
-        row
-        for row in range(alarm.begin + size, len(largest))
-        if largest[row + 1 - size : row + 1].max() < RECOVERED_LEVEL
-    ]
-    assert alarm.end == ends[0]
+    calm = np.lib.stride_tricks.sliding_window_view(largest, size).max(axis=1) < RECOVERED_LEVEL
+    assert alarm.end == np.flatnonzero(calm[alarm.begin + 1 :])[0] + alarm.begin + size
 
 
 def test_the_events_of_a_run_have_begin_and_end_of_every_alarm():
@@ -73,10 +69,7 @@ def test_an_event_names_the_reason_of_a_low_probability(
     ports = {name: np.tile(np.asarray(row, dtype=float), (20, 1)) for name, row in rows.items()}
     ports["alarm"][:5] = 0.0
     parameters = SimpleNamespace(initial_uncertainty=0.3, margin_unit=1.0)
-    loop = SimpleNamespace(
-        constraint_names=["height"],
-        angular_constraints=(),
-        assessment=SimpleNamespace(parameters=parameters),
-    )
+    names = {"constraint_names": ["height"], "angular_constraints": ()}
+    loop = SimpleNamespace(**names, assessment=SimpleNamespace(parameters=parameters))
     motion = Motion(time_s=0.02 * np.arange(20), ports=ports)
     assert reason_events(loop, motion, [0.2], 0.06, happens) == [(0.2, happens + reason)]

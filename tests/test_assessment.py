@@ -14,13 +14,7 @@ from drake_safety.learning.assessment_file import SCHEMA, SCHEMA_VERSION
 from drake_safety.learning.beliefs import EMPTY
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import split, training_segments
-from lip_assessments import (
-    QUICK,
-    held_out_segments,
-    inputs,
-    quick_assessment,
-    quick_episodes,
-)
+from lip_assessments import QUICK, held_out_segments, inputs, quick_assessment, quick_episodes
 from lip_episodes import make_episodes
 
 pytestmark = pytest.mark.train
@@ -158,9 +152,8 @@ def test_features_enter_a_second_time_with_a_feature_unit(held_out):
     num_raw = len(info.state_names) + info.horizon * len(info.output_names)
     state, preview, features = inputs(held_out, slice(0, 20))
     x = doubled.inputs_of(state, preview, features)
-    np.testing.assert_array_equal(
-        x[:, num_raw:], np.hstack([features, np.arcsinh(features / 0.05)])
-    )
+    expected = np.hstack([features, np.arcsinh(features / 0.05)])
+    np.testing.assert_array_equal(x[:, num_raw:], expected)
     features[:] = np.nan
     assert np.all(doubled.predict(state, preview, features).belief == EMPTY)
 
@@ -243,10 +236,7 @@ def test_saved_assessment_is_loaded_to_the_bit(assessment, held_out, tmp_path, p
     ("metadata", "message"),
     [
         (None, "is not a safety assessment of this version: its metadata has the entries"),
-        (
-            {SCHEMA: '{"schema_version": 11}'},
-            f"schema version 11, .* reads {SCHEMA_VERSION}: train",
-        ),
+        ({SCHEMA: '{"schema_version": 11}'}, f"version 11, .* reads {SCHEMA_VERSION}: train"),
         ({SCHEMA: f'{{"schema_version": {SCHEMA_VERSION}}}'}, "damaged .*: it has no 'sha256'"),
         ({SCHEMA: "[" * 100_000}, "torn' is a damaged safety assessment"),
     ],
@@ -272,10 +262,8 @@ def test_every_flipped_bit_is_noticed(path):
     header = int(content[:8].view(np.uint64)[0])
     rng = np.random.default_rng(0)
     # Half of them in names, shapes and metadata, half in numbers.
-    places = np.concatenate(
-        [rng.integers(8, 8 + header, 60), rng.integers(8 + header, len(content), 60)]
-    )
-    for place in places:
+    ends = ((8, 8 + header), (8 + header, len(content)))
+    for place in np.concatenate([rng.integers(*span, 60) for span in ends]):
         damaged = content.copy()
         damaged[place] ^= np.uint8(1 << rng.integers(8))
         path.write_bytes(damaged.tobytes())

@@ -71,3 +71,21 @@ def test_simulation_with_gamma_uses_no_cpu_time_in_threads_of_blas():
     process_s = time.process_time() - process_s
     assert thread_s > 0.01
     assert process_s - thread_s < 0.05 * thread_s
+
+
+def final_values(loop, seed):
+    context = loop.CreateDefaultContext()
+    loop.reset(context, np.random.default_rng(seed))
+    Simulator(loop, context).AdvanceTo(0.2)
+    ports = ("state", "features", "margins", "belief")
+    return np.concatenate([loop.GetOutputPort(name).Eval(context) for name in ports])
+
+
+def test_threads_with_one_diagram_give_the_same_bits_as_one_after_the_other():
+    name = "laikago_balancing"
+    loop = load_scenario(name).make_loop("actual", assessment=load_assessment(name))
+    alone = [final_values(loop, seed) for seed in range(4)]
+    assert len({values.tobytes() for values in alone}) == 4
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda seed: final_values(loop, seed), range(4)))
+    np.testing.assert_array_equal(alone, together)

@@ -8,6 +8,7 @@ from drake_safety.learning.distance import neighbour_graph
 from drake_safety.learning.maps import stack_members, train_map
 from drake_safety.learning.points import tsne
 from drake_safety.learning.segments import split
+from drake_safety.learning.trained_maps import Embedding
 from lip_assessments import map_data
 from lip_episodes import make_episodes
 
@@ -72,7 +73,7 @@ def test_training_gives_the_same_weights_for_a_seed_and_leaves_torchs_state_alon
 def test_input_beyond_the_range_is_clipped_to_its_edge(embedding):
     x = np.array([[9.0, 5.0, 1.0, -9.0], [0.1, 4.0, 1.1, 2.0]])
     low, high = [-1.0, 0.0, 0.5, -2.0], [1.0, 8.0, 1.5, 3.0]
-    clipping = embedding.clipping(np.array([low, high]))
+    clipping = Embedding(embedding.weights, np.array([low, high]))
     edge = np.array([[1.0, 5.0, 1.0, -2.0], [0.1, 4.0, 1.1, 2.0]])
     np.testing.assert_array_equal(clipping.embed(x), clipping.embed(edge))
     np.testing.assert_allclose(clipping.embed(x), embedding.embed(edge), rtol=1e-3)

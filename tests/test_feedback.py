@@ -53,16 +53,8 @@ def test_the_twin_begins_where_the_actual_robot_does_with_the_same_plan(kept):
 def test_pairs_are_kept_and_gone_on_with(kept):
     folder, pairs = kept
     assert completed(folder / "payload") == completed(folder / "nominal") == {0, 1, 2}
-    done = []
-    again = run_pairs(
-        quick(),
-        3,
-        variation="payload",
-        seed=7,
-        num_workers=1,
-        path=folder,
-        progress=lambda *count: done.append(count),
-    )
+    done, options = [], {"variation": "payload", "seed": 7, "num_workers": 1, "path": folder}
+    again = run_pairs(quick(), 3, progress=lambda *count: done.append(count), **options)
     assert done == [(3, 6), (6, 6)]
     for one, other in zip(pairs.actual, again.actual, strict=True):
         np.testing.assert_array_equal(one.state, other.state)
@@ -102,9 +94,8 @@ def test_the_plan_of_a_window_goes_through_what_was_desired(kept):
     loop = quick().make_loop()
     episode = pairs.actual[1]
     plant_state = np.concatenate([loop.kinematics.standing_positions(), np.zeros(18)])
-    start = window_start(
-        loop, RecordedWindow(episode=episode, plant_state=plant_state, start_time_s=0.0)
-    )
+    window = RecordedWindow(episode=episode, plant_state=plant_state, start_time_s=0.0)
+    start = window_start(loop, window)
     preview = episode.desired_preview.reshape(len(episode.time_s), -1, 3)
     for row, time_s in enumerate(episode.time_s[:-1]):
         np.testing.assert_allclose(start.plan.value(time_s).ravel(), preview[row, 0], atol=1e-12)

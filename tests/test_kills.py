@@ -63,34 +63,25 @@ def assert_kept(folder, undisturbed):
 
 
 @pytest.mark.train
-@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT])
-def test_a_killed_command_leaves_no_process_and_resumes_exactly(kill, tmp_path, undisturbed):
+@pytest.mark.parametrize(
+    ("kill", "is_worker", "code", "said"),
+    [
+        (signal.SIGKILL, False, -signal.SIGKILL, []),
+        (signal.SIGINT, False, 130, ["stopped; finished episodes are kept"]),
+        (signal.SIGKILL, True, 2, ["a worker process was killed", "--resume"]),
+    ],
+)
+def test_a_killed_command_leaves_no_process_and_resumes_exactly(
+    kill, is_worker, code, said, tmp_path, undisturbed
+):
     process = start(tmp_path)
     workers = workers_of(process)
     assert len(workers) == 2
-    process.send_signal(kill)
+    os.kill(workers[0].pid if is_worker else process.pid, kill)
     output = process.communicate(timeout=PATIENCE_S)[0]
     _, alive = psutil.wait_procs(workers, timeout=WITHIN_S)
-    assert not alive
-    if kill != signal.SIGKILL:
-        assert process.returncode == 130
-        assert "stopped; finished episodes are kept" in output
-        assert "Traceback" not in output
-    assert_kept(tmp_path / "episodes", undisturbed)
-
-
-@pytest.mark.train
-def test_a_killed_worker_is_one_line_that_says_how_to_go_on(tmp_path, undisturbed):
-    process = start(tmp_path)
-    workers = workers_of(process)
-    os.kill(workers[0].pid, signal.SIGKILL)
-    output = process.communicate(timeout=PATIENCE_S)[0]
-    assert process.returncode == 2
-    assert "a worker process was killed" in output
-    assert "--resume" in output
-    assert "Traceback" not in output
-    _, alive = psutil.wait_procs(workers, timeout=WITHIN_S)
-    assert not alive
+    assert not alive and process.returncode == code
+    assert all(words in output for words in said) and "Traceback" not in output
     assert_kept(tmp_path / "episodes", undisturbed)
 
 

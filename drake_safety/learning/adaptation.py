@@ -45,10 +45,13 @@ def paper_beliefs(
         uncertainty.append(np.where(deviation <= settings.gate, mu, parameters.initial_uncertainty))
     prior = prior_beliefs(training, grid, parameters, num_causes, np.stack(uncertainty))
     certain = belief_masses.from_scores(feedback.score, 0.0, feedback.cause, num_causes)
-    beliefs = []
-    for member_prior, member_points in zip(prior, points, strict=True):
+    beliefs, cells = [], np.tile(np.arange(grid.num_cells), 2)
+    for own, member_points in zip(prior, points, strict=True):
         actual = feedback_beliefs(certain, grid.locate(member_points), grid, settings)
-        beliefs.append(combined(member_prior, actual))
+        both = np.concatenate([own, actual])
+        fused = belief_masses.fuse_cells(both, cells, num_cells=grid.num_cells, min_count=0)
+        has_feedback = actual[:, belief_masses.UNCERTAINTY, None] < 1.0
+        beliefs.append(np.where(has_feedback, fused, own))
     return np.stack(beliefs)
 
 
@@ -112,16 +115,3 @@ def feedback_beliefs(
     # mu_v = beta exp(-alpha (n_f - 1))
     uncertainty = settings.first_uncertainty * np.exp(-settings.decay_rate * (num_feedback - 1.0))
     return belief_masses.average_cells(certain, cells, np.minimum(uncertainty, 1.0))
-
-
-def combined(prior: np.ndarray, feedback: np.ndarray) -> np.ndarray:
-    """Fuses prior and feedback of each cell, (R*R, 3 + n_c); without feedback, the prior."""
-    num_cells = len(prior)
-    both = belief_masses.fuse_cells(
-        np.concatenate([prior, feedback]),
-        np.tile(np.arange(num_cells), 2),
-        num_cells=num_cells,
-        min_count=0,
-    )
-    has_feedback = feedback[:, belief_masses.UNCERTAINTY] < 1.0
-    return np.where(has_feedback[:, None], both, prior)

@@ -272,10 +272,8 @@ class SafetyAssessment:
         step_s, trained_step_s = motions.info.step_s, self.detector_.step_s
         stride = round(trained_step_s / step_s)
         if not math.isclose(stride * step_s, trained_step_s):
-            raise ValueError(
-                f"{self._who}: rows of the motions are {step_s} s apart, which does not divide the "
-                f"{trained_step_s} s of the monitor's training"
-            )
+            who = f"{self._who}: rows of the motions are {step_s} s apart"
+            raise ValueError(f"{who}, which does not divide {trained_step_s} s, the monitor's")
         return [rows[::stride] for rows in usual_rows(motions)]
 
     def _replace_used(self, purpose: str, used: Sequence[UsedEpisodes]) -> None:
@@ -348,9 +346,8 @@ class SafetyAssessment:
         own = self.model
         model = replace(own, **learned) if learned else own
         if (given := model.shapes) != (expected := own.shapes):
-            raise ValueError(
-                f"{self._who}: beliefs and correction have the shapes {given}, expected {expected}"
-            )
+            what = f"beliefs and correction have the shapes {given}"
+            raise ValueError(f"{self._who}: {what}, expected {expected}")
         return model.predict(x)
 
     def _checked_inputs(self, ndim: int, state: np.ndarray, *others: Any) -> np.ndarray:

@@ -82,8 +82,7 @@ def learned_maps(
         tried = embedding = _train(data, parameters, progress)
         is_held_out = np.ones(len(segments), dtype=bool)
     else:
-        # As scikit-learn's CalibratedClassifierCV(ensemble=False): a first ensemble is evaluated
-        # on the held-out episodes, and the final one is trained on all episodes.
+        # A first ensemble is evaluated on the held-out episodes, the final one is trained on all.
         tried = _train(data.take(~is_held_out), parameters, lambda done: progress(0.5 * done))
         embedding = _train(data, parameters, lambda done: progress(0.5 * (1 + done)))
         tried_trees, trees = learned_trees(data, segments.episode, is_held_out, parameters.seed)
@@ -93,7 +92,7 @@ def learned_maps(
         tried.evaluate(judged), segments.take(is_held_out), parameters, trees_logit
     )
     known = np.quantile(x, [_CLIPPED_SHARE, 1.0 - _CLIPPED_SHARE], axis=0)
-    return embedding.clipping(known), base_logit, trees
+    return Embedding(embedding.weights, known), base_logit, trees
 
 
 def learned_trees(
@@ -149,7 +148,7 @@ def _train(data: MapData, parameters: AssessmentParameters, progress: _Report) -
 
 
 def stack_members(members: list[dict[str, np.ndarray]]) -> Embedding:
-    """Stacks members returned by `train_map` into one `Embedding`."""
+    """Stacks maps of `train_map`."""
     return Embedding({name: np.stack([member[name] for member in members]) for name in members[0]})
 
 
@@ -201,16 +200,12 @@ def train_map(
         is_unsafe = single(data.is_unsafe)
         low, high = parameters.margin_range
         margins = single(np.clip(data.margins, low, high) / parameters.margin_unit)
+        rate, num_batches = parameters.learning_rate, -(-len(x) // parameters.batch_size)
         optimiser = torch.optim.AdamW(
-            net.parameters(),
-            lr=parameters.learning_rate,
-            weight_decay=settings.weight_decay,
-            fused=True,
+            net.parameters(), lr=rate, weight_decay=settings.weight_decay, fused=True
         )
         schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser,
-            max_lr=parameters.learning_rate,
-            total_steps=settings.epochs * -(-len(x) // parameters.batch_size) + 1,
+            optimiser, max_lr=rate, total_steps=settings.epochs * num_batches + 1
         )
         # The share of targets varies between batches, so the mean over the whole set normalises.
         mean_target_weight = float(target_weight.mean())

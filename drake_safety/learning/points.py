@@ -38,8 +38,7 @@ def embedded_points(
     if num_targeted <= num_neighbours:
         raise ValueError(
             f"SafetyAssessment: perplexity {parameters.perplexity} needs more than "
-            f"{num_neighbours} segments, the {len(first)} episodes give {num_targeted}: record "
-            "more episodes"
+            f"{num_neighbours} segments, {len(first)} episodes give {num_targeted}: record more"
         )
     targeted = segments.take(has_target)
     graph = neighbour_graph(

@@ -67,11 +67,8 @@ class EpisodesInfo:
     def __post_init__(self) -> None:
         is_known = 1 <= self.horizon <= MOST_SAMPLES and self.preview_stride >= 1
         if not (is_known and self.step_s > 0.0):
-            raise ValueError(
-                f"episodes of '{self.scenario}': horizon {self.horizon}, preview_stride "
-                f"{self.preview_stride} and step_s {self.step_s} must be positive, and the first "
-                f"at most {MOST_SAMPLES}"
-            )
+            numbers = f"horizon {self.horizon}, preview_stride {self.preview_stride} and step_s"
+            raise ValueError(f"episodes of '{self.scenario}' cannot have {numbers} {self.step_s}")
 
     @property
     def preview_step_s(self) -> float:
@@ -216,10 +213,7 @@ def _check_episode(info: EpisodesInfo, episode: Episode) -> None:
         raise ValueError(f"{who}: first_step is {episode.first_step} of {num_rows} rows")
     causes = [""] if episode.is_safe else [DIVERGED, *info.constraint_names]
     if episode.cause not in causes:
-        raise ValueError(
-            f"{who}: is_safe is {episode.is_safe} and the cause '{episode.cause}', expected one of "
-            f"{causes}"
-        )
+        raise ValueError(f"{who}: the cause '{episode.cause}' is none of {causes}")
 
 
 def unsafety_score(
@@ -332,10 +326,8 @@ def training_segments(episodes: Episodes, parameters: AssessmentParameters) -> S
     for name in ("horizon", "preview_stride"):
         here, there = getattr(parameters, name), getattr(episodes.info, name)
         if here != there:
-            raise ValueError(
-                f"SafetyAssessment: {name} is {here}, of the episodes of "
-                f"'{episodes.info.scenario}' is {there}"
-            )
+            who = f"the episodes of '{episodes.info.scenario}'"
+            raise ValueError(f"SafetyAssessment: {name} is {here}, that of {who} is {there}")
     settings = mode_settings(parameters)
     return split(
         episodes, stride=settings.stride, discount=parameters.discount, shortest=settings.shortest

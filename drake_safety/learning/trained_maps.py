@@ -98,10 +98,6 @@ class Embedding:
         own, others = ({**maps.weights, "range": maps.input_range} for maps in (self, other))
         return own.keys() == others.keys() and all(np.array_equal(own[k], others[k]) for k in own)
 
-    def clipping(self, input_range: np.ndarray) -> Embedding:
-        """Returns the same maps, with inputs clipped to a range of each column, (2, n_x)."""
-        return Embedding(self.weights, input_range)
-
     def scaled(self, factors: np.ndarray) -> Embedding:
         """Returns maps with y scaled by one factor each, (K,), and the same safety logits."""
         weights = {name: w.copy() for name, w in self.weights.items()}
@@ -117,9 +113,8 @@ class Embedding:
         A row has the same bits whatever the others are.
         """
         if np.ndim(x) != 2 or np.shape(x)[1] != self.num_inputs:
-            raise ValueError(
-                f"Embedding: inputs have shape {np.shape(x)}, expected (N, {self.num_inputs})"
-            )
+            expected = f"expected (N, {self.num_inputs})"
+            raise ValueError(f"Embedding: inputs have shape {np.shape(x)}, {expected}")
         if are_usable(x):
             return self._outputs(self._clipped(x))
         is_usable = (np.abs(x) < INPUT_LIMIT).all(axis=1)  # False for NaN.
