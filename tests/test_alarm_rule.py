@@ -30,22 +30,20 @@ def test_the_events_of_a_run_have_begin_and_end_of_every_alarm():
     cause = np.full(50, "", dtype=object)
     cause[10:20], cause[40:] = "inputs frozen", "pushed steadily down"
     ports = {"safety_probability": np.ones((50, 1)), "alarm": alarm, "alarm_cause": cause}
-    rows = [
-        event_rows(events, Motion(time_s=time_s, ports=given), SimpleNamespace(**gamma))
-        for events, given, gamma in (
-            ([(0.5, "ball")], ports, {"calibrations_": {}}),
-            ([], ports, {"calibrations_": {"plan": None}}),
-            ([], {"safety_probability": alarm}, {"calibrations_": {}}),
-        )
-    ]
-    assert rows[0] == [
+
+    def rows(events, given, calibrations):
+        gamma = SimpleNamespace(calibrations_=calibrations)
+        return event_rows(events, Motion(time_s=time_s, ports=given), gamma)
+
+    assert rows([(0.5, "ball")], ports, {}) == [
         ("0.20", "monitor: inputs frozen", "1.00"),
         ("0.40", "monitor: the alarm ends", "1.00"),
         ("0.50", "ball", "1.00"),
         ("0.80", "monitor: pushed steadily down", "1.00"),
     ]
-    assert rows[1][0][1] == "monitor: inputs frozen. The promise is withdrawn"
-    assert rows[2] == []
+    promised = rows([], ports, {"plan": None})
+    assert promised[0][1] == "monitor: inputs frozen. The promise is withdrawn"
+    assert rows([], {"safety_probability": alarm}, {}) == []
 
 
 SAFE, UNSAFE, UNKNOWN = [0.7, 0.0, 0.3], [0.1, 0.6, 0.3], [0.0, 0.0, 1.0]

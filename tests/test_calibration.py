@@ -84,11 +84,10 @@ def test_either_class_is_called_the_other_as_seldom_as_promised():
     rng = np.random.default_rng(5)
     missed, false_alarms, unknown = [], [], []
     for _ in range(100):
-        found = calibrate(
-            *scored_episodes(rng, 400, 2.0), kind=PLAN, miss_rate=0.05, false_alarm_rate=0.1
-        )
+        rates = {"miss_rate": 0.05, "false_alarm_rate": 0.1}
+        thresholds = calibrate(*scored_episodes(rng, 400, 2.0), kind=PLAN, **rates)
         score, label = scored_episodes(rng, 400, 2.0)
-        verdict = found.verdicts(1.0 - score)
+        verdict = thresholds.verdicts(1.0 - score)
         missed.append(np.mean(verdict[label] == SAFE))
         false_alarms.append(np.mean(verdict[~label] == UNSAFE))
         unknown.append(np.mean(verdict == UNKNOWN))

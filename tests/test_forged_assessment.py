@@ -55,16 +55,11 @@ def put(array, value, place=0):
     return changed
 
 
-def test_unchanged_content_is_loaded(loaded):
-    assert loaded().info_.scenario == "laikago_balancing"
-
-
 @pytest.mark.parametrize(
     ("name", "change"),
     [
         ("beliefs", lambda a: put(a, np.nan)),
         ("beliefs", lambda a: a / 2),
-        ("beliefs", lambda a: a[:, 1:]),
         ("correction.guard", lambda a: put(a, 7)),
         ("detector.limits", lambda a: put(a, -1.0)),
         ("detector.predictor.hidden.1.bias", lambda a: a[:1]),
@@ -77,6 +72,7 @@ def test_unchanged_content_is_loaded(loaded):
     ],
 )
 def test_forged_array_is_refused_by_name(content, loaded, name, change):
+    assert loaded().info_.scenario == "laikago_balancing"  # Without the change.
     name_or_group = name.split(".")[0]
     with pytest.raises(ValueError, match=rf"forged\.safetensors.* damaged .*'{name_or_group}"):
         loaded({name: change(content[1][name])})

@@ -19,9 +19,7 @@ def interpolated(grid, points, values):
 @given(GRIDS)
 def test_each_centre_lies_in_its_own_cell(grid):
     np.testing.assert_array_equal(grid.locate(grid.centres), np.arange(grid.num_cells))
-
-
-def test_the_first_coordinate_counts_rows():
+    # The first coordinate counts rows.
     corners = np.array([[-69.0, -69.0], [-69.0, -59.0], [-59.0, -69.0]])
     np.testing.assert_array_equal(GRID.locate(corners), [0, 1, 14])
 

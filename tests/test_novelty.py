@@ -128,28 +128,23 @@ def test_actual_robots_inputs_are_known_after_adaptation(novelty):
         np.testing.assert_allclose(getattr(joined, name), value, rtol=1e-9, atol=1e-9)
 
 
-@pytest.fixture(scope="module")
-def balancing_inputs():
-    scenario = load_scenario("laikago_balancing")
+def test_shuffled_inputs_of_a_robot_are_unknown_in_every_output():
+    assessment, scenario = load_assessment("laikago_balancing"), load_scenario("laikago_balancing")
     loop = scenario.make_loop(**scenario.options_for("evaluation"))
     context, rng, rows = loop.CreateDefaultContext(), np.random.default_rng(5), []
     for _ in range(30):
         loop.reset(context, rng)
         names = ("state", "desired_preview", "features")
         rows.append([loop.GetOutputPort(name).Eval(context).copy() for name in names])
-    return [np.array(column) for column in zip(*rows, strict=True)]
-
-
-def test_shuffled_inputs_of_a_robot_are_unknown_in_every_output(balancing_inputs):
-    assessment = load_assessment("laikago_balancing")
-    assert (assessment.predict(*balancing_inputs).novelty <= 1.0).mean() > 0.9
+    inputs = [np.array(column) for column in zip(*rows, strict=True)]
+    assert (assessment.predict(*inputs).novelty <= 1.0).mean() > 0.9
     rng = np.random.default_rng(0)
-    result = assessment.predict(*(rng.permuted(part, axis=0) for part in balancing_inputs))
+    result = assessment.predict(*(rng.permuted(part, axis=0) for part in inputs))
     assert (result.novelty > 1.0).all()
     np.testing.assert_array_equal(result.belief, np.tile(EMPTY, (30, 1)))
     assert not result.probability.any() and not result.cause_probability.any()
     # The strangest input is called by its name.
-    state, *others = (part[0] for part in balancing_inputs)
+    state, *others = (part[0] for part in inputs)
     last = assessment.info_.state_names[-1]
     name, deviation = assessment.strangest_input(state + 100.0 * np.eye(len(state))[-1], *others)
     assert name == last and deviation > 30.0

@@ -12,7 +12,6 @@ import naive
 from command_line import call
 from drake_safety.assessments import assessed_scenarios, load_assessment
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.prediction import Correction, is_unknown
 
@@ -116,16 +115,6 @@ def test_graph_of_shipped_assessment_predicts_every_kind_of_input(name, mode, tm
     assert np.ptp(expected.probability) > 0.5
 
 
-def with_whole_numbers(assessment):
-    changed = copy.copy(assessment)
-    whole = {"margin_unit": 1, "margin_range": (-1, 2), "offset": 1, "safety_slope": 1}
-    changed.base_logit_ = dataclasses.replace(changed.base_logit_, **whole, margin_slope=2)
-    changed.grid_ = dataclasses.replace(changed.grid_, cell_length=10)
-    changed.parameters = dataclasses.replace(changed.parameters, feature_unit=1)
-    changed.columns_ = InputColumns(changed.info_, changed.parameters)
-    return changed
-
-
 def adapted_by_hand(assessment):
     """As adapted to feedback: correction, guard, beliefs and novelty differ."""
     rng = np.random.default_rng(1)
@@ -139,15 +128,10 @@ def adapted_by_hand(assessment):
     adapted.beliefs_ = assessment.beliefs_[:, ::-1]
     novelty, known = assessment.novelty_, assessment.novelty_.training
     span = known.largest - known.least
-    wider = dataclasses.replace(
-        known,
-        covariance=100.0 * known.covariance,
-        least=known.least - 10.0 * span,
-        largest=known.largest + 10.0 * span,
-    )
-    adapted.novelty_ = Novelty(
-        training=known, limits=novelty.limits, plan=novelty.plan, feedback=wider
-    )
+    ends = {"least": known.least - 10.0 * span, "largest": known.largest + 10.0 * span}
+    wider = dataclasses.replace(known, covariance=100.0 * known.covariance, **ends)
+    limits, plan = novelty.limits, novelty.plan
+    adapted.novelty_ = Novelty(training=known, limits=limits, plan=plan, feedback=wider)
     return adapted
 
 
@@ -163,11 +147,6 @@ def test_graph_of_adapted_assessment_has_its_present_adaptation(tmp_path):
     free = dataclasses.replace(adapted.correction_, guard=np.zeros_like(adapted.correction_.guard))
     unheld = adapted.predict(**ports, correction=free).probability
     assert np.max(unheld - said.probability) > 0.01
-
-
-def test_graph_takes_settings_that_are_whole_numbers(tmp_path):
-    assessment = with_whole_numbers(load_assessment("atlas_reaching"))
-    check_equal(assessment, exported(assessment, tmp_path))
 
 
 def test_graph_takes_one_row_or_many_and_has_the_same_bytes_again(tmp_path):

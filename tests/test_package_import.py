@@ -27,11 +27,9 @@ def test_a_checkout_needs_no_installation():
         "import drake_safety.models as m, drake_safety.diagrams.pendulum.task as d; "
         "print(m.__file__, d.__file__)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-    )
+    said = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True)
     modules = ("models/__init__.py", "diagrams/pendulum/task.py")
-    assert done.stdout.split() == [str(ROOT / name) for name in modules]
+    assert said.split() == [str(ROOT / name) for name in modules]
 
 
 def test_drakes_log_is_not_filtered_and_a_loop_gives_no_cause_to():

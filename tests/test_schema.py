@@ -114,7 +114,6 @@ def test_document_that_does_not_fit_is_refused_with_what_would(schema, text, mes
     ("text", "message"),
     [
         ("speed: fast", "'speed' must be a valid number; got 'fast'"),
-        ("speed: true", "'speed' must be a valid number; got True"),
         ("is_on: 1", "'is_on' must be a valid boolean; got 1"),
         ("part: {size: '3'}", r"'part\.size' must be a valid integer; got '3'"),
         ("3", r"this must be a mapping with keys of \['part', .*; got 3"),

@@ -24,13 +24,10 @@ class StandIn:
 
     def predict(self, state, desired_preview, features):
         assert features is not None
-        return SimpleNamespace(
-            probability=state[:, 0],
-            # More than half of the belief about every third input is of empty cells.
-            belief=np.where(
-                np.arange(len(state))[:, None] % 3 == 2, (0.2, 0.1, 0.7), (0.6, 0.1, 0.3)
-            ),
-        )
+        # More than half of the belief about every third input is of empty cells.
+        is_third = np.arange(len(state))[:, None] % 3 == 2
+        belief = np.where(is_third, (0.2, 0.1, 0.7), (0.6, 0.1, 0.3))
+        return SimpleNamespace(probability=state[:, 0], belief=belief)
 
 
 @pytest.mark.parametrize("uses_true_state", [True, False])

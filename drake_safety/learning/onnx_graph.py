@@ -71,9 +71,7 @@ class _Graph:
             if isinstance(given, _Value):
                 names.append(given.name)
                 continue
-            # Settings may be integers.
-            value = np.asarray(given, dtype=float if isinstance(given, int | float) else None)
-            value = np.ascontiguousarray(value).reshape(value.shape)
+            value = np.ascontiguousarray(given).reshape(np.shape(given))
             names.append(f"constant_{len(self.constants)}")
             self.constants.append(numpy_helper.from_array(value, names[-1]))
         name = output or f"{operator.lower()}_{len(self.nodes)}"
