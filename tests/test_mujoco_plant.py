@@ -258,12 +258,6 @@ def test_obstacles_stand_where_the_monitor_has_them_and_stop_an_arm():
     assert not ignore("l_foot", "WorldModelInstance::world")
 
 
-def test_a_ball_is_refused_by_default_too_where_pushes_are_sampled():
-    scenario = load_scenario("laikago_balancing")
-    with pytest.raises(ValueError, match=r"engine 'mujoco' has no ball.*pass ball=False"):
-        scenario.make_loop("mujoco")
-
-
 def test_a_robot_of_ones_own_reaches_in_mujoco():
     scenario = load_scenario(reaching_loops.porter_path())
     scenario.variations["nominal"] = MUJOCO

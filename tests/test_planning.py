@@ -8,9 +8,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.trained_maps import Embedding
 from drake_safety.planning.goal_verdict import SAFE, UNKNOWN, UNSAFE, assess_goal, goal_inputs
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
-from drake_safety.simulation.closed_loop import ClosedLoop
 from goal_field import BOX, FieldAssessment, GoalTask
-from shuttle_task import shuttling
 
 INSIDE = np.array([0.5, 0.0, 1.0])
 GOAL = np.array([0.9, 0.5, 1.5])
@@ -162,14 +160,6 @@ def test_the_reserve_of_the_papers_mode_ends_at_its_largest_probability():
     paper._gamma = lambda goals: 0.7 * gamma(goals)
     paper.base_logit_ = None
     assert 0.66 <= suggest(paper).probability <= 0.7
-
-
-def test_arguments_out_of_range_are_refused():
-    with pytest.raises(ValueError, match=r"three numbers; got \[0.5, 0.0\]"):
-        ask(constant(1.0), INSIDE[:2])
-    loop = ClosedLoop(shuttling(), "nominal", None)
-    with pytest.raises(ValueError, match="'ClosedLoop' has no plans with a goal"):
-        assess_goal(loop, FieldAssessment(constant(1.0)), INSIDE, threshold=0.5)
 
 
 def test_the_logits_gradient_is_that_of_finite_differences():

@@ -16,14 +16,3 @@ def test_random_pushes_are_horizontal_and_within_their_bounds_as_often_as_they_s
     # All around: a mean of unit vectors is short.
     directions = [np.array(push.force_n) / push.strength_n for push in pushes]
     assert np.linalg.norm(np.mean(directions, axis=0)) < 0.1
-
-
-def test_a_push_that_is_drawn_is_the_one_that_an_episode_would_begin_with():
-    pushes = RandomPushes(share=0.999)
-    episode, drawn = np.random.default_rng(3), np.random.default_rng(3)
-    assert drawn.random() < pushes.share
-    assert pushes.sample(episode, "trunk") == pushes.draw(drawn, "trunk")
-    # Whoever wants a push gets one, however few episodes begin with it.
-    assert RandomPushes(share=0.0).draw(np.random.default_rng(3), "trunk").body == "trunk"
-    named = RandomPushes(share=0.999, body="head").sample(np.random.default_rng(0), "trunk")
-    assert named.body == "head"

@@ -14,6 +14,7 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram, SolverOptions
 
 from drake_safety.control import whole_body_qp
 from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.observation import quaternion_of
 from drake_safety.control.whole_body_model import EQUALITY, PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import ITERATION_LIMIT, SOLVED, build_qp, solve_qp
 from legged_robots import robot_kinematics, robot_model
@@ -265,6 +266,22 @@ def test_free_joints_follow_the_posture():
     expected = 64.0 * (reference.posture - q[7:]) - 11.0 * v[6:]
     vdot = solved(model, q, v, reference).vdot[6:]
     np.testing.assert_allclose(vdot[free], expected[free], atol=0.02)
+
+
+def test_the_torques_do_not_depend_on_place_or_heading(model):
+    # The friction pyramid points along the world's axes, so by a quarter turn.
+    q, v, reference = random_program(model, np.random.default_rng(10), size=0.3)
+    X = RigidTransform(RotationMatrix.MakeZRotation(np.pi / 2), [3.0, -2.0, 0.0])
+    R, turn = X.rotation(), X.rotation().matrix()
+    X_WB = RigidTransform(RotationMatrix(quaternion_of(q)), q[4:7])
+    moved_q = model.kinematics.positions_at(X @ X_WB, q[7:])
+    moved_v = np.concatenate([turn @ v[:3], turn @ v[3:6], v[6:]])
+    moved = copy.deepcopy(reference)
+    for point in (moved.center_of_mass, moved.reaching):
+        point.position, point.rate = X @ point.position, turn @ point.rate
+    moved.orientations = [R @ R_WB for R_WB in reference.orientations]
+    torques = solved(model, moved_q, moved_v, moved).torques
+    np.testing.assert_allclose(torques, solved(model, q, v, reference).torques, atol=1e-5)
 
 
 def test_a_program_that_takes_long_is_given_up_and_says_so(monkeypatch):

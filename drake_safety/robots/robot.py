@@ -3,8 +3,7 @@
 import logging
 import re
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import field
 from itertools import chain
 from typing import Generic, Literal, TypeVar
@@ -24,7 +23,6 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
-    JointActuator,
     LinearSpringDamper,
     ModelInstanceIndex,
     PdControllerGains,
@@ -35,7 +33,7 @@ from pydrake.systems.framework import Context
 from drake_safety.files.schema import NotNegative, Positive, Triple, schema
 from drake_safety.robots.meshes import check_meshes
 from drake_safety.robots.model_files import model_file, package_parser
-from drake_safety.robots.robot_model import CollisionShape, RobotModel, by_pattern
+from drake_safety.robots.robot_model import RobotModel, by_pattern
 from drake_safety.robots.shift import JointShift, Shift
 from drake_safety.robots.urdf import drake_urdf, empty_shapes, read_urdf
 
@@ -115,81 +113,74 @@ def _set_friction(
 ) -> None:
     inspector = scene_graph.model_inspector()
     instance = plant.GetModelInstanceByName(robot.name)
+    source = plant.get_source_id()
     for foot in robot.feet.values():
         body = plant.GetBodyByName(foot.body, instance)
-        for geometry_id in plant.GetCollisionGeometriesForBody(body):
-            centre = inspector.GetPoseInFrame(geometry_id).translation()
+        for geometry in plant.GetCollisionGeometriesForBody(body):
+            centre = inspector.GetPoseInFrame(geometry).translation()
             offsets = np.linalg.norm(np.array(foot.contact_points) - centre, axis=1)
-            if offsets.min() < 1e-3 and isinstance(inspector.GetShape(geometry_id), Sphere):
-                properties = ProximityProperties(inspector.GetProximityProperties(geometry_id))
+            if offsets.min() < 1e-3 and isinstance(inspector.GetShape(geometry), Sphere):
+                properties = ProximityProperties(inspector.GetProximityProperties(geometry))
                 properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(mu, mu))
-                scene_graph.AssignRole(
-                    plant.get_source_id(), geometry_id, properties, RoleAssign.kReplace
-                )
+                scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
 
 
 def _add_description(plant: MultibodyPlant, robot: RobotModel) -> ModelInstanceIndex:
     """Adds a robot's bodies, joints and shapes; without a scene graph, geometry is left out."""
     parser = package_parser(plant, robot.urdf)
     path = model_file(robot.urdf, robot.source_dir, robot.requires)
-    text = None
+    is_urdf, text = path.suffix == ".urdf", None
     if path.is_file():
         check_meshes(path)
-    if path.suffix == ".urdf":
-        text = drake_urdf(
-            path,
-            with_collisions=robot.collision != "stated",
-            with_visuals=plant.geometry_source_is_registered(),
-        )
-    try:
-        with _quiet_about(robot):
-            if text is not None:
-                (instance,) = parser.AddModelsFromString(text, "urdf")
-            else:
-                (instance,) = parser.AddModels(str(path))
-    except SystemExit as error:  # pydrake raises it where a condition of Drake's C++ fails.
-        shapes = [x for *_, x in empty_shapes(read_urdf(path))] if path.suffix == ".urdf" else []
-        what = "; ".join([f"Drake cannot build '{path}'", *shapes, str(error)])
-        raise ValueError(what) from error
-    plant.RenameModelInstance(instance, robot.name)
-    return instance
-
-
-@contextmanager
-def _quiet_about(robot: RobotModel) -> Iterator[None]:
-    """Drops warnings about files of packages, which no user can change."""
-    drake, is_own = logging.getLogger("drake"), not robot.urdf.startswith("package://")
+    if is_urdf:
+        has_scene, is_stated = plant.geometry_source_is_registered(), robot.collision == "stated"
+        text = drake_urdf(path, with_collisions=not is_stated, with_visuals=has_scene)
+    drake, is_packaged = logging.getLogger("drake"), robot.urdf.startswith("package://")
 
     def pass_on(record: logging.LogRecord) -> bool:
-        return is_own or record.levelno > logging.WARNING
+        """Drops warnings about files of packages, which no user can change."""
+        return not is_packaged or record.levelno > logging.WARNING
 
     drake.addFilter(pass_on)
     try:
-        yield
+        if text is None:
+            (instance,) = parser.AddModels(str(path))
+        else:
+            (instance,) = parser.AddModelsFromString(text, "urdf")
+    except SystemExit as error:  # pydrake raises it where a condition of Drake's C++ fails.
+        shapes = [x for *_, x in empty_shapes(read_urdf(path))] if is_urdf else []
+        what = "; ".join([f"Drake cannot build '{path}'", *shapes, str(error)])
+        raise ValueError(what) from error
     finally:
         drake.removeFilter(pass_on)
+    plant.RenameModelInstance(instance, robot.name)
+    return instance
 
 
 def _add_stated_shapes(
     plant: MultibodyPlant, robot: RobotModel, instance: ModelInstanceIndex
 ) -> None:
     """Adds the collision geometry of robot.yaml: contact points and shapes."""
-    names = [plant.get_body(index).name() for index in plant.GetBodyIndices(instance)]
-    _require(robot, "body for shapes", robot.shapes, names)
-
-    def add(body: str, name: str, X_BG: RigidTransform, shape: Shape, mu: float) -> None:
-        plant.RegisterCollisionGeometry(
-            plant.GetBodyByName(body, instance), X_BG, shape, name, CoulombFriction(mu, mu)
-        )
-
-    for body in names:
-        shapes = by_pattern(robot.shapes, body, "shapes", robot.name, "body") or []
+    bodies = {body.name(): body for body in map(plant.get_body, plant.GetBodyIndices(instance))}
+    _require(robot, "body for shapes", robot.shapes, list(bodies))
+    material = CoulombFriction(_SHAPE_FRICTION, _SHAPE_FRICTION)
+    for name, body in bodies.items():
+        shapes = by_pattern(robot.shapes, name, "shapes", robot.name, "body") or []
         for i, stated in enumerate(shapes):
-            add(body, f"{body}_shape_{i}", *_shape_of(stated), _SHAPE_FRICTION)
+            shape: Shape = Box(*stated.box_m) if stated.box_m else Sphere(stated.radius_m)
+            X_BG = RigidTransform(stated.position_m)
+            if stated.to_m:
+                start, end = np.array([stated.position_m, stated.to_m], dtype=float)
+                length = float(np.linalg.norm(end - start))
+                R_BG = RotationMatrix.MakeFromOneVector((end - start) / length, 2)
+                X_BG = RigidTransform(R_BG, start + 0.5 * (end - start))
+                shape = Capsule(stated.radius_m, length)
+            plant.RegisterCollisionGeometry(body, X_BG, shape, f"{name}_shape_{i}", material)
+    material = CoulombFriction(robot.foot_friction, robot.foot_friction)
     for name, foot in robot.feet.items():
         for i, point in enumerate(foot.contact_points):
-            X_BG, sphere = RigidTransform(point), Sphere(foot.radius_m)
-            add(foot.body, f"{name}_contact_{i}", X_BG, sphere, robot.foot_friction)
+            place = bodies[foot.body], RigidTransform(point), Sphere(foot.radius_m)
+            plant.RegisterCollisionGeometry(*place, f"{name}_contact_{i}", material)
 
 
 def _ignore_neighbours(
@@ -206,18 +197,6 @@ def _ignore_neighbours(
             scene_graph.collision_filter_manager().Apply(apart)
 
 
-def _shape_of(stated: CollisionShape) -> tuple[RigidTransform, Shape]:
-    start = np.array(stated.position_m, dtype=float)
-    if stated.box_m:
-        return RigidTransform(start), Box(*stated.box_m)
-    if not stated.to_m:
-        return RigidTransform(start), Sphere(stated.radius_m)
-    axis = np.array(stated.to_m, dtype=float) - start
-    length = float(np.linalg.norm(axis))
-    R_BG = RotationMatrix.MakeFromOneVector(axis / length, 2)
-    return RigidTransform(R_BG, start + 0.5 * axis), Capsule(stated.radius_m, length)
-
-
 def add_robot(
     plant: MultibodyPlant,
     robot: RobotModel,
@@ -226,15 +205,12 @@ def add_robot(
     scene_graph: SceneGraph | None = None,
     servos: bool = True,
 ) -> ModelInstanceIndex:
-    """Adds a robot to a plant that is not finalised: model, servos, friction.
+    """Adds a robot, with robot.yaml's position ``servos`` or for torques, to a plant.
 
-    The variation's masses are parameters of the Context: see :func:`apply_masses`. Dry joint
-    friction is a second actuator on the joint that holds velocity zero with at most the friction
-    torque, solved implicitly with the contact.
-
-    Args:
-        scene_graph: Gets the feet's friction; None keeps the model file's friction.
-        servos: Whether the joints get robot.yaml's position servos; False for torque control.
+    The plant is not finalised. The variation's masses are parameters of the Context: see
+    :func:`apply_masses`. Dry joint friction is a second actuator on the joint that holds velocity
+    zero with at most the friction torque, solved implicitly with the contact. Without
+    ``scene_graph`` the feet keep the model file's friction.
     """
     variation = variation or PlantVariation()
     instance = _add_description(plant, robot)
@@ -258,16 +234,15 @@ def add_robot(
 
     # Before Finalize, the plant cannot list actuators by model instance.
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
-    actuated = {one.joint().name(): one for one in actuators if one.model_instance() == instance}
+    actuated = {a.joint().name(): a for a in actuators if a.model_instance() == instance}
     for name in joint_names:
         joint = plant.GetJointByName(name, instance)
-        actuator: JointActuator | None = actuated.get(name)
+        actuator = actuated.get(name)
         limit = by_pattern(robot.effort_limits, name, "effort limit", robot.name)
         if actuator is None:
             if limit is None:
                 continue
-            actuator = plant.AddJointActuator(f"{name}_actuator", joint, limit)
-            actuated[name] = actuator
+            actuator = actuated[name] = plant.AddJointActuator(f"{name}_actuator", joint, limit)
         elif limit is not None and np.isinf(actuator.effort_limit()):
             actuator.set_effort_limit(limit)
         shift = by_pattern(shifts.joints, name, "shift", robot.name) or JointShift()
@@ -293,8 +268,7 @@ def add_robot(
             friction = plant.AddJointActuator(f"{name}{_FRICTION_SUFFIX}", joint, most)
             friction.set_controller_gains(PdControllerGains(p=0.0, d=_FRICTION_DAMPING))
     if scene_graph is not None:
-        mu = variation.foot_friction or robot.foot_friction
-        _set_friction(scene_graph, plant, robot, mu)
+        _set_friction(scene_graph, plant, robot, variation.foot_friction or robot.foot_friction)
         _ignore_neighbours(plant, scene_graph, instance)
     for joint_name, position in posture_positions(plant, robot).items():
         plant.GetJointByName(joint_name, instance).set_default_positions([position])
@@ -331,7 +305,6 @@ def actuation_matrix(
     matrix = np.zeros((len(actuators), len(joint_names)))
     for row, actuator in enumerate(actuators):
         name = actuator.joint().name()
-        _require(robot, "joint", [name], joint_names)
         if actuator.name() != f"{name}{_FRICTION_SUFFIX}":
             matrix[row, joint_names.index(name)] = 1.0
     return matrix
@@ -355,10 +328,9 @@ def apply_masses(
     name = payload.body or robot.base
     _require(robot, "body", [name], [body.name() for body in bodies])
     body = plant.GetBodyByName(name, instance)
-    p_PcmBo_B = -np.array(payload.position_m)
-    M_PBo_B = SpatialInertia.SolidSphereWithMass(payload.mass_kg, PAYLOAD_RADIUS_M).Shift(p_PcmBo_B)
+    M_PPo_P = SpatialInertia.SolidSphereWithMass(payload.mass_kg, PAYLOAD_RADIUS_M)
     M_BBo_B = body.CalcSpatialInertiaInBodyFrame(context)
-    M_BBo_B += M_PBo_B
+    M_BBo_B += M_PPo_P.Shift(-np.array(payload.position_m))
     body.SetSpatialInertiaInBodyFrame(context, M_BBo_B)
 
 

@@ -81,8 +81,7 @@ class WholeBody:
     regularization: Positive = 1e-4
     """Weight of squared accelerations, including the base's."""
     force_regularization: Positive = 1e-2
-    """Weight of squared contact forces over the robot's mass, (f/m)² [m²/s⁴]; too large a weight
-    lets the robot sag."""
+    """Weight of squared contact forces over the robot's mass, (f/m)² [m²/s⁴]."""
     friction: Positive = 0.5
     """Friction coefficient of the planned contact forces, below the ground's own."""
 
@@ -112,8 +111,7 @@ class RobotModel:
 
     name: str = ""
     urdf: str = ""
-    """``package://…`` (ours, Drake's or a pip package's) or a path relative to the YAML file; any
-    format that Drake's Parser reads."""
+    """``package://…`` (ours, Drake's or a pip package's) or a path relative to the YAML file."""
     requires: Requirement = ""
     """What pip installs for ``urdf`` without dependencies, if no extra does."""
     base: str = ""
@@ -160,10 +158,8 @@ class RobotModel:
     def reaching_frame(self, hand: str) -> ReachingFrame:
         """Returns the reaching frame of a hand."""
         if hand not in self.reaching_frames:
-            raise ValueError(
-                f"robot '{self.name}' has no reaching frame '{hand}'; "
-                f"it has {list(self.reaching_frames)}"
-            )
+            names = list(self.reaching_frames)
+            raise ValueError(f"robot '{self.name}' has no reaching frame '{hand}'; it has {names}")
         return self.reaching_frames[hand]
 
     def mirror_partners(self, joint_names: Iterable[str]) -> dict[str, str]:
@@ -176,16 +172,12 @@ class RobotModel:
             except (re.error, IndexError):
                 pairs = {}
             if not pairs or not {*pairs.values()} <= {*names}:
-                raise ValueError(
-                    f"robot '{self.name}': mirror pattern '{pattern}: {template}' pairs joints "
-                    f"{pairs}; it has {names}"
-                )
+                what = f"mirror pattern '{pattern}: {template}' pairs joints {pairs}"
+                raise ValueError(f"robot '{self.name}': {what}; it has {names}")
             for joint, other in (*pairs.items(), *((other, one) for one, other in pairs.items())):
                 if partners.setdefault(joint, other) != other:
-                    raise ValueError(
-                        f"robot '{self.name}': mirror pairs joint '{joint}' with "
-                        f"'{partners[joint]}' and with '{other}'"
-                    )
+                    both = f"'{partners[joint]}' and with '{other}'"
+                    raise ValueError(f"robot '{self.name}': mirror pairs '{joint}' with {both}")
         return {name: partners.get(name, name) for name in names}
 
 

@@ -11,19 +11,15 @@ from typing import Any
 
 GRAVITY_M_S2 = 9.81
 """As in Drake."""
-_DIGITS = 4  # Significant digits of scaled values.
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSize:
-    """Size of a standing robot."""
+    """Height of a standing robot's base, the feet's extent from their centroid, and its mass."""
 
     height_m: float
-    """Height of the base."""
     half_length_m: float
-    """Largest distance of a contact point from the feet's centroid along x."""
     half_width_m: float
-    """Largest distance of a contact point from the feet's centroid along y."""
     mass_kg: float
 
     @property
@@ -85,4 +81,4 @@ def overlaid(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, An
 
 
 def _rounded(value: float) -> float:
-    return float(f"{value:.{_DIGITS}g}")
+    return float(f"{value:.4g}")

@@ -31,10 +31,8 @@ def read_urdf(path: Path) -> ET.Element:
     except ET.ParseError as error:
         raise ValueError(f"'{path}' is not XML: {error}") from error
     if root.tag != "robot":
-        raise ValueError(
-            f"'{path}' is not a URDF: its root element is <{root.tag}>, expected <robot>. Convert "
-            "it first, or write robot.yaml by hand: Drake also reads SDFormat and MJCF"
-        )
+        what = f"its root element is <{root.tag}>, expected <robot>"
+        raise ValueError(f"'{path}' is not a URDF: {what}. Convert it first")
     # It may be in a comment, too.
     if b"<xacro:" in content and any("xacro" in element.tag for element in root.iter()):
         raise ValueError(f"'{path}' is not expanded yet: run `xacro {path.name} > robot.urdf`")
@@ -51,16 +49,14 @@ def _faults(root: ET.Element) -> Iterator[str]:
     for link in links:
         mass = number(element := link.find("inertial/mass"), "value")
         if element is not None and not 0.0 <= mass < math.inf:
-            what = f"link '{link.get('name')}' has a mass of {mass:g} kg"
-            yield f"{what}, expected a finite number that is not negative"
+            yield f"link '{link.get('name')}' has a mass of {mass:g} kg"
     parents: dict[str | None, list[str | None]] = {}
     for joint in joints:
         for child in joint.findall("child"):
             parents.setdefault(child.get("link"), []).append(joint.get("name"))
     for name, several in parents.items():
         if len(several) > 1:
-            what = f"link '{name}' is the child of joints {several}"
-            yield f"{what}; expected one, as a URDF is a tree: remove the others"
+            yield f"link '{name}' is the child of joints {several}; expected one, as in a tree"
     for owner in (*links, *joints):
         for part in owner.iter():
             for key, text in part.attrib.items():
@@ -74,8 +70,7 @@ def _faults(root: ET.Element) -> Iterator[str]:
             wrong = ["lower", "upper"]
         if limit is not None and wrong and kind != "fixed":
             stated = " ".join(f'{key}="{limit.get(key)}"' for key in wrong)
-            what = f"joint '{joint.get('name')}' has {stated}"
-            yield f"{what}; expected lower below upper, and positive limits of effort and velocity"
+            yield f"joint '{joint.get('name')}' has {stated}; expected lower < upper, and positive"
 
 
 def drake_urdf(path: Path, *, with_collisions: bool, with_visuals: bool) -> str | None:
@@ -142,9 +137,9 @@ def empty_shapes(root: ET.Element) -> list[tuple[ET.Element, ET.Element, str]]:
                 sizes = [*map(as_number, " ".join(stated.values()).split())]
                 # Meshes may be mirrored by a negative scale.
                 if 0.0 in sizes or ("scale" not in stated and any(x < 0 for x in sizes)):
-                    words = f"the {shape.tag} of link '{link.get('name')}' is a "
-                    words += f"{part.tag.rpartition('}')[2]} of "
-                    words += ", ".join(f"{key} {text}" for key, text in stated.items())
+                    what = f"the {shape.tag} of link '{link.get('name')}'"
+                    size = ", ".join(f"{key} {text}" for key, text in stated.items())
+                    words = f"{what} is a {part.tag.rpartition('}')[2]} of {size}"
                     empty.append((link, shape, words))
     return empty
 
