@@ -53,7 +53,7 @@ class Scene:
     def collision_geometries(self):
         """The robot's collision geometries by name."""
         shapes = map(self.plant.GetCollisionGeometriesForBody, self.bodies.values())
-        return {self.geometry_name(geometry): geometry for of_body in shapes for geometry in of_body}
+        return {self.geometry_name(one): one for of_body in shapes for one in of_body}
 
     def contact_spheres(self):
         """Those of them that stand at a contact point of robot.yaml."""
