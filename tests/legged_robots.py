@@ -1,7 +1,4 @@
-"""Legged robots for the tests: one that comes with the package, and three made up on the spot.
-
-The made-up ones share no link name, number of legs or foot shape with any robot of the package.
-"""
+"""Legged robots for the tests: those of the package, and three made up on the spot."""
 
 import functools
 import math
@@ -92,22 +89,16 @@ def _legs():
     for side, y in (("left", 0.1), ("right", -0.1)):
         links = [f"{side}_{n}" for n in ("yaw", "roll", "thigh", "shin", "ankle", "sole")]
         joints = [f"{side}_{n}" for n in ("hip_z", "hip_x", "hip_y", "knee", "ankle_y", "ankle_x")]
-        box = (0.05, 0.05, 0.05)
-        long = (0.06, 0.06, 0.3)
-        parts += [
-            _link(links[0], 0.3, box, (0, 0, 0)),
-            _link(links[1], 0.3, box, (0, 0, 0)),
-            _link(links[2], 2.0, long, (0, 0, -0.15)),
-            _link(links[3], 1.0, long, (0, 0, -0.15)),
-            _link(links[4], 0.2, box, (0, 0, 0)),
-            _link(links[5], 0.5, (0.2, 0.1, 0.03), (0, 0, -0.04), [(p, 0.005) for p in corners]),
-        ]
+        box, long, middle = (0.05, 0.05, 0.05), (0.06, 0.06, 0.3), (0, 0, -0.15)
+        for link, mass in zip(links, (0.3, 0.3, 2.0, 1.0, 0.2), strict=False):
+            shape = (long, middle) if mass >= 1.0 else (box, (0, 0, 0))
+            parts.append(_link(link, mass, *shape))
+        sole = [(p, 0.005) for p in corners]
+        parts.append(_link(links[5], 0.5, (0.2, 0.1, 0.03), (0, 0, -0.04), sole))
         parents = ["pelvis", *links[:-1]]
         origins = [(0, y, 0), (0, 0, 0), (0, 0, 0), (0, 0, -0.3), (0, 0, -0.3), (0, 0, 0)]
         axes = ["0 0 1", "1 0 0", "0 1 0", "0 1 0", "0 1 0", "1 0 0"]
-        parts += [
-            _joint(*values) for values in zip(joints, parents, links, origins, axes, strict=True)
-        ]
+        parts += map(_joint, joints, parents, links, origins, axes)
         feet[side] = _frame(links[5], joints, 0.005, contact_points=corners)
     robot = {
         "base": "pelvis",
@@ -133,10 +124,7 @@ HAND_POINT, HAND_RADIUS_M = (0.22, 0.0, 0.0), 0.04
 
 
 def write_porter(folder: Path) -> Path:
-    """Writes two legs with two arms of three joints and a wrist; returns its robot.yaml.
-
-    The wrists turn without stops. A hand is a sphere, and nothing else of an arm can be touched.
-    """
+    """Writes two legs with two arms, of which only the hands, spheres, can be touched."""
     parts, robot = _legs()
     robot["whole_body"]["reaching"] = {"weight": 200.0}
     hands = robot["reaching_frames"] = {}

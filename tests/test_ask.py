@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import command_line
-from drake_safety.cli.ask import parse_target
 from drake_safety.cli.run import alarm_times
 from drake_safety.cli.training_folder import assessment_file
 from drake_safety.evaluation.metrics import Estimate
@@ -17,7 +16,6 @@ from drake_safety.evaluation.results import Results
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.calibration import Calibration
 from drake_safety.simulation.motion import Motion
-from drake_safety.simulation.scenario import load_scenario
 from reaching_targets import CAUSE, FAR, NEAR, SCENARIO, learned_targets
 
 pytestmark = pytest.mark.train
@@ -31,11 +29,6 @@ def trained(tmp_path_factory):
     folder, assessment = tmp_path_factory.mktemp("reaching"), learned_targets()
     assessment.save(assessment_file(folder, "sharpened"))
     return folder, assessment
-
-
-@pytest.fixture(scope="session")
-def loop(trained):
-    return load_scenario(SCENARIO).make_loop(assessment=trained[1])
 
 
 @pytest.fixture
@@ -123,11 +116,6 @@ def test_an_answer_takes_none_of_the_packages_that_training_takes(folder):
     heavy = {"torch", "dtaidistance", "openTSNE", "sklearn", "matplotlib", "numba"}
     heavy |= {"pandas", "pyarrow", "joblib", "tensorboard"}
     assert loaded & heavy == set()
-
-
-def test_a_named_target_is_the_point_of_that_name(loop):
-    for name, point in loop.named_targets.items():
-        np.testing.assert_array_equal(parse_target(loop, name), point)
 
 
 @pytest.mark.parametrize(

@@ -67,19 +67,6 @@ def test_a_lifted_foot_pushes_nothing_and_in_the_air_none_does():
     np.testing.assert_array_equal(flying, -gravity)
 
 
-def test_the_centre_of_mass_is_the_mean_of_the_bodies(kinematics):
-    q = random_positions(kinematics, np.random.default_rng(4))
-    com = kinematics.center_of_mass(q)
-    plant, context = kinematics.plant, kinematics.context
-    bodies = [plant.get_body(i) for i in plant.GetBodyIndices(kinematics.base.model_instance())]
-    moment = sum(
-        body.get_mass(context)
-        * (plant.EvalBodyPoseInWorld(context, body) @ body.CalcCenterOfMassInBodyFrame(context))
-        for body in bodies
-    )
-    np.testing.assert_allclose(com, moment / kinematics.total_mass, atol=1e-12)
-
-
 @pytest.mark.parametrize("entry", [0, 9])
 def test_positions_that_are_not_finite_are_refused_not_fatal(kinematics, entry):
     q = kinematics.standing_positions()

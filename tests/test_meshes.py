@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from drake_safety.robots.meshes import cache_folder, convex_hull, is_shown, mesh_points, shown_mesh
+from drake_safety.robots.meshes import convex_hull, is_shown, mesh_points, shown_mesh
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -29,14 +29,6 @@ def assert_colour(path, rgba):
     # trimesh keeps colours as bytes.
     found = material["pbrMetallicRoughness"]["baseColorFactor"]
     np.testing.assert_allclose(found, rgba, atol=1 / 255)
-
-
-def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    monkeypatch.delenv("DRAKE_SAFETY_CACHE", raising=False)
-    assert cache_folder() == tmp_path / "xdg" / "drake_safety"
-    monkeypatch.setenv("DRAKE_SAFETY_CACHE", str(tmp_path / "here"))
-    assert cache_folder() == tmp_path / "here"
 
 
 @pytest.mark.parametrize(

@@ -186,14 +186,6 @@ def test_new_and_check_tell_what_was_lost_and_changed(tmp_path):
     assert "warning  collision shapes" not in invoked("check", file, "--quick").output
 
 
-def test_a_check_says_how_far_it_is(spider):
-    file, counts = spider.folder / "balancing.yaml", []
-    for _ in check_scenario(file, num_episodes=2, progress=lambda *count: counts.append(count)):
-        pass
-    stands = [("stands for 1 s", i, 1) for i in (0, 1)]
-    assert counts == [*stands, *(("episodes", i, 2) for i in range(3))]
-
-
 def test_a_shape_of_the_base_is_asked_for_where_there_is_none(tmp_path):
     urdf = urdf_of_spider(
         tmp_path, lambda text: re.sub("<collision>.*?</collision>", "", text, count=1)

@@ -71,14 +71,6 @@ def rotated(yaw, vector):
     return np.array([[c, -s], [s, c]]) @ vector
 
 
-def test_footholds_turn_with_the_robot():
-    yaw, v = 3.0, np.array([1.0, -2.0, 0.0])
-    place = foothold(np.zeros(3), v, 0.0, FRONT_LEFT, 0.1, PARAMETERS)
-    v_turned = np.append(rotated(yaw, v[:2]), 0.0)
-    turned = foothold(np.zeros(3), v_turned, yaw, FRONT_LEFT, 0.1, PARAMETERS)
-    np.testing.assert_allclose(turned, rotated(yaw, place), atol=1e-12)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_a_foothold_stays_in_reach_and_on_its_own_side(seed):
     rng = np.random.default_rng(seed)

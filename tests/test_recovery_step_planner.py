@@ -73,15 +73,6 @@ def test_one_group_swings_at_a_time_and_the_groups_alternate(name):
     assert sorted(swung[0] + swung[1]) == list(range(len(bench.kinematics.foot_names)))
 
 
-def test_feet_step_in_the_direction_of_the_fall():
-    speed = (-0.4, 0.4)
-    bench = Stepping(speed=speed)
-    bench.advance(0.9 * bench.parameters.step_duration_s)
-    moved = (bench.feet_now() - bench.feet)[:, :2]
-    swung = np.concatenate([np.r_[bench.kinematics.foot_slices[i]] for i in bench.lifted()])
-    assert np.all(moved[swung] @ np.array(speed) > 0)
-
-
 @pytest.mark.parametrize(("heading", "turned"), [(0.5, 0.1), (3.1, 0.1), (-3.1, -0.2)])
 def test_a_base_that_has_turned_is_told_the_heading_in_which_the_recovery_began(heading, turned):
     bench = Stepping(stance_pose=(0.0, 0.0, heading), speed=(1.0, 0.0), max_twist_rad=0.3)

@@ -9,8 +9,6 @@ from pydrake.geometry import Box, Capsule, Sphere
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_safety.extras import MissingExtraError
-from drake_safety.robots import model_files
 from drake_safety.robots.model_files import model_file
 from drake_safety.robots.robot import add_robot
 from drake_safety.robots.robot_model import load_robot_file
@@ -94,14 +92,6 @@ def test_a_stated_speed_limit_holds_and_what_is_welded_to_a_neighbour_does_not_t
     assert scene_graph.model_inspector().CollisionFiltered(seat, tip)
     assert plant.GetJointByName("hip").velocity_upper_limit() == 7.0
     assert plant.GetJointByName("hip").velocity_lower_limit() == -7.0
-
-
-def test_a_package_that_an_extra_would_bring_is_asked_for_by_the_extras_name(monkeypatch):
-    monkeypatch.setattr(model_files, "_installed_folder", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'drake_safety\[robots\]'"):
-        model_file("package://example-robot-data/robots/a.urdf")
-    with pytest.raises(ValueError, match="no package 'nobody'"):
-        model_file("package://nobody/a.urdf")
 
 
 def test_a_package_of_pips_is_found_by_its_share_folder_or_as_a_python_package():

@@ -105,13 +105,6 @@ def test_faults_act_one_after_the_other():
     np.testing.assert_allclose(late, true(0.8) + 0.8)
 
 
-def test_without_faults_nothing_is_updated():
-    bench = Bench()
-    bench.at(1.0)
-    assert bench.simulator.get_num_discrete_updates() == 0
-    assert bench.own.num_discrete_state_groups() == 0
-
-
 def test_the_example_of_the_documentation_runs():
     page = SHIFTS_PAGE.read_text(encoding="utf-8")
     names = {}
