@@ -17,7 +17,7 @@ from drake_safety.control.observation import (
     walking_state_names,
 )
 from drake_safety.learning.segments import floats
-from drake_safety.systems.safety_monitor import FeaturedSafeSet, finite_margins
+from drake_safety.systems.safety_monitor import SafeSet, finite_margins
 
 
 class AssessorInputs(LeafSystem):
@@ -46,7 +46,7 @@ class AssessorInputs(LeafSystem):
     def __init__(
         self,
         kinematics: RobotKinematics,
-        safe_set: FeaturedSafeSet,
+        safe_set: SafeSet,
         *,
         num_outlook: int = 5,
         gravity: Sequence[float] | None = None,

@@ -72,11 +72,8 @@ class ChangeMonitor(LeafSystem):
         )
 
     def adopt(self, context: Context, adapted: SafetyAssessment) -> None:
-        """Takes over the detector of an assessment adapted from this system's own."""
+        """Takes over the detector of an adapted assessment, ends the alarm, empties the charts."""
         context.get_mutable_abstract_parameter(self._detector).set_value(adapted.detector_)
-
-    def reset(self, context: Context) -> None:
-        """Ends the alarm and empties the charts."""
         for name, value in self._initial.items():
             context.SetDiscreteState(self._groups[name], value)
 

@@ -44,24 +44,15 @@ class InverseKinematicsController(LeafSystem):
         offset_s: float = 0.0,
     ):
         super().__init__()
-        n_j = kinematics.num_joints
+        n_j, names = kinematics.num_joints, kinematics.joint_names
         if stiffness is None:
-            gains = map(kinematics.robot.gains_of, kinematics.joint_names)
+            gains = map(kinematics.robot.gains_of, names)
             stiffness = np.array([0.0 if gain is None else gain.stiffness for gain in gains])
-        stiffness = np.asarray(stiffness, dtype=float)
-        if stiffness.shape != (n_j,) or not np.all(stiffness > 0):
-            raise ValueError(
-                f"inverse kinematics controller: stiffness of {kinematics.joint_names} must be "
-                f"positive; got {stiffness}"
-            )
-        self._kinematics = kinematics
-        self._stiffness = stiffness
+        if not np.all(stiffness > 0):
+            raise ValueError(f"inverse kinematics: stiffness of {names} must be positive")
+        self._kinematics, self._stiffness, self._period_s = kinematics, stiffness, period_s
         self._rate_limit = _RATE_SHARE * kinematics.velocity_limits
-        self._lowest_rate = -self._rate_limit
-        self._period_s = period_s
-        self._limits = np.ascontiguousarray(kinematics.position_limits.T)
         n_p = 3 * kinematics.num_contacts
-        # Looking up ports by name in every update would cost more than evaluating them.
         self._state_port = self.DeclareVectorInputPort("plant_state", kinematics.num_states)
         self._desired_port = self.DeclareVectorInputPort("desired_output", 3)
         self._feet_port = self.DeclareVectorInputPort("desired_foot_positions", n_p)
@@ -124,7 +115,7 @@ class InverseKinematicsController(LeafSystem):
         guess = previous + self._period_s * last_rate
         desired, torques = self._solve(context, self.foot_positions(context), guess)
         rate = (desired - previous) / self._period_s
-        rate = np.minimum(np.maximum(rate, self._lowest_rate), self._rate_limit)
+        rate = np.minimum(np.maximum(rate, -self._rate_limit), self._rate_limit)
         self._command_joints(discrete_state, previous + self._period_s * rate, torques, rate)
 
     def _command_joints(
@@ -134,7 +125,7 @@ class InverseKinematicsController(LeafSystem):
         torques: np.ndarray,
         rate: np.ndarray,
     ) -> None:
-        lowest, highest = self._limits
+        lowest, highest = self._kinematics.position_limits.T
         positions = np.minimum(np.maximum(joints + torques / self._stiffness, lowest), highest)
         discrete_state.set_value(self._set_point, joints)
         discrete_state.set_value(self._command, np.concatenate([positions, rate]))

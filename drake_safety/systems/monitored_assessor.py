@@ -89,7 +89,6 @@ class MonitoredSafetyAssessor(Diagram):
         if self.monitor is not None:
             own_context = self.GetMutableSubsystemContext(self.monitor, context)
             self.monitor.adopt(own_context, adapted)
-            self.monitor.reset(own_context)
 
 
 def AddSafetyAssessor(

@@ -13,18 +13,13 @@ from drake_safety.learning.segments import floats
 
 
 class SafeSet(Protocol):
-    """A safe set: named constraints with signed margins."""
+    """A safe set: constraints with signed margins; features are further inputs of assessors."""
 
     names: tuple[str, ...]
+    feature_names: list[str]
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Signed margins (n_c,) of a state, negative where violated."""
-
-
-class FeaturedSafeSet(SafeSet, Protocol):
-    """A safe set with features, the assessor's inputs besides the state."""
-
-    feature_names: list[str]
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
         """Features (n_f,) of a measured state and the preview (H, n_z)."""

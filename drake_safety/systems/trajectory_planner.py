@@ -58,6 +58,12 @@ def to_world(stance_pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (x, y, 0.0)
 
 
+def _checked(plan: PiecewisePolynomial) -> PiecewisePolynomial:
+    if (size := (plan.rows(), plan.cols())) != (3, 1):
+        raise ValueError(f"planner: the plan must have 3 rows and one column; got {size}")
+    return plan
+
+
 class TrajectoryPlanner(LeafSystem):
     """Evaluates a plan z*(t) and its next H samples.
 
@@ -87,8 +93,8 @@ class TrajectoryPlanner(LeafSystem):
         super().__init__()
         outlook_s = step_s * (horizon - 1) if outlook_s is None else outlook_s
         check_times("planner", or_zero=["outlook_s"], step_s=step_s, outlook_s=outlook_s)
-        plan_and_rate = (None, None) if plan is None else self._with_rate(plan)
-        self._plan_index = self.DeclareAbstractParameter(Value(plan_and_rate))
+        checked = None if plan is None else _checked(plan)
+        self._plan_index = self.DeclareAbstractParameter(Value[object](checked))
         self._stance_index = self.DeclareNumericParameter(BasicVector(np.zeros(3)))
         self._stance_port = self.DeclareVectorInputPort("stance_pose", 3)
         self.DeclareVectorOutputPort("desired_output", 3, self._calc_output)
@@ -114,32 +120,22 @@ class TrajectoryPlanner(LeafSystem):
         self, context: Context, plan: PiecewisePolynomial, stance_pose: np.ndarray | None = None
     ) -> None:
         """Sets the plan, (n_z, 1) [m], and for an unconnected input the stance pose (3,)."""
-        value = context.get_mutable_abstract_parameter(self._plan_index)
-        value.set_value(self._with_rate(plan))
+        context.get_mutable_abstract_parameter(self._plan_index).set_value(_checked(plan))
         if stance_pose is not None:
             context.get_mutable_numeric_parameter(self._stance_index).SetFromVector(stance_pose)
 
     def get_plan(self, context: Context) -> PiecewisePolynomial:
         """Returns the plan in a Context, in the stance frame."""
-        return self._plan_and_rate(context)[0]
+        plan = context.get_abstract_parameter(self._plan_index).get_value()
+        if plan is None:
+            raise ValueError("planner: no plan; give one by plan= or set_plan(context, plan)")
+        return plan
 
     def plan_from_now(self, context: Context) -> PiecewisePolynomial:
         """Returns the plan in a Context over the time since now, in the stance frame."""
         plan = copy.copy(self.get_plan(context))
         plan.shiftRight(-context.get_time())
         return plan
-
-    @staticmethod
-    def _with_rate(plan: PiecewisePolynomial) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
-        if (size := (plan.rows(), plan.cols())) != (3, 1):
-            raise ValueError(f"planner: the plan must have 3 rows and one column; got {size}")
-        return plan, plan.MakeDerivative()
-
-    def _plan_and_rate(self, context: Context) -> tuple[PiecewisePolynomial, PiecewisePolynomial]:
-        plan, rate = context.get_abstract_parameter(self._plan_index).get_value()
-        if plan is None:
-            raise ValueError("planner: no plan; give one by plan= or set_plan(context, plan)")
-        return plan, rate
 
     def _stance_pose(self, context: Context) -> np.ndarray:
         if self._stance_port.HasValue(context):
@@ -151,9 +147,9 @@ class TrajectoryPlanner(LeafSystem):
         output.SetFromVector(to_world(self._stance_pose(context), z.T).ravel())
 
     def _calc_rate(self, context: Context, output: BasicVector) -> None:
-        plan, derivative = self._plan_and_rate(context)
+        plan = self.get_plan(context)
         time, rate = context.get_time(), np.zeros((3, 1))
         if plan.start_time() <= time <= plan.end_time():
-            rate = derivative.value(time)
+            rate = plan.EvalDerivative(time, derivative_order=1)
         yaw = self._stance_pose(context)[2]
         output.SetFromVector(to_world(np.array([0.0, 0.0, yaw]), rate.T).ravel())
