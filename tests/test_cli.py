@@ -15,7 +15,9 @@ from drake_safety.cli import main
 from drake_safety.cli.run import parse_pushes
 from drake_safety.learning.segments import EpisodeError
 from drake_safety.plants.balls import Throw
+from drake_safety.simulation.scenario import load_scenario
 from gliding_task import SCENARIO
+from live_scenarios import learned, quick
 
 
 @pytest.mark.train
@@ -112,6 +114,19 @@ def test_training_is_not_mixed_with_episodes_that_are_there_already(monkeypatch,
     (tmp_path / "episodes").mkdir()
     assert call(monkeypatch, "train", "laikago_balancing", "--out", tmp_path) == 2
     assert "already holds 3 episodes: pass --resume" in capsys.readouterr().out
+
+
+@pytest.mark.train
+def test_a_task_without_goals_or_balls_runs_an_episode_and_takes_no_push(
+    monkeypatch, capsys, tmp_path
+):
+    learned(quick(load_scenario("pendulum"))).save(tmp_path / "sharpened.safetensors")
+    command = ("run", "pendulum", "--assessment", tmp_path)
+    assert call(monkeypatch, *command, "--push", "ball") == 2
+    assert call(monkeypatch, *command) == 0
+    assert "the episode starts" in capsys.readouterr().out
+    written = {path.name for path in (tmp_path / "run").iterdir()}
+    assert written == {"recording.html", "run.json", "timeline.png", "timeline.svg"}
 
 
 @pytest.fixture

@@ -329,6 +329,13 @@ def test_another_policy_takes_over_where_the_baselines_has_walked(tmp_path):
     loop_comparison._check_alike(5, taking_over, there, start_of(taking_over))
 
 
+def test_a_policy_that_remembers_other_things_cannot_take_over_in_mid_stride(tmp_path):
+    clipped = go2(tmp_path, **{"{name: last_action}": "{name: last_action, clip: 5}"})
+    pair = ComparedPlant(load_scenario("go2_walking")), ComparedPlant(clipped)
+    with pytest.raises(ValueError, match=r"cannot take over in mid-stride.*standing_share: 1"):
+        start_of(loop_comparison.make_paired(pair, 1))
+
+
 def test_a_network_alone_is_a_policy(tmp_path):
     network = network_file(read_policy_file(GO2), str(GO2.parent))
     copy = tmp_path / "new.onnx"

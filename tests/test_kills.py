@@ -67,7 +67,7 @@ def assert_kept(folder, undisturbed):
     ("kill", "is_worker", "code", "said"),
     [
         (signal.SIGKILL, False, -signal.SIGKILL, []),
-        (signal.SIGINT, False, 130, ["stopped; finished episodes are kept"]),
+        (signal.SIGINT, False, 130, ["kept: the same command continues (train: with --resume)"]),
         (signal.SIGKILL, True, 2, ["a worker process was killed", "--resume"]),
     ],
 )

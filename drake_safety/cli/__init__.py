@@ -27,18 +27,10 @@ from drake_safety.learning.segments import EpisodeError, installed_versions
 
 COMMANDS = {
     "scenarios": ("prepare", "", "List the scenarios that come with the package."),
-    "new": (
-        "prepare",
-        "",
-        "Write the folder of a robot and a first scenario from a URDF or an MJCF, for review.",
-    ),
+    "new": ("prepare", "", "Write a robot's folder and a first scenario from a URDF or an MJCF."),
     "check": ("prepare", "", "Check a scenario and its robot, and print problems with remedies."),
     "train": ("train", "train", "Simulate the nominal closed loop and train Γ."),
-    "calibrate": (
-        "calibrate",
-        "train",
-        "Choose thresholds with a promised miss rate on fresh episodes.",
-    ),
+    "calibrate": ("calibrate", "train", "Choose thresholds with a promised miss rate."),
     "ask": ("ask", "", "Print the verdict on a target, or on a command of a walking robot."),
     "run": ("run", "", "Simulate once with Γ in the loop; write a recording and a timeline."),
     "play": ("play", "live", "Simulate a task on a page in the browser, in real time."),
@@ -153,7 +145,9 @@ def run_app(commands: Callable[..., Any], program: str) -> None:
         if code == _STOPPED:  # Typer's own answer to Ctrl-C.
             raise KeyboardInterrupt
     except (typer.Abort, KeyboardInterrupt):
-        console.say("stopped; finished episodes are kept")
+        console.say(
+            "stopped; finished episodes are kept: the same command continues (train: with --resume)"
+        )
         sys.exit(_STOPPED)
     except (Exception, SystemExit) as error:
         if isinstance(error, (ValueError, OSError, EpisodeError)) and _DEBUG not in sys.argv:

@@ -16,14 +16,14 @@ from rich.text import Text
 from typer import Argument, Option
 
 from drake_safety.files import progress
+from drake_safety.learning.segments import installed_versions
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
 
 ScenarioArgument = Annotated[
-    str,
-    Argument(help="Name of a scenario (see `scenarios`), or the path of your own YAML file."),
+    str, Argument(help="Name of a scenario (see `scenarios`), or the path of your own YAML file.")
 ]
 AssessmentOption = Annotated[
     Path | None,
@@ -122,6 +122,4 @@ def made_by(scenario: str, program: str = "drake-safety") -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Versions of the library and of packages that its results depend on."""
-    from drake_safety.learning.segments import installed_versions
-
     return installed_versions("drake", "numpy", "scipy", "scikit-learn", "torch")

@@ -98,8 +98,7 @@ def evaluate(
         Option(help="Fresh throws at the actual plant; 600 for tasks with recovery.", min=0),
     ] = None,
     shifts: Annotated[
-        int,
-        Option(help="Evaluate changed plants and sensors instead, by so many motions.", min=0),
+        int, Option(help="Evaluate changed plants and sensors instead, by so many motions.", min=0)
     ] = 0,
     seed: Annotated[
         int | None, Option(help=f"First seed; {EVALUATION.first}, or {SHIFTS.first} with --shifts.")

@@ -21,11 +21,7 @@ _CELL_M = 0.5  # Of Meshcat's grid.
 
 
 class FollowingCamera:
-    """Keeps a robot on legs in the middle of the picture, and the ground below it.
-
-    Attributes:
-        size_m: Size of the robot: twice the height of its base, or the extent of its feet [m].
-    """
+    """Keeps a robot on legs in the middle of the picture, and the ground below it."""
 
     def __init__(self, loop: LeggedLoop, meshcat: Meshcat):
         self.meshcat = meshcat
@@ -33,6 +29,7 @@ class FollowingCamera:
         self._target, self._time_s = np.zeros(2), np.inf
         q = loop.kinematics.standing_positions()
         contacts = loop.kinematics.contact_positions(q)
+        # Twice the height of the base, or the extent of the feet.
         self.size_m = float(max(2 * q[6], *np.ptp(contacts, axis=0)))
         self._height_m = 0.7 * float(q[6])
         meshcat.SetProperty("/Axes", "visible", False)

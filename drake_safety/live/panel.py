@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
@@ -45,39 +44,33 @@ class Slider:
 
 
 class LivePanel:
-    """What every viewer of a session sees and controls; the session and a page share it.
+    """What every viewer of a session sees and controls.
 
-    They run in two threads. Each replaces whole values, which needs no lock; a click needs one.
-
-    Attributes:
-        probability: The probability; NaN before the first.
-        buttons: Key of each button by its name, as `KeyboardEvent.code`; "" for none.
+    The session and a page share it. They run in two threads, of which each replaces whole values.
     """
 
     def __init__(self, *, title: str, threshold: float):
-        self.title = title
-        self.threshold = threshold
+        self.title, self.threshold = title, threshold
         self.status = Status()
         self.probability = math.nan
         self.belief: tuple[float, ...] = _UNKNOWN
-        self.buttons: dict[str, str] = {}
+        self.buttons: dict[str, str] = {}  # Keys as `KeyboardEvent.code`, or "", by name.
         self.sliders: dict[str, Slider] = {}
         self.is_stopped = False
         self._clicks: set[str] = set()
-        self._clicking = threading.Lock()
         self._history: deque[tuple[float, float]] = deque()
 
     def click(self, name: str) -> None:
         """Clicks a button; until it is taken, further clicks count as the same."""
-        with self._clicking:
-            self._clicks.add(name)
+        self._clicks.add(name)
 
     def take_click(self, name: str) -> bool:
         """Whether a button was clicked since the last call."""
-        with self._clicking:
-            is_clicked = name in self._clicks
-            self._clicks.discard(name)
-        return is_clicked
+        try:
+            self._clicks.remove(name)  # Looks and removes at once: no click is lost.
+        except KeyError:
+            return False
+        return True
 
     def set_value(self, name: str, value: Any) -> None:
         """Sets a slider, within its range, to what a page sent; what is no number is ignored."""
@@ -88,18 +81,14 @@ class LivePanel:
     def show_belief(
         self, probability: float, belief: np.ndarray, time_s: float | None = None
     ) -> None:
-        """Shows a probability, or NaN, and a belief, on the curve if there is a time [s].
-
-        A belief (3,) that is not finite is "don't know".
-        """
+        """Shows a probability, or NaN, and a belief (3,), on the curve if there is a time [s]."""
         self.probability = float(probability)
         self.belief = tuple(belief.tolist()) if np.isfinite(belief).all() else _UNKNOWN
-        if time_s is None:
-            return
-        shown = self.probability if math.isfinite(self.probability) else 0.0
-        self._history.append((time_s, min(max(shown, 0.0), 1.0)))
-        while self._history[0][0] < time_s - HISTORY_S:
-            self._history.popleft()
+        if time_s is not None:
+            shown = self.probability if math.isfinite(self.probability) else 0.0
+            self._history.append((time_s, min(max(shown, 0.0), 1.0)))
+            while self._history[0][0] < time_s - HISTORY_S:
+                self._history.popleft()
 
     def clear_history(self) -> None:
         """Clears the curve."""

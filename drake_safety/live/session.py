@@ -72,14 +72,8 @@ class LiveSession:
 
     The capabilities of the loop, which is built with this Meshcat and an assessment, decide what
     the controls do: change commands, choose a goal, or throw balls. Any other task runs episode
-    after episode from random starts.
-
-    Attributes:
-        threshold: Lowest probability that is shown as "safe", and of accepted goals.
-        unsafe_below: Probability below which a goal is unsafe; in between is "don't know".
-        cause: The constraint that was violated first since the start; "" for none.
-        command: The present command, (3,), of a loop that follows commands.
-        verdict, nearest: On the present goal, and the nearest accepted one; None if not asked.
+    after episode from random starts. From the threshold on a probability is "safe", and a goal
+    below ``unsafe_below`` is unsafe; in between is "don't know".
     """
 
     def __init__(
@@ -96,7 +90,8 @@ class LiveSession:
         self.assessment: Any = loop.assessment
         self.meshcat = meshcat
         self.threshold, self.unsafe_below = threshold, unsafe_below
-        self.cause, self._rate = "", 0.0
+        self._simulator = Simulator(loop)
+        self.cause = ""  # The constraint that was violated first since the start.
         self.command, self.is_guarded = np.zeros(3), True
         self.verdict: GoalVerdict | None = None
         self.nearest: GoalVerdict | None = None
@@ -176,8 +171,7 @@ class LiveSession:
 
     def run(self) -> None:
         """Ticks in real time until Stop is clicked or :meth:`end` is called."""
-        self._rate = 1.0
-        self._simulator.set_target_realtime_rate(self._rate)
+        self._simulator.set_target_realtime_rate(1.0)
         self._simulator.ResetStatistics()
         try:
             while not (self._is_ended or self.panel.take_click(STOP)):
@@ -197,8 +191,7 @@ class LiveSession:
     def _start(self) -> None:
         """Resets the robot, with a Context of default values."""
         loop, end_s = self.loop, math.inf
-        self._simulator = Simulator(loop)
-        self._simulator.set_target_realtime_rate(self._rate)
+        self._simulator.reset_context(loop.CreateDefaultContext())
         self.context = self._simulator.get_mutable_context()
         self.cause, self._num_waits = "", 0
         match self._use:
