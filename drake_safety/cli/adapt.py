@@ -35,13 +35,10 @@ _MOTION_S = 1.25 * LEAST_MOTION_S  # Of a simulated actual plant, some of which 
 def adapt(
     scenario: console.ScenarioArgument,
     assessment: console.AssessmentOption = None,
-    feedback: Annotated[
-        int, Option(help="Actual episodes, each with a nominal twin.", min=1)
-    ] = 160,
+    feedback: Annotated[int, Option(help="Actual episodes, with nominal twins.", min=1)] = 160,
     variation: Annotated[str, Option(help="Variation of the actual plant.")] = "actual",
     log: Annotated[
-        list[Path] | None,
-        Option(help="Logs of a robot, in place of a variation; one or more.", exists=True),
+        list[Path] | None, Option(help="Logs of a robot, in place of a variation.", exists=True)
     ] = None,
     log_map: Annotated[Path | None, Option("--map", help="Map of their columns (YAML).")] = None,
     out: Annotated[
@@ -133,10 +130,9 @@ def adapt(
 def _held_out(
     prior: SafetyAssessment, pairs: list[EpisodePair], units: np.ndarray
 ) -> dict[str, Estimate]:
-    """Brier scores on actual episodes, before and after adapting to those of other units.
+    """Brier scores on actual episodes, before and after adapting to other units, logs or pairs.
 
-    Units (N,) are the pairs' logs, or the pairs; intervals are over them. A single one has no
-    score.
+    Intervals are over units (N,). A single one has no score.
     """
     folds, errors = np.unique(units, return_inverse=True)[1] % _NUM_FOLDS, []
     for fold in range(folds.max() + 1 if folds.any() else 0):

@@ -10,7 +10,7 @@ from typer import Exit, Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
-from drake_safety.files.reading import did_you_mean, is_number
+from drake_safety.files.reading import is_number
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.simulation.capabilities import HasGoals, goal_words, require
@@ -26,9 +26,7 @@ def ask(
     hand: console.HandOption = None,
     duration: Annotated[
         float | None,
-        Option(
-            help="Of a command [s], after which the robot stops; an episode by default.", min=0.1
-        ),
+        Option(help="Of a command [s], then it stops; by default an episode.", min=0.1),
     ] = None,
     mode: console.ModeOption = MODES[0],
 ) -> None:
@@ -62,10 +60,8 @@ def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
     if len(entries) == 3 and all(map(is_number, entries)):
         return np.array([float(entry) for entry in entries])
     raise ValueError(
-        f"{words.goal} '{text}'{did_you_mean(text, named_targets)}: give {' '.join(words.axes)}, "
-        "three numbers "
-        f"[{', '.join(words.units)}], or one of the names that scenario '{loop.scenario.name}' "
-        f"gives: {list(named_targets)}"
+        f"{words.goal} '{text}': give {' '.join(words.axes)} [{', '.join(words.units)}], or one of "
+        f"the names that scenario '{loop.scenario.name}' gives: {list(named_targets)}"
     )
 
 
@@ -90,10 +86,8 @@ def print_verdict(
     subject = f" of {words.subject}" if words.is_point else ""
     sign = "<" if probability < threshold else "≥"
     numbers = f"probability {probability:.3f} {sign} threshold {threshold:.3f}"
-    lines = {
-        words.goal: f"{words.value(verdict.goal)}{subject}",
-        "verdict": f"{verdict.verdict}: {verdict.reason or numbers}",
-    }
+    lines = {words.goal: f"{words.value(verdict.goal)}{subject}"}
+    lines["verdict"] = f"{verdict.verdict}: {verdict.reason or numbers}"
     if np.isfinite(probability):
         safe, unsafe, unknown = verdict.belief.tolist()
         lines["belief"] = f"safe {safe:.2f}, unsafe {unsafe:.2f}, don't know {unknown:.2f}"

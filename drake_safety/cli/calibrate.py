@@ -23,18 +23,15 @@ def calibrate(
     scenario: console.ScenarioArgument,
     assessment: console.AssessmentOption = None,
     miss_rate: Annotated[
-        float, Option(help="Promised miss rate: share of unsafe episodes classified safe.")
+        float, Option(help="Promised share of unsafe episodes called safe.")
     ] = 0.01,
-    false_alarm_rate: Annotated[
-        float, Option(help="Promised share of safe episodes classified unsafe, not 'don't know'.")
-    ] = 0.05,
+    false_alarm_rate: Annotated[float, Option(help="And of safe ones called unsafe.")] = 0.05,
     confidence: Annotated[
         float | None, Option(help="Confidence of the promise, such as 0.95; on average by default.")
     ] = None,
     episodes: Annotated[int, Option(help="Fresh episodes.", min=2)] = 1000,
     variation: Annotated[
-        str | None,
-        Option(help="Plant of the promise; by default of `adapt`, but not --log, else nominal."),
+        str | None, Option(help="Plant of the promise; by default that of `adapt`, else nominal.")
     ] = None,
     seed: Annotated[int, Option(help="Seed of the episodes.")] = CALIBRATION.first,
     workers: console.WorkersOption = None,
@@ -57,8 +54,8 @@ def calibrate(
     drawn = [one.seed for one in learned[MODES[0]].used_ if one.purpose == "adaptation"]
     if (is_of_logs := NOT_DRAWN in drawn) and variation is None:
         raise ValueError(
-            f"calibrate: '{folder.path}' is adapted to a robot of logs, which no plant simulates: "
-            f"nothing can be promised for it, only for a simulated plant by --variation {plant}"
+            f"calibrate: no plant simulates the robot of the logs that '{folder.path}' is adapted "
+            f"to: a promise holds for a simulated plant, --variation {plant}"
         )
     for gamma in learned.values():
         folders.check_fresh(gamma, loaded)

@@ -69,13 +69,9 @@ class Evaluation:
 
     def fresh(self, what: str, number: int, purpose: str) -> Episodes:
         """Fresh nominal episodes, kept in the run's folder."""
+        seed, progress = self.seeds[purpose], partial(self.stages, what)
         return folders.run_fresh_episodes(
-            self.scenario,
-            self.run_folder,
-            number,
-            self.seeds[purpose],
-            partial(self.stages, what),
-            self.workers,
+            self.scenario, self.run_folder, number, seed, progress, self.workers
         )
 
     def add(self, estimates: Mapping[Key, Estimate], **figures: Figure) -> None:
@@ -90,22 +86,15 @@ def evaluate(
     scenario: console.ScenarioArgument,
     assessment: console.TrainingOption,
     episodes: Annotated[int, Option(help="Fresh nominal episodes.", min=1)] = 1000,
-    calibration_episodes: Annotated[
-        int, Option(help="Other nominal ones, for thresholds.", min=20)
-    ] = 300,
+    calibration_episodes: Annotated[int, Option(help="Others, for thresholds.", min=20)] = 300,
     throws: Annotated[
-        int | None,
-        Option(help="Fresh throws at the actual plant; 600 for tasks with recovery.", min=0),
+        int | None, Option(help="Throws at the actual plant; 600 for tasks with recovery.", min=0)
     ] = None,
     shifts: Annotated[
         int, Option(help="Evaluate changed plants and sensors instead, by so many motions.", min=0)
     ] = 0,
-    seed: Annotated[
-        int | None, Option(help=f"First seed; {EVALUATION.first}, or {SHIFTS.first} with --shifts.")
-    ] = None,
-    out: Annotated[
-        Path | None, Option(help="Folder for tables and pictures; ASSESSMENT's by default.")
-    ] = None,
+    seed: Annotated[int | None, Option(help="First seed; another with --shifts.")] = None,
+    out: Annotated[Path | None, Option(help="Folder of results; by default ASSESSMENT.")] = None,
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
 ) -> None:

@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 from typer import Argument, Exit, Option
 
 from drake_safety.cli import console
@@ -31,7 +30,7 @@ from drake_safety.evaluation.loop_comparison import (
     compare_loops,
     make_paired,
 )
-from drake_safety.evaluation.outcomes import BELIEFS, UNSAFE, Outcome
+from drake_safety.evaluation.outcomes import UNSAFE, Outcome
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.tables import Column
 from drake_safety.files.atomic import write_file
@@ -47,12 +46,8 @@ _POINTS = Column("", "", "points", digits=1)
 _PANELS = """<!doctype html><meta charset="utf-8">
 <style>body { display: flex; height: 95vh } iframe { flex: 1 }</style>"""
 
-MetricOption = Annotated[
-    str, Option(help="Failure: unsafe, fall, a constraint's name, or tracking=BOUND.")
-]
-OutOption = Annotated[
-    Path | None, Option(help="Folder of episodes and results; by default runs/SCENARIO-COMMAND.")
-]
+MetricOption = Annotated[str, Option(help="unsafe, fall, a constraint, or tracking=BOUND.")]
+OutOption = Annotated[Path | None, Option(help="Folder; by default runs/SCENARIO-COMMAND.")]
 
 
 def gate(
@@ -62,8 +57,8 @@ def gate(
         list[str] | None,
         Option(
             metavar="KEY=VALUE",
-            help="A candidate by what it changes, several in quotes: policy=FILE, variation=NAME, "
-            "robot=FILE, or any key of a scenario, such as parameters.push.share=0.1.",
+            help="A candidate by what it changes: policy=FILE, variation=NAME, robot=FILE, or a "
+            "key of a scenario, such as parameters.push.share=0.1; several in quotes.",
         ),
     ] = None,
     baseline: Annotated[str, Option(metavar="KEY=VALUE", help="The same for all loops.")] = "",
@@ -239,15 +234,6 @@ def _report(
         new, old = one.newly_failing, one.no_longer_failing
         _show_episodes(f"{name}: episodes that newly fail", new, metric)
         _show_episodes(f"{name}: episodes that fail no longer", old, metric)
-        sides = BELIEFS if any(each.belief for each in new) else ()
-        causes = []
-        for cause in dict.fromkeys(each.cause for each in (*new, *old)):
-            here = [each for each in new if each.cause == cause]
-            believed = [BELIEFS[int(np.argmax(each.belief))] for each in here if each.belief]
-            lost = sum(each.cause == cause for each in old)
-            causes.append((spoken(cause or metric), len(here), *map(believed.count, sides), lost))
-        headings = ("cause", "newly fail", *(f"Γ: {what}" for what in sides), "fail no longer")
-        _show(f"{name}: by cause", headings, causes)
         for each in [*new, *old][:1]:
             replay = f"--replay={each.episode}"
             console.say("to see one:", console.command_line("drake-safety", replay))

@@ -30,14 +30,11 @@ _LEAST_S = 1.0  # Of motion in which no alarm says something.
 def monitor(
     scenario: console.ScenarioArgument,
     log: Annotated[
-        list[Path],
-        Option(help="Log of a robot, .npz file of sequences, or folder of either; repeatable."),
+        list[Path], Option(help="Log, .npz file of sequences, or folder of either; repeatable.")
     ],
     log_map: Annotated[Path, Option("--map", help="Map of their columns, a YAML file.")],
     assessment: console.AssessmentOption = None,
-    out: Annotated[
-        Path | None, Option(help="Folder to write; ASSESSMENT/monitor by default.")
-    ] = None,
+    out: Annotated[Path | None, Option(help="Folder; by default ASSESSMENT/monitor.")] = None,
 ) -> None:
     """Run the change monitor over logs of a robot: its alarms, their causes, and its levels."""
     loaded, learned, gamma = folders.open_assessment(scenario, assessment)
@@ -59,10 +56,7 @@ def monitor(
     console.say("figures ", folder / "monitor.json")
     console.say("pictures", folder)
     if short := sum(not entry["alarms"] and entry["judged_s"] < _LEAST_S for entry in logs):
-        raise ValueError(
-            f"{short} of {len(logs)} logs have less than {_LEAST_S:g} s of motion without a "
-            "missing value"
-        )
+        raise ValueError(f"{short} of {len(logs)} logs have less than {_LEAST_S:g} s of motion")
 
 
 def _files(path: Path) -> list[Path]:

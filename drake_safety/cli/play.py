@@ -30,9 +30,7 @@ def play(
     recovery: console.RecoveryOption = None,
     seed: Annotated[int, Option(help="Seed of start and noise.")] = DEMONSTRATION.first,
     mode: console.ModeOption = MODES[0],
-    port: Annotated[
-        int | None, Option(help="Of the page; the first free one from 7000 on by default.")
-    ] = None,
+    port: Annotated[int | None, Option(help="Of the page; by default a free one.")] = None,
     host: Annotated[
         str, Option(help="Address that serves the page; whoever reaches it can use the controls.")
     ] = console.LOOPBACK,
@@ -62,23 +60,22 @@ def play(
     served = {"host": host, "port": page_port, "scene_url": meshcat.web_url()}
     with serve_page(session.panel, **served):
         # An exception of a handler could be raised, and lost, inside Drake.
-        numbers = (signal.SIGINT, signal.SIGTERM)
-        handlers = {number: signal.signal(number, session.end) for number in numbers}
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, session.end)
         console.say(f"live at http://{host}:{page_port}")
         console.say("Stop, on the page, or Ctrl-C ends")
         session.run()
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
 
 
 def _page_port(host: str, port: int | None) -> int:
     """The port of the page, which is free."""
-    candidates = range(_FIRST_PORT, _FIRST_PORT + 200) if port is None else [port]
-    for candidate in candidates:
+    for candidate in range(_FIRST_PORT, _FIRST_PORT + 200) if port is None else [port]:
         with contextlib.suppress(OSError, OverflowError):
             socket.create_server((host, candidate)).close()
             return candidate
-    raise ValueError(f"no page can be served at {host}:{candidates[0]}: this port is not free")
+    raise ValueError(
+        f"no page can be served at {host}:{port or _FIRST_PORT}: this port is not free"
+    )
 
 
 def _hidden_host() -> str:

@@ -46,15 +46,12 @@ def new(
     model: Annotated[Path, Option("--urdf", "--mjcf", help="Its model file.", dir_okay=False)],
     task: Annotated[str, Option(help="'balancing', 'reaching' or 'walking'.")] = "balancing",
     policy: Annotated[
-        Path | None,
-        Option(help="For 'walking': a network, a deploy.yaml or a config.yaml.", dir_okay=False),
+        Path | None, Option(help="Of walking: network, deploy.yaml or config.yaml.", dir_okay=False)
     ] = None,
     motors: Annotated[
         str | None, Option(help="Joints in the order of a deploy.yaml's motors, with commas.")
     ] = None,
-    feet: Annotated[
-        str | None, Option(help="Links that touch the ground, with commas; the lowest by default.")
-    ] = None,
+    feet: Annotated[str | None, Option(help="Links on the ground; by default the lowest.")] = None,
     hands: Annotated[str | None, Option(help="Links that arms end in, with commas.")] = None,
     out: Annotated[Path | None, Option(help="Folder to write; NAME by default.")] = None,
 ) -> None:
@@ -79,20 +76,16 @@ def new(
     for path in files:
         console.say("wrote", path)
     if written.num_hulls:
-        console.say(
-            f"{written.num_hulls} convex hulls replace collision meshes that Drake does not read: "
-            f"look at them by python -m pydrake.visualization.model_visualizer {files[0]}"
-        )
+        look = f"look at them by python -m pydrake.visualization.model_visualizer {files[0]}"
+        console.say(f"{written.num_hulls} convex hulls replace collision meshes: {look}")
     for what in written.decided:
         console.say("decided", what)
     for what in (*written.copy.warnings, *written.copy.left_out):
         console.say(f"note  {what}", style="yellow")
     if bare := written.copy.bare_links:
-        console.say(
-            f"WARNING  {len(bare)} links have lost their collision meshes, and everything passes "
-            f"through {', '.join(bare)}: add boxes or capsules to {files[0]}",
-            style="bold red",
-        )
+        lost = f"{len(bare)} links have lost their collision meshes, and everything passes through"
+        remedy = f"{', '.join(bare)}: add boxes or capsules to {files[0]}"
+        console.say(f"WARNING  {lost} {remedy}", style="bold red")
     for what in asked:
         console.say(f"ask   {what}", style="yellow")
     console.say("next: drake-safety check", written.files[-1])
@@ -106,10 +99,7 @@ def check(
     scenario: console.ScenarioArgument,
     quick: Annotated[bool, Option("--quick", help="Without the share of unsafe episodes.")] = False,
     import_: Annotated[
-        bool,
-        Option(
-            "--import/--no-import", help="Import the scenario's task, which runs a stranger's code."
-        ),
+        bool, Option("--import/--no-import", help="Import the task, which runs a stranger's code.")
     ] = True,
 ) -> None:
     """Check a scenario and its robot, and print problems with their remedies.
@@ -138,10 +128,7 @@ def check(
         console.say(f"{num_problems} problem{'s' * (num_problems > 1)}", style="red")
         raise Exit(1)
     if not import_:
-        console.say(
-            "its files are right; not checked, as its code was not run: parameters, policy and "
-            "network, diagram, standing, episodes"
-        )
+        console.say("its files are right; nothing else is checked, as its code was not run")
         return
     if quick:
         console.say("not checked: the share of unsafe episodes")

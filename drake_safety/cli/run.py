@@ -57,9 +57,7 @@ def run(
     target: console.TargetOption = None,
     hand: console.HandOption = None,
     force: Annotated[bool, Option("--force", help="Go to the target even if Γ refuses.")] = False,
-    guard: Annotated[
-        bool, Option("--guard", help="Pass on the nearest accepted command instead.")
-    ] = False,
+    guard: Annotated[bool, Option("--guard", help="Pass on an accepted command.")] = False,
     push: Annotated[
         list[str] | None,
         Option(
@@ -70,15 +68,11 @@ def run(
     variation: console.VariationOption = "nominal",
     recovery: console.RecoveryOption = None,
     duration: Annotated[
-        float | None,
-        Option(help="Seconds: by default 5 with balls, an episode, one more to a target.", min=0.1),
+        float | None, Option(help="Seconds; by default an episode, or 5 with balls.", min=0.1)
     ] = None,
     seed: Annotated[int, Option(help="Seed of start, plan and noise.")] = DEMONSTRATION.first,
     mode: console.ModeOption = MODES[0],
-    out: Annotated[
-        Path | None,
-        Option(help="Folder of run/: recording, figures, events; ASSESSMENT by default."),
-    ] = None,
+    out: Annotated[Path | None, Option(help="Folder of run/; by default ASSESSMENT.")] = None,
 ) -> None:
     """Simulate once with Γ in the loop; write a recording, a timeline and the events.
 
@@ -229,11 +223,9 @@ def _all_events(
 def reason_events(
     loop: Any, motion: Motion, times_s: list[float], threshold: float, happens: str = ""
 ) -> _Events:
-    """Why Γ was low at given times: "don't know" and its reason, or a cause.
-
-    A recovery, which ``happens``, heeds no alarm.
-    """
+    """Why Γ was low at given times: "don't know" and its reason, or a cause."""
     names, parameters = loop.constraint_names, loop.assessment.parameters
+    # A recovery, which happens, heeds no alarm.
     probability, belief = map(motion.__getitem__, _WITHOUT_ALARM if happens else _GAMMA[:2])
     events = []
     for time_s in times_s:

@@ -35,21 +35,13 @@ def train(
     motion: Annotated[
         float | None,
         Option(
-            help="Minutes of undisturbed motion for the monitor; by default 6 s an episode, up to "
-            "48.",
-            min=0.0,
+            help="Minutes of motion for the monitor; by default 6 s an episode, to 48.", min=0.0
         ),
     ] = None,
     falls: Annotated[
-        int | None,
-        Option(
-            help="Episodes for the probability of a fall; a quarter of the others by default.",
-            min=0,
-        ),
+        int | None, Option(help="Episodes until a fall; by default a quarter of the others.", min=0)
     ] = None,
-    mode: Annotated[
-        str, Option(help="'sharpened', 'paper' (the method as published), or 'both'.")
-    ] = "both",
+    mode: Annotated[str, Option(help="'sharpened', 'paper' (as published), or 'both'.")] = "both",
     resume: Annotated[bool, Option("--resume", help="Continue with the episodes in OUT.")] = False,
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
@@ -76,8 +68,7 @@ def train(
     motion_s = max(min(6.0 * episodes, 2880.0), 2.0 * piece_s) if motion is None else 60.0 * motion
     if 0.0 < motion_s <= piece_s:
         raise ValueError(
-            f"train: --motion {motion_s / 60.0:g} gives one motion, and the monitor needs two: "
-            "give 2 or more, or 0 to learn it from the episodes"
+            f"train: --motion {motion_s / 60.0:g} is too little: give 2 or more, or 0 for none"
         )
     with console.open_stages() as stages:
         for folder, options in sets.items():

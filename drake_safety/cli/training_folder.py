@@ -17,8 +17,7 @@ from drake_safety.simulation.worker_processes import Progress
 
 MODES = ("sharpened", "paper")
 """Modes, the default first."""
-DEFAULT_THRESHOLD = 0.5
-"""Lowest probability of an accepted goal where no promise has chosen one."""
+_DEFAULT_THRESHOLD = 0.5  # Of goals, where no promise has chosen one.
 
 
 class AssessmentFolder(NamedTuple):
@@ -121,8 +120,8 @@ def assessment_folder(scenario: Scenario, given: Path | None) -> AssessmentFolde
             break
     else:
         raise ValueError(
-            f"the package has no assessment of what scenario '{scenario.name}' simulates, only of "
-            f"{names}: pass --assessment with a folder of `drake-safety train`"
+            f"the package has no assessment of what '{scenario.name}' simulates, only of {names}: "
+            "pass --assessment with a folder of `drake-safety train`"
         )
     console.say("assessment        comes with the package,", shipped)
     # A separate folder, so that no training is overwritten.
@@ -155,9 +154,9 @@ def check_fresh(
     if not scenario.adopt(trained):
         own = scenario.simulation_hash()
         raise ValueError(
-            f"the assessment was trained on scenario '{trained.scenario}' of robot "
-            f"'{trained.robot}' with hash {trained.scenario_hash[:12]}; '{scenario.name}' of robot "
-            f"'{scenario.robot_name}' now has hash {own[:12]}"
+            f"the assessment was trained on '{trained.scenario}' of '{trained.robot}' with hash "
+            f"{trained.scenario_hash[:12]}; '{scenario.name}' of '{scenario.robot_name}' has "
+            f"{own[:12]}"
         )
     assessment.check_unused(*seeds)
 
@@ -179,4 +178,4 @@ def goal_threshold(assessment: SafetyAssessment) -> GoalThreshold:
     if (stored := assessment.calibrations_.get("plan")) is not None:
         return GoalThreshold(stored.threshold, stored.unsafe_below, stored.origin)
     origin = "the default, which promises nothing: `drake-safety calibrate` chooses one"
-    return GoalThreshold(DEFAULT_THRESHOLD, DEFAULT_THRESHOLD, origin)
+    return GoalThreshold(_DEFAULT_THRESHOLD, _DEFAULT_THRESHOLD, origin)

@@ -19,8 +19,6 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 UNSAFE = "unsafe"
 HELD = "held actions"
 """Cause of an episode in which a controller found no command, and held the last one."""
-BELIEFS = ("safe", "unsafe", "don't know")
-"""Names of the entries of a belief."""
 
 Metric = str | Callable[[Episode], float]
 """How bad an episode is: ``unsafe``, ``fall``, a constraint, ``tracking=BOUND``, or a function with

@@ -9,7 +9,6 @@ import socket
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator, MutableMapping
-from functools import partial
 from importlib.resources import files
 from ipaddress import ip_address
 from typing import Any
@@ -40,21 +39,17 @@ def serve_page(panel: LivePanel, *, host: str, port: int, scene_url: str) -> Ite
     """
     app.add_middleware(_only_own, host=host)
     app.mount(_SCENE, _forward(scene_url))
-    serve = partial(
-        ui.run,
-        lambda: build_page(panel),
-        title=panel.title,
-        host=host,
-        port=port,
-        show=False,
-        reload=False,
-        tailwind=False,
-        binding_refresh_interval=None,
-        reconnect_timeout=10.0,
-        show_welcome_message=False,
-        timeout_graceful_shutdown=1,
-    )
-    thread = threading.Thread(target=serve, name="page", daemon=True)
+    options: Any = {
+        "title": panel.title,
+        "host": host,
+        "port": port,
+        "show": False,
+        "reload": False,
+    }
+    options |= {"tailwind": False, "binding_refresh_interval": None, "reconnect_timeout": 10.0}
+    options |= {"show_welcome_message": False, "timeout_graceful_shutdown": 1}
+    built = (lambda: build_page(panel),)
+    thread = threading.Thread(target=ui.run, args=built, kwargs=options, daemon=True)
     thread.start()
     end = time.monotonic() + _WITHIN_S
     while not (app.is_started and Server.instance.started):
@@ -78,9 +73,8 @@ def _only_own(application: _Application, host: str) -> _Application:
         known.add(socket.gethostname().lower())
 
     def is_own(headers: dict[bytes, bytes]) -> bool:
-        server, page = (
-            headers.get(key, b"").decode("latin-1").lower() for key in (b"host", b"origin")
-        )
+        names = (headers.get(key, b"") for key in (b"host", b"origin"))
+        server, page = (name.decode("latin-1").lower() for name in names)
         with contextlib.suppress(ValueError):
             name = urlsplit(f"//{server}").hostname or ""
             if name in known or (is_for_all and ip_address(name)):
@@ -137,11 +131,12 @@ async def _answer(send: Any, status: int, body: bytes, kind: str = "text/plain")
 
 def build_page(panel: LivePanel) -> None:
     """Builds the page of a viewer."""
-    here = files("drake_safety.live")
+    here = files(__package__)
+    css, script = (here.joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
     tones = " ".join(f"--{name}: {_css(name)};" for name in COLOURS)
     ui.colors(primary=_css("safe"))
-    ui.add_css(f":root {{ {tones} }}\n{here.joinpath('page.css').read_text('utf-8')}")
-    ui.add_head_html(f"<script>{here.joinpath('page.js').read_text('utf-8')}</script>")
+    ui.add_css(f":root {{ {tones} }}\n{css}")
+    ui.add_head_html(f"<script>{script}</script>")
     with ui.element().classes("scene"):
         ui.element("iframe").props(f'src="{_SCENE}/?reconnect_ms=-1" title="scene"')
         with ui.element().classes("veil"):
@@ -180,11 +175,9 @@ def _build_readings(panel: LivePanel) -> Callable[[], None]:
         cause.set_text(status.cause.replace("_", " "))
         note.set_text(status.note)
         box.style(f"background: var(--{status.tone})")
-        for part, label, share, name in zip(
-            parts, shares, panel.belief, _BELIEF.values(), strict=True
-        ):
-            part.style(f"flex: {share:.2f}")
-            label.set_text(f"{name} {share:.0%}")
+        for i, name in enumerate(_BELIEF.values()):
+            parts[i].style(f"flex: {panel.belief[i]:.2f}")
+            shares[i].set_text(f"{name} {panel.belief[i]:.0%}")
         series, curve = chart.options["series"][0], panel.curve()
         if curve != series["data"]:
             series["data"] = curve
@@ -222,21 +215,17 @@ def _build_controls(panel: LivePanel) -> Callable[[], None]:
 
 
 def _chart_options(threshold: float) -> dict[str, Any]:
-    limit = {
-        "silent": True,
-        "symbol": "none",
-        "data": [{"yAxis": threshold}],
-        "lineStyle": {"color": _css("unsafe"), "type": "solid", "width": 1.5},
-        "label": {"formatter": "threshold {c}", "position": "insideStartTop"},
-    }
-    curve = {
+    limit: Any = {"silent": True, "symbol": "none", "data": [{"yAxis": threshold}]}
+    limit["lineStyle"] = {"color": _css("unsafe"), "type": "solid", "width": 1.5}
+    limit["label"] = {"formatter": "threshold {c}", "position": "insideStartTop"}
+    curve: Any = {
         "type": "line",
         "showSymbol": False,
         "silent": True,
-        "lineStyle": {"color": _css("safe"), "width": 2.5},
         "data": [],
         "markLine": limit,
     }
+    curve["lineStyle"] = {"color": _css("safe"), "width": 2.5}
     return {
         "animation": False,
         "grid": {"left": 30, "right": 10, "top": 30, "bottom": 22},

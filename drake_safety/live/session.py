@@ -93,6 +93,7 @@ class LiveSession:
         self._simulator = Simulator(loop)
         self.cause = ""  # The constraint that was violated first since the start.
         self.command, self.is_guarded = np.zeros(3), True
+        # On the present goal, and the nearest accepted one.
         self.verdict: GoalVerdict | None = None
         self.nearest: GoalVerdict | None = None
         self._goal = np.full(3, np.nan)
@@ -239,11 +240,11 @@ class LiveSession:
         if not np.isfinite(margins).all():
             raise DivergenceError(f"a margin is not finite at {now_s:.2f} s")
         left = loop.constraint_names[violated(margins)] if is_outside(margins) else ""
-        if self._use == "episodes" and left and not self.cause:
-            self._end_s = now_s + _SHOWN_S
-        self.cause = self.cause or left
         if self._use == "episodes":
-            left = self.cause  # Until the next start.
+            if left and not self.cause:
+                self._end_s = now_s + _SHOWN_S
+            left = self.cause or left  # Until the next start.
+        self.cause = self.cause or left
         note = self._note()
         if self.has_fallen:
             self._end_s = min(self._end_s, now_s + _SHOWN_S)
@@ -282,10 +283,11 @@ class LiveSession:
         names, margins = self.loop.constraint_names, self._eval("predicted_margins")
         unit = self.assessment.parameters.margin_unit
         cause = likely_cause(names, self._eval("cause_probability"), margins, unit)
-        margin = margins[names.index(cause)] if cause else math.nan
+        if not cause:
+            return ""
         # Without its number, which would flicker.
-        label, _ = cause_words(cause, margin, self.loop.angular_constraints)
-        return f"{label}: {cause}" if cause else ""
+        words = cause_words(cause, margins[names.index(cause)], self.loop.angular_constraints)
+        return f"{words[0]}: {cause}"
 
     def _eval(self, port: str) -> Any:
         return self.loop.GetOutputPort(port).Eval(self.context)
@@ -339,23 +341,19 @@ class LiveSession:
         self._goal = goal = self._slid_goal()
         self.meshcat.SetTransform(_GOAL, RigidTransform(goal))
         self.meshcat.SetProperty(_NEAREST, "visible", False)
-        asked = (self.loop, self.assessment, goal)
+        loop, gamma, limit = self.loop, self.assessment, self.threshold
         self.verdict = verdict = assess_goal(
-            *asked, threshold=self.threshold, unsafe_below=self.unsafe_below
+            loop, gamma, goal, threshold=limit, unsafe_below=self.unsafe_below
         )
         self.nearest = None
         if is_thorough and not verdict.is_accepted:
-            self.nearest = nearest_accepted_goal(
-                *asked,
-                threshold=self.threshold,
-                rng=np.random.default_rng(self._seed),
-                num_candidates=_NUM_CANDIDATES,
-            )
+            few: Any = {"rng": np.random.default_rng(self._seed), "num_candidates": _NUM_CANDIDATES}
+            self.nearest = nearest_accepted_goal(loop, gamma, goal, threshold=limit, **few)
         self.panel.show_belief(verdict.probability, verdict.belief)
         if verdict.is_accepted:
             self.panel.status = Status("accepted", note="Space goes there", tone="safe")
             return verdict
-        cause = ": ".join(filter(None, verdict.cause_words(self.loop.angular_constraints)))
+        cause = ": ".join(filter(None, verdict.cause_words(loop.angular_constraints)))
         note = "nothing near is accepted" if is_thorough else verdict.reason
         if self.nearest is not None:
             distance_m = float(np.linalg.norm(self.nearest.goal - verdict.goal))
