@@ -6,13 +6,7 @@ from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.prediction import is_unknown
 from lip_assessments import QUICK, worse
 from lip_episodes import make_episodes
-from studies.adaptation import (
-    Pool,
-    TestSet,
-    boosting_estimates,
-    pool_estimates,
-    scores,
-)
+from studies.adaptation import Pool, TestSet, pool_estimates, scores
 
 pytestmark = pytest.mark.train
 
@@ -67,17 +61,3 @@ def test_pools_differ(assessment, judged):
     assert found[assessment.parameters.mode, "", "gap"].value == pytest.approx(differing / 70)
     with pytest.raises(ValueError, match="only 30 pairs of episodes"):
         pool_estimates(assessment, pools, sizes=(41,))
-
-
-def test_boosting_learns_from_the_feedback_too(judged):
-    nominal, pairs = make_episodes(60, seed=12, noise=0.002), worse()
-    pools = [Pool(feedback=pairs, test=judged), Pool(feedback=pairs[::-1], test=judged)]
-    found = boosting_estimates(nominal, pools, lambda *report: None, sizes=(30, 80))
-    assert {method for _, method, _ in found} == {"prior", "alone 30", "refitted 30"}
-    prior, alone, refitted = (
-        found["boosting", who, "auc"] for who in ("prior", "alone 30", "refitted 30")
-    )
-    # Without feedback both pools are judged alike; a third of the feedback contradicts the test.
-    assert prior.low == prior.high > 0.7
-    assert alone.low < alone.high < prior.low
-    assert alone.value < refitted.value < prior.value

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 
 from drake_safety.simulation.motion import Motion
-from studies.alarms import (
-    Alarm,
-    evaluate_alarms,
-    first_alarm,
-    lowest_value,
-    tilt,
-)
+from studies.alarms import Alarm, evaluate_alarms, first_alarm, lowest_value, tilt
 
 PUSH_S, LEAVE_S, FALL_S, END_S = 1.0, 1.4, 1.8, 3.6
 

@@ -135,16 +135,9 @@ def test_a_calibration_is_stored_and_used_by_who_evaluates(
 
 
 @pytest.mark.train
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--throws", "3"], "pass --throws 0: task 'Shuttling' has no ball to throw"),
-        (["--seed", "-3"], "seed 0 gives episodes that start as the 60 'nominal'"),
-    ],
-)
-def test_what_cannot_be_evaluated_is_refused_before_anything_is_simulated(
-    monkeypatch, capsys, shuttle_run, arguments, message
+def test_seeds_of_the_training_are_refused_before_anything_is_simulated(
+    monkeypatch, capsys, shuttle_run
 ):
     monkeypatch.setattr(rollouts, "run_episode", None)
-    assert evaluate_shuttle(monkeypatch, shuttle_run, *arguments) == 2
-    assert message in " ".join(capsys.readouterr().out.split())
+    assert evaluate_shuttle(monkeypatch, shuttle_run, "--seed", -3) == 2
+    assert "seed 0 gives episodes that start as the 60 'nominal'" in capsys.readouterr().out

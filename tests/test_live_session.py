@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from pydrake.geometry import Meshcat
 
-from drake_safety import AddSafetyAssessor, load_scenario
+from drake_safety import load_scenario
 from drake_safety.cli.console import open_viewer
 from drake_safety.live import session as live
 from drake_safety.live.session import GO, PUSH, START, STOP, TICK_S, LiveSession
 from drake_safety.plants.pushes import Push
-from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS
 from gliding_task import Gliding, gliding
 from live_scenarios import learned, quick
 from reaching_targets import FAR, NEAR, SCENARIO, learned_targets
@@ -37,17 +36,6 @@ class Pushed(Gliding):
         x, _ = self.GetOutputPort("state").Eval(context)
         mass_context = self.mass.GetMyMutableContextFromRoot(context)
         mass_context.SetDiscreteState([x, push.force_n[0]])
-
-
-class FewPorts(Gliding):
-    """A task that exports no more of its assessor than it has to."""
-
-    def export(self, builder, ports, *, period_s):
-        inputs = {name: ports[name] for name in ("state", "desired_preview", "features", "margins")}
-        assessor = AddSafetyAssessor(builder, self.assessment, period_s=period_s, **inputs)
-        ports |= {name: assessor.GetOutputPort(name) for name in ASSESSMENT_PORTS}
-        for name, port in ports.items():
-            builder.ExportOutput(port, name)
 
 
 @pytest.fixture(scope="module")
@@ -277,8 +265,7 @@ def test_an_alarm_of_the_monitor_is_shown_with_its_cause(pendulum):
 
 @train
 @pytest.mark.parametrize(
-    ("state", "shown_after_s", "cause"),
-    [((0.0, 0.0), 2.0, ""), ((0.59, 10.0), TICK_S, "front")],
+    ("state", "shown_after_s", "cause"), [((0.0, 0.0), 2.0, ""), ((0.59, 10.0), TICK_S, "front")]
 )
 def test_the_end_of_an_episode_is_shown_until_the_next_start(pendulum, state, shown_after_s, cause):
     set_pendulum(pendulum, *state)
@@ -314,14 +301,12 @@ def test_a_simulation_that_fails_is_shown_and_the_next_begins(meshcat, failure, 
 
 
 @train
-def test_a_task_is_pushed_by_a_button_and_must_export_what_is_shown(meshcat):
+def test_a_task_is_pushed_by_a_button(meshcat):
     scenario = quick(gliding())
-    assessment = learned(scenario)
-    session = LiveSession(Pushed(scenario, assessment=assessment), meshcat, threshold=0.5)
+    loop = Pushed(scenario, assessment=learned(scenario))
+    session = LiveSession(loop, meshcat, threshold=0.5)
     ticks(session, PUSH)
     assert value_of(session, "state")[1] >= 2.0
-    with pytest.raises(ValueError, match=r"'FewPorts' exports no port \['cause_probability'"):
-        LiveSession(FewPorts(scenario, assessment=assessment), meshcat, threshold=0.5)
 
 
 def test_only_this_machine_reaches_a_viewer():

@@ -1,7 +1,6 @@
 import json
 import re
 import shutil
-import sys
 from html.parser import HTMLParser
 from types import SimpleNamespace
 
@@ -78,20 +77,6 @@ def test_it_says_what_was_learned_from_what_is_promised_and_where_a_baseline_is_
     assert "drake-safety evaluate lip --assessment" in words
     assert "AUC: gradient boosting, 0.950 against 0.900 (the intervals overlap)" in words
     assert whole.page.all("td", "class").count("best") == 9
-
-
-def test_a_folder_that_is_no_run_or_is_damaged_and_a_missing_extra_are_named(
-    copy, tmp_path, monkeypatch
-):
-    (copy / "sharpened.safetensors").write_bytes(b"half of it")
-    with pytest.raises(ValueError, match=r"sharpened\.safetensors"):
-        page_of(copy)
-    (tmp_path / "holiday.jpg").write_bytes(b"")
-    with pytest.raises(ValueError, match=r"neither an assessment nor results.*holiday\.jpg"):
-        page_of(tmp_path)
-    monkeypatch.setitem(sys.modules, "jinja2", None)
-    with pytest.raises(ValueError, match=r"pip install 'drake_safety\[report\]'"):
-        page_of(copy)
 
 
 def test_names_that_look_like_html_stay_text(copy):

@@ -9,15 +9,12 @@ import pytest
 from cart_episodes import make_episode, make_info
 from drake_safety import load_assessment, load_scenario
 from drake_safety.evaluation import shift_study
-from drake_safety.evaluation.metrics import proportion
-from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.shift_study import (
     CONFIDENT,
     false_alarms,
     monitored,
     run_monitored,
     shift_estimates,
-    shifts_tables,
 )
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
 from drake_safety.learning.change_detector import Alarm
@@ -168,22 +165,3 @@ def test_the_catalogue_is_scaled_to_the_robot():
     own = load_scenario("pendulum")
     shifts = plant_shifts(own, own.make_loop())
     assert list(shifts) == [f"variation {n}" for n in own.variations if n != "nominal"]
-
-
-NAMES = ["friction+10%", "collision (arm)", "v1.heavy", "../up", "größe $a_1$ $", "0.5", "a%2Eb"]
-
-
-def test_a_variation_may_have_any_name(tmp_path):
-    scenario = load_scenario("pendulum")
-    nominal = scenario.variation("nominal")
-    scenario.variations = {"nominal": nominal} | dict.fromkeys(NAMES, nominal)
-    shifts = plant_shifts(scenario, scenario.make_loop())
-    found = {}
-    for name in shifts:
-        found[f"shifts.{name}", "", "unsafe"] = proportion(1, 2)
-        found[f"shifts.{name}", "gamma", "unknown"] = proportion(1, 4)
-    Results(found).write(tmp_path / "shifts.json")
-    read = Results.read(tmp_path / "shifts.json")
-    (table,) = shifts_tables(read)
-    assert [row.label for row in table.rows] == [f"variation {n}".replace("_", " ") for n in NAMES]
-    assert all(None not in row.estimates for row in table.rows)

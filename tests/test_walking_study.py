@@ -5,12 +5,7 @@ import pytest
 
 from drake_safety import load_scenario
 from drake_safety.simulation.motion import Motion
-from studies.walking import (
-    guard_estimates,
-    push_estimates,
-    recovery_estimates,
-    speed_estimates,
-)
+from studies.walking import guard_estimates, push_estimates, recovery_estimates, speed_estimates
 from studies.walking_motions import run_motions, run_push
 
 

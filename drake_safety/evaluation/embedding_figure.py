@@ -28,10 +28,7 @@ _SAFETY = LinearSegmentedColormap.from_list(
 
 
 def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure:
-    """Plots the map: segments in the embedding, beliefs of the cells, and causes.
-
-    It shows the first map of an ensemble, and causes if two of them have 5 % of what is unsafe.
-    """
+    """Plots the first map: segments, beliefs of the cells, and causes if two have 5 % or more."""
     cells, grid = assessment.beliefs_[0], assessment.grid_
     assert assessment.training_.count is not None
     count = assessment.training_.count[0]
@@ -48,12 +45,8 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
         ink = np.where(is_empty, style.FAINT_INK, np.where(is_bright, style.INK, "white"))
         place: dict[str, Any] = {"ha": "center", "va": "center_baseline", "fontsize": 6.5}
         for i in np.flatnonzero(count):
-            middle.text(
-                *grid.centres[i],
-                f"{count[i]}" if count[i] < 1000 else f"{count[i] / 1000:.1f}k",
-                color=ink[i],
-                **place,
-            )
+            text = f"{count[i]}" if count[i] < 1000 else f"{count[i] / 1000:.1f}k"
+            middle.text(*grid.centres[i], text, color=ink[i], **place)
         middle.set_title("Belief of each cell: safe")
         middle.set_xlabel("numbers: training segments; hatched: don't know")
         for last in others:
@@ -78,16 +71,14 @@ def draw_values(
     return colours
 
 
-def _draw_segments(
-    fig: Figure, axes: Axes, assessment: SafetyAssessment, episodes: Episodes
-) -> None:
-    parameters = assessment.parameters
+def _draw_segments(fig: Figure, axes: Axes, gamma: SafetyAssessment, episodes: Episodes) -> None:
+    parameters = gamma.parameters
     segments = split(episodes, stride=max(parameters.horizon // 2, 1), discount=parameters.discount)
     # Drawn in random order, so that neither class hides the other.
     order = np.random.default_rng(0).permutation(len(segments))[:_MAX_POINTS]
     segments = segments.take(order)
-    result = assessment.predict(segments.state, segments.desired_preview, segments.features)
-    _draw_grid(axes, assessment.grid_)
+    result = gamma.predict(segments.state, segments.desired_preview, segments.features)
+    _draw_grid(axes, gamma.grid_)
     shade = ScalarMappable(Normalize(0.0, 1.0), _SAFETY.reversed())
     dots: dict[str, Any] = {"s": 5.0, "linewidths": 0.0, "alpha": 0.85, "rasterized": True}
     x, y = result.embedding.T

@@ -22,7 +22,7 @@ def evaluate_episodes(
 ) -> dict[Key, Estimate]:
     """Evaluates scorers on fresh episodes, on every segment and at k = 0.
 
-    Thresholds have the best balanced accuracy on the calibration set, separately for either.
+    Thresholds have the best balanced accuracy on the calibration set.
     """
     segments, others = (split(one, stride=1, discount=1.0) for one in (test, calibration))
     rows_of = {
@@ -85,8 +85,6 @@ def promised_miss_rate(is_unsafe: np.ndarray) -> float:
     """Miss rate that thresholds chosen on plans with these labels, (N,), can promise."""
     num_unsafe, wanted = int(is_unsafe.sum()), 1.0 - PROMISED_UNSAFE_RECALL
     if num_unsafe == 0:
-        raise ValueError(
-            f"thresholds: 0 of {len(is_unsafe)} calibration plans are unsafe; it takes "
-            f"{episodes_needed(wanted)} to promise an unsafe recall of {PROMISED_UNSAFE_RECALL:g}"
-        )
+        needed = f"it takes {episodes_needed(wanted)} to promise {PROMISED_UNSAFE_RECALL:g}"
+        raise ValueError(f"0 of {len(is_unsafe)} calibration plans are unsafe; {needed}")
     return max(1.0 / (num_unsafe + 1), wanted)

@@ -31,15 +31,11 @@ _EVEN = 0.5  # Share of the simulations that do not depend on Γ, in case that i
 
 @dataclass(frozen=True, kw_only=True)
 class FailureRate:
-    """An estimated failure rate with its 95 % interval.
-
-    Attributes:
-        plain_rollouts: Number of random episodes whose share of failures has the same variance.
-        failures: The episodes that failed, by time.
-    """
+    """An estimated failure rate with its 95 % interval, and the episodes that failed, by time."""
 
     rate: Estimate
     plain_rollouts: float
+    """Number of random episodes whose share of failures has the same variance."""
     failures: list[Outcome]
 
 
@@ -63,24 +59,18 @@ def estimate_failure_rate(
     starts, is unbiased however wrong Γ is. Starts and episodes are kept in the folder ``path``.
     """
     if not _NUM_STRATA <= num_rollouts <= num_starts:
-        raise ValueError(
-            f"estimate_failure_rate: num_rollouts must be in {_NUM_STRATA}..num_starts, "
-            f"{num_starts}; got {num_rollouts}"
-        )
+        raise ValueError(f"num_rollouts must be in {_NUM_STRATA}..{num_starts}; got {num_rollouts}")
     options = scenario.options_for("pairs", variation)
     make = worker_loop(scenario, variation, **options)
     reader = OutcomeReader(make(), metric, assessment)
 
     def collected(stage: str, indices: Sequence[int], **simulated: Any) -> Episodes:
         info = episodes_info(make(), seed, options | simulated)
+        run = partial(run_episode, seed=seed, **simulated)
+        folder = None if path is None else Path(path) / f"{info.scenario_hash[:12]}-{seed}"
+        shown = None if progress is None else partial(progress, stage)
         return collect_episodes(
-            info,
-            indices,
-            make,
-            partial(run_episode, seed=seed, **simulated),
-            num_workers=num_workers,
-            path=None if path is None else Path(path) / f"{info.scenario_hash[:12]}-{seed}",
-            progress=None if progress is None else partial(progress, stage),
+            info, indices, make, run, num_workers=num_workers, path=folder, progress=shown
         )
 
     starts = collected("starts", range(num_starts), until_first_row=True)

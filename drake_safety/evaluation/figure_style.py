@@ -78,16 +78,9 @@ def new_figure(width: float, height: float) -> Figure:
 def draw_threshold(axes: Axes, threshold: float, colour: str) -> None:
     """Draws the line of a threshold, with its value beside it, outside the axes."""
     axes.axhline(threshold, color=colour, linestyle="--", linewidth=1.2)
-    axes.annotate(
-        f"threshold {threshold:.3g}",
-        (1.0, threshold),
-        xycoords=("axes fraction", "data"),
-        xytext=(6, 0),
-        textcoords="offset points",
-        va="center",
-        color=colour,
-        fontsize=9,
-    )
+    place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+    place |= {"xytext": (6, 0), "va": "center", "color": colour, "fontsize": 9}
+    axes.annotate(f"threshold {threshold:.3g}", (1.0, threshold), **place)
 
 
 def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:

@@ -26,9 +26,8 @@ def interval_figure(estimates: Mapping[Key, Estimate]) -> Figure:
                 keys = [key for key in estimates if (key[0], key[2]) == (name, metric)]
                 shown = [estimates[key] for key in keys]
                 # NaN ends, such as those of a value without interval, draw no bar.
-                value, low, high = (
-                    np.array([[r.value, r.low, r.high] for r in shown]).reshape(-1, 3).T
-                )
+                ends = np.array([[one.value, one.low, one.high] for one in shown])
+                value, low, high = ends.reshape(-1, 3).T
                 places = [methods.index(method) for _, method, _ in keys]
                 axes.errorbar(
                     value,
@@ -45,7 +44,6 @@ def interval_figure(estimates: Mapping[Key, Estimate]) -> Figure:
         panels[0].set_yticks(range(len(methods)), [style.label_of(method) for method in methods])
         panels[0].set_ylim(len(methods) - 0.5, -0.5)
         if len(sets) > 1:
-            fig.legend(
-                *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(sets)
-            )
+            handles = panels[0].get_legend_handles_labels()
+            fig.legend(*handles, loc="outside lower center", ncols=len(sets))
     return fig

@@ -44,22 +44,15 @@ class ComparedPlant(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What is known of a candidate after a number of pairs.
-
-    Attributes:
-        verdict: "worse", "better", "not worse" (by `worse_by`), or "undecided".
-        both: Number of pairs in which both fail alike.
-        difference: Mean outcome of the candidate minus that of the baseline at each look.
-        newly_failing: The candidate's episodes that fail, or do worse than the baseline's, by time,
-            with Γ's belief at the baseline's start.
-        no_longer_failing: The baseline's that do worse.
-    """
+    """What is known of a candidate after a number of pairs, in some of which both fail alike."""
 
     verdict: str
     pairs: int
     both: int
     difference: list[Estimate]
+    """Mean outcome of the candidate minus that of the baseline at each look."""
     newly_failing: list[Outcome]
+    """Episodes in which the candidate does worse, by time, with Γ's belief of the baseline's."""
     no_longer_failing: list[Outcome]
     worse_by: float
 
@@ -82,14 +75,9 @@ def compare_loops(
     """Simulates two closed loops in the same episodes until it is known which one fails more.
 
     Every 16 pairs it looks at a confidence sequence of the difference of their failure rates:
-    *worse* means that it is above 0, *better* below 0, *not worse* below `worse_by`.
-
-    Args:
-        metric: What counts as a failure. A diverged simulation does, but for a function.
-        alpha: Probability of a wrong verdict, of each kind. With k candidates pass alpha / k.
-        path: Folder in which episodes are kept; those that it holds are not simulated again.
-        assessment: Γ of the baseline's scenario, which says whether a change was foreseen.
-        each_look: Called with what is known at each look.
+    *worse* means that it is above 0, *better* below 0, *not worse* below `worse_by`. A verdict of
+    each kind is wrong with probability alpha: with k candidates pass alpha / k. Episodes are kept
+    in the folder ``path``. Γ of the baseline's scenario says whether a change was foreseen.
     """
     if not (0.0 < worse_by < 1.0 and 0.0 < alpha < 1.0):
         raise ValueError(f"worse_by and alpha must be in (0, 1); got {worse_by} and {alpha}")
@@ -155,10 +143,8 @@ def check_pair(
     """Builds two loops and begins their first episode, before hours of simulations."""
     hashes = [scenario.simulation_hash(variation) for scenario, variation in pair]
     if hashes[0] == hashes[1]:
-        name, variation = pair[0].scenario.name, pair[0].variation
-        raise ValueError(
-            f"the candidate is the baseline: scenario '{name}', variation '{variation}'"
-        )
+        what = f"scenario '{pair[0].scenario.name}', variation '{pair[0].variation}'"
+        raise ValueError(f"the candidate is the baseline: {what}")
     starts = []
     for side, who in enumerate(("baseline", "candidate")):
         loop = make_paired(pair, side)
@@ -226,7 +212,6 @@ def _run_pair(
 def _run_with_start(
     loop: ClosedLoop, index: int, **options: Any
 ) -> tuple[Episode, dict[str, np.ndarray]]:
-    """An episode, and state, plan and disturbances at its start."""
     start: dict[str, np.ndarray] = {}
     episode = run_episode(
         loop, index, at_start=lambda context: start.update(_start_of(loop, context)), **options

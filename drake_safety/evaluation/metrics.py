@@ -19,17 +19,13 @@ from drake_safety.learning.segments import Segments
 
 @dataclass(frozen=True)
 class Estimate:
-    """An estimated value and its interval.
-
-    Attributes:
-        value: The estimate; NaN without samples.
-        n: Number of independent samples: episodes or throws, never segments.
-    """
+    """An estimated value, NaN without samples, and its interval."""
 
     value: float
     low: float
     high: float
     n: int
+    """Number of independent samples: episodes or throws, never segments."""
 
     @classmethod
     def exact(cls, value: float, n: int) -> Estimate:
@@ -51,10 +47,7 @@ class Bootstrap:
     def over_episodes(
         self, statistic: Callable[[np.ndarray], float], episode: np.ndarray
     ) -> Estimate:
-        """A statistic of weights of samples, (N,), with an interval by resampling whole episodes.
-
-        The statistic is NaN where it is undefined; `episode` is the index of each sample's, (N,).
-        """
+        """A statistic of weights (N,), or NaN, by resampling the episodes of samples, (N,)."""
         members = np.unique(episode, return_inverse=True)[1]
         value = statistic(np.ones(len(members)))
         num_episodes = int(members.max()) + 1 if members.size else 0
@@ -120,10 +113,7 @@ def rate_per_hour(count: float, duration_s: float, n: int) -> Estimate:
 def area_under_curve(
     unsafe_score: np.ndarray, is_unsafe: np.ndarray, weight: np.ndarray | None = None
 ) -> float:
-    """Area under the ROC curve: probability that an unsafe sample scores above a safe one.
-
-    Scores, labels and weights are (N,). A NaN score counts as the most unsafe, a tie one half.
-    """
+    """Area under the ROC curve of scores, labels and weights, (N,); a tie counts one half."""
     score, label = _checked(unsafe_score, is_unsafe)
     weight = np.ones(len(score)) if weight is None else np.asarray(weight, dtype=float)
     return _ranked_area(np.unique(score, return_inverse=True)[1], label, weight)
@@ -145,16 +135,12 @@ def auc(
 def share(
     is_hit: np.ndarray, episode: np.ndarray, *, bootstrap: Bootstrap = _BOOTSTRAP
 ) -> Estimate:
-    """The share of samples (N,) that hit, with an interval over their episodes (N,).
-
-    It is a bootstrap, but that of Clopper and Pearson with one sample an episode, and over the
-    number of episodes where all or no samples hit and resampling has no spread.
-    """
+    """The share of samples (N,) that hit, with an interval over their episodes (N,)."""
     num_hits, num_samples = int(is_hit.sum()), len(is_hit)
     num_episodes = len(np.unique(episode))
     if num_samples == num_episodes:
         return proportion(num_hits, num_samples)
-    if num_hits in (0, num_samples):
+    if num_hits in (0, num_samples):  # Resampling has no spread.
         return proportion(num_episodes if num_hits else 0, num_episodes)
     return mean(is_hit, episode, bootstrap=bootstrap)
 
@@ -172,10 +158,7 @@ def mean(values: np.ndarray, episode: np.ndarray, *, bootstrap: Bootstrap) -> Es
 def segment_estimates(
     segments: Segments, unsafe_score: np.ndarray, *, threshold: float
 ) -> dict[str, Estimate]:
-    """AUC, recalls and Brier score of a scorer on segments, with intervals over episodes.
-
-    Scores (N,) are in [0, 1], and unsafe above the threshold.
-    """
+    """AUC, recalls and Brier score of unsafe scores (N,) in [0, 1], unsafe above the threshold."""
     score, label = _checked(unsafe_score, segments.is_unsafe)
     episode, probability = segments.episode, np.minimum(score, 1.0)  # "Don't know" is infinite.
     return {
@@ -192,8 +175,7 @@ def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
     finite = np.unique(score[np.isfinite(score)])
     if label.all() or not label.any() or finite.size == 0:
         raise ValueError(
-            f"a threshold takes finite scores of both classes; got {int(label.sum())} unsafe ones "
-            f"of {len(label)}, of which {len(finite)} differ"
+            f"a threshold takes both classes; got {label.sum()} of {len(label)} unsafe"
         )
     middle = 0.5 * (finite[:-1] + finite[1:])
     # Infinite scores stay above every threshold.
@@ -212,8 +194,7 @@ def _checked(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> tuple[np.ndarra
     score, label = np.asarray(unsafe_score, dtype=float), np.asarray(is_unsafe)
     if label.dtype != bool or score.ndim != 1 or score.shape != label.shape:
         raise ValueError(
-            f"expected as many scores as boolean labels; got {score.shape} and {label.shape} of "
-            f"{label.dtype}"
+            f"expected as many scores as boolean labels; got {score.shape}, {label.shape}"
         )
     return np.where(np.isnan(score), math.inf, score), label
 

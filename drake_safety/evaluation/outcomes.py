@@ -27,14 +27,10 @@ values in [0, 1]. Episodes of the first and the last end where they leave the sa
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What is kept of an episode.
+    """How bad an episode is, when it failed or ended, and what it violated first.
 
-    Attributes:
-        value: How bad it is, in [0, 1].
-        time_s: When it failed, or ended [s].
-        cause: The constraint that it violated first, or `HELD`; "" for none.
-        commanded: The desired output of the first undisturbed row, as far ahead as Γ sees, (n_z,).
-        belief: Γ's belief (safe, unsafe, don't know) in this row; None without Γ.
+    The desired output ``commanded`` (n_z,), as far ahead as Γ sees, and Γ's belief, None without Γ,
+    are those of the first undisturbed row.
     """
 
     episode: int
@@ -46,11 +42,7 @@ class Outcome:
 
 
 class OutcomeReader:
-    """Reads what is kept of the episodes of a loop.
-
-    Attributes:
-        simulated: Options of the simulation.
-    """
+    """Reads what is kept of the episodes of a loop, which are ``simulated`` by some options."""
 
     def __init__(self, loop: ClosedLoop, metric: Metric, gamma: SafetyAssessment | None = None):
         self._metric, self._gamma = metric, gamma
@@ -63,7 +55,7 @@ class OutcomeReader:
                 self.simulated["until"] = name
 
     def read(self, episode: Episode) -> Outcome:
-        """What is kept of an episode."""
+        """Reads an episode."""
         is_held = episode.num_controller_failures > 0
         is_bad = self._bad_rows(episode) | _last_row(episode, is_held or episode.cause == DIVERGED)
         value = float(self._metric(episode) if callable(self._metric) else is_bad.any())
@@ -97,9 +89,7 @@ def _bad_rows(loop: ClosedLoop, metric: str) -> Callable[[Episode], np.ndarray]:
     name = _constraint(loop, metric)
     if name not in names:
         known = [UNSAFE, "fall", "tracking=BOUND", *names]
-        raise ValueError(
-            f"metric '{metric}': expected one of {known}, or in Python a function of an episode"
-        )
+        raise ValueError(f"metric '{metric}': expected one of {known}, or a Python function")
     # The cause may be a constraint without a negative margin, by a task's own port ``safe``.
     k = names.index(name)
     return lambda one: is_outside(one.margins[:, [k]]) | _last_row(one, one.cause == name)

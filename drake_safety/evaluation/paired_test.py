@@ -23,14 +23,10 @@ _EDGE = 1e-9  # Of the range of means, where a bet would be infinite.
 def betting_log_e(values: np.ndarray, counts: np.ndarray, mean: float) -> np.ndarray:
     """Logarithm of the capital of bets that the mean of outcomes in [-1, 1] is above m.
 
-    The factor of an outcome d is 1 + λ(d - m) with λ = u / (1 + m) for a share u of the capital;
-    that is a weighted mean over fixed shares, and monotone in m (Waudby-Smith and Ramdas,
-    Estimating means of bounded random variables by betting, JRSS B 2024).
-
-    Args:
-        values: The different outcomes, (V,).
-        counts: How often each was seen, (..., V).
-        mean: m, in (-1, 1).
+    Each value (V,) was seen so often, (..., V). The factor of an outcome d is 1 + λ(d - m) with
+    λ = u / (1 + m) for a share u of the capital; that is a weighted mean over fixed shares, and
+    monotone in m (Waudby-Smith and Ramdas, Estimating means of bounded random variables by betting,
+    JRSS B 2024).
     """
     from scipy.special import logsumexp
 

@@ -35,12 +35,9 @@ def verdict_shares(
 
 
 class Reliability(NamedTuple):
-    """Predicted probabilities against observed frequencies, in bins of equal numbers of rows.
+    """Predicted probabilities (B,) against observed shares, in bins of equal numbers of rows.
 
-    Attributes:
-        expected: Mean predicted probability of an unsafe end, (B,).
-        observed: Share of unsafe ends, by bin.
-        error: Expected calibration error, the mean distance between the two over all rows.
+    The error is the mean distance between the two over all rows.
     """
 
     expected: np.ndarray

@@ -18,11 +18,7 @@ from drake_safety.simulation.dataset import read_info
 
 
 def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -> Path:
-    """Writes ``report.html`` into the folder of a run, from what is there.
-
-    Recordings are linked, all else is inside the page. The command of the training is in the folder
-    ``episodes``.
-    """
+    """Writes ``report.html`` into the folder of a run; only recordings are outside the page."""
     require_extra("report", "report")
     from jinja2 import Environment, StrictUndefined
 
@@ -37,10 +33,7 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
     ]
     if not assessments and not results:
         there = sorted(path.name for path in folder.iterdir())[:8]
-        raise ValueError(
-            f"report: '{folder}' holds neither an assessment nor results, but {there}; "
-            "`drake-safety train` and `evaluate` write them"
-        )
+        raise ValueError(f"'{folder}' holds neither an assessment nor results, but {there}")
     names = [one.info_.scenario for one in assessments.values()]
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True

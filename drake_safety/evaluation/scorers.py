@@ -17,10 +17,8 @@ from drake_safety.learning.segments import Segments
 class Scorer:
     """A source of safety probabilities.
 
-    Attributes:
-        probability: Safety probability, (N,), of states (N, n_s), previews (N, H*n_z) and features
-            (N, n_f); NaN where nothing is known.
-        uses_true_state: Whether it takes the state without noise in nominal episodes.
+    They are (N,), of states (N, n_s), previews (N, H*n_z) and features (N, n_f); NaN is "don't
+    know". Some take the state without noise in nominal episodes.
     """
 
     name: str

@@ -1,9 +1,7 @@
 """Γ and its monitor under shifts: "don't know", rows sure and wrong, alarms.
 
 A row is sure and wrong (a confident error) where it is called safe with at least 0.9 in a motion
-that ends unsafely. Figures with monitor are of undisturbed motions that follow each other, as on a
-robot that is put on its feet. There a row counts if the motion leaves the safe set within an
-episode's duration, and rows during an alarm are "don't know".
+that ends unsafely, with monitor within an episode's duration and outside alarms.
 """
 
 from __future__ import annotations
@@ -14,16 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from drake_safety.evaluation import metrics
 from drake_safety.evaluation.figure_style import spoken
-from drake_safety.evaluation.metrics import (
-    Bootstrap,
-    Estimate,
-    auc,
-    mean,
-    proportion,
-    quantile,
-    rate_per_hour,
-)
+from drake_safety.evaluation.metrics import Bootstrap, Estimate, mean, proportion, quantile
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.evaluation.tables import Column, Row, Table
@@ -44,10 +35,8 @@ SPANS_S = (10.0, 60.0)
 """Times since a change over which confident errors are counted [s]."""
 _FIRST_S = 12.0  # Simulated of each motion; only those without an alarm go on.
 _UNKNOWN = Column("unknown", "don't know", "=%", digits=1)
-_ERROR, _AUC = (
-    Column("confident_error", "sure and wrong", "=%", digits=1),
-    Column("auc", "AUC", "="),
-)
+_ERROR = Column("confident_error", "sure and wrong", "=%", digits=1)
+_AUC = Column("auc", "AUC", "=")
 _COLUMNS = (
     ("", Column("unsafe", "unsafe", "=%", digits=1)),
     *(("gamma", one) for one in (_UNKNOWN, _ERROR, _AUC)),
@@ -60,10 +49,9 @@ _COLUMNS = (
     ("monitor", Column("confident_error_60s", "60 s", "=%", digits=1)),
 )  # By method.
 _MEANING = (
-    'Shares of rows; sure and wrong: called safe with at least 0.9, not "don\'t know", in motions '
-    'that end unsafely. AUC: of all rows, "don\'t know" the least safe. With monitor, motions '
-    'follow each other, and rows after its alarm count as "don\'t know": with `on_alarm: report` '
-    "the alarm does not do that. Intervals are in shifts.json."
+    "Shares of rows; sure and wrong: called safe with at least 0.9 in motions that end unsafely. "
+    'AUC: of all rows, "don\'t know" the least safe. With monitor, motions follow each other, and '
+    'rows after its alarm count as "don\'t know". Intervals are in shifts.json.'
 )
 
 
@@ -80,11 +68,7 @@ def safety_probability(
 def shift_estimates(
     assessments: Mapping[str, SafetyAssessment], episodes: Episodes
 ) -> dict[tuple[str, str], Estimate]:
-    """Shares of rows sure and wrong and "don't know", and the AUC of all rows, of each Γ.
-
-    Rows count from the first undisturbed one. Estimates are by name of Γ, "" for the episodes
-    themselves, and metric.
-    """
+    """Shares of rows sure and wrong and "don't know", and the AUC, by name of Γ and metric."""
     kept = [one for one in episodes if one.cause != DIVERGED]
     motion = np.repeat(np.arange(len(kept)), [len(one.state) - one.first_step for one in kept])
     is_unsafe = np.array([not one.is_safe for one in kept])
@@ -97,7 +81,7 @@ def shift_estimates(
         estimates[name, "unknown"] = mean(np.isnan(probability), motion, bootstrap=BOOTSTRAP)
         if 0 < is_unsafe.sum() < len(is_unsafe):
             score = 1.0 - np.nan_to_num(probability)
-            estimates[name, "auc"] = auc(score, is_unsafe[motion], motion)
+            estimates[name, "auc"] = metrics.auc(score, is_unsafe[motion], motion)
     return estimates
 
 
@@ -128,18 +112,12 @@ def run_monitored(
 
 
 class Minute(NamedTuple):
-    """A minute that begins with a motion and goes on with the next ones.
-
-    Attributes:
-        alarm_s: Time of the first alarm [s]; infinite without one, as is the next.
-        error_s: Durations of confident errors in the first 10 s and 60 s, outside alarms [s].
-        silent_error_s: The same without a monitor [s].
-    """
+    """A minute that begins with a motion and goes on with the next ones; infinite is never."""
 
     alarm_s: float
     leave_s: float
-    error_s: list[float]
-    silent_error_s: list[float]
+    error_s: list[float]  # Confident errors in the first 10 s and 60 s, outside alarms.
+    silent_error_s: list[float]  # The same without a monitor.
 
 
 def monitored(motions: Sequence[Episode], assessment: SafetyAssessment) -> list[Minute]:
@@ -195,19 +173,18 @@ def monitor_estimates(minutes: Sequence[Minute]) -> dict[str, Estimate]:
 
 def error_estimates(error_s: Sequence[Sequence[float]]) -> dict[str, Estimate]:
     """Shares of confident errors since a change, from their durations in each minute [s]."""
-    return {
-        f"confident_error_{span_s:g}s": mean(
-            np.array(of_span) / span_s, np.arange(len(error_s)), bootstrap=BOOTSTRAP
-        )
-        for span_s, of_span in zip(SPANS_S, zip(*error_s, strict=True), strict=True)
-    }
+    minute, estimates = np.arange(len(error_s)), {}
+    for span_s, errors in zip(SPANS_S, zip(*error_s, strict=True), strict=True):
+        share = mean(np.array(errors) / span_s, minute, bootstrap=BOOTSTRAP)
+        estimates[f"confident_error_{span_s:g}s"] = share
+    return estimates
 
 
 def false_alarms(motions: Episodes, detector: ChangeDetector) -> Estimate:
     """False alarms per hour on motions of the nominal plant, not shortly before they leave it."""
     rows = [one for one in usual_rows(motions) if len(one)]
     count = sum(len(detector.watch([one])[1]) for one in rows)
-    return rate_per_hour(count, sum(map(len, rows)) * detector.step_s, len(rows))
+    return metrics.rate_per_hour(count, sum(map(len, rows)) * detector.step_s, len(rows))
 
 
 def shifts_tables(results: Results) -> list[Table]:
@@ -221,16 +198,9 @@ def shifts_tables(results: Results) -> list[Table]:
         )
     there = {(method, metric) for _, method, metric in results}
     shown = [(method, one) for method, one in _COLUMNS if (method, one.key) in there]
-    rows = [
-        Row(
-            method="",
-            label=spoken(set.removeprefix("shifts.")),
-            estimates=[results.get((set, method, column.key)) for method, column in shown],
-        )
-        for set in sets
-    ]
-    columns = [column for _, column in shown]
-    table = Table(
-        corner="shift", columns=columns, rows=rows, title="Γ under shifts", meaning=meaning
-    )
-    return [table] if rows else []
+    rows, columns = [], [column for _, column in shown]
+    for set in sets:
+        estimates = [results.get((set, method, column.key)) for method, column in shown]
+        rows.append(Row("", spoken(set.removeprefix("shifts.")), estimates))
+    options = {"title": "Γ under shifts", "meaning": meaning}
+    return [Table(corner="shift", columns=columns, rows=rows, **options)] if rows else []

@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,16 +22,11 @@ from drake_safety.simulation.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class PlantShift:
-    """A plant, or a fault of its sensors, that training does not have.
+    """A plant, or a fault of its sensors, that training does not have."""
 
-    Attributes:
-        kind: "plant" or "sensor".
-        options: Of its diagram.
-    """
-
-    kind: str
+    kind: Literal["plant", "sensor"]
     variation: PlantVariation
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)  # Of its diagram.
 
 
 def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:

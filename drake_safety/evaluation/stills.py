@@ -63,16 +63,15 @@ class StillCamera:
         farthest = radius
         for one in others:
             self._pose(one)
-            reach = np.linalg.norm(self._corners() - self._target()[:, None], axis=0).max()
-            farthest = max(farthest, float(reach))
+            away = np.linalg.norm(self._corners() - self._target()[:, None], axis=0)
+            farthest = max(farthest, float(away.max()))
         narrow = 0.5 * _FIELD_OF_VIEW_RAD * min(1.0, width / height)
         self._eye = view.room * farthest / math.sin(narrow) * view.direction()
         size = width * SUPERSAMPLING, height * SUPERSAMPLING
         clipping = ClippingRange(0.05, 30.0 * max(farthest, 1.0))
         info = CameraInfo(*size, _FIELD_OF_VIEW_RAD)
-        self._camera = ColorRenderCamera(
-            RenderCameraCore(_RENDERER, info, clipping, RigidTransform())
-        )
+        core = RenderCameraCore(_RENDERER, info, clipping, RigidTransform())
+        self._camera = ColorRenderCamera(core)
         is_physical = any(path.endswith(".gltf") for path in self._meshes().values())
         brightness = _PBR_BRIGHTNESS if is_physical else 1.0
         self._add_renderer(_lighting(centre, radius, brightness))
@@ -174,7 +173,7 @@ def render_stills(
 ) -> list[tuple[float, np.ndarray]]:
     """Logged instants [s] and RGB images (height, width, 3) nearest to the times of stills [s].
 
-    ``positions`` (N, n_q) are all positions of the loop's plant at the instants ``time_s`` (N,).
+    ``positions`` (N, n_q) are those of the loop's whole plant.
     """
     rows = _nearest_rows(time_s, still_times_s)
     shown = np.array([positions[row] for row in (0, *rows)])
@@ -212,9 +211,6 @@ def _lighting(centre: np.ndarray, radius: float, brightness: float) -> RenderEng
 
     fill = [(6.0, -8.0, 3.2, 0.42), (-6.0, 8.0, 3.2, 0.42), (6.0, 8.0, 5.0, 0.22)]
     fill += [(-6.0, -8.0, 3.0, 0.22), (0.0, 0.0, 12.0, 0.12)]
-    return RenderEngineVtkParams(
-        default_clear_color=_BACKGROUND,
-        cast_shadows=True,
-        shadow_map_size=2048,
-        lights=[lamp(2.0, -2.6, 6.8, 0.55, "spot"), *(lamp(*one) for one in fill)],
-    )
+    lights = [lamp(2.0, -2.6, 6.8, 0.55, "spot"), *(lamp(*one) for one in fill)]
+    shadows: dict[str, Any] = {"cast_shadows": True, "shadow_map_size": 2048}
+    return RenderEngineVtkParams(default_clear_color=_BACKGROUND, lights=lights, **shadows)

@@ -17,18 +17,12 @@ _SCALES = {"%": 100.0, "points": 100.0, "=%": 100.0, "ms": 1000.0}
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table: a metric and how it is written.
-
-    Attributes:
-        unit: "", "%", "points", "ms", "s", "/h", "of" (counts out of n), or "=" and "=%" for values
-            without interval.
-        better: 1 if larger is better, -1 if smaller is, 0 otherwise.
-    """
+    """A column of a table: a metric and how it is written."""
 
     key: str
     title: str
-    unit: str = ""
-    better: int = 0
+    unit: str = ""  # "%", "points", "ms", "s", "/h", "of" n, or "=", "=%" without interval.
+    better: int = 0  # 1 if larger is better, -1 if smaller is.
     digits: int = 3
 
     def value_text(self, estimate: Estimate | None) -> str:

@@ -23,12 +23,8 @@ _MAX_STILL_HEIGHT, _STILL_TITLE_HEIGHT, _AXIS_LABEL_HEIGHT = 2.6, 0.35, 0.6
 _LABEL_ROW_HEIGHT, _NUM_LABEL_ROWS = 0.2, 8  # Of names above the curve.
 _NUM_LEVELS, _MOST_POINTS = 4, 4000  # Curves of levels, and points of each.
 _Style = Mapping[str, Any]
-_LEGEND: _Style = {
-    "loc": "center left",
-    "bbox_to_anchor": (1.0, 0.5),
-    "handlelength": 1.4,
-    "borderaxespad": 0.3,
-}
+_BESIDE: _Style = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+_LEGEND: _Style = {**_BESIDE, "handlelength": 1.4, "borderaxespad": 0.3}
 
 
 class _Event(NamedTuple):
@@ -57,14 +53,10 @@ def timeline_figure(
     constraint_names: Sequence[str] = (),
     angular_constraints: Sequence[str] = (),
 ) -> Figure:
-    """Plots the probability (N,) over time, with names of events, stills, belief and margins.
+    """Plots the probability (N,) over time (N,), with names of events.
 
-    Args:
-        time_s: Instants [s], (N,).
-        stills: (time [s], RGB image (height, width, 3)), drawn above the curve.
-        belief: Masses (safe, unsafe, unknown), (N, 3); drawn stacked below.
-        margins: Signed margins [m, rad], (N, n_c); drawn at the bottom.
-        angular_constraints: Constraints whose margins are angles.
+    Above the curve are stills, times [s] and RGB images (height, width, 3), and below it the belief
+    (N, 3) and the margins [m, rad], (N, n_c).
     """
     unsafe = style.UNSAFE_COLOUR
     events = []
@@ -197,16 +189,8 @@ def _write_names(axes: Axes, events: Sequence[_Event], ends: tuple[float, float]
     for i, event in enumerate(events):
         is_left = event.time_s > np.mean(axes.get_xlim())
         place = (event.time_s, top - (i % _NUM_LABEL_ROWS + 0.5) * row_height)
-        axes.annotate(
-            event.words,
-            place,
-            xytext=(-7 if is_left else 7, 0),
-            textcoords="offset points",
-            ha="right" if is_left else "left",
-            va="center",
-            color=event.colour,
-            fontsize=9,
-            zorder=6,
-            # Lines of events pass behind.
-            path_effects=[withStroke(linewidth=3.0, foreground="white")],
-        )
+        look: dict[str, Any] = {"xytext": (-7, 0), "ha": "right"} if is_left else {"xytext": (7, 0)}
+        look |= {"textcoords": "offset points", "va": "center", "fontsize": 9, "zorder": 6}
+        # Lines of events pass behind.
+        behind = [withStroke(linewidth=3.0, foreground="white")]
+        axes.annotate(event.words, place, color=event.colour, path_effects=behind, **look)

@@ -36,9 +36,8 @@ Kind = tuple[str, str, Sequence[Column]]
 _KINDS: dict[str, Kind] = {
     "segments": (
         "Every segment of the motion",
-        "Each segment of fresh motions is classified: does the motion stay safe to its end? "
-        f"{_SCORES} Recalls are at the threshold of best balanced accuracy on other motions. "
-        f"{INPUTS}",
+        f"Does a motion stay safe from a segment to its end? {_SCORES} Recalls are at the "
+        f"threshold of best balanced accuracy on other motions. {INPUTS}",
         _JUDGED,
     ),
     "episodes": (
@@ -94,13 +93,7 @@ def verdict_tables(results: Results) -> list[Table]:
     ]
     outcomes = [metric for set, method, metric in results if (set, method) == ("plans", "outcomes")]
     columns = [Column(name, label_of(name), "%", digits=1) for name in outcomes]
-    tables.append(
-        Table(
-            corner="targets",
-            columns=columns,
-            rows=rows_of(results, {("plans", "outcomes"): "all targets"}, columns),
-            title="Outcomes of the motions",
-            meaning="Safe, or the violated constraint.",
-        )
-    )
+    rows = rows_of(results, {("plans", "outcomes"): "all targets"}, columns)
+    title = "Outcomes of the motions: safe, or the violated constraint"
+    tables.append(Table(corner="targets", columns=columns, rows=rows, title=title))
     return [table for table in tables if table.rows]

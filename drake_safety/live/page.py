@@ -39,15 +39,10 @@ def serve_page(panel: LivePanel, *, host: str, port: int, scene_url: str) -> Ite
     """
     app.add_middleware(_only_own, host=host)
     app.mount(_SCENE, _forward(scene_url))
-    options: Any = {
-        "title": panel.title,
-        "host": host,
-        "port": port,
-        "show": False,
-        "reload": False,
-    }
-    options |= {"tailwind": False, "binding_refresh_interval": None, "reconnect_timeout": 10.0}
-    options |= {"show_welcome_message": False, "timeout_graceful_shutdown": 1}
+    options: Any = {"title": panel.title, "host": host, "port": port, "show": False}
+    options |= {"reload": False, "tailwind": False, "binding_refresh_interval": None}
+    options |= {"reconnect_timeout": 10.0, "timeout_graceful_shutdown": 1}
+    options["show_welcome_message"] = False
     built = (lambda: build_page(panel),)
     thread = threading.Thread(target=ui.run, args=built, kwargs=options, daemon=True)
     thread.start()
@@ -218,14 +213,8 @@ def _chart_options(threshold: float) -> dict[str, Any]:
     limit: Any = {"silent": True, "symbol": "none", "data": [{"yAxis": threshold}]}
     limit["lineStyle"] = {"color": _css("unsafe"), "type": "solid", "width": 1.5}
     limit["label"] = {"formatter": "threshold {c}", "position": "insideStartTop"}
-    curve: Any = {
-        "type": "line",
-        "showSymbol": False,
-        "silent": True,
-        "data": [],
-        "markLine": limit,
-    }
-    curve["lineStyle"] = {"color": _css("safe"), "width": 2.5}
+    curve: Any = {"type": "line", "showSymbol": False, "silent": True, "data": []}
+    curve |= {"lineStyle": {"color": _css("safe"), "width": 2.5}, "markLine": limit}
     return {
         "animation": False,
         "grid": {"left": 30, "right": 10, "top": 30, "bottom": 22},

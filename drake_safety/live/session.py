@@ -38,10 +38,8 @@ from drake_safety.simulation.closed_loop import ClosedLoop, require_ports
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import episode_rng
 
-TICK_S = 0.04
-"""Simulated time per tick [s]."""
-BREAK_S = 0.02
-"""Real time between ticks while nothing is simulated [s]."""
+TICK_S = 0.04  # Simulated per tick.
+BREAK_S = 0.02  # Of real time between ticks while nothing is simulated.
 STOP, START = "Stop", "Start again"
 THROW, PUSH = "Throw", "Push"
 ASK, GO, FORCE = "Ask", "Go", "Go all the same"
@@ -55,14 +53,12 @@ STEPS = (
     ("Turn right", "ArrowRight", 2, -1),
     ("Left", "KeyA", 1, 1),
     ("Right", "KeyD", 1, -1),
-)
-"""Name and key of each button that changes a command, the entry of it, and the sign of the step."""
+)  # Buttons that change a command, their keys, the entry of it, and the sign of the step.
 
 _PORTS = ("safety_probability", "belief", "cause_probability", "predicted_margins")
 _SHOWN_S = 1.5  # From a fall, a failure or the end of an episode to the next start.
 _FLIGHT_S = 0.2  # From a ball's release to its impact, so that it is visible.
 _NUM_CANDIDATES = 24  # Per batch of the search: few, because the user waits for the answer.
-_SIZE_M = 1.0  # Of a plant without legs, for markers.
 _NUM_STEPS = 8  # Key presses from zero to the farthest command of training.
 _GOAL, _NEAREST = f"{WORLD}/target", f"{WORLD}/nearest_accepted"
 
@@ -100,8 +96,7 @@ class LiveSession:
         self._seed, self._rngs = seed, map(episode_rng, repeat(seed), count())
         self._end_s = math.inf  # Of the motion.
         self._num_waits = 0  # Ticks for which a failure is still shown.
-        self._is_ended = False
-        self._said, self._said_until_s = "", -math.inf
+        self._is_ended, self._said, self._said_until_s = False, "", -math.inf
         self._camera = FollowingCamera(loop, meshcat) if isinstance(loop, LeggedLoop) else None
         self.panel = LivePanel(title=loop.scenario.name, threshold=threshold)
         self.panel.buttons[STOP] = "Escape"
@@ -122,7 +117,7 @@ class LiveSession:
             start = next(iter(loop.named_targets.values()), box.mean(axis=0))
             for name, low, high, value in zip(AXES, *box.tolist(), start, strict=True):
                 self.panel.sliders[name] = Slider(low, high, 0.01, value)
-            marker = Sphere(0.03 * (self._camera.size_m if self._camera else _SIZE_M))
+            marker = Sphere(0.03 * (self._camera.size_m if self._camera else 1.0))
             meshcat.SetObject(_GOAL, marker, Rgba(*COLOURS["plain"], 0.8))
             meshcat.SetObject(_NEAREST, marker, Rgba(*COLOURS["safe"], 0.8))
         elif isinstance(loop, HasBall):
@@ -190,7 +185,6 @@ class LiveSession:
         self._actions[name] = action
 
     def _start(self) -> None:
-        """Resets the robot, with a Context of default values."""
         loop, end_s = self.loop, math.inf
         self._simulator.reset_context(loop.CreateDefaultContext())
         self.context = self._simulator.get_mutable_context()
@@ -212,7 +206,6 @@ class LiveSession:
         self._begin(end_s)
 
     def _begin(self, end_s: float) -> None:
-        """Initializes the simulator after a reset, and redraws."""
         self._end_s, self._said_until_s = end_s, -math.inf
         self._simulator.Initialize()
         self.panel.clear_history()
@@ -235,7 +228,6 @@ class LiveSession:
             self._end_s = -math.inf
 
     def _status(self) -> Status:
-        """What the robot does after a tick."""
         loop, now_s, margins = self.loop, self.context.get_time(), self._eval("margins")
         if not np.isfinite(margins).all():
             raise DivergenceError(f"a margin is not finite at {now_s:.2f} s")
@@ -267,7 +259,6 @@ class LiveSession:
         return Status("unsafe", self._cause(), note, "unsafe")
 
     def _note(self) -> str:
-        """What was said last, or the command."""
         if self.context.get_time() < self._said_until_s:
             return self._said
         if self._use != "commands":
@@ -279,7 +270,6 @@ class LiveSession:
         self._said, self._said_until_s = note, self.context.get_time() + 3.0
 
     def _cause(self) -> str:
-        """The constraint that is most likely to be violated, in words; "" for none."""
         names, margins = self.loop.constraint_names, self._eval("predicted_margins")
         unit = self.assessment.parameters.margin_unit
         cause = likely_cause(names, self._eval("cause_probability"), margins, unit)
@@ -296,10 +286,9 @@ class LiveSession:
         return self.loop.HasOutputPort(port) and is_on(self._eval(port)[0])
 
     def _push(self) -> None:
-        """Begins a random push."""
         push = self.loop.sample_push(next(self._rngs))
-        start_s = self.context.get_time() + 0.5 * TICK_S
-        self.loop.set_push(self.context, replace(push, time_s=start_s))
+        push = replace(push, time_s=self.context.get_time() + 0.5 * TICK_S)
+        self.loop.set_push(self.context, push)
         self._say(f"pushed with {push.strength_n:.0f} N for {push.duration_s:g} s")
 
     def _throw(self) -> None:
@@ -330,7 +319,6 @@ class LiveSession:
         return np.array([self.panel.sliders[name].value for name in AXES])
 
     def _go(self, *, is_forced: bool) -> None:
-        """Starts the motion to a goal that is accepted, or forced."""
         verdict = self._assess(is_thorough=not is_forced)
         if verdict.is_accepted or is_forced:
             self.loop.reset_standing(self.context, verdict.goal, next(self._rngs))
