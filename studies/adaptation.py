@@ -18,7 +18,6 @@ from drake_safety.cli.console import (
 )
 from drake_safety.cli.training_folder import (
     MODES,
-    adapted_folder,
     assessment_folder,
     episodes_folder,
     feedback_options,
@@ -84,7 +83,7 @@ def adaptation(
     ASSESSMENT/adapted-VARIATION.
     """
     learned = assessment_folder(load_scenario(scenario), assessment)
-    folder = adapted_folder(learned.out, variation)
+    folder = learned.out / f"adapted-{variation}"
     with open_study(
         "study",
         scenario,

@@ -5,7 +5,7 @@ import pytest
 
 from command_line import call
 from drake_safety import SafetyAssessment, load_scenario, run_episode, run_episodes
-from drake_safety.cli.training_folder import MODES, adapted_folder, assessment_file
+from drake_safety.cli.training_folder import MODES, assessment_file
 from drake_safety.learning.assessment_parameters import PaperReading
 from drake_safety.learning.segments import Episodes
 from drake_safety.logs.episodes import cut_log, motions_from_log
@@ -77,7 +77,7 @@ def test_logs_adapt_as_the_runs_that_they_are_of(folder, tmp_path, monkeypatch, 
     pairs = EpisodePairs(actual=actual, nominal=nominal, nominal_hash=hash_).feedback()
     assert sorted(pair.differs for pair in pairs) == [False, True]
     for mode in MODES:
-        before, adapted = load(folder, mode), load(adapted_folder(folder, "run"), mode)
+        before, adapted = load(folder, mode), load(folder / "adapted-run", mode)
         same = load(folder, mode).adapt(unwritten, motions=motions)
         near = load(folder, mode).adapt(pairs)
         changed = np.abs(adapted.beliefs_ - before.beliefs_).max()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from command_line import call
-from drake_safety.cli.training_folder import MODES, adapted_folder, load_assessment
+from drake_safety.cli.training_folder import MODES, load_assessment
 from drake_safety.learning.change_detector import usual_rows
 from drake_safety.learning.seeds import FALLS, MOTION
 from drake_safety.simulation.dataset import load_episodes
@@ -49,7 +49,7 @@ def test_the_monitor_is_learned_from_undisturbed_motion_that_is_kept(monkeypatch
     actual = load_episodes(folder)
     assert (actual.info.variation, actual.info.seed) == ("actual", MOTION.first + 1)
     for mode in MODES:
-        adapted = load_assessment(adapted_folder(out, "actual"), mode).detector_
+        adapted = load_assessment(out / "adapted-actual", mode).detector_
         assert same_detector(adapted, learned[mode].with_motions(usual_rows(actual)))
         assert not same_detector(adapted, learned[mode])
     # Without motion it is learned from the episodes, whose rows are a step apart.

@@ -40,7 +40,7 @@ COMMANDS = {
     "adapt": ("adapt", "train", "Adapt Γ to an actual robot, and say whether it is better."),
     "monitor": ("monitor", "", "Run the change monitor over logs of a robot."),
     "export": ("export", "", "Write Γ as one ONNX file."),
-    "report": ("report", "report", "Write RUN/report.html, a self-contained page of a run."),
+    "report": ("export", "report", "Write RUN/report.html, a self-contained page of a run."),
 }
 """In the order of the help: module, the extra that it needs, and a line of help."""
 _DEBUG = "--debug"
@@ -112,9 +112,7 @@ def _print_version(is_wanted: bool) -> None:
 def _common(
     version: Annotated[
         bool,
-        typer.Option(
-            "--version", help="Show the version and exit.", callback=_print_version, is_eager=True
-        ),
+        typer.Option("--version", help="Versions.", callback=_print_version, is_eager=True),
     ] = False,
 ) -> None:
     pass

@@ -65,7 +65,7 @@ def adapt(
     if len({path.resolve() for path in logs}) < len(logs):
         raise ValueError("adapt: logs must differ, as each is judged by the others")
     name = logs[0].stem if logs else variation
-    folder = out or folders.adapted_folder(learned.out, name)
+    folder = out or learned.out / f"adapted-{name}"
     folders.check_writable(folder)
     with console.open_stages() as stages:
         if log_map is not None:
@@ -112,17 +112,12 @@ def adapt(
         "change": {mode: gamma.correction_.change.tolist() for mode, gamma in adapted.items()},
         "monitor": adapted[MODES[0]].detector_.describe(),
     }
-    figures = {
-        ("held_out", mode, metric): estimate
-        for mode, estimates in scores.items()
-        for metric, estimate in estimates.items()
-    }
+    figures = {("held_out", m, metric): one for m in MODES for metric, one in scores[m].items()}
     Results(figures, console.made_by(loaded.name) | entries).write(folder / "adaptation.json")
     console.say(f"adapted to '{name}': {num_differing} of {len(sets)} pairs end differently")
     console.say(adapted[MODES[0]].detector_.describe())
     for mode in MODES:
         console.say(f"{mode}: {_summary(scores[mode], held)}")
-    for mode in adapted:
         console.say("assessment", folders.assessment_file(folder, mode))
     console.say("figures   ", folder / "adaptation.json")
 

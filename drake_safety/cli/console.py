@@ -26,11 +26,7 @@ ScenarioArgument = Annotated[
     str, Argument(help="Name of a scenario (see `scenarios`), or the path of your own YAML file.")
 ]
 AssessmentOption = Annotated[
-    Path | None,
-    Option(
-        help="Folder that `train` wrote; by default the assessment that comes with the package.",
-        file_okay=False,
-    ),
+    Path | None, Option(help="Folder of `train`; by default of the package.", file_okay=False)
 ]
 TrainingOption = Annotated[
     Path, Option(help="Folder that `train` wrote, with its episodes.", file_okay=False)
@@ -48,13 +44,11 @@ TargetOption = Annotated[
 ]
 HandOption = Annotated[str | None, Option(help="Reaching hand; the trained one by default.")]
 RecoveryOption = Annotated[
-    bool | None,
-    Option(help="Whether Γ triggers recovery; by default in balancing, not in walking."),
+    bool | None, Option(help="Whether Γ triggers recovery; by default in balancing only.")
 ]
 WorkersOption = Annotated[int | None, Option(help="Worker processes; one a core by default.")]
 ClusterOption = Annotated[
-    str | None,
-    Option(help="Address of dask's scheduler, whose workers simulate in place of this machine's."),
+    str | None, Option(help="Address of dask's scheduler, whose workers simulate instead.")
 ]
 LOOPBACK = "127.0.0.1"
 """Address that only this machine reaches."""

@@ -44,7 +44,6 @@ from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
-_DEFAULT_THROWS = 600
 _MOST_JUDGED = 1000  # Nominal motions under `--shifts`.
 
 
@@ -107,7 +106,7 @@ def evaluate(
     loop, block = loaded.make_loop(), SHIFTS if shifts else EVALUATION
     if throws is None:
         is_thrown_at = isinstance(loop, HasBall) and not isinstance(loop, HasGoals)
-        throws = _DEFAULT_THROWS if is_thrown_at else 0
+        throws = 600 if is_thrown_at else 0
     elif throws:
         require(loop, HasBall, "evaluate: pass --throws 0")
     with evaluating(loaded, assessment, folder, block, seed, workers) as evaluation:
@@ -238,19 +237,15 @@ def _add_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> N
         judged[name] |= {("monitor", metric): one for metric, one in watched.items()}
     stages("shifted motions", len(shifts), len(shifts))
     fresh_seed = FRESH_MOTION.first_beside(seed)
+    duration_s = num_nominal * scenario.episode_duration_s
+    folder = folders.fresh_episodes_folder(evaluation.run_folder, "motion", fresh_seed, {})
+    report = partial(stages, "undisturbed nominal motion")
     usual = run_motions(
-        scenario,
-        num_nominal * scenario.episode_duration_s,
-        seed=fresh_seed,
-        num_workers=workers,
-        path=folders.fresh_episodes_folder(evaluation.run_folder, "motion", fresh_seed, {}),
-        progress=partial(stages, "undisturbed nominal motion"),
+        scenario, duration_s, seed=fresh_seed, num_workers=workers, path=folder, progress=report
     )
     alarms = shift_study.false_alarms(usual, gamma.detector_)
     judged["nominal"]["monitor", "false_alarms_per_hour"] = alarms
-    estimates = {
-        (f"shifts.{name}", *key): one for name, each in judged.items() for key, one in each.items()
-    }
-    evaluation.add(estimates)
+    for name, each in judged.items():
+        evaluation.add({(f"shifts.{name}", *key): one for key, one in each.items()})
     kinds = {name: shift.kind for name, shift in shifts.items()}
     evaluation.entries["kinds"] = {"nominal": "nominal"} | kinds

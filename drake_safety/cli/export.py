@@ -1,11 +1,11 @@
-"""``drake-safety export``: Γ as one ONNX file."""
+"""What others read: ``drake-safety export`` and ``report``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated
 
-from typer import Option
+from typer import Argument, Option
 
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
@@ -26,3 +26,13 @@ def export(
         verdicts = f"safe from {one.threshold:.4f}, unsafe below {one.unsafe_below:.4f}"
         console.say(f"{one.kind:<16}  {verdicts}: {one.promise}")
     console.say(f"written           {out.stat().st_size / 1e6:.2f} MB,", out)
+
+
+def report(
+    run: Annotated[Path, Argument(help="Folder written by `train` and other commands.")],
+) -> None:
+    """Write RUN/report.html, a self-contained page of what is there."""
+    from drake_safety.evaluation.report import write_report
+
+    written = write_report(run, episodes=folders.episodes_folder(run), versions=console.versions())
+    console.say("page", written)

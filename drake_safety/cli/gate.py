@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import html
 import math
-import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -42,7 +41,6 @@ from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import load_scenario
 
 _MOST_SHOWN = 10  # Of a table of episodes.
-_POINTS = Column("", "", "points", digits=1)
 _PANELS = """<!doctype html><meta charset="utf-8">
 <style>body { display: flex; height: 95vh } iframe { flex: 1 }</style>"""
 
@@ -57,8 +55,7 @@ def gate(
         list[str] | None,
         Option(
             metavar="KEY=VALUE",
-            help="A candidate by what it changes: policy=FILE, variation=NAME, robot=FILE, or a "
-            "key of a scenario, such as parameters.push.share=0.1; several in quotes.",
+            help="What a candidate changes: policy=FILE, variation=NAME, or a scenario's key.",
         ),
     ] = None,
     baseline: Annotated[str, Option(metavar="KEY=VALUE", help="The same for all loops.")] = "",
@@ -79,9 +76,7 @@ def gate(
     Ctrl-C. Episodes are kept in OUT: the same command continues.
     """
     given = {Path(one).stem: (one, baseline) for one in candidates or []}
-    for text in dict.fromkeys(candidate or []):
-        short = re.sub(r"(?<==)\S*/", "", text)  # Files without their folders.
-        given[text if short in given else short] = (scenario, f"{baseline} {text}")
+    given |= {text: (scenario, f"{baseline} {text}") for text in candidate or []}
     if len(given) < max(replay is None, len(candidates or []) + len(candidate or [])):
         raise ValueError("gate: name different candidates: YAML files, or --candidate KEY=VALUE")
     first = changed_plant(scenario, baseline)
@@ -223,10 +218,10 @@ def _report(
     worse_by: float,
 ) -> None:
     """Prints what is known, and the episodes that end differently."""
-    rows = []
+    rows, points = [], Column("", "", "points", digits=1)
     for name, one in verdicts.items():
         counts = f"{one.both}, {len(one.no_longer_failing)}, {len(one.newly_failing)}"
-        rows.append((name, one.verdict, one.pairs, counts, _POINTS.text(one.difference[-1])))
+        rows.append((name, one.verdict, one.pairs, counts, points.text(one.difference[-1])))
     failing = "fail: both, only baseline, only candidate"
     columns = ("candidate", "verdict", "pairs", failing, "difference [points]")
     _show(f"{first.scenario.name}, {first.variation}: {metric}", columns, rows)
@@ -238,9 +233,8 @@ def _report(
             replay = f"--replay={each.episode}"
             console.say("to see one:", console.command_line("drake-safety", replay))
     console.say(
-        "a verdict, or an end of an interval, is wrong with a probability of at most "
-        f"{100 * alpha:.3g} % a candidate, whenever one looks; 'not worse': by "
-        f"{100 * worse_by:g} points"
+        f"a verdict or end of an interval is wrong with a probability of at most {100 * alpha:.3g} "
+        f"% a candidate, whenever one looks; 'not worse': by {100 * worse_by:g} points"
     )
 
 
@@ -252,9 +246,8 @@ def _show_episodes(title: str, episodes: Sequence[Outcome], metric: str) -> None
     for one in episodes[:_MOST_SHOWN]:
         commanded = ", ".join(f"{value:.3g}" for value in one.commanded)
         belief = ", ".join(f"{mass:.2f}" for mass in one.belief or ()) or "–"
-        rows.append(
-            (one.episode, spoken(one.cause or metric), f"{one.time_s:.2f}", commanded, belief)
-        )
+        cause = spoken(one.cause or metric)
+        rows.append((one.episode, cause, f"{one.time_s:.2f}", commanded, belief))
     _show(title, ("episode", "cause", "at [s]", "commanded", "Γ: safe, unsafe, unknown"), rows)
 
 

@@ -40,7 +40,6 @@ def play(
 
     loaded, _, gamma = folders.open_assessment(scenario, assessment, mode)
     options = console.given(hand=hand, recovery=recovery)
-    # Check the capabilities of the task before a browser is opened.
     task = loaded.make_loop(variation, assessment=gamma, **options)
     rule = folders.goal_threshold(gamma)
     threshold = rule.threshold
@@ -51,14 +50,13 @@ def play(
     else:
         console.say(f"threshold {threshold:.3g}, {rule.origin}")
     page_port = _page_port(host, port)
-    # The page forwards the scene, from an address that other pages cannot guess.
-    meshcat = console.open_viewer(_hidden_host())
+    # The page forwards the scene, on Linux from one of millions of this machine's addresses.
+    hidden = ".".join(["127", *(str(1 + secrets.randbelow(254)) for _ in range(3))])
+    meshcat = console.open_viewer(hidden if sys.platform == "linux" else console.LOOPBACK)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=meshcat, **options)
-    session = LiveSession(
-        loop, meshcat, threshold=threshold, unsafe_below=rule.unsafe_below, seed=seed
-    )
-    served = {"host": host, "port": page_port, "scene_url": meshcat.web_url()}
-    with serve_page(session.panel, **served):
+    limits = {"threshold": threshold, "unsafe_below": rule.unsafe_below}
+    session = LiveSession(loop, meshcat, **limits, seed=seed)
+    with serve_page(session.panel, host=host, port=page_port, scene_url=meshcat.web_url()):
         # An exception of a handler could be raised, and lost, inside Drake.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, session.end)
@@ -76,10 +74,3 @@ def _page_port(host: str, port: int | None) -> int:
     raise ValueError(
         f"no page can be served at {host}:{port or _FIRST_PORT}: this port is not free"
     )
-
-
-def _hidden_host() -> str:
-    """An address that only this machine reaches: on Linux one of millions."""
-    if sys.platform != "linux":
-        return console.LOOPBACK
-    return ".".join(["127", *(str(1 + secrets.randbelow(254)) for _ in range(3))])

@@ -60,10 +60,7 @@ def run(
     guard: Annotated[bool, Option("--guard", help="Pass on an accepted command.")] = False,
     push: Annotated[
         list[str] | None,
-        Option(
-            help="With a target: a push of the scenario. Otherwise, repeatable: 'ball' for the "
-            "scenario's balls, or 'time=1 mass=3 speed=9 direction=90' [s, kg, m/s, degrees]."
-        ),
+        Option(help="A push or 'ball' of the scenario, or 'time=1 mass=3 speed=9 direction=90'."),
     ] = None,
     variation: console.VariationOption = "nominal",
     recovery: console.RecoveryOption = None,
@@ -83,12 +80,11 @@ def run(
     folders.check_writable(folder)
     rule = folders.goal_threshold(gamma)
     options = console.given(hand=hand, recovery=recovery)
-    # Check the capabilities of the task before a browser is opened. The verdict is on what is
-    # asked, whatever a guard would pass on.
+    # The verdict is on what is asked, whatever a guard would pass on.
     loop = loaded.make_loop(variation, assessment=gamma, **options)
     duration_s, simulated = loaded.episode_duration_s, partial(_move, rule=rule)
     if target is not None:
-        goal, one_push = parse_target(loop, target), named_push(loop, push or [])
+        goal, one_push = parse_target(loop, target), named_push(loop, push)
         verdict, nearest = judge_target(loop, goal, rule)
         print_verdict(loop, verdict, nearest, rule.origin)
         if not (verdict.is_accepted or force or guard):
@@ -97,11 +93,9 @@ def run(
         duration_s += _AFTER_EPISODE_S
         simulated = partial(_go, goal=goal, push=one_push, rule=rule)
     elif isinstance(loop, HasGoals):
-        words = goal_words(loop)
-        raise ValueError(
-            f"run: task '{type(loop).__name__}' needs a {words.goal}: pass --{words.goal} "
-            f"{' '.join(words.axes)}, or one of the names {list(loop.named_targets)}"
-        )
+        words, names = goal_words(loop), list(loop.named_targets)
+        what = f"{' '.join(words.axes)}, or one of the names {names}"
+        raise ValueError(f"run: the task needs a {words.goal}: pass --{words.goal} {what}")
     elif isinstance(loop, HasBall):
         duration_s, options["ball"] = _WITH_BALLS_S, True
         simulated = partial(_throw, throws=parse_pushes(loaded, push or []))
@@ -310,7 +304,7 @@ def _save(folder: Path, viewer: Meshcat, loop: Any, shown: _Shown) -> None:
         console.say("picture  ", path)
 
 
-def named_push(loop: ClosedLoop, names: list[str]) -> Push | None:
+def named_push(loop: ClosedLoop, names: list[str] | None) -> Push | None:
     """The push that ``--push`` names, if any."""
     if not names:
         return None

@@ -86,11 +86,6 @@ def feedback_options(
     }
 
 
-def adapted_folder(folder: Path, variation: str) -> Path:
-    """Folder of adapted assessments, which other commands accept as that of a training."""
-    return folder / f"adapted-{variation}"
-
-
 def assessment_file(folder: Path, mode: str) -> Path:
     """File of the assessment of a mode."""
     return folder / f"{mode}.safetensors"
@@ -154,9 +149,8 @@ def check_fresh(
     if not scenario.adopt(trained):
         own = scenario.simulation_hash()
         raise ValueError(
-            f"the assessment was trained on '{trained.scenario}' of '{trained.robot}' with hash "
-            f"{trained.scenario_hash[:12]}; '{scenario.name}' of '{scenario.robot_name}' has "
-            f"{own[:12]}"
+            f"the assessment is of scenario '{trained.scenario}' with hash "
+            f"{trained.scenario_hash[:12]}; '{scenario.name}' has {own[:12]}"
         )
     assessment.check_unused(*seeds)
 
