@@ -54,7 +54,7 @@ def test_the_curve_is_bounded_and_ends_now(panel):
     assert -HISTORY_S <= curve[0][0] < -HISTORY_S + 0.05
     assert len(curve) <= HISTORY_S / 0.04 + 2
     assert panel.belief == (0.0, 0.0, 1.0)
-    panel.clear_history()
+    panel.history.clear()
     assert panel.curve() == []
 
 

@@ -125,10 +125,7 @@ def adapt(
 def _held_out(
     prior: SafetyAssessment, pairs: list[EpisodePair], units: np.ndarray
 ) -> dict[str, Estimate]:
-    """Brier scores on actual episodes, before and after adapting to other units, logs or pairs.
-
-    Intervals are over units (N,). A single one has no score.
-    """
+    """Brier scores before and after adapting to other units (N,), logs or pairs; none of one."""
     folds, errors = np.unique(units, return_inverse=True)[1] % _NUM_FOLDS, []
     for fold in range(folds.max() + 1 if folds.any() else 0):
         adapted = prior.adapt([pairs[i] for i in np.flatnonzero(folds != fold)])

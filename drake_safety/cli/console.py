@@ -28,9 +28,7 @@ ScenarioArgument = Annotated[
 AssessmentOption = Annotated[
     Path | None, Option(help="Folder of `train`; by default of the package.", file_okay=False)
 ]
-TrainingOption = Annotated[
-    Path, Option(help="Folder that `train` wrote, with its episodes.", file_okay=False)
-]
+TrainingOption = Annotated[Path, Option(help="Folder that `train` wrote.", file_okay=False)]
 ModeOption = Annotated[str, Option(help="'sharpened' or 'paper'.")]
 VariationOption = Annotated[str, Option(help="Variation of the plant.")]
 TargetOption = Annotated[

@@ -44,8 +44,6 @@ from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
-_MOST_JUDGED = 1000  # Nominal motions under `--shifts`.
-
 
 @dataclass
 class Evaluation:
@@ -221,7 +219,7 @@ def _add_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> N
     names = {"gamma" if mode == MODES[0] else mode: g for mode, g in evaluation.assessments.items()}
     shifts = plant_shifts(scenario, scenario.make_loop())
     nominal = evaluation.fresh("nominal motions", num_nominal, "shifts")
-    judged = {"nominal": shift_study.shift_estimates(names, nominal[:_MOST_JUDGED])}
+    judged = {"nominal": shift_study.shift_estimates(names, nominal[:1000])}
     for i, (name, shift) in enumerate(shifts.items()):
         stages("shifted motions", i, len(shifts))
         shifted = shifted_scenario(scenario, name, shift.variation)

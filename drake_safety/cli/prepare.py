@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -64,7 +65,7 @@ def new(
     # Before anything is written.
     template = None if policy is None else survey_policy(policy, _names(motors), console.say)
     moved = () if template is None else template.joints or None
-    limbs = {"feet": _names(feet) or None, "hands": _names(hands) or None}
+    limbs = {k: re.split(r"\s*,\s*", v) for k, v in (("feet", feet), ("hands", hands)) if v}
     written = write_robot(name, model, task, out or Path(name), **limbs, moved=moved)
     files, asked, sizes = written.files, written.asked, written.sizes
     if template is not None:
@@ -89,10 +90,6 @@ def new(
     for what in asked:
         console.say(f"ask   {what}", style="yellow")
     console.say("next: drake-safety check", written.files[-1])
-
-
-def _names(text: str | None) -> list[str]:
-    return [name.strip() for name in (text or "").split(",") if name.strip()]
 
 
 def check(
@@ -128,8 +125,7 @@ def check(
         console.say(f"{num_problems} problem{'s' * (num_problems > 1)}", style="red")
         raise Exit(1)
     if not import_:
-        console.say("its files are right; nothing else is checked, as its code was not run")
-        return
+        return console.say("its files are right; not checked, as its code was not run: all else")
     if quick:
         console.say("not checked: the share of unsafe episodes")
     console.say("ready: drake-safety train", scenario, "--out FOLDER")

@@ -20,6 +20,7 @@ from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import Episodes, split
 
 _MAX_POINTS = 12000
+_BAR: dict[str, Any] = {"shrink": 0.8, "pad": 0.02}
 _LEAST_CAUSE = 0.05
 _PALE = ("#f0b48f", "#f2efe9", "#a3c4e2")
 _SAFETY = LinearSegmentedColormap.from_list(
@@ -67,7 +68,7 @@ def draw_values(
     shade = ScalarMappable(Normalize(0.0, most), _SAFETY)
     colours = shade.to_rgba(value)
     _draw_cells(axes, grid, colours, is_empty)
-    _add_colour_bar(fig, axes, shade, label)
+    fig.colorbar(shade, ax=axes, label=label, **_BAR).outline.set_visible(False)
     return colours
 
 
@@ -85,7 +86,7 @@ def _draw_segments(fig: Figure, axes: Axes, gamma: SafetyAssessment, episodes: E
     axes.scatter(x, y, c=segments.score, cmap=shade.cmap, vmin=0.0, vmax=1.0, **dots)
     axes.set_title("Segments in the embedding")
     axes.set_xlabel(f"{len(segments)} segments of {len(episodes)} episodes")
-    _add_colour_bar(fig, axes, shade, "unsafety score λ")
+    fig.colorbar(shade, ax=axes, label="unsafety score λ", **_BAR).outline.set_visible(False)
 
 
 def _draw_causes(axes: Axes, grid: Grid, cells: np.ndarray, names: Sequence[str]) -> None:
@@ -123,8 +124,3 @@ def _draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarra
     axes.add_collection(PatchCollection(filled, fc=colours[~is_empty], ec="white", lw=0.8))
     _draw_grid(axes, grid)
     axes.set_xlabel(f"{len(filled)} of {grid.num_cells} cells hold a belief")
-
-
-def _add_colour_bar(fig: Figure, axes: Axes, shade: ScalarMappable, label: str) -> None:
-    bar = fig.colorbar(shade, ax=axes, shrink=0.8, pad=0.02, label=label)
-    bar.outline.set_visible(False)

@@ -62,7 +62,6 @@ _LABELS = {
     "unknown": "don't know",
     "delay_s": "alarm after [s]",
 }
-_DPI = 200
 
 
 def drawing_style() -> AbstractContextManager[None]:
@@ -90,7 +89,7 @@ def save(fig: Figure, path: str | os.PathLike[str]) -> list[Path]:
         # Without the date, equal figures are equal files.
         metadata: dict[str, Any] | None = {"Date": None} if one.suffix == ".svg" else None
         with drawing_style(), io.BytesIO() as content:
-            fig.savefig(content, format=one.suffix[1:], dpi=_DPI, metadata=metadata)
+            fig.savefig(content, format=one.suffix[1:], dpi=200, metadata=metadata)
             write_file(one, content.getvalue())
     return paths
 

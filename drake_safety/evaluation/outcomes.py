@@ -96,7 +96,6 @@ def _bad_rows(loop: ClosedLoop, metric: str) -> Callable[[Episode], np.ndarray]:
 
 
 def _constraint(loop: ClosedLoop, metric: str) -> str:
-    """The metric, or the constraint of a fall."""
     return require(loop, CanFall, "metric 'fall'").fall_name if metric == "fall" else metric
 
 

@@ -59,10 +59,8 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
 
 def _pictures(folder: Path) -> list[tuple[str, str]]:
     """Titles and data URLs of the pictures in a folder."""
-    return [
-        (
-            spoken(path.stem).capitalize(),
-            f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode('ascii')}",
-        )
-        for path in sorted(folder.glob("*.png"))
-    ]
+    pictures = []
+    for path in sorted(folder.glob("*.png")):
+        content = base64.b64encode(path.read_bytes()).decode("ascii")
+        pictures.append((spoken(path.stem).capitalize(), f"data:image/png;base64,{content}"))
+    return pictures

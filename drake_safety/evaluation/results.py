@@ -16,7 +16,6 @@ from drake_safety.files.reading import reading
 from drake_safety.files.schema import load_typed
 
 SCHEMA = "drake_safety.results"
-_NUM_DIGITS = 6  # Significant digits in a file, more than any table shows.
 
 Key = tuple[str, str, str]
 """What was judged, such as "episodes"; what judged it, such as "sharpened", or "" for a figure of
@@ -65,4 +64,4 @@ class Results(dict[Key, Estimate]):
 
 
 def _rounded(number: float) -> float | None:
-    return float(f"{number:.{_NUM_DIGITS}g}") if math.isfinite(number) else None
+    return float(f"{number:.6g}") if math.isfinite(number) else None

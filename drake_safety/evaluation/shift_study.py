@@ -26,13 +26,10 @@ from drake_safety.simulation.rollouts import run_motion, worker_loop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import map_items
 
-SEEN = ("state", "desired_preview", "features")
-"""Output ports that are inputs of assessor and monitor."""
-CONFIDENT = 0.9
-"""Least safety probability of a confident verdict."""
+SEEN = ("state", "desired_preview", "features")  # Ports that assessor and monitor read.
+CONFIDENT = 0.9  # Least safety probability of a confident verdict.
 BOOTSTRAP = Bootstrap(num_resamples=200)
-SPANS_S = (10.0, 60.0)
-"""Times since a change over which confident errors are counted [s]."""
+SPANS_S = (10.0, 60.0)  # Times since a change over which confident errors are counted.
 _FIRST_S = 12.0  # Simulated of each motion; only those without an alarm go on.
 _UNKNOWN = Column("unknown", "don't know", "=%", digits=1)
 _ERROR = Column("confident_error", "sure and wrong", "=%", digits=1)

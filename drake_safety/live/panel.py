@@ -58,7 +58,7 @@ class LivePanel:
         self.sliders: dict[str, Slider] = {}
         self.is_stopped = False
         self._clicks: set[str] = set()
-        self._history: deque[tuple[float, float]] = deque()
+        self.history: deque[tuple[float, float]] = deque()  # Times [s] and probabilities.
 
     def click(self, name: str) -> None:
         """Clicks a button; until it is taken, further clicks count as the same."""
@@ -86,17 +86,13 @@ class LivePanel:
         self.belief = tuple(belief.tolist()) if np.isfinite(belief).all() else _UNKNOWN
         if time_s is not None:
             shown = self.probability if math.isfinite(self.probability) else 0.0
-            self._history.append((time_s, min(max(shown, 0.0), 1.0)))
-            while self._history[0][0] < time_s - HISTORY_S:
-                self._history.popleft()
-
-    def clear_history(self) -> None:
-        """Clears the curve."""
-        self._history.clear()
+            self.history.append((time_s, min(max(shown, 0.0), 1.0)))
+            while self.history[0][0] < time_s - HISTORY_S:
+                self.history.popleft()
 
     def curve(self) -> list[tuple[float, float]]:
         """Points (time before the last one [s], at most 0; probability in [0, 1]), oldest first."""
-        points = list(self._history)
+        points = list(self.history)
         return [(round(time_s - points[-1][0], 2), round(value, 3)) for time_s, value in points]
 
     def stop(self) -> None:

@@ -208,7 +208,7 @@ class LiveSession:
     def _begin(self, end_s: float) -> None:
         self._end_s, self._said_until_s = end_s, -math.inf
         self._simulator.Initialize()
-        self.panel.clear_history()
+        self.panel.history.clear()
         if self._camera is not None:
             self._camera.follow(self.context)
 
