@@ -125,7 +125,7 @@ def check(
         console.say(f"{num_problems} problem{'s' * (num_problems > 1)}", style="red")
         raise Exit(1)
     if not import_:
-        return console.say("its files are right; not checked, as its code was not run: all else")
+        return console.say("its files are right; nothing else is checked: its code was not run")
     if quick:
         console.say("not checked: the share of unsafe episodes")
     console.say("ready: drake-safety train", scenario, "--out FOLDER")
