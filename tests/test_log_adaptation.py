@@ -116,10 +116,7 @@ def test_a_promise_after_logs_is_for_a_plant_that_is_named(folder, capsys, monke
     command = ("calibrate", folder / "short.yaml", "--assessment", tmp_path, *few)
     assert call(monkeypatch, *command) == 2
     printed = " ".join(capsys.readouterr().out.split())
-    assert (
-        "nothing can be promised for it, only for a simulated plant by --variation actual"
-        in printed
-    )
+    assert "a promise holds for a simulated plant, --variation actual" in printed
     assert not load(tmp_path, MODES[0]).calibrations_
     assert call(monkeypatch, *command, "--variation", "actual") == 0
     for calibration in load(tmp_path, MODES[0]).calibrations_.values():
