@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated
 
@@ -65,7 +64,7 @@ def new(
     # Before anything is written.
     template = None if policy is None else survey_policy(policy, _names(motors), console.say)
     moved = () if template is None else template.joints or None
-    limbs = {k: re.split(r"\s*,\s*", v) for k, v in (("feet", feet), ("hands", hands)) if v}
+    limbs = {"feet": _names(feet) or None, "hands": _names(hands) or None}
     written = write_robot(name, model, task, out or Path(name), **limbs, moved=moved)
     files, asked, sizes = written.files, written.asked, written.sizes
     if template is not None:
@@ -90,6 +89,10 @@ def new(
     for what in asked:
         console.say(f"ask   {what}", style="yellow")
     console.say("next: drake-safety check", written.files[-1])
+
+
+def _names(text: str | None) -> list[str]:
+    return [name.strip() for name in (text or "").split(",") if name.strip()]
 
 
 def check(
