@@ -30,12 +30,7 @@ from drake_safety.importing.urdf_survey import (
     require_motors,
 )
 from drake_safety.robots.meshes import above
-from drake_safety.robots.plausibility import (
-    effort_unit,
-    listed,
-    odd_inertias,
-    odd_limits,
-)
+from drake_safety.robots.plausibility import effort_unit, listed, odd_inertias, odd_limits
 from drake_safety.robots.robot_model import as_pattern, load_robot_file
 from drake_safety.robots.urdf import joint_elements
 

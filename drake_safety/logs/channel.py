@@ -21,23 +21,16 @@ Wanted = Mapping[str, Sequence[str]]
 
 @dataclass(kw_only=True, eq=False)
 class Channel:
-    """Columns of one table or topic, unconverted.
-
-    Attributes:
-        time: Time in the log's unit, integers or floats, (N,); dates and durations become ns.
-        frame: N rows of floats; the index is their number in the file.
-        row_name: Name of a row: "line", "row" or "message".
-        origin: Instant from which ``time_s`` counts, in the log's unit.
-    """
+    """Columns of one table or topic, unconverted."""
 
     path: Path
     topic: str = ""
-    time: np.ndarray
+    time: np.ndarray  # In the log's unit, (N,); dates and durations become ns.
     time_unit: TimeUnit
     time_name: str
-    frame: pd.DataFrame
-    row_name: str
-    origin: float | int = 0
+    frame: pd.DataFrame  # N rows of floats; the index is their number in the file.
+    row_name: str  # "line", "row" or "message".
+    origin: float | int = 0  # Instant from which ``time_s`` counts, in the log's unit.
 
     def __post_init__(self) -> None:
         if self.time.dtype.kind in "mM":

@@ -11,7 +11,7 @@ import math
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -44,41 +44,32 @@ _MEASURES = ("from their means", "while the lowest one stands", "or rest at seve
 _MIRRORS = {"left and right": (1, -1), "front and rear": (-1, 1)}
 _INVERSE = "'base_orientation' is the inverse, of the world in the base"
 
+# A reading in words, and the changes by positions and by velocities in it, (M, n) each.
 _Reading = tuple[str, np.ndarray, np.ndarray]
-"""A reading in words, and the changes by positions and by velocities in it, (M, n) each."""
 
 
 class _Pose(NamedTuple):
-    """A reading of pose and joints: whether the robot stands at first, and how its feet rest [m].
-
-    A foot rests by how it moves in a step and differs in height from all, in its best fifth.
-    """
+    """A reading of pose and joints: whether the robot stands at first, and how its feet rest."""
 
     what: str
     stands: bool
-    slips: list[float]
-    height: float
-    rest: np.ndarray
+    slips: list[float]  # By every measure [m].
+    height: float  # Of all feet [m].
+    rest: np.ndarray  # Motion and distance from that height of each foot in its best fifth [m].
 
 
 def check(sources: list[Source], kinematics: RobotKinematics) -> list[str]:
-    """Checks the first piece's start and the longest one's motion, and the values of all.
-
-    Returns notes on the height of the feet.
-    """
+    """Checks the first piece's start, the longest one's motion, and all values; returns notes."""
     longest, notes = max(sources, key=lambda source: float(np.ptp(source.at_s))), list[str]()
     for source in sources:
         norms = np.linalg.norm(source.table("base_orientation"), axis=1)
         if (is_bad := np.abs(norms - 1.0) > _NORM_TOLERANCE).any():
             row = int(np.argmax(is_bad))
-            raise ValueError(
-                f"{source.channels['base_orientation'].where(row)}, columns "
-                f"{source.log_map.base_orientation.columns}: the quaternion has a norm of "
-                f"{norms[row]:g}, expected 1"
-            )
+            where = source.channels["base_orientation"].where(row)
+            where += f", columns {source.log_map.base_orientation.columns}"
+            raise ValueError(f"{where}: the quaternion has a norm of {norms[row]:g}, expected 1")
         if source is sources[0]:
             _check_start(source, kinematics)
-            _check_desired_output(source, kinematics)
         if beyond := _beyond_stops(kinematics, source.table("joint_positions")):
             row, joint, text = beyond
             column = source.log_map.joint_positions.column(source.joints[joint])
@@ -94,10 +85,7 @@ def check(sources: list[Source], kinematics: RobotKinematics) -> list[str]:
 
 
 def _check_speed(source: Source, name: str, kinematics: RobotKinematics) -> None:
-    """Checks that a quantity nowhere moves, or jumps between two rows, as no robot does.
-
-    Rare jumps take 5 ms at least, so that noise does not reach the limits.
-    """
+    """Checks that a quantity nowhere moves, or jumps between two rows, as no robot does."""
     channel, values = source.channels[name], source.table(name)
     is_angle = "angular" in name or "orientation" in name
     limit = np.array(_FASTEST_RAD_S if is_angle else _FASTEST_M_S)
@@ -112,6 +100,7 @@ def _check_speed(source: Source, name: str, kinematics: RobotKinematics) -> None
             cosines = np.sum(values[1:] * values[:-1], axis=1)
             speeds[1:] = 2 * np.arccos(np.minimum(np.abs(cosines), 1.0))[:, None]
         steps_s = np.diff(channel.time_s)[:, None]
+        # Rare jumps take 5 ms at least, so that noise does not reach the limits.
         is_usual = (np.median(speeds[1:] / steps_s, axis=0) > limit).any()
         speeds[1:] /= steps_s if is_usual else np.maximum(steps_s, _JUMP_S)
     if not (is_beyond := speeds > limit).any():
@@ -132,8 +121,7 @@ def _implausible(kinematics: RobotKinematics, q: np.ndarray) -> str:
     if beyond := _beyond_stops(kinematics, q[None, 7:]):
         return beyond[2]
     up = quaternion_of(q).rotation()[2, 2]
-    tilt = math.acos(min(max(up, -1.0), 1.0))
-    if tilt > _MAX_TILT_RAD:
+    if (tilt := math.acos(min(max(up, -1.0), 1.0))) > _MAX_TILT_RAD:
         return f"its base is tilted by {math.degrees(tilt):.0f}° from upright"
     height = _lowest_foot(kinematics, q)
     if abs(height) > _FOOT_SHARE * kinematics.standing_height:
@@ -153,11 +141,8 @@ def _beyond_stops(kinematics: RobotKinematics, joints: np.ndarray) -> tuple[int,
     joint = int(np.argmax(excess[row]))
     if not excess[row, joint] > _FAR_RAD:
         return None
-    text = (
-        f"joint '{kinematics.joint_names[joint]}' is at {joints[row, joint]:.3g} rad, far beyond "
-        f"its stops {low[joint]:.3g} and {high[joint]:.3g}"
-    )
-    return row, joint, text
+    text = f"joint '{kinematics.joint_names[joint]}' is at {joints[row, joint]:.3g} rad"
+    return row, joint, f"{text}, far beyond its stops {low[joint]:.3g} and {high[joint]:.3g}"
 
 
 def _check_start(source: Source, kinematics: RobotKinematics) -> None:
@@ -167,6 +152,7 @@ def _check_start(source: Source, kinematics: RobotKinematics) -> None:
         return _implausible(kinematics, read.positions(source.at_s[:1])[0])
 
     if not (reason := wrong(source)):
+        _check_desired_output(source, kinematics)
         return
     likely = []
     for name, units in (("joint_positions", ANGLE_UNITS), ("base_position", LENGTH_UNITS)):
@@ -188,31 +174,24 @@ def _check_start(source: Source, kinematics: RobotKinematics) -> None:
             side = "lower" if height > 0 else "higher"
             likely.append(f"it were {abs(height):.3g} m {side}: {_offset_text(source, height)}")
     hint = f"; it would stand if {' or '.join(likely)}" if likely else ""
-    raise ValueError(
-        f"{source.where}: robot '{kinematics.robot.name}' does not stand on the ground z = 0 at "
-        f"the start: {reason}{hint}"
-    )
+    what = f"robot '{kinematics.robot.name}' does not stand on the ground z = 0 at the start"
+    raise ValueError(f"{source.where}: {what}: {reason}{hint}")
 
 
 def _check_desired_output(source: Source, kinematics: RobotKinematics) -> None:
-    """Checks that the desired output, if there is one, begins near the base."""
     if "desired_output" not in source.channels:
         return
     desired, base = (source.at(n, source.at_s[:1]) for n in ("desired_output", "base_position"))
     distance = float(np.linalg.norm(desired - base))
     if distance > _REACH_SHARE * kinematics.standing_height:
         raise ValueError(
-            f"{source.where}: the desired output is {distance:.3g} m from the base of robot "
-            f"'{kinematics.robot.name}': check its frame and its unit; it is a position, no "
-            "velocity command"
+            f"{source.where}: the desired output is {distance:.3g} m from the robot's base: check "
+            "its frame and its unit; it is a position, no velocity command"
         )
 
 
 def _check_stance(source: Source, kinematics: RobotKinematics) -> list[str]:
-    """Checks that feet do not rest better by another reading of the base's pose or the joints.
-
-    Returns a note if they rest above or below the ground.
-    """
+    """Checks that feet rest best as the map reads them; notes their height over the ground."""
     if np.ptp(source.at_s) < _SHORTEST_S:
         return []
     poses = _poses(source, kinematics)
@@ -222,16 +201,13 @@ def _check_stance(source: Source, kinematics: RobotKinematics) -> list[str]:
         best, slip = _stillest(others, i) or given, given.slips[i]
         if slip > max(_SLIP_M, _SLIP_FACTOR * best.slips[i]):
             raise ValueError(
-                f"{source.where} and after it: the feet of robot '{kinematics.robot.name}' slide "
-                f"by {slip:.3g} m with the base ({measure}), but only by {best.slips[i]:.3g} m if "
-                f"{best.what}"
+                f"{source.where} and after it: the feet slide by {slip:.3g} m with the base "
+                f"({measure}), but only by {best.slips[i]:.3g} m if {best.what}"
             )
     if abs(height := given.height) < _HIGH_M:
         return []
-    return [
-        f"{source.where} and after it: the feet rest {_side(height)} the ground z = 0: "
-        f"{_offset_text(source, height)} would put them on it"
-    ]
+    text = f"{source.where} and after it: the feet rest {_side(height)} the ground z = 0"
+    return [f"{text}: {_offset_text(source, height)} would put them on it"]
 
 
 def _side(height: float) -> str:
@@ -299,9 +275,8 @@ def _poses(source: Source, kinematics: RobotKinematics) -> Iterator[_Pose]:
     factors = np.ones((len(signs), joints.shape[1]))
     for leg in legs:
         factors[:, leg] = signs
-    rests = np.array(
-        [pose("", R_WB, p_WB, read, contacts(read)).rest for read in factors[:, None] * joints]
-    )
+    turned = factors[:, None] * joints
+    rests = np.array([pose("", R_WB, p_WB, read, contacts(read)).rest for read in turned])
     best = np.argmax(rests <= rests.min(axis=0) + 0.001, axis=0)
     for leg, i in zip(legs, best, strict=True):
         factors[0, leg] = signs[i]
@@ -399,12 +374,7 @@ def _scaled(
 
 
 def _require(
-    source: Source,
-    name: str,
-    columns: list[str],
-    width_s: float,
-    given: _Reading,
-    *tiers: list[_Reading],
+    source: Source, name: str, columns: list[str], width_s: float, given: _Reading, *tiers: Any
 ) -> None:
     """Raises if the given reading differs and one of a tier does not, or if it differs by far."""
 
@@ -436,10 +406,8 @@ def _require(
     is_still = any(not np.median(np.linalg.norm(part, axis=1)[moves]) for part in given[1:])
     is_far = share > _WRONG and (size > _FAR * least or is_still)
     if is_far and width_s > num_rows * np.median(np.diff(source.channels[name].time_s)):
-        raise ValueError(
-            f"{text}; no other frame, sign or unit agrees: leave '{name}' out of the map, then the "
-            f"derivative is used, unless '{VELOCITIES[name]}' stands still"
-        )
+        remedy = f"leave '{name}' out of the map, unless '{VELOCITIES[name]}' stands still"
+        raise ValueError(f"{text}; no other frame, sign or unit agrees: {remedy}")
 
 
 def _turn_text(turn: Rotation) -> str:

@@ -15,16 +15,11 @@ from drake_safety.logs.log_map import VELOCITIES, LogMap, si_units
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Source:
-    """The quantities of a piece of a log in SI units, at their own rows and at any time.
-
-    Attributes:
-        joints: Names of the joints in the robot's order.
-        channels: Columns of every quantity that is in the map, by its field of the map.
-    """
+    """The quantities of a piece of a log in SI units, at their own rows and at any time."""
 
     log_map: LogMap
-    joints: list[str]
-    channels: Mapping[str, Channel]
+    joints: list[str]  # In the robot's order.
+    channels: Mapping[str, Channel]  # By field of the map.
 
     @cached_property
     def at_s(self) -> np.ndarray:
@@ -43,10 +38,8 @@ class Source:
         """Returns a quantity's columns in the unit m or rad, per second, (N, n)."""
         part = getattr(self.log_map, name)
         values = self.channels[name].frame[columns := part.names(self.joints)].to_numpy()
-        factors, offsets = (
-            [of.get(one, by) for one in columns] for of, by in ((part.sign, 1), (part.offset, 0))
-        )
-        return si_units(part) * (factors * values + offsets)
+        signs, offsets = [part.sign.get(name, 1) for name in columns], part.offset
+        return si_units(part) * (signs * values + [offsets.get(name, 0) for name in columns])
 
     def at(self, name: str, at_s: np.ndarray) -> np.ndarray:
         """Returns a quantity's columns at times (M,) [s], linearly, (M, n)."""

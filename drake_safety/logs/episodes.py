@@ -34,8 +34,7 @@ def _loggable_loop(loop: LeggedLoop | Scenario) -> LeggedLoop:
     if loop.memory_features:
         raise ValueError(
             f"scenario '{loop.scenario.name}' reads {sorted(loop.memory_features)}, its policy's "
-            "memory, which no log has: 'adapt' takes none of such robots, 'monitor' sequences of "
-            "what the policy observes and commands, an .npz file"
+            "memory, which no log has; 'monitor' takes .npz files of what the policy observes"
         )
     return loop
 
@@ -46,17 +45,14 @@ def cut_log(
     """Converts logs to consecutive episodes of the actual robot, with the starts of their twins.
 
     Episodes have the scenario's duration; none reaches over a cut of a log. The last one ends where
-    the robot leaves the safe set; later rows are ignored. A safe remainder that is too short for a
-    segment is dropped. The preview is the logged z*, constant after the last row, in the stance
-    frame of the episode's first row.
+    the robot leaves the safe set. A safe remainder that is too short for a segment is dropped. The
+    preview is the logged z*, constant after the last row, in the stance frame of the first row.
 
     Args:
-        log: The log, or several of one robot, whose episodes are numbered consecutively.
         loop: The loop without Γ that evaluates the states, or a scenario with an ``actual`` one.
 
     Returns:
-        The episodes and their starts: ``run_episode(nominal_loop, start=starts[i])`` is the twin
-        of ``episodes[i]``.
+        The episodes, and starts for ``run_episode`` on the nominal loop: their twins.
     """
     loop = _loggable_loop(loop)
     scenario, assessment = loop.scenario, loop.scenario.assessment
@@ -79,10 +75,7 @@ def cut_log(
 
 
 def motions_from_log(
-    log: RobotLog | Sequence[RobotLog],
-    loop: LeggedLoop | Scenario,
-    *,
-    step_s: float | None = None,
+    log: RobotLog | Sequence[RobotLog], loop: LeggedLoop | Scenario, *, step_s: float | None = None
 ) -> Episodes:
     """Converts logs to motions of up to a minute for a `ChangeDetector`, with their times in it.
 
@@ -128,14 +121,10 @@ class _Cutter:
     def _cut(self, log: RobotLog) -> tuple[list[tuple[Episode, EpisodeStart]], bool]:
         """Episodes and starts of a piece, and whether it leaves the safe set."""
         if log.robot != self.loop.robot.name:
-            raise ValueError(
-                f"log '{log.path}' is of robot '{log.robot}', scenario "
-                f"'{self.loop.scenario.name}' of '{self.loop.robot.name}'"
-            )
+            other = f"scenario '{self.loop.scenario.name}' of '{self.loop.robot.name}'"
+            raise ValueError(f"log '{log.path}' is of robot '{log.robot}', {other}")
         if log.desired_output is None:
-            raise ValueError(
-                f"log '{log.path}' has no desired output, which the preview needs: map it"
-            )
+            raise ValueError(f"log '{log.path}' has no desired output: the preview needs it")
         context = self.loop.CreateDefaultContext()
         found: list[tuple[Episode, EpisodeStart]] = []
         begin_s = 0.0
@@ -177,10 +166,11 @@ class _Cutter:
         X_SW = planar_pose(start.stance_pose(kinematics)).inverse()
         z = X_SW.multiply(points.T).T.reshape(len(knots), -1)
         # A shape-preserving interpolation does not overshoot at steps of z*.
-        interpolate = PiecewisePolynomial.CubicShapePreserving
-        if len(knots) < 3:
-            interpolate = PiecewisePolynomial.FirstOrderHold
-        start.plan = interpolate(knots - begin_s, z.T)
+        smooth, linear = (
+            PiecewisePolynomial.CubicShapePreserving,
+            PiecewisePolynomial.FirstOrderHold,
+        )
+        start.plan = (smooth if len(knots) > 2 else linear)(knots - begin_s, z.T)
         return start
 
     def _episode(self, log: RobotLog, context: Context, begin_s: float) -> Episode:

@@ -154,9 +154,9 @@ class LogMap:
     def __post_init__(self) -> None:
         for name in ("base_position", "base_orientation"):
             if not getattr(self, name).columns:
+                where = "docs/logs.md, 'Logs without a base position'"
                 raise ValueError(
-                    f"'{name}.columns' is missing; a state estimator adds what the robot does not "
-                    "log (docs/logs.md, 'Logs without a base position')"
+                    f"'{name}.columns' is missing; a state estimator adds it ({where})"
                 )
         for name in ("base_position", "desired_output"):
             if len(columns := getattr(self, name).columns) > 3:

@@ -57,10 +57,8 @@ def _channels(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel]:
     with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
         there = f"its topics are {listed(sorted({c.topic for c in reader.connections}))}"
         if "" in wanted:
-            raise ValueError(
-                f"log '{path}' has messages: the map must name the topic of {list(wanted[''])}; "
-                f"{there}"
-            )
+            what = f"the map must name the topic of {list(wanted[''])}"
+            raise ValueError(f"log '{path}' has messages: {what}; {there}")
         connections = [c for c in reader.connections if c.topic in wanted]
         if missing := wanted.keys() - {c.topic for c in connections}:
             raise ValueError(f"log '{path}' has no messages of topics {sorted(missing)}; {there}")
@@ -94,11 +92,7 @@ def _channels(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel]:
 
 
 def field_of(path: str) -> Callable[[Any], Any]:
-    """Returns a function that reads a field of a message.
-
-    An entry ``[NAME]`` has the index of NAME in the field ``name`` beside it, as in
-    sensor_msgs/JointState, or is itself called NAME, as in ``transforms[base]``.
-    """
+    """Returns a function that reads a field of a message, with entries by number or by name."""
     if not path or "".join(match.group() for match in _STEP.finditer(path)) != path:
         raise ValueError(f"'{path}' is not a field path, such as pose.position.x or q[3]")
     steps = [match.groups() for match in _STEP.finditer(path) if match.group() != "."]
@@ -128,7 +122,7 @@ def field_of(path: str) -> Callable[[Any], Any]:
 
 
 def _names_of(owner: Any, entries: Any) -> list[str]:
-    """Names of a field's entries: their own, as of transforms, or those beside the field."""
+    """Names of a field's entries: their own, as of transforms, or beside it, as of joints."""
     for key in ("child_frame_id", "name"):
         if all(hasattr(one, key) for one in entries):
             return [str(getattr(one, key)).lstrip("/") for one in entries]

@@ -36,10 +36,9 @@ def continued(channel: Channel, max_gap_s: float) -> tuple[Channel, dict[str, fl
 
 
 def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
-    """Sorts rows that are a little out of order, and joins those of one time.
+    """Sorts rows that are a little out of order, joins those of one time, and says what is lost.
 
-    Returns also what is lost by that: nothing where rows of one time have values of other columns,
-    as messages have that name some joints only.
+    Rows of one time may have values of other columns, as messages that name some joints only.
     """
     time, clock = channel.time, channel.time_name
     if (is_bad := ~np.isfinite(time)).any():
@@ -48,10 +47,8 @@ def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
     step = np.diff(time)
     if (is_back := step < -max_gap_s * TIME_UNITS[channel.time_unit]).any():
         row = int(np.argmax(is_back)) + 1
-        raise ValueError(
-            f"{channel.where(row, clock)}: time runs backwards, from {time[row - 1]} to "
-            f"{time[row]} {channel.time_unit}"
-        )
+        what = f"from {time[row - 1]} to {time[row]} {channel.time_unit}"
+        raise ValueError(f"{channel.where(row, clock)}: time runs backwards, {what}")
     if (step > 0).all():
         return channel, []
     import pandas as pd
@@ -64,10 +61,8 @@ def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
         share = num_lost / len(time)
         # Equal rows of one time are one measurement.
         if (groups.nunique() - 1).clip(lower=0).sum().max() > _MANY_SAME * len(time):
-            raise ValueError(
-                f"{where}: {share:.1%} of the rows share a time with another row: its stamps have "
-                "too few digits, or are of another column"
-            )
+            what = f"{share:.1%} of the rows share a time with another row"
+            raise ValueError(f"{where}: {what}: its stamps have too few digits")
         lost.append(f"{where}: time stands still in {share:.1%} of the rows: the first is kept")
     joined = channel.select(np.unique(time, return_index=True)[1])
     return replace(joined, frame=groups.first().set_axis(joined.frame.index)), lost
@@ -167,10 +162,7 @@ def _held(command: Channel, base: Channel, max_gap_s: float) -> Channel:
 def cut(
     channels: Mapping[str, Channel], max_gap_s: float
 ) -> tuple[list[dict[str, Channel]], list[str]]:
-    """Cuts quantities where a value is missing or a gap in time is longer than ``max_gap_s``.
-
-    Returns the channels of each piece in order of time, and the reasons of the cuts.
-    """
+    """Cuts quantities at missing values and long gaps; returns channels by piece, and reasons."""
     pieces: list[tuple[float, float, dict[str, Channel]]] = [(-math.inf, math.inf, {})]
     reasons: dict[str, None] = {}
     for name, channel in channels.items():
@@ -192,17 +184,13 @@ def _unbroken(channel: Channel, max_gap_s: float) -> tuple[list[Channel], list[s
     steps_s, clock = np.diff(channel.time_s), channel.time_name
     if len(channel.time) < MIN_ROWS:
         of = f" of topic '{channel.topic}'" if channel.topic else ""
-        raise ValueError(
-            f"log '{channel.path}'{of} has {len(channel.time)} rows with a value and a time of "
-            f"their own, expected at least {MIN_ROWS}"
-        )
+        what = f"has {len(channel.time)} rows with a value and a time of their own"
+        raise ValueError(f"log '{channel.path}'{of} {what}, expected at least {MIN_ROWS}")
     low, high = _INTERVALS_S
     if not low <= (usual_s := float(np.median(steps_s))) <= high:
-        usual = usual_s * TIME_UNITS[channel.time_unit]
-        raise ValueError(
-            f"{channel.where(0, clock)}: rows are {usual:g} apart, which as "
-            f"{channel.time_unit} is implausible: check 'time.unit' of the map"
-        )
+        usual = f"{usual_s * TIME_UNITS[channel.time_unit]:g} {channel.time_unit}"
+        what = f"rows are {usual} apart, which is implausible: check 'time.unit' of the map"
+        raise ValueError(f"{channel.where(0, clock)}: {what}")
     # A value that is missing, not finite or absurdly large is bad.
     bad = ~(channel.frame.abs() < LARGEST).to_numpy()
     is_bad = bad.any(axis=1)

@@ -63,29 +63,21 @@ class RobotLog:
 
     def states_at(self, at_s: np.ndarray) -> np.ndarray:
         """States (M, n_q + n_v) at times (M,) [s]: rotations by slerp, others linearly."""
-        rotations = rotations_at(
-            self.time_s, Rotation.from_quat(self.q[:, :4], scalar_first=True), at_s
-        )
+        quaternions = Rotation.from_quat(self.q[:, :4], scalar_first=True)
+        rotations = rotations_at(self.time_s, quaternions, at_s)
         rest = values_at(self.time_s, np.hstack([self.q[:, 4:], self.v]), at_s)
         return np.hstack([rotations.as_quat(scalar_first=True), rest])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LogPieces:
-    """What is left of a log that was cut at missing values and gaps.
-
-    Attributes:
-        duration_s: Duration of the whole log [s].
-        row_share: Share of its rows that have a time of their own.
-        lost: What was cut or left out, and where.
-        notes: What was resampled, or is a derivative.
-    """
+    """What is left of a log that was cut at missing values and gaps."""
 
     pieces: list[RobotLog]
-    duration_s: float
-    row_share: float
-    lost: list[str]
-    notes: list[str]
+    duration_s: float  # Of the whole log.
+    row_share: float  # Of its rows that have a time of their own.
+    lost: list[str]  # What was cut or left out, and where.
+    notes: list[str]  # What was resampled, or is a derivative.
 
     @property
     def cuts(self) -> list[str]:
@@ -124,10 +116,8 @@ def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> Lo
         raise ValueError(f"log '{path}' does not exist")
     suffix = ".bag" if path.is_dir() else path.suffix.lower()
     if suffix not in _READERS:
-        raise ValueError(
-            f"log '{path}' has the suffix '{suffix}'; known are {list(FORMATS)} and the folder of "
-            "a ROS 2 bag"
-        )
+        known = f"{list(FORMATS)} and the folder of a ROS 2 bag"
+        raise ValueError(f"log '{path}' has the suffix '{suffix}'; known are {known}")
     topics = _READERS[suffix](path, _wanted(log_map, kinematics), log_map.time)
     lost, row_share, restarts = list[str](), 1.0, dict[str, float]()
     for topic, channel in topics.items():
@@ -152,10 +142,8 @@ def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> Lo
         if end <= begin:
             spans = {topic: topics[topic].time_s[[0, -1]].tolist() for topic in sorted(measured)}
             why = f"its topics do not overlap: {spans}"
-        raise ValueError(
-            f"log '{path}' has no {MIN_ROWS} rows without a missing value or a gap between "
-            f"them: {why}"
-        )
+        what = f"has no {MIN_ROWS} rows without a missing value or a gap between them"
+        raise ValueError(f"log '{path}' {what}: {why}")
     notes += check(sources, kinematics)
     unit = TIME_UNITS[next(iter(topics.values())).time_unit]
     begins = (np.array([*restarts.values()]) - origin) / unit
@@ -198,19 +186,15 @@ def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> Wanted:
             unknown = [joint for joint in part.columns if joint not in joints]
             missing = [joint for joint, column in zip(joints, columns, strict=True) if not column]
             if unknown or missing:
-                raise ValueError(
-                    f"map: '{name}' must give a column to every joint {joints}; it has none for "
-                    f"{missing}, and the robot has no joints {unknown}"
-                )
-        if name == "foot_positions" and len(columns) not in (0, 3 * kinematics.num_contacts):
-            raise ValueError(
-                f"map: 'foot_positions.columns' must be x, y, z of {kinematics.num_contacts} "
-                f"contact points of robot '{kinematics.robot.name}'; got {len(columns)} columns"
-            )
-        if others := [one for one in (*part.sign, *part.offset) if one not in columns]:
-            raise ValueError(
-                f"map: 'sign' and 'offset' of '{name}' are by column, of {columns}; got {others}"
-            )
+                what = f"it has none for {missing}, and the robot has no joints {unknown}"
+                raise ValueError(f"map: '{name}' must give a column to every joint; {what}")
+        count = 3 * kinematics.num_contacts
+        if name == "foot_positions" and len(columns) not in (0, count):
+            what = f"of every contact point, {count} columns"
+            raise ValueError(f"map: '{name}.columns' must be x, y, z {what}; got {len(columns)}")
+        if others := [other for other in (*part.sign, *part.offset) if other not in columns]:
+            what = f"are by column, of {columns}; got {others}"
+            raise ValueError(f"map: 'sign' and 'offset' of '{name}' {what}")
         if columns:
             wanted.setdefault(part.topic, []).extend(columns)
     return {topic: list(dict.fromkeys(names)) for topic, names in wanted.items()}

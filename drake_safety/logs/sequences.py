@@ -50,16 +50,14 @@ def read_sequences(
     given_s, step_s = sequence_map.step_s, detector.step_s
     stride = max(1, round(step_s / max(given_s, 1e-6)))
     if not math.isclose(stride * given_s, step_s, rel_tol=1e-6):
-        raise ValueError(
-            f"map: 'step_s' is {given_s}, expected {step_s}, the time between two rows of the "
-            "monitor, or an integer fraction of it [s]"
-        )
+        what = f"expected {step_s}, the monitor's step, or an integer fraction of it [s]"
+        raise ValueError(f"map: 'step_s' is {given_s}, {what}")
     data, names = _arrays(path, sequence_map)
     columns = {name: sequence_map.columns.get(name, name) for name in inputs}
     if missing := [column for column in dict.fromkeys(columns.values()) if column not in names]:
+        what = f"{missing}, which the monitor reads; they have {listed(names)}"
         raise ValueError(
-            f"sequences '{path}' have no observations {missing}, which the monitor reads; they "
-            f"have {listed(names)}: 'columns' of the map may name another one for an input"
+            f"sequences '{path}' have no observations {what}: see 'columns' of the map"
         )
     rows = np.zeros((*data[:, ::stride].shape[:2], len(every)))
     for name, column in columns.items():
@@ -80,8 +78,7 @@ def _arrays(path: Path, sequence_map: SequenceMap) -> tuple[np.ndarray, list[str
     if data.ndim not in (2, 3) or data.shape[-1] != len(names) or data.dtype.kind not in "fiu":
         raise ValueError(
             f"sequences '{path}': '{sequence_map.data}' is {data.dtype} of shape {data.shape}, "
-            f"expected numbers (num_sequences, num_steps, {len(names)}): '{sequence_map.names}' "
-            f"has {len(names)} names"
+            f"expected numbers (num_sequences, num_steps, {len(names)})"
         )
     return data.reshape(-1, *data.shape[-2:]), names
 

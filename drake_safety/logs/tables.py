@@ -76,9 +76,8 @@ def _columns(path: Path, wanted: Wanted, time: LogTime, existing: list[str]) -> 
         raise ValueError(f"log '{path}' is a table: 'time.column' of the map must name its time")
     names = list(dict.fromkeys([time.column, *wanted[""]]))
     if missing := [name for name in names if name not in existing]:
-        raise ValueError(
-            f"log '{path}' has no columns {listed(missing, 5)}; it has {listed(existing)}"
-        )
+        what = f"{listed(missing, 5)}; it has {listed(existing)}"
+        raise ValueError(f"log '{path}' has no columns {what}")
     if twice := [name for name in names if existing.count(name) > 1]:
         raise ValueError(f"log '{path}' has columns of the same name: {twice}")
     return names

@@ -29,32 +29,22 @@ from drake_safety.robots.robot_model import JointGains, RobotModel, as_pattern, 
 
 @dataclass(kw_only=True, eq=False)
 class PolicyInput:
-    """What observation terms are functions of.
+    """What observation terms are functions of."""
 
-    Attributes:
-        R_WB: Orientation of the base, (3, 3).
-        w_WB, v_WB: Its velocities in the world, (3,) [rad/s, m/s].
-        positions: Joint positions less those of zero action, in the policy's order, (n_a,) [rad].
-        command: (v_x, v_y, ω_z), (3,) [m/s, rad/s].
-        action: The last action, (n_a,).
-        phases: Phases of the gait clock, in [-π, π], (n_p,) [rad].
-        all_positions: As ``positions``, of all joints of the robot in its order, (n_j,) [rad].
-    """
-
-    R_WB: np.ndarray
-    w_WB: np.ndarray
+    R_WB: np.ndarray  # Orientation of the base, (3, 3).
+    w_WB: np.ndarray  # Its velocities in the world, (3,) [rad/s, m/s].
     v_WB: np.ndarray
-    positions: np.ndarray
+    positions: np.ndarray  # Of joints, less those of zero action, in its order, (n_a,) [rad].
     rates: np.ndarray
-    command: np.ndarray
-    action: np.ndarray
-    phases: np.ndarray
-    all_positions: np.ndarray
+    command: np.ndarray  # (v_x, v_y, ω_z), (3,) [m/s, rad/s].
+    action: np.ndarray  # The last one, (n_a,).
+    phases: np.ndarray  # Of the gait clock, in [-π, π], (n_p,) [rad].
+    all_positions: np.ndarray  # Of all joints of the robot in its order, (n_j,) [rad].
     all_rates: np.ndarray
 
 
 Term = Callable[[PolicyInput], np.ndarray]
-# Names of Isaac Lab; those of the gait clock and of the parts of the command are Holosoma's.
+# Registered terms by the names of Isaac Lab; clocks and parts of the command are Holosoma's.
 TERMS: dict[str, Term] = {
     "base_lin_vel": lambda inputs: inputs.R_WB.T @ inputs.v_WB,
     "base_ang_vel": lambda inputs: inputs.R_WB.T @ inputs.w_WB,
@@ -69,7 +59,6 @@ TERMS: dict[str, Term] = {
     "cos_phase": lambda inputs: np.cos(inputs.phases),
     "gait_phase": lambda inputs: np.hstack([np.sin(inputs.phases), np.cos(inputs.phases)]),
 }
-"""Registered terms by name."""
 
 
 def observation_term(name: str) -> Callable[[Term], Term]:
@@ -118,9 +107,8 @@ class CommandLimits:
     lowest: Triple = field(default_factory=lambda: [-1.0, -1.0, -1.0])
     highest: Triple = field(default_factory=lambda: [1.0, 1.0, 1.0])
     change: Annotated[list[float], Field(min_length=3, max_length=3)] = field(
-        default_factory=lambda: [math.inf, math.inf, math.inf]
+        default_factory=lambda: 3 * [math.inf]  # Largest in one period.
     )
-    """Largest change in one period."""
 
     def __post_init__(self) -> None:
         if not np.all(np.less_equal(self.lowest, self.highest)):
@@ -138,9 +126,8 @@ class WholeHistory:
 
     def __post_init__(self) -> None:
         if sorted(self.ages) != list(range(len(self.ages))):
-            raise ValueError(
-                f"ages must name each of the newest {len(self.ages)} samples once; got {self.ages}"
-            )
+            samples = f"the newest {len(self.ages)} samples"
+            raise ValueError(f"ages must name each of {samples} once; got {self.ages}")
 
 
 @schema(kw_only=True)
@@ -184,7 +171,6 @@ class Policy:
     Attributes:
         joints: The policy's joints as indices into the robot's, (n_a,).
         default_positions: Positions of all joints of the robot at zero action, (n_j,) [rad].
-        action_scale: Joint positions per unit of action, (n_a,) [rad].
         num_inputs: Number of entries of the network's input, n_o.
     """
 
@@ -205,10 +191,8 @@ class Policy:
             names = []  # Some are observed, and not moved.
         unknown = [name for name in names if name not in joint_names]
         if unknown or len(set(names)) != len(names):
-            raise ValueError(
-                f"{who}: joints must be different joints of the robot; got {names}, of which it "
-                f"lacks {unknown}; it has {joint_names}"
-            )
+            what = f"got {names}, of which it lacks {unknown}; it has {joint_names}"
+            raise ValueError(f"{who}: joints must be different joints of the robot; {what}")
         self.joint_names = list(names)
         self.joints = np.array([joint_names.index(name) for name in names], dtype=int)
 
@@ -260,14 +244,11 @@ class Policy:
         widths, all_ages, described = [], [], []
         for term, spec in self._terms:
             width = np.asarray(term(still)).size
+            text = f"{who}: term '{spec.name}'"
             if not width:
-                raise ValueError(
-                    f"{who}: term '{spec.name}' needs a clock: state 'gait: {{period_s: ...}}' [s]"
-                )
+                raise ValueError(f"{text} needs a clock: state 'gait: {{period_s: ...}}' [s]")
             if len(spec.scale) not in (1, width):
-                raise ValueError(
-                    f"{who}: term '{spec.name}' has {width} entries; got {len(spec.scale)} scales"
-                )
+                raise ValueError(f"{text} has {width} entries; got {len(spec.scale)} scales")
             ages = parameters.history.ages or list(range(spec.history))[::-1]
             widths.append(width)
             all_ages.append(ages)

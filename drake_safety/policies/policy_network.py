@@ -31,11 +31,7 @@ _Memory = Mapping[str, np.ndarray]
 
 @dataclass(kw_only=True)
 class PolicyMetadata:
-    """What an ONNX file says of its policy as in ``policy.yaml``; empty where it says nothing.
-
-    Attributes:
-        unread: Entries that do not fit, and why.
-    """
+    """What an ONNX file says of its policy as in ``policy.yaml``; empty where it says nothing."""
 
     joints: list[str] = field(default_factory=list)
     stiffness: dict[str, float] = field(default_factory=dict)
@@ -43,7 +39,7 @@ class PolicyMetadata:
     default_positions: dict[str, float] = field(default_factory=dict)
     action_scale: dict[str, float] = field(default_factory=dict)
     observation: list[dict[str, Any]] = field(default_factory=list)
-    unread: list[str] = field(default_factory=list)
+    unread: list[str] = field(default_factory=list)  # Entries that do not fit, and why.
 
 
 # Keys of Holosoma, then of Isaac Lab and mjlab.
@@ -140,8 +136,6 @@ class PolicyNetwork:
         evaluate: Maps a batch and parts of the memory by name to the action and the new parts.
         widths: Entries of observation and action; None where the file does not say them.
         start: Parts of the memory at the start; all that may be memory until :meth:`check`.
-        shape: Shape of a batch of one observation.
-        outputs: Names and shapes of what it returns, the action first.
     """
 
     path: Path
@@ -149,9 +143,9 @@ class PolicyNetwork:
     widths: tuple[int | None, int | None]
     metadata: PolicyMetadata = field(default_factory=PolicyMetadata)
     start: _Memory = field(default_factory=dict)
-    shape: tuple[int, ...] = (1, -1)
+    shape: tuple[int, ...] = (1, -1)  # Of a batch of one observation.
     dtype: Any = np.float32
-    outputs: list[str] = field(default_factory=list)
+    outputs: list[str] = field(default_factory=list)  # Names and shapes, the action first.
 
     @property
     def initial_memory(self) -> np.ndarray:
@@ -198,25 +192,20 @@ class PolicyNetwork:
             if self.shape == (1, -1) and num_samples > 1:
                 self.shape = (1, num_samples, -1)
                 return self.check(who, num_inputs, num_outputs, terms, num_samples)
-            raise ValueError(
-                f"{who}: the network takes no observation of {num_inputs} entries ({terms}): "
-                f"{_reason(error)}"
-            ) from error
+            what = f"the network takes no observation of {num_inputs} entries ({terms})"
+            raise ValueError(f"{who}: {what}: {_reason(error)}") from error
         if action.shape != (num_outputs,) or num_acting not in (None, num_outputs):
             raise ValueError(
                 f"{who}: the network returns {action.size} actions, expected one for each of "
                 f"{num_outputs} joints; its outputs are {self.outputs}, the first the action"
             )
         if not np.isfinite(action).all():
-            raise ValueError(
-                f"{who}: the network returns {np.sum(~np.isfinite(action))} of {num_outputs} "
-                "actions that are not finite: it is damaged, or its training has diverged"
-            )
+            count = f"{np.sum(~np.isfinite(action))} of {num_outputs} actions"
+            raise ValueError(f"{who}: the network returns {count} that are not finite")
         if action.tobytes() != again.tobytes():
-            raise ValueError(
-                f"{who}: the network answers the same observation differently after another: it "
-                f"draws random numbers, or has a memory that is not read; {_SUPPORTED}"
-            )
+            what = "the network answers the same observation differently after another"
+            why = "it draws random numbers, or has a memory that is not read"
+            raise ValueError(f"{who}: {what}: {why}; {_SUPPORTED}")
 
 
 def _reason(error: Exception) -> str:
@@ -233,10 +222,8 @@ def _flat(parts: Iterable[np.ndarray]) -> np.ndarray:
 def load_network(path: Path) -> PolicyNetwork:
     """Loads a network from an ONNX (``.onnx``) or TorchScript (``.pt``, ``.jit``) file."""
     if path.suffix not in _KINDS:
-        raise ValueError(
-            f"{path}: a policy's network is one of {list(_KINDS)}; got '{path.suffix}'"
-            f"{_described(path)}"
-        )
+        known = f"one of {list(_KINDS)}; got '{path.suffix}'"
+        raise ValueError(f"{path}: a policy's network is {known}{_described(path)}")
     if not path.is_file():
         raise ValueError(f"{path}: the policy's network does not exist")
     return _load_onnx(path) if path.suffix == ".onnx" else _load_torchscript(path)
@@ -264,10 +251,8 @@ def network_files(path: Path) -> list[Path]:
     files = {name: path.parent / name for name in names}
     lost = [n for n, file in files.items() if {"/", ".."} & {*Path(n).parts} or not file.is_file()]
     if lost:
-        raise ValueError(
-            f"{path}: its weights are in {names}, as paths from its folder; there is no "
-            f"{', '.join(lost)}"
-        )
+        what = f"its weights are in {names}, as paths from its folder"
+        raise ValueError(f"{path}: {what}; there is no {', '.join(lost)}")
     return [path, *files.values()]
 
 
@@ -289,9 +274,8 @@ def _described(path: Path) -> str:
         names = {Path(name).name for name in archive.namelist()}
         if "data.pkl" in names and "constants.pkl" not in names:  # With both it is TorchScript.
             head = b"\x80"
-    is_pickle = head == b"\x80"
     text = ", but a pickle, such as a training checkpoint: export the policy as TorchScript or ONNX"
-    return text if is_pickle else ""
+    return text if head == b"\x80" else ""
 
 
 def _load_onnx(path: Path) -> PolicyNetwork:
@@ -304,9 +288,8 @@ def _load_onnx(path: Path) -> PolicyNetwork:
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
     with _reading(path, "an ONNX network"):
-        session = onnxruntime.InferenceSession(
-            str(path), options, providers=["CPUExecutionProvider"]
-        )
+        providers = ["CPUExecutionProvider"]
+        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
     inputs, outputs = session.get_inputs(), session.get_outputs()
     shapes = {value.name: _shape(value) for value in outputs}
     # Such as h_out after h_in, or hn after h0.
@@ -328,10 +311,7 @@ def _load_onnx(path: Path) -> PolicyNetwork:
     if free and (not memory or free[-1] == len(shape) - 1):
         shape[free[-1]] = -1
     num_acting = (acting[0].shape or [None])[-1]
-    widths = (
-        None if -1 in shape else math.prod(shape),
-        num_acting if isinstance(num_acting, int) else None,
-    )
+    width = None if -1 in shape else math.prod(shape)
 
     def evaluate(batch: np.ndarray, parts: _Memory) -> tuple[np.ndarray, _Memory]:
         given = {**start, **parts, name: batch}
@@ -341,7 +321,7 @@ def _load_onnx(path: Path) -> PolicyNetwork:
     return PolicyNetwork(
         path,
         evaluate,
-        widths,
+        (width, num_acting if isinstance(num_acting, int) else None),
         read_metadata(session.get_modelmeta().custom_metadata_map),
         start,
         tuple(shape),
