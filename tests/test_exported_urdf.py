@@ -32,9 +32,8 @@ def robot_of(text, folder, task="balancing", **options):
 
 def findings_of(written, *, is_imported=True):
     """What a check warns of or refuses."""
-    findings = check_scenario(
-        written.files[-1], num_episodes=0, is_imported=is_imported, check_robot=check_urdf
-    )
+    options = {"is_imported": is_imported, "check_robot": check_urdf}
+    findings = check_scenario(written.files[-1], num_episodes=0, **options)
     return {f.item: f for f in findings if f.remedy}
 
 
@@ -43,10 +42,6 @@ def obj(path, points):
     rows = [("v", *point) for point in points]
     rows += [("f", *face) for face in ConvexHull(points).simplices + 1]
     path.write_text("\n".join(" ".join(map(str, row)) for row in rows))
-
-
-def each(text, names):
-    return "".join(map(text.format, names))
 
 
 MOTOR = """<transmission name="{0}_t"><type>transmission_interface/SimpleTransmission</type>
@@ -73,7 +68,9 @@ REFUSED = {
     "by <mimic>: 'FL_calf_joint' (FL_thigh_joint). Remedy: remove": quadruped(
         {KNEE: KNEE + MIMIC.format("FL_thigh", -1, -0.2)}
     ),
-    "'FR_calf_joint' (no transmission, as others": quadruped(above=each(MOTOR, DRIVEN)),
+    "'FR_calf_joint' (no transmission, as others": quadruped(
+        above="".join(map(MOTOR.format, DRIVEN))
+    ),
     "'FL_calf_joint' (effort=\"0\")": quadruped({CALF: CALF.replace("23.7", "0")}),
     "have equal limits: 'FL_hip_joint' (0)": quadruped({STOPS: 'lower="0" upper="0"'}),
     "'FL_foot' (shank.obj); 'FR_foot' (shank.obj)": quadruped({FOOT: LOST}),
@@ -83,9 +80,7 @@ REFUSED = {
         above=joint("rod", "FL_foot", "FR_foot")
     ),
     "'arm0_joint' moves link 'arm0', which has no mass": quadruped(above=MASSLESS),
-    "link 'trunk' has a negative moment of inertia, -0.02": quadruped(
-        {'ixx="0.06"': 'ixx="-0.02"'}
-    ),
+    "'trunk' has a negative moment of inertia": quadruped({'ixx="0.06"': 'ixx="-0.02"'}),
     "'trunk' would stand 320 m high. Are the <origin>s in millimetres?": MILLIMETRES,
 }
 
@@ -115,15 +110,9 @@ def with_moments(change, names="ixx|iyy|izz"):
     [
         (biped(FOOT), "the contact points of the feet lie on a line"),
         (with_moments(lambda moment: 1e6 * moment), "17 links have inertias"),
-        (
-            with_moments(lambda value: 1e3 * value, "mass value|ixx|iyy|izz"),
-            "has 8.16e+03 kg (grams or tonnes?)",
-        ),
-        (quadruped({STOPS: 'lower="-45" upper="45"'}), "limits in degrees instead of radians?"),
-        (
-            framed("collision", 'box size="0.1 0.1 0.0"'),
-            "the collision of link 'frame' is a box of size 0.1 0.1 0.0: it is left out",
-        ),
+        (with_moments(lambda x: 1e3 * x, "mass value|ixx|iyy|izz"), "has 8.16e+03 kg (grams or"),
+        (quadruped({STOPS: 'lower="-45" upper="45"'}), "their limits in degrees?"),
+        (framed("collision", 'box size="0.1 0.1 0.0"'), "is a box of size 0.1 0.1 0.0: it is left"),
     ],
 )
 def test_what_is_odd_is_noted_at_once_and_nothing_else(text, note, tmp_path):
@@ -202,7 +191,6 @@ def test_wheels_are_named_in_the_terminal_and_in_the_files(tmp_path):
     np.testing.assert_allclose([limb.points for limb in written.legs], 0.0, atol=1e-6)
     note = f"joints {[f'{leg}_foot_joint' for leg in LEGS]} have no stops"
     assert any(note in warning for warning in written.copy.warnings)
-    assert "a wheel of the last is held by its servo" in written.files[1].read_text()
     assert "turn wheels, servos hold" in written.files[2].read_text()
     assert "wheels" in findings_of(written, is_imported=False)
 
@@ -287,12 +275,10 @@ def test_check_names_what_was_spoilt_by_hand(tmp_path):
     written = robot_of(quadruped(), tmp_path)
     text = written.files[0].read_text()
 
-    def finding(edits):
+    for edits, message in (
+        ({"0.4 0.2 0.1": "0 0.2 0.1"}, "link 'trunk' is a box of size 0 0.2 0.1"),
+        ({KNEE: KNEE + '<mimic joint="FL_thigh_joint"/>'}, "['FL_calf_joint'] follow others by"),
+    ):
         written.files[0].write_text(edited(text, edits))
-        return next(one for one in findings_of(written).values() if not one.is_ok)
-
-    assert (
-        "link 'trunk' is a box of size 0 0.2 0.1" in finding({"0.4 0.2 0.1": "0 0.2 0.1"}).message
-    )
-    leg = finding({KNEE: KNEE + '<mimic joint="FL_thigh_joint"/>'})
-    assert "['FL_calf_joint'] follow others by <mimic>" in leg.message
+        first = next(finding for finding in findings_of(written).values() if not finding.is_ok)
+        assert message in first.message

@@ -102,7 +102,7 @@ def test_collisions_of_a_hull_that_overlaps_another_link_are_off(tmp_path):
     assert "<member" not in (tmp_path / "hexapod.urdf").read_text()
     assert_nothing_overlaps(written)
     readme = (written.folder / "README.md").read_text().lower()
-    assert "which overlap or are excluded, are off" in readme
+    assert "which overlap or are excluded, never collide" in readme
 
 
 def test_new_gives_normals_to_meshes_of_visuals_and_of_links_without_one(tmp_path, caplog):

@@ -74,9 +74,9 @@ SPOILT = {
     "metres as millimetres": (lambda f: f.assign(base_z=f.base_z / 1e3), [],
                               "below the ground.*'base_position.unit' is m$"),
     "milliseconds": (lambda f: f.assign(stamp=f.stamp / 1e6), [("unit: ns", "unit: s")],
-                     r"2.5 apart, which as s is implausible: check 'time.unit'"),
+                     r"2.5 s apart, which is implausible: check 'time.unit'"),
     "goal in millimetres": (lambda f: f.assign(goal_z=1e3 * f.goal_z), [],
-                            "desired output is .* m from the base"),
+                            "desired output is .* m from the robot"),
     "a joint beyond its stop": (
         lambda f: f.assign(**{f"{JOINTS[2]}_pos": f[f"{JOINTS[2]}_pos"] + 200.0 * (f.index == 9)}),
         [], rf"line 11, column '{JOINTS[2]}_pos': joint .* far beyond its stops"),

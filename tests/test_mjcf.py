@@ -212,7 +212,7 @@ MANY = '<replicate count="3000" offset="1 0 0">{}</replicate>'
     [
         (robot(arm('type="ball"')), "body 'arm_j' has a ball joint; replace it by three hinges"),
         (robot(arm(), free='<joint type="ball"/>'), "moves in 3 of 6 .* by <freejoint/>"),
-        (robot(arm(), LOOP), "connects bodies 'arm_j' and 'base' to a loop"),
+        (robot(arm(), LOOP), "connects 'arm_j' and 'base' to a loop"),
         (robot(arm("", MANY.format(MANY.format(BALL)))), "<replicate> with .* takes"),
         (robot(more='<asset><texture width="1e6" height="1e6"/></asset>'), "<texture> with"),
     ],

@@ -21,13 +21,9 @@ VTK = (
     "# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 4 double\n"
     "0 0 0 1 0 0 0 1 0 0 0 1\nCELLS 1 5\n4 0 1 2 3\nCELL_TYPES 1\n10\n"
 )
-GLTF = json.dumps(
-    {
-        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
-        "bufferViews": [{"buffer": 0, "byteLength": 36}],
-        "buffers": [{"byteLength": 36}],
-    }
-)
+ACCESSOR = {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}
+GLTF = {"bufferViews": [{"buffer": 0, "byteLength": 36}], "buffers": [{"byteLength": 36}]}
+GLTF = json.dumps({"accessors": [ACCESSOR]} | GLTF)
 TRIANGLE = [[0, 0, 0], [2, 0, 0], [0, 1, 4]]
 
 
@@ -57,20 +53,14 @@ def loaded_quietly(copy, folder, caplog):
     return plant
 
 
-@pytest.mark.parametrize(
-    ("name", "url"),
-    [
-        ("hull", "package://bot_description/hull.obj"),
-        ("hull", "..\\hull.obj"),
-    ],
-)
-def test_a_mesh_that_drake_shows_goes_along_as_it_is(name, url, tmp_path):
+@pytest.mark.parametrize("url", ["package://bot_description/hull.obj", "..\\hull.obj"])
+def test_a_mesh_that_drake_shows_goes_along_as_it_is(url, tmp_path):
     source = tmp_path / "bot_description" / "urdf"
     source.mkdir(parents=True)
-    (source.parent / f"{name}.obj").write_text(TETRAHEDRON)
+    (source.parent / "hull.obj").write_text(TETRAHEDRON)
     copy, folder = copy_of(source, mesh("visual", url))
-    assert meshes_of(folder) == [f"meshes/{name}.obj"]
-    assert (folder / "meshes" / f"{name}.obj").read_text() == TETRAHEDRON
+    assert meshes_of(folder) == ["meshes/hull.obj"]
+    assert (folder / "meshes" / "hull.obj").read_text() == TETRAHEDRON
     assert copy.notes == []
 
 
@@ -110,9 +100,8 @@ def test_friction_and_impossible_inertias_are_corrected_and_told(tmp_path):
         '<limit effort="5" velocity="2" lower="-1" upper="1"/>'
         '<dynamics damping="0.1" friction="0.2"/></joint>'
     )
-    copy = simulatable_copy(
-        written(tmp_path, LINK.format("a", GOOD, ""), LINK.format("b", odd, ""), joint)
-    )
+    links = [LINK.format("a", GOOD, ""), LINK.format("b", odd, "")]
+    copy = simulatable_copy(written(tmp_path, *links, joint))
     assert copy.joint_friction == {"j": 0.2}
     assert [element.get("ixy") for element in copy.root.iter("inertia")] == ["0", "0"]
     assert read_drives(copy.root).efforts["j"] == 5.0
@@ -137,19 +126,13 @@ def test_what_drake_ignores_or_warns_of_is_left_out_and_other_motors_stay(tmp_pa
     )
     joint = '<joint name="{}" type="{}"><parent link="a"/><child link="{}"/>{}</joint>'
     limit = '<limit effort="5" velocity="2" lower="-1" upper="1"/>'
-    copy = simulatable_copy(
-        written(
-            tmp_path,
-            *(LINK.format(name, GOOD, "") for name in "abc"),
-            joint.format("j", "revolute", "b", limit),
-            joint.format(
-                "k", "fixed", "c", '<mimic joint="j"/><safety_controller k_velocity="1"/>'
-            ),
-            motor.format("transmission_interface/SimpleTransmission", "j", "j"),
-            motor.format("transmission_interface/SimpleTransmission", "k", "k"),
-            motor.format("transmission_interface/DifferentialTransmission", "j", "d"),
-        )
-    )
+    parts = [LINK.format(name, GOOD, "") for name in "abc"]
+    parts.append(joint.format("j", "revolute", "b", limit))
+    odd = '<mimic joint="j"/><safety_controller k_velocity="1"/>'
+    parts.append(joint.format("k", "fixed", "c", odd))
+    for kind, name, driver in (("Simple", "j", "j"), ("Simple", "k", "k"), ("Other", "j", "d")):
+        parts.append(motor.format(f"transmission_interface/{kind}Transmission", name, driver))
+    copy = simulatable_copy(written(tmp_path, *parts))
     assert [one.get("name") for one in copy.root.iter("actuator")] == ["m_j"]
     assert loaded_quietly(copy, tmp_path, caplog).num_actuators() == 1
 
@@ -188,9 +171,8 @@ def test_no_mesh_from_outside_the_description_is_copied(tmp_path, url, is_copied
         place.mkdir(parents=True, exist_ok=True)
         (place / "a.obj").write_text(TETRAHEDRON)
     (inside / "urdf" / "linked.obj").symlink_to(outside / "a.obj")
-    copy, folder = copy_of(
-        inside / "urdf", mesh("visual", url.format(inside=inside, outside=outside))
-    )
+    url = url.format(inside=inside, outside=outside)
+    copy, folder = copy_of(inside / "urdf", mesh("visual", url))
     assert [path.name for path in folder.glob("meshes/*")] == ["a.obj"] * is_copied
     if not is_copied:
         (note,) = copy.left_out

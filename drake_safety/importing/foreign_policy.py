@@ -147,7 +147,7 @@ def _from_unitree(file: _Entries, path: Path, motors: Sequence[str]) -> dict[str
     """A ``deploy.yaml``: gains are in the order of the motors, all else in the network's."""
     motor_of, network = file.indices("joint_ids_map"), _network(path, *_EXPORTED)
     count, last = len(motor_of), max(motor_of, default=0)
-    names = list(motors) or file.raw.get("joint_names") or []
+    names = motors or (file.get("joint_names", list[str]) if "joint_names" in file else [])
     for what in ("stiffness", "damping"):
         if isinstance(gains := file.get(what), list):
             file.refuse(len(gains) <= last, f"'{what}' must have an entry for each motor")
@@ -177,8 +177,8 @@ def _from_unitree(file: _Entries, path: Path, motors: Sequence[str]) -> dict[str
         "period_s": file.number("step_dt"),
         **_unitree_observation(file.inner("observations"), count),
     }
-    if "base_velocity" in (file.raw.get("commands") or {}):
-        bounds = file.inner("commands").inner("base_velocity").inner("ranges")
+    if "commands" in file and "base_velocity" in (commands := file.inner("commands")):
+        bounds = commands.inner("base_velocity").inner("ranges")
         pairs = [bounds.numbers(key, 2) for key in ("lin_vel_x", "lin_vel_y", "ang_vel_z")]
         lowest, highest = zip(*pairs, strict=True)
         converted["command"] = {"lowest": list(lowest), "highest": list(highest)}
@@ -199,9 +199,10 @@ def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
     converted: dict[str, Any] = {"observation": observation}
     for key in (key for key in terms.raw if key not in ("use_gym_history", "scale_first")):
         spec, name = terms.inner(key, _TERM_KEYS), TERM_NAMES.get(key, key)
-        params = _Entries(spec.raw.get("params") or {}, f"{spec.who} params,")
+        params = spec.inner("params") if "params" in spec else _Entries({}, spec.who)
         entry: dict[str, Any] = {"name": name, "clip": math.inf}
-        entry["history"] = max(int(spec.raw.get("history_length") or 1), 1)
+        length = spec.number("history_length") if "history_length" in spec else 1
+        entry["history"] = max(int(length), 1)
         if "scale" in spec:
             scale = spec.raw["scale"]
             size = _width(name, count) or (len(scale) if isinstance(scale, list) else 1)
@@ -220,8 +221,7 @@ def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
     if terms.raw.get("use_gym_history", False):  # Whole observations, the oldest first.
         lengths = {entry.pop("history") for entry in observation}
         terms.refuse(len(lengths) != 1, f"use_gym_history needs one history_length; got {lengths}")
-        if (length := lengths.pop()) > 1:
-            converted["history"] = {"ages": list(range(length))[::-1], "by": "time"}
+        converted["history"] = {"ages": list(range(lengths.pop()))[::-1], "by": "time"}
     return converted
 
 

@@ -29,21 +29,15 @@ _STL = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
 
 @dataclass(kw_only=True)
 class ModelFacts:
-    """What a model file says of a robot beyond a URDF, by the names of its joints and bodies.
+    """What a model file says of a robot beyond a URDF, by the names of its joints and bodies."""
 
-    Attributes:
-        gains: Stiffness and damping of position servos [N·m/rad, N·m·s/rad].
-        rotor_inertia: Inertia of the rotors as the joints feel it [kg·m²].
-        postures: Joint positions [rad] by keyframe.
-        apart: Pairs of bodies that do not collide, each in alphabetical order.
-        left_out: What is left out, a note each.
-    """
-
+    # Stiffness and damping of position servos [N·m/rad, N·m·s/rad].
     gains: dict[str, tuple[float, float]] = field(default_factory=dict)
-    rotor_inertia: dict[str, float] = field(default_factory=dict)
-    postures: dict[str, dict[str, float]] = field(default_factory=dict)
+    rotor_inertia: dict[str, float] = field(default_factory=dict)  # As the joints feel it [kg·m²].
+    postures: dict[str, dict[str, float]] = field(default_factory=dict)  # By keyframe [rad].
+    # Pairs of bodies that do not collide, each in alphabetical order.
     apart: set[tuple[str, str]] = field(default_factory=set)
-    left_out: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)  # A note each.
 
 
 def is_mjcf(path: Path) -> bool:
@@ -103,17 +97,15 @@ class _Robot:
             raise ValueError("it has no joint")
         (base, _), *others = Counter(roots.tolist()).most_common()
         self.bodies = self._names("body", np.flatnonzero(model.body_rootid == base).tolist())
-        ids, kinds = np.flatnonzero(roots == base), mujoco.mjtJoint
+        ids = np.flatnonzero(roots == base)
         is_base, num_ways = model.jnt_bodyid[ids] == base, int(model.body_dofnum[base])
         # A free joint, or as free by three slides and a ball or three hinges.
         if num_ways not in (0, 6):
-            raise ValueError(
-                f"the base '{self.bodies[base]}' moves in {num_ways} of 6 directions; replace its "
-                "joints by <freejoint/>"
-            )
+            what = f"the base '{self.bodies[base]}' moves in {num_ways} of 6 directions"
+            raise ValueError(f"{what}; replace its joints by <freejoint/>")
         self.joints = self._names("joint", ids[~is_base].tolist())
         for j in self.joints:
-            if model.jnt_type[j] == kinds.mjJNT_BALL:
+            if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL:
                 child = self.bodies[int(model.jnt_bodyid[j])]
                 raise ValueError(f"body '{child}' has a ball joint; replace it by three hinges")
         fixed = [] if num_ways else [base]
@@ -194,9 +186,7 @@ class _Robot:
                     pair = model.site_bodyid[pair].tolist()
                 if self.bodies.keys() >= set(pair):
                     one, other = (self.bodies[i] for i in pair)
-                    raise ValueError(
-                        f"a constraint connects bodies '{one}' and '{other}' to a loop"
-                    )
+                    raise ValueError(f"a constraint connects '{one}' and '{other}' to a loop")
             if kind == kinds.mjEQ_JOINT and self.joints.keys() >= set(pair):
                 self.mimics[pair[0]] = _tag("mimic", joint=self.joints[pair[1]])
             else:
@@ -287,11 +277,8 @@ class _Robot:
             X_PJ = X_PB @ RigidTransform(one.pos) @ X_AJ
             self._add_joint(joint, kind, parent, child, X_PJ, *inside)
             if j in self.efforts:
-                inside = [
-                    _tag("type", "transmission_interface/SimpleTransmission"),
-                    _tag("joint", name=joint),
-                    _tag("actuator", name=f"{joint}_motor"),
-                ]
+                kind = _tag("type", "transmission_interface/SimpleTransmission")
+                inside = [kind, _tag("joint", name=joint), _tag("actuator", name=f"{joint}_motor")]
                 self.parts.append(_tag("transmission", *inside, name=f"{joint}_transmission"))
             parent, X_PB = child, RigidTransform(-one.pos)
         if parent != name:

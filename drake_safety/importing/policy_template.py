@@ -13,26 +13,17 @@ import yaml
 from drake_safety.files.atomic import write_file
 from drake_safety.files.reading import yaml_text
 from drake_safety.importing.foreign_policy import converted_policy
+from drake_safety.policies import policy_network
 from drake_safety.policies.policy import TERMS
-from drake_safety.policies.policy_network import (
-    PolicyNetwork,
-    load_network,
-    network_files,
-    network_kinds,
-)
 from drake_safety.robots.robot_model import as_pattern
 
 
 @dataclass(kw_only=True)
 class PolicyTemplate:
-    """What the files of a policy tell.
+    """What the files of a policy tell."""
 
-    Attributes:
-        stated: Values of a file of another project, by key of ``policy.yaml``.
-    """
-
-    network: PolicyNetwork
-    stated: dict[str, Any] = field(default_factory=dict)
+    network: policy_network.PolicyNetwork
+    stated: dict[str, Any] = field(default_factory=dict)  # By key of ``policy.yaml``.
     source: str = ""
 
     @property
@@ -46,7 +37,7 @@ class PolicyTemplate:
         """Writes ``policy.yaml`` into a robot's folder, and copies the network's files there."""
         text, asked = self.yaml(robot_joints, posture)
         written = []
-        for source in network_files(self.network.path):
+        for source in policy_network.network_files(self.network.path):
             written.append(folder / source.relative_to(self.network.path.parent))
             write_file(written[-1], source.read_bytes())
         path = folder / "policy.yaml"
@@ -65,7 +56,7 @@ class PolicyTemplate:
 
         missing = [name for name in self.joints if name not in robot_joints]
         _, num_moved = self.network.widths
-        observed: list[str] = []
+        observed, what = list[str](), ""
         if missing:
             what = f"the robot's joints in the network's order; {missing} are none of them"
         elif not self.joints:
@@ -74,20 +65,15 @@ class PolicyTemplate:
             observed = self.joints
             what = f"the {num_moved} joints that it moves, in its order, of the {len(observed)} "
             what += "that it names, which joint_pos_rel and joint_vel_rel observe"
-        else:
-            what = ""
         if what:
             known.pop("joints", None)
             ask(f"joints: [{', '.join(map(yaml_text, observed or robot_joints))}]", what)
         angles = [f"{yaml_text(as_pattern(name))}: {q:g}" for name, q in posture.items() if q]
         said = vars(metadata) | {"gains": metadata.stiffness and metadata.damping} | known
         servo, units = "{.*: {stiffness: 20.0, damping: 0.5}}", "[N·m/rad, N·m·s/rad]"
+        zero = f"{{{', '.join(angles)}}}"
         for key, example, what in (
-            (
-                "default_positions",
-                f"{{{', '.join(angles)}}}",
-                "joint positions at zero action [rad]",
-            ),
+            ("default_positions", zero, "joint positions at zero action [rad]"),
             ("action_scale", "{.*: 0.25}", "joint positions per unit of action [rad]"),
             ("gains", servo, f"the servos' gains of training {units}"),
         ):
@@ -109,9 +95,8 @@ class PolicyTemplate:
                     term["joints"] = [*observed]
             unstated = [k for k in ("scale", "history") if k not in metadata.observation[0]]
             if unstated:
-                asked.append(
-                    f"{' and '.join(unstated)} of the terms of the observation; 1 is assumed"
-                )
+                what = f"{' and '.join(unstated)} of the terms of the observation"
+                asked.append(f"{what}; 1 is assumed")
         if "observation" not in known:
             width, _ = self.network.widths
             entries = "" if width is None else f", {width} entries"
@@ -148,17 +133,11 @@ class PolicyTemplate:
 def survey_policy(
     path: Path, motors: Sequence[str] = (), announce: Callable[[str], object] = lambda text: None
 ) -> PolicyTemplate:
-    """Reads what the files of a policy tell.
-
-    Args:
-        path: A network (``.onnx``, ``.pt``, ``.jit``), a ``deploy.yaml`` of unitree_rl_lab or a
-            ``config.yaml`` of rl_sar.
-        motors: Joints in the order of the robot's motors, which a ``deploy.yaml`` numbers.
-        announce: Called with what the network is, before it is loaded.
-    """
+    """Reads a network or another project's file; announces what a network is before it is run."""
     is_described = path.suffix in (".yaml", ".yml")
     converted = converted_policy(path, motors) if is_described else {}
     file = Path(converted.pop("network", path))
-    for text in network_kinds([file]):
+    for text in policy_network.network_kinds([file]):
         announce(text)
-    return PolicyTemplate(network=load_network(file), stated=converted, source=path.name)
+    network = policy_network.load_network(file)
+    return PolicyTemplate(network=network, stated=converted, source=path.name)

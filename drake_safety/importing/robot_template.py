@@ -14,21 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from drake_safety.files.reading import yaml_text
+from drake_safety.importing import urdf_survey
 from drake_safety.importing.mjcf import ModelFacts, is_mjcf, mjcf_to_urdf
 from drake_safety.importing.scenario_template import TASKS, Sizes, scenario_yaml
 from drake_safety.importing.simulatable_urdf import simulatable_copy
 from drake_safety.importing.standing_posture import standing_posture
 from drake_safety.importing.urdf_copy import UrdfCopy
-from drake_safety.importing.urdf_survey import (
-    WITHOUT_STOPS_RAD,
-    Limb,
-    Survey,
-    base_at_hips,
-    mirrored,
-    require_feet,
-    require_masses,
-    require_motors,
-)
+from drake_safety.importing.urdf_survey import WITHOUT_STOPS_RAD, Limb, Survey
 from drake_safety.robots.meshes import above
 from drake_safety.robots.plausibility import effort_unit, listed, odd_inertias, odd_limits
 from drake_safety.robots.robot_model import as_pattern, load_robot_file
@@ -45,15 +37,7 @@ _LEAST_STANCE = 0.02  # Half the stance's width, by the height.
 
 @dataclass(kw_only=True)
 class NewRobot:
-    """A robot found in a model file, and the folder that `write_robot` has written.
-
-    Attributes:
-        posture: Joint positions while it stands [rad].
-        wheels: Joints that turn wheels at the ends of legs.
-        fixed: Joints that move neither a foot nor a hand.
-        odd: Joints with efforts that no such motor has; robot.yaml estimates them.
-        asked: Values that the file lacks and the user must supply.
-    """
+    """A robot found in a model file, and the folder that `write_robot` has written."""
 
     name: str
     task: str
@@ -63,15 +47,11 @@ class NewRobot:
     survey: Survey = field(init=False)
     legs: list[Limb] = field(default_factory=list)
     arms: list[Limb] = field(default_factory=list)
-    posture: dict[str, float] = field(default_factory=dict)
+    posture: dict[str, float] = field(default_factory=dict)  # While it stands [rad].
     posture_source: str = ""
-    wheels: list[str] = field(default_factory=list)
-    fixed: list[str] = field(default_factory=list)
-    odd: set[str] = field(default_factory=set)
-    asked: list[str] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.renew_survey()
+    fixed: list[str] = field(default_factory=list)  # Joints that move no foot or hand.
+    odd: set[str] = field(default_factory=set)  # Joints with efforts that no such motor has.
+    asked: list[str] = field(default_factory=list)  # Values that the user must supply.
 
     def renew_survey(self) -> None:
         """Writes the URDF, and surveys what is written."""
@@ -168,6 +148,7 @@ def write_robot(
         copy.left_out = facts.left_out + copy.left_out
         copy.notes += [f"it is converted from '{model.name}'", *facts.left_out][urdf == model :]
         new = NewRobot(name=name, task=task, folder=Path(scratch), copy=copy, facts=facts)
+        new.renew_survey()
         _find_limbs(new, feet, hands, moved or ())
         _fix_joints(new, moved)
         _stand(new)
@@ -191,50 +172,41 @@ def _find_limbs(
 ) -> None:
     copy = new.copy
     if feet is None:
-        require_feet(new.survey, copy)
+        urdf_survey.require_feet(new.survey, copy)
     root = new.survey.base
-    pose = base_at_hips(new.survey, new.survey.legs(feet))
+    pose = urdf_survey.base_at_hips(new.survey, new.survey.legs(feet))
     if pose is not None:
         base = copy.add_root("hips", root, pose)
         copy.warn(f"the root link '{root}' is far from the hips; the base is a new link '{base}'")
         new.renew_survey()
     new.legs = new.survey.legs(feet)
-    require_motors(new.survey, new.legs, moved)
+    urdf_survey.require_motors(new.survey, new.legs, moved)
     new.arms = new.survey.arms(new.legs, hands)
     if new.task == "reaching" and not new.arms:
-        raise ValueError(
-            f"new: '{copy.source}' has no arm (a limb of four joints or more that is not a leg) to "
-            "reach with; name its end by --hands, or use --task balancing"
-        )
-    ends = [limb.joints[-1] for limb in new.legs]
-    new.wheels = [name for name in ends if np.ptp(new.survey.limits[name]) > WITHOUT_STOPS_RAD]
+        what = "no arm (a limb of four joints or more that is not a leg): name its end by --hands"
+        raise ValueError(f"new: '{copy.source}' has {what}")
 
 
 def _fix_joints(new: NewRobot, moved: Collection[str] | None) -> None:
     """Fixes what moves no foot or hand, and notes couplings, motors and wheels."""
     survey, copy, stated = new.survey, new.copy, set(moved or ())
-    mimics = copy.drives.mimics
     legged, armed = (
         {joint for limb in limbs for joint in survey.chain(limb.body)}
         for limbs in (new.legs, new.arms)
     )
     used = legged | armed | (set(survey.limits) if moved is None else stated)
-    coupled = used & set(mimics)
+    coupled = used & set(copy.drives.mimics)
     passive = copy.drives.passive(sorted(used - legged - coupled - stated))
     used -= coupled | set(passive)
-    spans = {name: high - low for name, (low, high) in survey.limits.items() if name in legged}
+    spans = {name: np.ptp(survey.limits[name]) for name in legged}
     turns = [name for name, span in spans.items() if 8 * math.pi < span <= WITHOUT_STOPS_RAD]
+    ends = [limb.joints[-1] for limb in new.legs]
+    wheels = [name for name in ends if spans[name] > WITHOUT_STOPS_RAD]
     for names, note in (
         (coupled, "follow others by <mimic> and are fixed"),
         (passive, f"have no motor and are fixed: {listed(passive)}"),
-        (
-            turns,
-            "of legs turn more than four times: are their limits in degrees instead of radians?",
-        ),
-        (
-            new.wheels,
-            "have no stops: if they turn wheels, servos hold these, so that they do not roll",
-        ),
+        (turns, "of legs turn more than four times: are their limits in degrees?"),
+        (wheels, "have no stops: if they turn wheels, servos hold these, so that none rolls"),
     ):
         if names:
             copy.warn(f"joints {sorted(names)} {note}")
@@ -255,7 +227,7 @@ def _fix_joints(new: NewRobot, moved: Collection[str] | None) -> None:
 def _stand(new: NewRobot) -> None:
     """Finds the posture, and what touches what in it."""
     copy = new.copy
-    require_masses(new.survey)
+    urdf_survey.require_masses(new.survey)
     try:
         new.posture, new.posture_source = standing_posture(new.survey, new.legs, new.facts.postures)
     except ValueError as error:
@@ -282,16 +254,13 @@ def _stand(new: NewRobot) -> None:
     copy.ignore_collisions(survey.overlaps() | new.facts.apart)
     sizes = new.sizes
     if not _LEAST_HEIGHT_M < sizes.height_m < _GREATEST_HEIGHT_M:
-        raise ValueError(
-            f"new: '{copy.source}': base '{survey.base}' would stand {sizes.height_m:.3g} m high. "
-            "Are the <origin>s in millimetres?"
-        )
+        what = f"base '{survey.base}' would stand {sizes.height_m:.3g} m high"
+        raise ValueError(f"new: '{copy.source}': {what}. Are the <origin>s in millimetres?")
     if min(sizes.half_length_m, sizes.half_width_m) < _LEAST_STANCE * sizes.height_m:
         copy.warn("the contact points of the feet lie on a line, on which no posture stands")
+    guessed = [limb.body for limb in new.legs if limb.is_guess]
     new.asked += [
-        f"where foot '{limb.body}' touches: the file has no shape there [m]"
-        for limb in new.legs
-        if limb.is_guess
+        f"where foot '{foot}' touches: the file has no shape there [m]" for foot in guessed
     ]
     if not any(survey.geometries(survey.welded(survey.base))):  # Balls are thrown at it.
         new.asked.append(f"a <collision> shape of the base '{survey.base}', in {new.name}.urdf [m]")
@@ -308,20 +277,18 @@ def _robot_yaml(new: NewRobot) -> str:
         f"urdf: {new.name}.urdf",
         f"base: {base}  # {sizes.mass_kg:.2f} kg in all, {sizes.height_m:.3f} m high [m]",
         f"posture:  # standing, {new.posture_source} [rad]",
-        *_indented(posture),
+        *(f"  {entry}" for entry in posture),
         "feet:  # contact_points are centres of spheres, in the body's frame [m]",
     ]
 
     def add(title: str, entries: list[str]) -> None:
         """Adds a block, unless it is empty."""
-        lines.extend([title, *_indented(entries)] if entries else [])
+        lines.extend([title, *(f"  {entry}" for entry in entries)] if entries else [])
 
     for limb in new.legs:
         points = [[round(float(value), 5) for value in point] for point in limb.points]
         about = [f"contact_points: {points}", f"radius_m: {float(f'{limb.radius_m:.5g}')}"]
         lines += _limb_lines(limb, about, "  # ASK its contact points [m]" * limb.is_guess)
-        if limb.joints[-1] in new.wheels:
-            lines[-1] += "  # a wheel of the last is held by its servo"
     lines += ["reaching_frames:"] * bool(new.arms)
     for limb in new.arms:
         about = [
@@ -340,17 +307,16 @@ def _robot_yaml(new: NewRobot) -> str:
         origin = f"  # of {source}" if name in facts.gains else ""
         gains.append(f"{key}: {{stiffness: {stiffness:.4g}, damping: {damping:.4g}}}{origin}")
     note = "ASK the maker's; these grow with mass times height " if guessed else ""
-    lines += [f"joint_gains:  # {note}[N·m/rad, N·m·s/rad]", *_indented(gains)]
+    add(f"joint_gains:  # {note}[N·m/rad, N·m·s/rad]", gains)
     if guessed:
         which = f" of {len(guessed)} joints" if len(guessed) < len(keys) else ""
-        new.asked.append(
-            f"the maker's servo gains{which} [N·m/rad, N·m·s/rad]; estimated from mass and height"
-        )
+        units = "[N·m/rad, N·m·s/rad]"
+        new.asked.append(f"the maker's servo gains{which} {units}; estimated from mass and height")
     rotors = [f"{keys[j]}: {facts.rotor_inertia[j]:.4g}" for j in names if j in facts.rotor_inertia]
     add(f"rotor_inertia:  # of {source} [kg·m²]", rotors)
     survey, efforts = new.survey, []
     indices = survey.plant.GetJointActuatorIndices(survey.instance)
-    motors = [*map(survey.plant.get_joint_actuator, indices)]
+    motors = map(survey.plant.get_joint_actuator, indices)
     driven = {motor.joint().name() for motor in motors if math.isfinite(motor.effort_limit())}
     for name in (name for name in names if name not in driven - new.odd):
         stated = limit = new.copy.drives.efforts[name]
@@ -364,22 +330,18 @@ def _robot_yaml(new: NewRobot) -> str:
     add("effort_limits:  # where the file has no motor, or no plausible limit [N·m, N]", efforts)
     lines.append("foot_friction: 0.6  # ASK Coulomb's coefficient of feet on your ground [1]")
     new.asked.append("the friction of feet on your ground [1]; 0.6 is assumed")
-    partners = {keys[name]: other.replace("\\", r"\\") for name, other in mirrored(names).items()}
+    pairs = urdf_survey.mirrored(names).items()
+    partners = {keys[name]: other.replace("\\", r"\\") for name, other in pairs}
     add("mirror:", [f"{key}: {yaml_text(other)}" for key, other in partners.items()])
     if bare := new.copy.bare_links:
         lines.append("without_collision:  # ASK shapes in place of these links' lost meshes [m]")
         lines += [f"  - {yaml_text(link)}" for link in bare]
-        new.asked.append(
-            f"collision shapes of the {len(bare)} links under 'without_collision' in robot.yaml [m]"
-        )
+        links = f"{len(bare)} links under 'without_collision' in robot.yaml"
+        new.asked.append(f"collision shapes of the {links} [m]")
     lines += ["whole_body:", f"  orientation: {{{base}: {{weight: 20.0}}}}"]
     if new.task == "balancing" and len(new.legs) > 2:
         lines.append("  posture: {weight: 0.001}")
     return "\n".join(lines) + "\n"
-
-
-def _indented(entries: list[str]) -> list[str]:
-    return [f"  {entry}" for entry in entries]
 
 
 def _limb_lines(limb: Limb, about: list[str], note: str = "") -> list[str]:

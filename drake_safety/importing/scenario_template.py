@@ -11,31 +11,20 @@ from drake_safety.robots.robot_size import BALANCING_REFERENCE, RobotSize
 
 @dataclass(frozen=True, kw_only=True)
 class Sizes(RobotSize):
-    """Sizes of a standing robot, as far as scenarios need them.
+    """Sizes of a standing robot, as far as scenarios need them."""
 
-    Attributes:
-        lateral_m: Smallest distance of a foot from the midline.
-        reach_m: Length of an arm; 0 without arms.
-        shoulder_m: First joint of that arm, relative to the feet's centroid on the ground, (3,).
-        arm_joints: First joint of every arm.
-        joint_friction_nm: Median dry friction of the joints; None if the URDF has none.
-    """
-
-    lateral_m: float
-    reach_m: float
-    shoulder_m: list[float]
+    lateral_m: float  # Smallest distance of a foot from the midline.
+    reach_m: float  # Length of an arm; 0 without arms.
+    shoulder_m: list[float]  # Its first joint from the feet's centroid on the ground, (3,).
     base: str
-    arm_joints: list[str]
-    joint_friction_nm: float | None = None
+    arm_joints: list[str]  # First joint of every arm.
+    joint_friction_nm: float | None = None  # Median; None if the URDF has none.
 
 
 def scenario_yaml(task: str, sizes: Sizes) -> str:
     """Writes the scenario of a task as commented YAML."""
-    on_alarm = (
-        'on_alarm: unknown  # DECIDED an alarm of the monitor makes every belief "don\'t know"; '
-        "report: only says so\n"
-    )
-    return TASKS[task](sizes) + on_alarm
+    what = 'an alarm of the monitor makes every belief "don\'t know"; report: only says so'
+    return TASKS[task](sizes) + f"on_alarm: unknown  # DECIDED {what}\n"
 
 
 def _numbers(values: Sequence[float]) -> str:

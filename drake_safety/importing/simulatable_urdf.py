@@ -16,25 +16,8 @@ import numpy as np
 
 from drake_safety.extras import MissingExtraError
 from drake_safety.importing.urdf_copy import UrdfCopy, pose_of
-from drake_safety.robots.meshes import (
-    SHOWN_FORMATS,
-    check_meshes,
-    convex_hull,
-    mesh_points,
-    shown_mesh,
-)
+from drake_safety.robots import meshes, urdf
 from drake_safety.robots.model_files import model_file
-from drake_safety.robots.urdf import (
-    as_number,
-    empty_shapes,
-    joint_elements,
-    number,
-    read_urdf,
-    remove,
-    remove_fixed_mimics,
-    replace_visual_meshes,
-    shape_meshes,
-)
 
 if TYPE_CHECKING:
     import trimesh
@@ -53,18 +36,14 @@ _NOISE = 1e-12  # Of moments of inertia that should be zero [kg·m²].
 
 
 def simulatable_copy(path: Path) -> UrdfCopy:
-    """Reads a URDF, replaces what Drake rejects, and collects its meshes.
-
-    Of meshes that Drake does not read, visual ones are converted to glTF and collision ones become
-    convex hulls, see :mod:`~drake_safety.robots.meshes`; what cannot be read is left out.
-    """
-    copy = UrdfCopy(source=path, root=read_urdf(path))
-    remove_fixed_mimics(copy.root)
+    """Reads a URDF, replaces what Drake rejects, and collects and converts its meshes."""
+    copy = UrdfCopy(source=path, root=urdf.read_urdf(path))
+    urdf.remove_fixed_mimics(copy.root)
     for place, tag in _IGNORED:
         for element in copy.root.findall(place):
-            remove(element, tag)
+            urdf.remove(element, tag)
     copy.drop_world()
-    for link, shape, words in empty_shapes(copy.root):
+    for link, shape, words in urdf.empty_shapes(copy.root):
         link.remove(shape)
         copy.warn(f"{words}: it is left out")
     _simplify_joints(copy)
@@ -77,16 +56,16 @@ def simulatable_copy(path: Path) -> UrdfCopy:
 def _simplify_joints(copy: UrdfCopy) -> None:
     """Removes speed limits of zero, dry friction, and transmissions that Drake ignores."""
     fixed = set()
-    for joint in joint_elements(copy.root):
+    for joint in urdf.joint_elements(copy.root):
         name, limit, dynamics = joint.get("name", ""), joint.find("limit"), joint.find("dynamics")
         if joint.get("type") == "fixed":
             fixed.add(name)
-        elif limit is not None and number(limit, "velocity") == 0:
+        elif limit is not None and urdf.number(limit, "velocity") == 0:
             del limit.attrib["velocity"]  # At which no joint would move.
             copy.warn(f"velocity=\"0\" of joint '{name}' is read as no limit")
         friction = None if dynamics is None else dynamics.attrib.pop("friction", None)
-        if as_number(friction) > 0:
-            copy.joint_friction[name] = as_number(friction)
+        if urdf.as_number(friction) > 0:
+            copy.joint_friction[name] = urdf.as_number(friction)
     for transmission in copy.root.findall("transmission"):
         kind, driven = transmission.findtext("type", "").strip(), transmission.find("joint")
         is_simple = kind.rpartition("/")[2] == "SimpleTransmission"
@@ -99,20 +78,20 @@ def _simplify_joints(copy: UrdfCopy) -> None:
 def _fix_inertias(copy: UrdfCopy) -> None:
     """Corrects impossible inertias, and removes those of bodies without mass."""
     for link in copy.root.iter("link"):
-        inertia, mass = link.find("inertial/inertia"), number(link.find("inertial/mass"), "value")
+        inertia = link.find("inertial/inertia")
+        mass = urdf.number(link.find("inertial/mass"), "value")
         if inertia is None:
             continue
         if not mass > 0:
-            remove(link, "inertial")
+            urdf.remove(link, "inertial")
             continue
         name, moments = link.get("name"), np.zeros((3, 3))
-        moments[_ROWS, _COLUMNS] = np.nan_to_num([number(inertia, key) for key in _MOMENTS])
+        moments[_ROWS, _COLUMNS] = np.nan_to_num([urdf.number(inertia, key) for key in _MOMENTS])
         moments[_COLUMNS, _ROWS] = moments[_ROWS, _COLUMNS]
         values, diagonal = np.linalg.eigvalsh(moments), moments.diagonal().copy()
         if (lowest := diagonal.min()) < -max(_ROUNDING * values[2], _NOISE):
-            raise ValueError(
-                f"new: '{copy.source}': link '{name}' has a negative moment of inertia, {lowest:g}"
-            )
+            what = f"link '{name}' has a negative moment of inertia, {lowest:g}"
+            raise ValueError(f"new: '{copy.source}': {what}")
         is_singular = values[0] < _ROUNDING * values[2] and np.triu(moments, 1).any()
         # Flat and thin bodies are allowed.
         if not is_singular and values[2] <= (1 + _ROUNDING) * (values[0] + values[1]):
@@ -123,10 +102,8 @@ def _fix_inertias(copy: UrdfCopy) -> None:
         diagonal[largest] = min(diagonal[largest], most)
         for key, value in zip(_MOMENTS, np.diag(diagonal)[_ROWS, _COLUMNS], strict=True):
             inertia.set(key, f"{value:.9g}")
-        copy.notes.append(
-            f"link '{name}' has an impossible inertia; its products of inertia are set to zero, "
-            "its largest moment is at most the sum of the others"
-        )
+        what = "products are set to zero, its largest moment is at most the sum of the others"
+        copy.notes.append(f"link '{name}' has an impossible inertia; its {what}")
 
 
 def _name_materials(copy: UrdfCopy) -> None:
@@ -162,11 +139,10 @@ def _gather_meshes(copy: UrdfCopy) -> None:
         try:
             if (file := _mesh_file(url, copy.source)) is not None:
                 name = file.name
-                check_meshes(file)
+                meshes.check_meshes(file)
                 return convert(file)
         except MissingExtraError as error:
-            why = "Drake does not read are left out, until you "
-            why += f"`pip install '{error.needs}'` and write the folder again"
+            why = f"Drake does not read are left out, until you `pip install '{error.needs}'`"
         except ValueError as error:
             why = "cannot be read are left out"
             name = str(error) if name in str(error) else f"{name}: {error}"
@@ -174,25 +150,25 @@ def _gather_meshes(copy: UrdfCopy) -> None:
         return ""
 
     def shown(file: Path, rgba: str = "") -> str:
-        mesh = shown_mesh(file, rgba)
+        mesh = meshes.shown_mesh(file, rgba)
         if mesh == file:
             return added(file, file.name)
         done.setdefault("visual meshes are converted to glTF", []).append(file.name)
         return added(mesh, f"{file.stem}.gltf")
 
-    replace_visual_meshes(
+    urdf.replace_visual_meshes(
         copy.root, lambda url, rgba: converted("visual", url, partial(shown, rgba=rgba))
     )
     hulls: dict[str, list[trimesh.Trimesh]] = {}
-    for link, shape, mesh in shape_meshes(copy.root, "collision"):
+    for link, shape, mesh in urdf.shape_meshes(copy.root, "collision"):
         name, url = link.get("name", ""), mesh.get("filename", "")
 
         def touched(file: Path, link: str = name, shape: ET.Element = shape) -> str:
-            if file.suffix.lower() in SHOWN_FORMATS:
+            if file.suffix.lower() in meshes.SHOWN_FORMATS:
                 return added(file, file.name)
             scale = shape.find("geometry/mesh").get("scale", "1 1 1")  # type: ignore[union-attr]
-            points = mesh_points(file) * [*map(float, scale.split())]
-            hulls.setdefault(link, []).append(convex_hull((pose_of(shape) @ points.T).T))
+            points = meshes.mesh_points(file) * [*map(float, scale.split())]
+            hulls.setdefault(link, []).append(meshes.convex_hull((pose_of(shape) @ points.T).T))
             what = "collision meshes that Drake does not read are replaced by convex hulls"
             done.setdefault(what, []).append(file.name)
             return "hull"
@@ -218,15 +194,11 @@ def _gather_meshes(copy: UrdfCopy) -> None:
 
 
 def _counted(names: dict[str, list[str]]) -> list[str]:
-    return [f"{what}: {', '.join(dict.fromkeys(meshes))}" for what, meshes in names.items()]
+    return [f"{what}: {', '.join(dict.fromkeys(files))}" for what, files in names.items()]
 
 
 def _mesh_file(url: str, source: Path) -> Path | None:
-    """The file of a mesh beside a URDF, in a ROS package around it, or in an installed one.
-
-    Raises:
-        ValueError: It lies outside these folders.
-    """
+    """The file of a mesh beside a URDF, in a ROS package around it, or in an installed one."""
     scheme, _, rest = url.rpartition("://")
     rest = unquote(rest.replace("\\", "/"))
     folder = source.resolve().parent

@@ -53,10 +53,9 @@ def _stands(survey: Survey, legs: list[Limb], posture: dict[str, float]) -> bool
 def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]:
     """Solves for joint positions by name [rad] in which the robot can stand.
 
-    Every foot is level and under its hip, the joint where the long links begin; legs that spread
-    at zero, as a spider's, keep half of their spread. Of several solutions for a leg, the one with
-    small angles and a knee that bends backwards (bipeds: forwards, spread legs: upwards) is taken.
-    If the centre of mass is not amid the feet, all feet are moved under it.
+    Every foot is level and under its hip, or at half the spread of a leg such as a spider's. Of a
+    leg's solutions, one of small angles whose knee bends backwards (bipeds: forwards, spread legs:
+    upwards) is taken. If the centre of mass is not amid the feet, all are moved under it.
     """
     survey.set_joints({})
     solvers = [_Leg(survey, leg, len(legs)) for leg in legs]
@@ -92,10 +91,8 @@ def _solved(survey: Survey, solvers: list[_Leg]) -> dict[str, float]:
         else:
             survey.set_joints(solved)
             return {name: round(value, 4) for name, value in survey.posture().items()}
-    raise ValueError(
-        f"no standing posture found: the feet {sorted(out_of_reach)} cannot reach the ground under "
-        "their hips within their joints' stops. Are these all feet (--feet)?"
-    )
+    what = f"the feet {sorted(out_of_reach)} cannot reach the ground under their hips"
+    raise ValueError(f"no standing posture found: {what}. Are these all feet (--feet)?")
 
 
 class _Leg:

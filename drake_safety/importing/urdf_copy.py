@@ -25,17 +25,12 @@ _MOVABLE = ("revolute", "continuous", "prismatic", "screw")
 
 @dataclass(frozen=True, kw_only=True)
 class JointDrives:
-    """Drives of the joints of a URDF.
+    """Drives of the joints of a URDF."""
 
-    Attributes:
-        mimics: The joint that a coupled one follows.
-        listed: Joints with a transmission (ROS 1) or a command interface (``<ros2_control>``).
-        efforts: Effort limits [N·m]; NaN without one.
-    """
-
-    mimics: dict[str, str] = field(default_factory=dict)
+    mimics: dict[str, str] = field(default_factory=dict)  # The joint that a coupled one follows.
+    # Joints with a transmission (ROS 1) or a command interface (``<ros2_control>``).
     listed: set[str] = field(default_factory=set)
-    efforts: dict[str, float] = field(default_factory=dict)
+    efforts: dict[str, float] = field(default_factory=dict)  # Limits [N·m]; NaN without one.
 
     def passive(self, names: Collection[str]) -> dict[str, str]:
         """Returns the joints of some that have no motor, and the evidence."""
@@ -50,29 +45,19 @@ class JointDrives:
 
 @dataclass(kw_only=True)
 class UrdfCopy:
-    """An editable copy of a URDF file.
-
-    Attributes:
-        notes: Descriptions of the changes, one sentence each.
-        warnings: Notes that the user should see at once.
-        left_out: Notes about meshes that were removed.
-        mesh_urls: Collision meshes of the file by link.
-        lost_links: Links of collision meshes that were removed.
-        joint_friction: Removed dry friction by joint [N·m].
-        meshes: Original files by name relative to the copy.
-        hulls: Convex hulls in place of collision meshes, by link, in its frame [m].
-    """
+    """An editable copy of a URDF file."""
 
     source: Path
     root: ET.Element
     drives: JointDrives = field(init=False)
-    notes: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
-    mesh_urls: dict[str, list[str]] = field(default_factory=dict)
-    lost_links: set[str] = field(default_factory=set)
-    joint_friction: dict[str, float] = field(default_factory=dict)
-    meshes: dict[str, Path] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)  # The changes, one sentence each.
+    warnings: list[str] = field(default_factory=list)  # Notes that the user should see at once.
+    left_out: list[str] = field(default_factory=list)  # Notes about meshes that were removed.
+    mesh_urls: dict[str, list[str]] = field(default_factory=dict)  # Collision meshes by link.
+    lost_links: set[str] = field(default_factory=set)  # Of collision meshes that were removed.
+    joint_friction: dict[str, float] = field(default_factory=dict)  # Removed, by joint [N·m].
+    meshes: dict[str, Path] = field(default_factory=dict)  # Files by name relative to the copy.
+    # Convex hulls in place of collision meshes, by link, in its frame [m].
     hulls: dict[str, list[trimesh.Trimesh]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -173,7 +158,7 @@ class UrdfCopy:
                 ET.SubElement(group, f"{drake}member", link=link)
             ET.SubElement(group, f"{drake}ignored_collision_filter_group", name=name)
             self.notes.append(
-                f"collisions of links '{one}' and '{other}', which overlap or are excluded, are off"
+                f"'{one}' and '{other}', which overlap or are excluded, never collide"
             )
 
     def write(self, path: Path) -> None:
@@ -221,10 +206,9 @@ def read_drives(root: ET.Element) -> JointDrives:
     joints = {joint.get("name", ""): joint for joint in movable}
     motors = "transmission//joint", "ros2_control/joint[command_interface]"
     mimics = {name: joint.find("mimic") for name, joint in joints.items()}
+    followed = ((name, mimic) for name, mimic in mimics.items() if mimic is not None)
     return JointDrives(
-        mimics={
-            name: mimic.get("joint", "") for name, mimic in mimics.items() if mimic is not None
-        },
+        mimics={name: mimic.get("joint", "") for name, mimic in followed},
         listed={joint.get("name", "") for place in motors for joint in root.findall(place)},
         efforts={name: number(joint.find("limit"), "effort") for name, joint in joints.items()},
     )

@@ -79,9 +79,7 @@ class Survey:
         self.bodies = [body.name() for body in bodies]
         floating = [body.name() for body in bodies if body.is_floating_base_body()]
         if len(floating) != 1:
-            raise ValueError(
-                f"'{self.source}' must have exactly one floating body, its base; got {floating}"
-            )
+            raise ValueError(f"'{self.source}' must have one floating body; got {floating}")
         (self.base,) = floating
         joints = [plant.get_joint(i) for i in plant.GetJointIndices(self.instance)]
         if odd := [j.name() for j in joints if 1 < j.num_velocities() < 6]:
@@ -89,16 +87,14 @@ class Survey:
         self._above = {joint.child_body().name(): joint for joint in joints}
         single = (joint for joint in joints if joint.num_velocities() == 1)
         self.joints: list[Joint] = sorted(single, key=lambda joint: joint.position_start())
-        self.limits = {
-            joint.name(): (*joint.position_lower_limits(), *joint.position_upper_limits())
-            for joint in self.joints
-        }
         self._index = {joint.name(): joint.position_start() for joint in self.joints}
-        self._neutral = {}
-        for name, (low, high) in self.limits.items():
+        self.limits, self._neutral = dict[str, tuple[float, float]](), dict[str, float]()
+        for joint in self.joints:
+            (low,), (high,) = joint.position_lower_limits(), joint.position_upper_limits()
+            self.limits[joint.name()] = low, high
             # The position nearest to zero that is not beyond a stop, nor at one unless zero is.
             room = 0.0 if low <= 0.0 <= high else min(_STOP_RAD, 0.1 * (high - low))
-            self._neutral[name] = float(np.clip(0.0, low + room, high - room))
+            self._neutral[joint.name()] = float(np.clip(0.0, low + room, high - room))
         self.set_joints({})
         self.total_mass = plant.CalcTotalMass(self.context, [self.instance])
 
@@ -177,10 +173,8 @@ class Survey:
             moved = (group for group in groups if len(self.chain(group[0])) >= 2)
             groups = [group for group in moved if self.lowest(group) <= highest]
         if len(groups) < 2:
-            raise ValueError(
-                f"found {len(groups)} feet, expected at least 2: name the links that touch the "
-                f"ground by --feet; limbs end in {ends}"
-            )
+            what = f"found {len(groups)} feet, expected at least 2: name them by --feet"
+            raise ValueError(f"{what}; limbs end in {ends}")
         limbs = [self._leg(group) for group in groups]
         shared = set.intersection(*(set(limb.joints) for limb in limbs))
         for limb in limbs:
@@ -190,12 +184,9 @@ class Survey:
         return [limbs[i] for i in np.lexsort([[y for _, y, _ in places], [-p[0] for p in places]])]
 
     def arms(self, legs: list[Limb], named: list[str] | None = None) -> list[Limb]:
-        """Returns other limbs that end in named links, by default those of four joints or more.
-
-        A hand's fingers are no limbs.
-        """
+        """Returns other limbs that end in named links, by default those of four joints or more."""
         feet = {limb.body for limb in legs}
-        # Ends of limbs by their first four joints: chains and bodies.
+        # Ends of limbs by their first four joints: chains and bodies. Fingers are no limbs.
         hands: dict[tuple[str, ...], list[tuple[list[str], str]]] = {}
         for group in self._groups(named):
             chain = self.chain(group[0])
@@ -260,19 +251,15 @@ class Survey:
             body = max(group, key=lambda name: ("foot" in name.lower(), group.index(name)))
             return Limb(body=body, joints=joints)
         # A sphere of the URDF's rather than what is hardly lower, such as the shank at its height.
-        foot = min(shapes, key=lambda one: one.lowest_m - (_LEVEL_M if one.is_sphere else 0.0))
+        foot = min(shapes, key=lambda shape: shape.lowest_m - _LEVEL_M * shape.is_sphere)
         # A sole may be several shapes.
         level_m = foot.lowest_m + _FLAT_M
         if foot.is_sphere:
             level_m = min(shape.lowest_m for shape in shapes) + _LEVEL_M
-        alike = (
-            shape.centers
-            for shape in shapes
-            if (shape.body, shape.is_sphere) == (foot.body, foot.is_sphere)
-            and abs(shape.radius_m - foot.radius_m) < 1e-6
-            and shape.lowest_m < level_m
-        )
-        centers = np.concatenate([*alike])
+        low = [shape for shape in shapes if shape.lowest_m < level_m]
+        alike = [s for s in low if (s.body, s.is_sphere) == (foot.body, foot.is_sphere)]
+        alike = [shape for shape in alike if abs(shape.radius_m - foot.radius_m) < 1e-6]
+        centers = np.concatenate([shape.centers for shape in alike])
         centers = centers[centers[:, 2] < centers[:, 2].min() + _LEVEL_M + foot.radius_m]
         return Limb(
             body=foot.body,
@@ -316,9 +303,8 @@ def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]
         point[axis] = math.copysign(half[axis] - min(radius, half[axis]), down[axis])
         return (X_WG @ point)[None], radius
     # A thin sole's spheres rise above it.
-    inner = np.where(
-        np.arange(3) == axis, half - _CORNER_RADIUS_M, np.maximum(half - _CORNER_RADIUS_M, 0.0)
-    )
+    inner = half - _CORNER_RADIUS_M
+    inner = np.where(np.arange(3) == axis, inner, np.maximum(inner, 0.0))
     signs = np.array(np.meshgrid(*3 * [[-1, 1]])).reshape(3, -1).T
     signs = signs[signs[:, axis] * down[axis] > 0]
     return (X_WG @ (signs * inner).T).T, _CORNER_RADIUS_M
@@ -340,11 +326,9 @@ def require_feet(survey: Survey, copy: UrdfCopy) -> None:
         and (survey.pose(name).translation()[2] < z - 0.25 * floor or not shaped & set(group))
     ]
     if lost:
-        raise ValueError(
-            f"new: '{survey.source}': collision meshes at the ends of limbs were not found or not "
-            f"read, so that the feet cannot be told: {'; '.join(lost)}. Put them where the URDF "
-            f"says, or name the feet by --feet. {'. '.join(copy.left_out)}"
-        )
+        what = f"no collision meshes at the ends of limbs: {'; '.join(lost)}"
+        remedy = "put them where the URDF says, or name the feet by --feet"
+        raise ValueError(f"new: '{survey.source}': {what}; {remedy}. {'. '.join(copy.left_out)}")
 
 
 def require_motors(survey: Survey, legs: list[Limb], moved: Collection[str]) -> None:
@@ -362,8 +346,8 @@ def require_motors(survey: Survey, legs: list[Limb], moved: Collection[str]) -> 
     ):
         if names:
             raise ValueError(
-                f"new: '{survey.source}': a robot that stands by servos needs a motor on every "
-                f"joint of its legs, but some {what}: {listed(names)}. Remedy: {remedy}"
+                f"new: '{survey.source}': every joint of a leg needs a motor, but some {what}: "
+                f"{listed(names)}. Remedy: {remedy}"
             )
 
 
@@ -372,10 +356,8 @@ def require_masses(survey: Survey) -> None:
     M = survey.plant.CalcMassMatrix(survey.context)
     for joint in survey.joints:
         if M[joint.velocity_start(), joint.velocity_start()] < _LEAST_INERTIA:
-            raise ValueError(
-                f"new: '{survey.source}': joint '{joint.name()}' moves link "
-                f"'{joint.child_body().name()}', which has no mass or inertia about its axis"
-            )
+            what = f"joint '{joint.name()}' moves link '{joint.child_body().name()}'"
+            raise ValueError(f"new: '{survey.source}': {what}, which has no mass or inertia")
 
 
 def base_at_hips(survey: Survey, legs: list[Limb]) -> RigidTransform | None:

@@ -165,7 +165,7 @@ def _check_start(source: Source, kinematics: RobotKinematics) -> None:
     if best := _stillest([pose for pose in poses if "joint" not in pose.what], 1):
         likely.append(best.what)
     if not likely:
-        likely = [pose.what for pose in (_stillest(poses, 1),) if pose]
+        likely = [best.what] if (best := _stillest(poses, 1)) else []
         q = source.positions(source.at_s[:1])[0]
         height = _lowest_foot(kinematics, q)
         q[6] -= height

@@ -82,10 +82,8 @@ def quantities(
         channel = replace(channel, frame=channel.frame[columns])
         # Velocities that are 0 or missing in every row were never filled in.
         if name in VELOCITIES and not channel.frame.fillna(0.0).any(axis=None):
-            notes.append(
-                f"{_start_of(name, channel)} is 0 or missing in every row: the derivative of "
-                f"'{VELOCITIES[name]}' is used"
-            )
+            what = f"0 or missing in every row: the derivative of '{VELOCITIES[name]}' is used"
+            notes.append(f"{_start_of(name, channel)} is {what}")
             log_map = replace(log_map, **{name: type(part)()})
         else:
             own[name] = channel
@@ -96,20 +94,16 @@ def quantities(
         if share < _SPARSE:  # The values are of several sources.
             own |= {name: _present(part, log_map.max_gap_s) for name, part in used.items()}
             rows = f"the messages of topic '{topic}'" if topic else "the rows"
-            notes.append(
-                f"log '{channel.path}': {share:.0%} of {rows} have every value: each "
-                "quantity is read at its own rows and resampled"
-            )
+            what = "each quantity is read at its own rows and resampled"
+            notes.append(f"log '{channel.path}': {share:.0%} of {rows} have every value: {what}")
     for name, channel in own.items():
         if name in COMMANDS:
             own[name] = _held(channel, own["base_position"], log_map.max_gap_s)
             continue
         own[name], number = _without_holds(channel)
         if number > 1:
-            notes.append(
-                f"{_start_of(name, channel)} changes only at every {number:.3g}th row: the rows "
-                "that repeat it are left out"
-            )
+            what = f"changes only at every {number:.3g}th row: the others are left out"
+            notes.append(f"{_start_of(name, channel)} {what}")
         if name == "base_orientation":  # Zero quaternions are those before an estimator starts.
             frame = own[name].frame
             own[name] = replace(own[name], frame=frame.where(frame.any(axis=1)))

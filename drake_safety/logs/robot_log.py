@@ -75,7 +75,6 @@ class LogPieces:
 
     pieces: list[RobotLog]
     duration_s: float  # Of the whole log.
-    row_share: float  # Of its rows that have a time of their own.
     lost: list[str]  # What was cut or left out, and where.
     notes: list[str]  # What was resampled, or is a derivative.
 
@@ -86,8 +85,8 @@ class LogPieces:
 
     @property
     def kept_share(self) -> float:
-        """Share of the log's rows that was kept, if they are evenly spaced."""
-        return self.row_share * sum(one.duration_s for one in self.pieces) / self.duration_s
+        """Share of the log's duration that was kept."""
+        return sum(piece.duration_s for piece in self.pieces) / self.duration_s
 
     def summary(self) -> str:
         """How much of the log is kept, and the first cuts; "" if it is read as it is."""
@@ -119,14 +118,12 @@ def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> Lo
         known = f"{list(FORMATS)} and the folder of a ROS 2 bag"
         raise ValueError(f"log '{path}' has the suffix '{suffix}'; known are {known}")
     topics = _READERS[suffix](path, _wanted(log_map, kinematics), log_map.time)
-    lost, row_share, restarts = list[str](), 1.0, dict[str, float]()
+    lost, restarts = list[str](), dict[str, float]()
     for topic, channel in topics.items():
         if len(topics) == 1:  # Else all topics would have to begin anew together.
             channel, restarts = continued(channel, log_map.max_gap_s)
         topics[topic], joined = in_order(channel, log_map.max_gap_s)
         lost += joined
-        if joined:
-            row_share = min(row_share, len(topics[topic].time) / len(channel.time))
     origin = min((channel.time[0] for channel in topics.values() if len(channel.time)), default=0)
     topics = {topic: replace(channel, origin=origin) for topic, channel in topics.items()}
     channels, log_map, notes = quantities(topics, log_map, joints)
@@ -162,9 +159,7 @@ def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> Lo
         for i, source in enumerate(sources)
     ]
     duration_s = end - begin - 2 * log_map.max_gap_s * len(restarts)
-    return LogPieces(
-        pieces=pieces, duration_s=duration_s, row_share=row_share, lost=lost, notes=notes
-    )
+    return LogPieces(pieces=pieces, duration_s=duration_s, lost=lost, notes=notes)
 
 
 def read_log(path: str | Path, map_file: str | Path, robot: RobotModel) -> RobotLog:

@@ -210,12 +210,11 @@ class Policy:
 
         positions = by_joint("default_positions", joint_names)
         scales, damping = by_joint("action_scale", names), by_joint("damping", names)
-        servos = {
-            name: JointGains(stiffness=stiffness, damping=damping[name])
-            for name, stiffness in by_joint("stiffness", names).items()
-            if name in damping
-        }
-        self.gains: dict[str, JointGains] = servos | by_joint("gains", names)
+        self.gains: dict[str, JointGains] = {}
+        for name, stiffness in by_joint("stiffness", names).items():
+            if name in damping:
+                self.gains[name] = JointGains(stiffness=stiffness, damping=damping[name])
+        self.gains |= by_joint("gains", names)
         missing = []
         if not names:
             count = f", {num_moved} that it moves" if num_moved else ""
@@ -234,9 +233,8 @@ class Policy:
         self.default_positions = np.array([positions.get(name, 0.0) for name in joint_names])
         self.action_scale = np.array([scales[name] for name in names])
         gait = parameters.gait
-        self.initial_phases = (
-            _wrapped(2 * math.pi * np.array(gait.offsets)) if gait.period_s else np.zeros(0)
-        )
+        offsets = np.array(gait.offsets if gait.period_s else [], dtype=float)
+        self.initial_phases = _wrapped(2 * math.pi * offsets)
         self._terms = [(_term(spec, joint_names, who), spec) for spec in parameters.observation]
         q = np.concatenate([np.eye(1, NUM_BASE_POSITIONS)[0], self.default_positions])
         v = np.zeros(NUM_BASE_VELOCITIES + len(joint_names))

@@ -299,10 +299,8 @@ def _load_onnx(path: Path) -> PolicyNetwork:
     observed = [value for value in inputs if value.name not in after]
     acting = [value for value in outputs if value.name not in after.values()]
     if len(observed) != 1 or not acting:
-        raise ValueError(
-            f"{path}: got inputs {[f'{value.name} {value.shape}' for value in inputs]} and "
-            f"outputs {[f'{value.name} {value.shape}' for value in outputs]}; {_SUPPORTED}"
-        )
+        got = [[f"{value.name} {value.shape}" for value in values] for values in (inputs, outputs)]
+        raise ValueError(f"{path}: got inputs {got[0]} and outputs {got[1]}; {_SUPPORTED}")
     dtypes = {"tensor(double)": np.float64, "tensor(float16)": np.float16}
     start = {v.name: np.zeros(_shape(v), dtypes.get(v.type, np.float32)) for v in memory}
     name, sizes, shape = observed[0].name, observed[0].shape, _shape(observed[0])
