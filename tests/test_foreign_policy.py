@@ -149,7 +149,6 @@ def test_what_a_deploy_yaml_cannot_say_here_is_refused(tmp_path, old, new, messa
     [
         ({"camera": 1}, r"unknown keys \['camera'\]"),
         ({"num_observations": 45}, "num_observations is 45, .* 8 entries"),
-        ({"wheel_indices": [1]}, "wheels are not supported"),
         ({"rl_kp": [1, 2, 3]}, "'rl_kp' must have 2 entries; got 3"),
         ({"clip_actions_upper": [8, 9]}, "must be the same for all joints"),
         ({"observations_history": [0, 2]}, "newest 2 samples once"),

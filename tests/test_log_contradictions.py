@@ -46,21 +46,6 @@ def oriented(change):
     return lambda frame: with_values(frame, QUATERNION, change(turns_of(frame)).as_quat())
 
 
-def in_world(columns):
-    def spoil(frame):
-        return with_values(frame, columns, turns_of(frame).apply(np.array(frame[columns])))
-
-    return spoil
-
-
-def exchanged(one, other):
-    return lambda frame: frame.assign(**{one: frame[other], other: frame[one]})
-
-
-def about(axis, angle):
-    return Rotation.from_rotvec(np.deg2rad(angle) * np.eye(3)["xyz".index(axis)])
-
-
 def with_legs(names):
     """Columns of joints that were written in another order of the legs."""
     order = [JOINTS.index(names[one[:2]] + one[2:]) for one in JOINTS]
@@ -81,7 +66,8 @@ def with_signs(*parts):
 
 UNMAPPED = [(line, "") for line in TABLE_MAP.splitlines() if "velocit" in line]
 CONTRADICTIONS = {
-    "in the world": (in_world(LINEAR), [], r"linear_velocity', columns .* by 0\.48 m/s.*, but by "
+    "in the world": (lambda f: with_values(f, LINEAR, turns_of(f).apply(np.array(f[LINEAR]))), [],
+                     r"linear_velocity', columns .* by 0\.48 m/s.*, but by "
                      r"0\.00 m/s if 'base_linear_velocity.frame' is world"),
     "millimetres": (times(LINEAR, 1e3), [], "if 'base_linear_velocity.unit' is mm"),
     "x forwards, z down": (times(LINEAR, 1, -1, -1), [], r"by 180° about \[-?1.0, 0.0, 0.0\] in"
@@ -92,9 +78,10 @@ CONTRADICTIONS = {
     "gyro turned": (lambda f: f.assign(gyro_x=f.gyro_y, gyro_y=-f.gyro_x), [],
                     r"turned by 90° about \[-?0.0, -?0.0, 1.0\] .* in the body"),
     "motors": (times(RATES, 6.33), [], "is multiplied by 0.158: a gear ratio"),
-    "two exchanged": (exchanged(RATES[1], RATES[4]), [], f"it is of joint '{JOINTS[4]}'"),
+    "two exchanged": (lambda f: f.assign(**{RATES[1]: f[RATES[4]], RATES[4]: f[RATES[1]]}), [],
+                      f"it is of joint '{JOINTS[4]}'"),
     "half as fast": (lambda f: f.assign(stamp=2 * f.stamp), [], "by 0.5: .*the rate of time"),
-    "another north": (oriented(lambda R: about("z", 57) * R), [],
+    "another north": (oriented(lambda R: Rotation.from_rotvec([0, 0, 1]) * R), [],
                       "slide by .*_orientation' is turned by 60° about the vertical"),
     "order": (lambda f: f, [("order: xyzw", "order: wxyz")],
               r"line 2 and .* slide by .* 'base_orientation.order' is xyzw"),

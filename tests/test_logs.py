@@ -118,11 +118,7 @@ def test_without_the_extra_it_is_named(kind, tmp_path, monkeypatch):
 def test_what_is_no_log_or_no_table_with_topics_is_refused(tmp_path):
     log = tmp_path / "run.csv"
     columns = map_beside(log)
-    for path, message in [
-        (log, "does not exist"),
-        (tmp_path, "without the metadata.yaml"),
-        (columns, "suffix '.yaml'; known are"),
-    ]:
+    for path, message in [(log, "does not exist"), (columns, "suffix '.yaml'; known are")]:
         with pytest.raises(ValueError, match=message):
             read_log(path, columns, ROBOT)
     write(few_rows(), tmp_path, "csv")

@@ -266,11 +266,7 @@ def test_geoms_are_seen_or_collide_by_their_groups_masks_and_exclusions(dog):
     [
         ("", STANCE, "keyframe '0'"),
         # Feet that are not level.
-        (
-            "name='home'",
-            2 * "0 0.8 -1.6 " + 2 * "0 0.7 -1.4 ",
-            "solved: feet under the hips",
-        ),
+        ("name='home'", 2 * "0 0.8 -1.6 " + 2 * "0 0.7 -1.4 ", "solved: feet under the hips"),
     ],
 )
 def test_a_posture_is_a_keyframe_in_which_the_robot_stands(tmp_path, name, joints, source):

@@ -22,10 +22,6 @@ def surveyed(request, tmp_path_factory):
     return survey, yaml.safe_load(path.read_text())
 
 
-def sorted_points(points):
-    return sorted(np.round(points, 6).tolist())
-
-
 def test_the_limbs_are_those_that_the_robots_own_file_names(surveyed):
     survey, known = surveyed
     survey.set_joints({})
@@ -36,7 +32,8 @@ def test_the_limbs_are_those_that_the_robots_own_file_names(surveyed):
         leg = legs[foot["body"]]
         assert leg.joints == foot["joints"]
         assert leg.radius_m == pytest.approx(foot["radius_m"])
-        assert sorted_points(leg.points) == sorted_points(foot["contact_points"])
+        points = [sorted(np.round(of, 6).tolist()) for of in (leg.points, foot["contact_points"])]
+        assert points[0] == points[1]
     arms = {arm.body: arm.joints for arm in survey.arms(survey.legs())}
     frames = known.get("reaching_frames", {}).values()
     assert arms == {frame["body"]: frame["joints"] for frame in frames if "joints" in frame}

@@ -123,8 +123,7 @@ class _Robot:
             if body != base:
                 self._add_joints(body)
             self._add_link(body)
-        for signature in model.exclude_signature.tolist():
-            pair = divmod(signature, 1 << 16)
+        for pair in (divmod(code, 1 << 16) for code in model.exclude_signature.tolist()):
             if self.bodies.keys() >= set(pair):
                 one, other = sorted(self.bodies[i] for i in pair)
                 self.facts.apart.add((one, other))
@@ -168,10 +167,9 @@ class _Robot:
         odd = [i for i, j in others.items() if j < 0 or gains[j][0] <= 0]
         what = "actuators that are neither motors nor position servos of a joint have no gains"
         self._note(what, "actuator", odd)
-        for j in self.efforts:
-            if model.jnt_actfrclimited[j]:
-                most = float(np.abs(model.jnt_actfrcrange[j]).max())
-                self.efforts[j] = min(self.efforts[j], most)
+        for j in (j for j in self.efforts if model.jnt_actfrclimited[j]):
+            most = float(np.abs(model.jnt_actfrcrange[j]).max())
+            self.efforts[j] = min(self.efforts[j], most)
         names, facts = self.joints, self.facts
         facts.gains = {names[j]: (float(k), float(d)) for j, (k, d) in gains.items() if k > 0}
         facts.rotor_inertia = {names[j]: inertia for j, inertia in armature.items() if inertia > 0}
@@ -268,12 +266,9 @@ class _Robot:
                 X_AJ = RigidTransform(AngleAxis(-q, one.axis), np.zeros(3))
             if math.isfinite(self.efforts.get(j, math.inf)):
                 limit["effort"] = self.efforts[j]
-            inside = [
-                _tag("axis", xyz=one.axis),
-                _tag("limit", **limit) if limit else "",
-                _tag("dynamics", damping=self.damping[j], friction=one.frictionloss),
-                self.mimics.get(j, ""),
-            ]
+            dynamics = _tag("dynamics", damping=self.damping[j], friction=one.frictionloss)
+            inside = [_tag("axis", xyz=one.axis), dynamics, self.mimics.get(j, "")]
+            inside += [_tag("limit", **limit)] if limit else []
             X_PJ = X_PB @ RigidTransform(one.pos) @ X_AJ
             self._add_joint(joint, kind, parent, child, X_PJ, *inside)
             if j in self.efforts:

@@ -190,10 +190,8 @@ def _find_limbs(
 def _fix_joints(new: NewRobot, moved: Collection[str] | None) -> None:
     """Fixes what moves no foot or hand, and notes couplings, motors and wheels."""
     survey, copy, stated = new.survey, new.copy, set(moved or ())
-    legged, armed = (
-        {joint for limb in limbs for joint in survey.chain(limb.body)}
-        for limbs in (new.legs, new.arms)
-    )
+    legged = {joint for limb in new.legs for joint in survey.chain(limb.body)}
+    armed = {joint for limb in new.arms for joint in survey.chain(limb.body)}
     used = legged | armed | (set(survey.limits) if moved is None else stated)
     coupled = used & set(copy.drives.mimics)
     passive = copy.drives.passive(sorted(used - legged - coupled - stated))

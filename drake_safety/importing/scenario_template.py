@@ -32,8 +32,7 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def _variations(sizes: Sizes, mass_scale: float, position: float, velocity: float) -> str:
-    friction = sizes.joint_friction_nm
-    if friction is None:
+    if (friction := sizes.joint_friction_nm) is None:
         scale = sizes.factors(BALANCING_REFERENCE)
         friction = 0.4 * scale["mass"] * scale["height"]
     noise = f"{{position: {position:g}, velocity: {velocity:g}}}  # of your sensors [m, rad; 1/s]"

@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
-from itertools import chain, count
+from itertools import chain, count, product
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote
@@ -22,12 +22,9 @@ from drake_safety.robots.model_files import model_file
 if TYPE_CHECKING:
     import trimesh
 
-_IGNORED = (  # By Drake, with a warning: places and tags.
-    (".", "gazebo"),
-    ("joint", "calibration"),
-    ("joint", "safety_controller"),
-    ("transmission/actuator", "mechanicalReduction"),
-)
+# Places and tags of what Drake ignores with a warning.
+_IGNORED = {".": ["gazebo"], "joint": ["calibration", "safety_controller"]}
+_IGNORED |= {"transmission/actuator": ["mechanicalReduction"]}
 _PLACED = "origin", "geometry"  # Parts that a collision shape and a visual share.
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ROWS, _COLUMNS = np.triu_indices(3)
@@ -39,8 +36,8 @@ def simulatable_copy(path: Path) -> UrdfCopy:
     """Reads a URDF, replaces what Drake rejects, and collects and converts its meshes."""
     copy = UrdfCopy(source=path, root=urdf.read_urdf(path))
     urdf.remove_fixed_mimics(copy.root)
-    for place, tag in _IGNORED:
-        for element in copy.root.findall(place):
+    for place, tags in _IGNORED.items():
+        for element, tag in product(copy.root.findall(place), tags):
             urdf.remove(element, tag)
     copy.drop_world()
     for link, shape, words in urdf.empty_shapes(copy.root):
