@@ -78,17 +78,16 @@ def recorded(index=0):
 
 
 @functools.cache
-def walked(speed_m_s=0.4, turn_rad_s=0.3, duration_s=2.0, rate_hz=200):
+def walked():
     """A trot in the world's direction of 1 rad, whose stance feet do not move, with a rocking base.
 
     Velocities are the derivatives of the positions.
     """
-    kinematics = balancing_loop().kinematics
-    time_s = np.arange(int(duration_s * rate_hz)) / rate_hz
+    kinematics, time_s = balancing_loop().kinematics, np.arange(400) / 200
 
     def heading(at_s):
-        yaw = 1.0 + turn_rad_s * at_s
-        x = speed_m_s / turn_rad_s * np.stack([np.sin(yaw), -np.cos(yaw)], axis=-1)
+        yaw = 1.0 + 0.3 * at_s
+        x = 0.4 / 0.3 * np.stack([np.sin(yaw), -np.cos(yaw)], axis=-1)
         return yaw, x
 
     def print_of(foot, at_s):
@@ -263,11 +262,11 @@ def messages(log, store, change):
         yield "/feet", stamp, feet
 
 
-def write(log, folder, kind, *, change=lambda message, i: [(message, 0)], chunk_size=1 << 20):
+def write(log, folder, kind, *, change=lambda message, i: [(message, 0)]):
     """Writes a log in one of the `FORMATS`; returns its path.
 
     In messages `change` gives, for a message of joints and its number, those to be written instead,
-    each with a delay [ns]; `chunk_size` is that of an MCAP file.
+    each with a delay [ns].
     """
     if kind in ("csv", "parquet"):
         return save(frame_of(log), folder, kind)
@@ -281,7 +280,7 @@ def write(log, folder, kind, *, change=lambda message, i: [(message, 0)], chunk_
     found = [(t, at, serialize(m, TYPES[t])) for t, at, m in messages(log, store, change)]
     if kind == "mcap":
         with path.open("wb") as file:
-            writer = mcap.writer.Writer(file, chunk_size)
+            writer = mcap.writer.Writer(file)
             writer.start("ros2")
             channels = {}
             for topic, name in TYPES.items():

@@ -21,10 +21,7 @@ def new(folder, policy, *more):
 
 
 def save_script(path, module, batch=None):
-    """Writes a module as TorchScript, after an evaluation of a batch if one is given.
-
-    Returns its path.
-    """
+    """Writes a module as TorchScript, after an evaluation of a batch if one is given."""
     import torch
 
     with warnings.catch_warnings():
@@ -48,11 +45,7 @@ def save_network(path, num_inputs, num_outputs, scale=0.01):
 
 
 def recurrent_module(num_inputs, num_outputs, *, size=4, is_replaced=False):
-    """An LSTM of random weights whose memory is in buffers, as exporters of rsl_rl write it.
-
-    Args:
-        is_replaced: Whether its buffers are replaced, not written to.
-    """
+    """An LSTM of random weights whose memory is in buffers, which it writes to or replaces."""
     import torch
 
     class Recurrent(torch.nn.Module):
@@ -90,12 +83,7 @@ def save_onnx(
 
     Args:
         memory: Pairs of names of the memory's inputs and outputs: two for an LSTM, one for a GRU.
-        shape: Of the observation; (1, num_inputs) by default.
-        metadata: Entries of the file's metadata.
         files: Paths, from the file's folder, of files for the first weights.
-
-    Returns:
-        The path.
     """
     import numpy as np
     import onnx

@@ -91,25 +91,21 @@ def test_motions_of_a_log_go_on_through_its_episodes_at_the_monitors_rows():
 
 
 def test_after_the_last_row_the_desired_output_stays_as_it_is():
-    log = part(recorded(SAFE), 0, 161)
-    (episode,) = cut_log(log, balancing_loop())[0]
+    (episode,) = cut_log(part(recorded(SAFE), 0, 161), balancing_loop())[0]
     preview = episode.desired_preview[-1].reshape(-1, 3)
     np.testing.assert_allclose(preview, np.tile(preview[0], (len(preview), 1)), atol=1e-9)
-
-
-def test_a_log_without_desired_output_is_refused():
-    log = dataclasses.replace(recorded(SAFE), desired_output=None)
-    with pytest.raises(ValueError, match="has no desired output"):
-        cut_log(log, balancing_loop())[0]
 
 
 def test_what_gives_no_episode_is_refused():
     log = recorded(SAFE)
     short = [dataclasses.replace(part(log, 0, 41), piece=i) for i in range(2)]
-    with pytest.raises(ValueError, match="too short for a segment of 10 steps"):
-        cut_log(short, balancing_loop())[0]
-    with pytest.raises(ValueError, match="is of robot 'laikago', scenario 'porting' of"):
-        cut_log(log, porter())[0]
     low = dataclasses.replace(log, q=log.q - np.eye(log.q.shape[1])[6] * 0.1)
-    with pytest.raises(ValueError, match=r"begins outside the safe set.*'height'"):
-        cut_log(low, balancing_loop())[0]
+    for odd, message in (
+        (dataclasses.replace(log, desired_output=None), "has no desired output"),
+        (short, "too short for a segment of 10 steps"),
+        (low, "begins outside the safe set.*'height'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            cut_log(odd, balancing_loop())
+    with pytest.raises(ValueError, match="is of robot 'laikago', scenario 'porting' of"):
+        cut_log(log, porter())
