@@ -25,11 +25,7 @@ _FREE_RAD = 2.5  # Range of a joint without stops.
 def standing_posture(
     survey: Survey, legs: list[Limb], keyframes: Mapping[str, Mapping[str, float]]
 ) -> tuple[dict[str, float], str]:
-    """Returns a standing posture [rad] and its source: a keyframe, home or stand first, or solved.
-
-    A keyframe serves if the robot stands in it: joints within their stops and not all at zero,
-    contact points equally low, and the centre of mass amid them.
-    """
+    """Returns a standing posture [rad] and its source: a keyframe, such as home, or solved."""
     names = sorted(keyframes, key=lambda name: not re.search("home|stand", name.lower()))
     for name in names:
         posture = {joint: round(keyframes[name][joint], 4) for joint in survey.posture()}
@@ -40,6 +36,7 @@ def standing_posture(
 
 
 def _stands(survey: Survey, legs: list[Limb], posture: dict[str, float]) -> bool:
+    """Whether feet are level, the centre of mass amid them, joints within stops, not all at 0."""
     survey.set_joints(posture)
     points = np.concatenate([survey.positions(leg) - [0, 0, leg.radius_m] for leg in legs])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -139,17 +136,15 @@ class _Leg:
                 parts.append(0.1 * turn.angle() * np.asarray(turn.axis()))
             return np.concatenate(parts)
 
+        def costs(angles: np.ndarray) -> np.ndarray:
+            return np.concatenate([errors(angles), 1e-4 * angles])
+
         low, high = self._bounds
         rng = np.random.default_rng(0)
         solutions: list[np.ndarray] = []
         for index in range(_NUM_GUESSES):
             guess = rng.uniform(low, high) if index else np.clip(0.0, low, high)
-            angles = least_squares(
-                lambda angles: np.concatenate([errors(angles), 1e-4 * angles]),
-                guess,
-                bounds=(low, high),
-                max_nfev=40,
-            ).x
+            angles = least_squares(costs, guess, bounds=(low, high), max_nfev=40).x
             if np.abs(errors(angles)).max() <= _TOLERANCE_M:
                 solutions.append(angles)
             if len(solutions) == _ENOUGH:

@@ -345,10 +345,8 @@ def require_motors(survey: Survey, legs: list[Limb], moved: Collection[str]) -> 
         (stuck, "have equal limits", "correct <limit>, or fix them"),
     ):
         if names:
-            raise ValueError(
-                f"new: '{survey.source}': every joint of a leg needs a motor, but some {what}: "
-                f"{listed(names)}. Remedy: {remedy}"
-            )
+            text = f"every joint of a leg needs a motor, but some {what}: {listed(names)}"
+            raise ValueError(f"new: '{survey.source}': {text}. Remedy: {remedy}")
 
 
 def require_masses(survey: Survey) -> None:

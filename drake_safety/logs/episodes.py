@@ -64,10 +64,8 @@ def cut_log(
         pairs = [pair for _, several in parts for pair in several]
         if not pairs:
             longest = max((piece for piece, _ in parts), key=lambda piece: piece.duration_s)
-            raise ValueError(
-                f"log '{longest.path}' lasts {longest.duration_s:g} s: too short for a segment of "
-                f"{shortest} steps of {scenario.step_s} s of scenario '{scenario.name}'"
-            )
+            what = f"too short for a segment of {shortest} steps of {scenario.step_s} s"
+            raise ValueError(f"log '{longest.path}' lasts {longest.duration_s:g} s: {what}")
         episodes += [episode for episode, _ in pairs]
         starts += [start for _, start in pairs]
     episodes = [replace(episode, index=i) for i, episode in enumerate(episodes)]
@@ -108,7 +106,7 @@ class _Cutter:
     ) -> Iterator[list[tuple[RobotLog, list[tuple[Episode, EpisodeStart]]]]]:
         """The pieces of each log, to where the robot leaves the safe set, and their episodes."""
         logs = [log] if isinstance(log, RobotLog) else log
-        begins = [i for i, one in enumerate(logs) if i == 0 or one.piece == 0]
+        begins = [i for i, piece in enumerate(logs) if i == 0 or piece.piece == 0]
         for begin, end in itertools.pairwise([*begins, len(logs)]):
             parts = []
             for piece in logs[begin:end]:

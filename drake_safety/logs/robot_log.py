@@ -34,27 +34,17 @@ _MOST_CUTS = 3  # In a message.
 
 @dataclass(kw_only=True, eq=False)
 class RobotLog:
-    """Motion of a robot.
-
-    Attributes:
-        time_s: Time since the first row, increasing, (N,) [s].
-        q: Positions: base quaternion (w, x, y, z), base position, joints, (N, n_q).
-        v: Velocities: of the base in the world, angular first, then of the joints, (N, n_v).
-        desired_output: z* in the world, (N, n_z) [m], or None.
-        foot_positions: Desired foot positions, (N, 3 n_c) [m], or None.
-        piece: Number of this piece of a log that was cut, from 0, and again where time begins anew.
-        begin_s: Time of the first row since the log's first row of any topic [s].
-    """
+    """Motion of a robot."""
 
     path: Path
     robot: str
-    time_s: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    desired_output: np.ndarray | None = None
-    foot_positions: np.ndarray | None = None
-    piece: int = 0
-    begin_s: float = 0.0
+    time_s: np.ndarray  # Since the first row, increasing, (N,) [s].
+    q: np.ndarray  # Base quaternion (w, x, y, z), base position, joints, (N, n_q).
+    v: np.ndarray  # Of the base in the world, angular first, then of the joints, (N, n_v).
+    desired_output: np.ndarray | None = None  # z* in the world, (N, n_z) [m].
+    foot_positions: np.ndarray | None = None  # Desired, (N, 3 n_c) [m].
+    piece: int = 0  # Number of this piece of a cut log, from 0, again where time begins anew.
+    begin_s: float = 0.0  # Time of the first row since the log's first row of any topic.
 
     @property
     def duration_s(self) -> float:

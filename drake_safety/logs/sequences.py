@@ -37,10 +37,8 @@ class SequenceMap:
 def read_sequences(
     path: Path, sequence_map: SequenceMap, detector: ChangeDetector, info: EpisodesInfo
 ) -> list[list[Motion]]:
-    """Reads the motions of each sequence in an ``.npz`` file; none reaches over a missing value.
-
-    Only the detector's inputs are read, which the info of its training names; others are 0.
-    """
+    """Reads the motions of each sequence in an ``.npz`` file; none reaches over a missing value."""
+    # Only the detector's inputs are read; others are 0.
     every = [*info.state_names, *preview_names(info), *info.feature_names]
     inputs = {every[i]: i for i in detector.columns.tolist()}
     scale, offset = sequence_map.scale, sequence_map.offset

@@ -130,18 +130,14 @@ def _parsed(text: str) -> Any:
 
 @dataclass(eq=False)
 class PolicyNetwork:
-    """A network that maps an observation (n_o,) and its memory (n_m,) to an action (n_a,).
-
-    Attributes:
-        evaluate: Maps a batch and parts of the memory by name to the action and the new parts.
-        widths: Entries of observation and action; None where the file does not say them.
-        start: Parts of the memory at the start; all that may be memory until :meth:`check`.
-    """
+    """A network that maps an observation (n_o,) and its memory (n_m,) to an action (n_a,)."""
 
     path: Path
+    # Maps a batch and parts of the memory by name to the action and the new parts.
     evaluate: Callable[[np.ndarray, _Memory], tuple[np.ndarray, _Memory]]
-    widths: tuple[int | None, int | None]
+    widths: tuple[int | None, int | None]  # Of observation and action; None if it is not said.
     metadata: PolicyMetadata = field(default_factory=PolicyMetadata)
+    # The memory at the start by name; all that may be memory until it is checked.
     start: _Memory = field(default_factory=dict)
     shape: tuple[int, ...] = (1, -1)  # Of a batch of one observation.
     dtype: Any = np.float32
@@ -172,10 +168,9 @@ class PolicyNetwork:
         """
         width, num_acting = self.widths
         if width not in (None, num_inputs):
-            raise ValueError(
-                f"{who}: the network expects an observation of {width} entries; the terms have "
-                f"{num_inputs}: {terms}. 'joints' of a term name joints that it does not move"
-            )
+            what = f"the network expects an observation of {width} entries; the terms have"
+            hint = "'joints' of a term name joints that it does not move"
+            raise ValueError(f"{who}: {what} {num_inputs}: {terms}. {hint}")
         probe = np.linspace(-1.0, 1.0, num_inputs, dtype=np.float32)
         try:
             _, after = self.evaluate(probe.astype(self.dtype).reshape(self.shape), self.start)
@@ -195,10 +190,8 @@ class PolicyNetwork:
             what = f"the network takes no observation of {num_inputs} entries ({terms})"
             raise ValueError(f"{who}: {what}: {_reason(error)}") from error
         if action.shape != (num_outputs,) or num_acting not in (None, num_outputs):
-            raise ValueError(
-                f"{who}: the network returns {action.size} actions, expected one for each of "
-                f"{num_outputs} joints; its outputs are {self.outputs}, the first the action"
-            )
+            what = f"expected {num_outputs}; its outputs are {self.outputs}, the first the action"
+            raise ValueError(f"{who}: the network returns {action.size} actions, {what}")
         if not np.isfinite(action).all():
             count = f"{np.sum(~np.isfinite(action))} of {num_outputs} actions"
             raise ValueError(f"{who}: the network returns {count} that are not finite")
