@@ -129,4 +129,3 @@ TASKS: dict[str, Callable[[Sizes], str]] = {
     "reaching": _reaching,
     "walking": _walking,
 }
-"""Writers of scenarios by task."""

@@ -28,8 +28,8 @@ _FOOT_SHARE = 0.2  # Largest height of the lowest foot, relative to the standing
 _FAR_RAD = 0.3  # Largest excess over a joint stop by servo errors and encoder offsets.
 _REACH_SHARE = 3.0  # Largest distance of z* from the base, relative to the standing height.
 _WINDOW_S, _MANY_WINDOWS = 0.1, 400
+# Least change in a window, and difference, that tells motion from noise [m, rad].
 _LEAST = {"base_linear_velocity": 0.01, "base_angular_velocity": 0.05, "joint_velocities": 0.1}
-"""Least change in a window, and difference, that tells motion from noise [m, rad]."""
 _DISAGREES, _AGREES = 0.4, 0.25  # Of the motion, if another reading agrees.
 _WRONG, _FAR = 0.9, 3.0  # Of the motion, and of the least change, if none does.
 _FACTOR, _TURN_RAD = 1.6, math.radians(30.0)  # Least factor of a unit or rate, and turn of axes.

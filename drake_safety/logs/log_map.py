@@ -23,10 +23,8 @@ VELOCITIES = {
     "joint_velocities": "joint_positions",
 }
 """Velocities that a log may have, and the positions whose derivatives they are."""
-COMMANDS = ("desired_output", "foot_positions")
-"""What a log may have that is valid until its next value."""
-QUANTITIES = (*VELOCITIES.values(), *VELOCITIES, *COMMANDS)
-"""Fields of a LogMap that name columns."""
+COMMANDS = ("desired_output", "foot_positions")  # Valid until the next value.
+QUANTITIES = (*VELOCITIES.values(), *VELOCITIES, *COMMANDS)  # Fields of a LogMap with columns.
 
 
 @schema(kw_only=True)
@@ -56,8 +54,7 @@ class _Columns(_Quantity):
 
     columns: list[str] = field(default_factory=list)
     """Columns, or fields of the messages such as ``pose.pose.position.x``."""
-    multiple: ClassVar[int] = 3
-    """Of a value's columns."""
+    multiple: ClassVar[int] = 3  # Of a value's columns.
 
     def names(self, joints: Sequence[str]) -> list[str]:
         """Returns the columns; those of a quantity of joints are in their order."""

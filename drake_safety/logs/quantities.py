@@ -12,8 +12,7 @@ from drake_safety.learning.segments import LARGEST
 from drake_safety.logs.channel import Channel
 from drake_safety.logs.log_map import COMMANDS, QUANTITIES, TIME_UNITS, VELOCITIES, LogMap
 
-MIN_ROWS = 3
-"""Least number of rows, for derivatives."""
+MIN_ROWS = 3  # For derivatives.
 _INTERVALS_S = (1e-4, 0.5)  # Range of the median time between two rows.
 _SPARSE = 0.9  # Share of complete rows below which every quantity has rows of its own.
 _MANY_HELD, _REGULAR = 6, 0.9  # Least rows of whole holds of a value, and share of equal holds.

@@ -26,9 +26,7 @@ _READERS = {
     ".mcap": read_messages,
     ".bag": read_messages,
 }
-FORMATS = tuple(_READERS)
-"""Suffixes of readable files; a folder is a ROS 2 bag."""
-
+FORMATS = tuple(_READERS)  # Suffixes of files; a folder is a ROS 2 bag.
 _MOST_CUTS = 3  # In a message.
 
 
@@ -175,8 +173,7 @@ def _wanted(log_map: LogMap, kinematics: RobotKinematics) -> Wanted:
                 raise ValueError(f"map: '{name}' must give a column to every joint; {what}")
         count = 3 * kinematics.num_contacts
         if name == "foot_positions" and len(columns) not in (0, count):
-            what = f"of every contact point, {count} columns"
-            raise ValueError(f"map: '{name}.columns' must be x, y, z {what}; got {len(columns)}")
+            raise ValueError(f"map: '{name}.columns' must be {count}, x, y, z of every contact")
         if others := [other for other in (*part.sign, *part.offset) if other not in columns]:
             what = f"are by column, of {columns}; got {others}"
             raise ValueError(f"map: 'sign' and 'offset' of '{name}' {what}")
