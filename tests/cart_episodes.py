@@ -1,7 +1,5 @@
 """Made-up episodes of a cart, and the names of what an episode holds row by row."""
 
-import dataclasses
-
 import numpy as np
 
 from drake_safety.learning.segments import Episode, EpisodesInfo
@@ -54,10 +52,6 @@ def make_episode(index, info=None, num_rows=5, **changes):
 def assert_identical(episodes, others):
     """Bit for bit."""
     for one, other in zip(episodes, others, strict=True):
-        for field in dataclasses.fields(one):
-            a, b = getattr(one, field.name), getattr(other, field.name)
-            if field.name in ARRAYS:
-                assert (a.dtype, a.shape) == (b.dtype, b.shape)
-                assert a.dtype == np.float64
-                a, b = a.tobytes(), b.tobytes()
-            assert a == b, field.name
+        for name, value in vars(one).items():
+            a, b = np.asarray(value), np.asarray(getattr(other, name))
+            assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes()), name

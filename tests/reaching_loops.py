@@ -12,8 +12,8 @@ import yaml
 
 from drake_safety import load_scenario, run_episode
 from drake_safety.robots.robot import PlantVariation
-from gliding_task import evaluated
 from legged_robots import write_porter
+from toy_tasks import evaluated
 
 SCENES = "package://drake_safety_models/scenes"
 NOISE = {"position": 0.001, "velocity": 0.01}

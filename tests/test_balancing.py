@@ -4,13 +4,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pydrake.geometry import Role
+from pydrake.systems.analysis import Simulator
 
 from balancing_loops import PACKAGED, packaged_loop, standing_loop, started
 from drake_safety import load_assessment, load_scenario, run_episode
 from drake_safety.control.safe_sets import BalanceSafeSet
-from drake_safety.diagrams.balancing.sampling import (
-    calm_start,
-)
+from drake_safety.diagrams.balancing.sampling import calm_start
 from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.plants.balls import Throw
 from legged_robots import robot_kinematics
@@ -34,6 +33,23 @@ def test_any_robot_with_feet_stands_for_two_seconds_within_five_millimetres(name
     assert episode.is_safe and episode.time_s[-1] == pytest.approx(2.0)
     error = np.linalg.norm(episode.output - episode.desired_output, axis=1)
     assert error.max() < 0.005
+
+
+def test_noise_follows_from_the_generator_and_is_held_for_a_control_period():
+    loop = standing_loop(variation="noisy")
+
+    def noise(seed, time_s):
+        simulator = Simulator(loop)
+        context = simulator.get_mutable_context()
+        loop.reset_to(context, np.random.default_rng(seed), loop.standing_start())
+        simulator.AdvanceTo(time_s)
+        measured, true = (loop.GetOutputPort(n).Eval(context) for n in ("state", "true_state"))
+        return (measured - true)[:12]
+
+    np.testing.assert_array_equal(noise(0, 0.011), noise(0, 0.011))
+    np.testing.assert_allclose(noise(0, 0.019), noise(0, 0.011), atol=1e-3)
+    for other in (noise(1, 0.011), noise(0, 0.021)):
+        assert np.abs(other - noise(0, 0.011)).max() > 2e-3
 
 
 def test_the_plant_has_the_variations_mass_and_the_controller_the_nominal_one():
@@ -144,17 +160,19 @@ def test_a_low_probability_makes_the_robot_step_and_balance_again():
     assert margins[-1].min() > 0 and clearance[-1].max() < 0.005
 
 
-def test_in_a_lasting_alarm_the_robot_steps_by_gamma_alone():
-    scenario, gamma = load_scenario("laikago_balancing"), load_assessment("laikago_balancing")
+@pytest.mark.parametrize("on_alarm", ["unknown", "report"])
+def test_in_a_lasting_alarm_the_robot_steps_by_gamma_alone(on_alarm):
+    scenario = load_scenario("laikago_balancing", {"on_alarm": on_alarm})
+    gamma = load_assessment("laikago_balancing")
     gamma.detector_ = replace(gamma.detector_, alarm_level=-1.0)
-    scenario.on_alarm = "unknown"
     weak, strong = scenario.parameters.demonstration
     loop = scenario.make_loop("nominal", assessment=gamma, ball=True)
     throws = [replace(weak, time_s=0.4), replace(strong, time_s=1.2)]
     log = run_throw(
         loop, 0, seed=7_000_000, throws=throws, duration_s=1.5, ports=["alarm", "belief"]
     )
-    assert log["alarm"][5:].all() and (log["belief"][5:] == [0.0, 0.0, 1.0]).all()
+    is_unknown = (log["belief"][5:] == [0.0, 0.0, 1.0]).all()
+    assert log["alarm"][5:].all() and is_unknown == (on_alarm == "unknown")
     ((start_s, _),) = log.recovery_intervals_s
     assert 1.2 < start_s < 1.3
 

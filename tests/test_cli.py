@@ -15,8 +15,8 @@ from drake_safety.cli.run import parse_pushes
 from drake_safety.learning.segments import EpisodeError
 from drake_safety.plants.balls import Throw
 from drake_safety.simulation.scenario import load_scenario
-from gliding_task import SCENARIO
 from live_scenarios import learned, quick
+from toy_tasks import SCENARIO
 
 
 @pytest.mark.train

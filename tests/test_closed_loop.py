@@ -1,3 +1,4 @@
+from dataclasses import fields
 from types import SimpleNamespace
 
 import numpy as np
@@ -5,10 +6,18 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_safety import check_contract
-from drake_safety.simulation.closed_loop import REQUIRED_PORTS, ClosedLoop
-from gliding_task import Gliding, gliding
-from shuttle_task import shuttling
+from drake_safety import check_contract, load_scenario
+from drake_safety.diagrams.balancing.throws import HasBall
+from drake_safety.simulation.capabilities import (
+    CanBePushed,
+    CanFall,
+    CanStartAnywhere,
+    FollowsCommands,
+    HasGoals,
+    MovesUndisturbed,
+)
+from drake_safety.simulation.closed_loop import ASSESSMENT_PORTS, REQUIRED_PORTS, ClosedLoop
+from toy_tasks import Gliding, gliding, shuttling
 
 NAMES = ("state_names", "output_names", "feature_names", "constraint_names")
 WHOLE = {"desired_preview": 10}
@@ -44,11 +53,7 @@ def test_a_task_that_keeps_the_contract_has_no_problem(make):
 @pytest.mark.parametrize(
     ("options", "item", "message"),
     [
-        (
-            {"ports": REQUIRED_PORTS[1:]},
-            "ports",
-            "'Constant' exports no port ['state']; it",
-        ),
+        ({"ports": REQUIRED_PORTS[1:]}, "ports", "'Constant' exports no port ['state']; it"),
         ({"sizes": WHOLE | {"state": 2}}, "ports", "sizes {'state': 2}; by their names expected"),
         ({"value": np.nan}, "values at the start", "'features'"),
         ({"start": None}, "reset", "returns None"),
@@ -76,3 +81,26 @@ def test_an_assessment_of_another_diagram_is_refused_with_both_sides_named(chang
     info |= {name: getattr(loop, name) for name in NAMES}
     with pytest.raises(ValueError, match=message):
         scenario.make_loop(assessment=SimpleNamespace(info_=SimpleNamespace(**info | change)))
+
+
+OF_LEGS = {CanFall, CanStartAnywhere, MovesUndisturbed}
+ASKED = (HasGoals, HasBall, CanBePushed, FollowsCommands, *OF_LEGS)
+HAS = {
+    "laikago_balancing": {HasBall, *OF_LEGS},
+    "atlas_reaching": {HasGoals, CanBePushed, *OF_LEGS},
+    "go2_walking": {HasGoals, CanBePushed, FollowsCommands, *OF_LEGS},
+    "pendulum": {CanStartAnywhere},
+}
+
+
+@pytest.mark.parametrize("name", HAS)
+def test_a_task_of_the_package_keeps_the_contract_and_has_its_capabilities(name):
+    scenario = load_scenario(name)
+    loop = scenario.make_loop()
+    assert {capability for capability in ASKED if isinstance(loop, capability)} == HAS[name]
+    assert all(finding.is_ok for finding in check_contract(loop))
+    assert not loop.fall_name or loop.fall_name in loop.constraint_names
+    assert not any(loop.HasOutputPort(port) for port in ASSESSMENT_PORTS)
+    # What the hash leaves out are parameters that the task has.
+    parameters = scenario.parameters
+    assert set(getattr(parameters, "online", ())) <= {field.name for field in fields(parameters)}

@@ -16,11 +16,6 @@ def outputs(loop, context):
     return {port.get_name(): port.Eval(context).copy() for port in vectors}
 
 
-def assert_equal(values, expected):
-    for name, value in expected.items():
-        np.testing.assert_array_equal(values[name], value, err_msg=name)
-
-
 @pytest.mark.parametrize(
     ("name", "variation", "options", "copied_s", "follows_s"),
     [
@@ -45,10 +40,10 @@ def test_a_copied_context_goes_on_as_its_original(name, variation, options, copi
         simulator.AdvanceTo(time_s)
         copies.append(Simulator(loop, context.Clone()))
         copies[-1].Initialize()
-        assert_equal(outputs(loop, copies[-1].get_context()), outputs(loop, context))
+        np.testing.assert_equal(outputs(loop, copies[-1].get_context()), outputs(loop, context))
     simulator.AdvanceTo(copied_s[-1] + follows_s)
     expected = outputs(loop, context)
     assert expected.get("recovery_active", [1.0]) == [1.0] or not is_triggered
     for copy in copies:
         copy.AdvanceTo(context.get_time())
-        assert_equal(outputs(loop, copy.get_context()), expected)
+        np.testing.assert_equal(outputs(loop, copy.get_context()), expected)

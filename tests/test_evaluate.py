@@ -9,7 +9,7 @@ from drake_safety.learning.seeds import SHIFTS
 from drake_safety.simulation import rollouts
 from drake_safety.simulation.dataset import completed
 from drake_safety.simulation.scenario import load_scenario
-from shuttle_task import train_shuttle
+from toy_tasks import train_shuttle
 
 
 @pytest.fixture(scope="module")

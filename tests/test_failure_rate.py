@@ -17,7 +17,7 @@ from drake_safety.evaluation.failure_rate import (
 )
 from drake_safety.evaluation.metrics import proportion
 from drake_safety.evaluation.results import Results
-from shuttle_task import train_shuttle
+from toy_tasks import train_shuttle
 
 NUM_STARTS, NUM_ROLLOUTS, NUM_REPLAYS = 4000, 400, 200
 RANDOM = "random"

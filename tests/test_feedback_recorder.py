@@ -5,8 +5,8 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from drake_safety.systems import feedback_recorder
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
-from gliding_task import declare_outputs
 from system_doubles import INFO, STEP_S
+from toy_tasks import declare_outputs
 
 WATCH_S, NUM_STEPS = 0.01, 5
 

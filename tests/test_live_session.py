@@ -16,9 +16,9 @@ from drake_safety.cli.console import open_viewer
 from drake_safety.live import session as live
 from drake_safety.live.session import GO, PUSH, START, STOP, TICK_S, LiveSession
 from drake_safety.plants.pushes import Push
-from gliding_task import Gliding, gliding
 from live_scenarios import learned, quick
 from reaching_targets import FAR, NEAR, SCENARIO, learned_targets
+from toy_tasks import Gliding, gliding
 
 train = pytest.mark.train
 SHOWN_S = 1.5

@@ -8,9 +8,9 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_safety import AddSafetyAssessor, AssessmentParameters, SafetyAssessment
-from gliding_task import evaluated
 from lip_assessments import QUICK, worse
 from lip_episodes import STEP_S, make_episodes
+from toy_tasks import evaluated
 
 pytestmark = pytest.mark.train
 

@@ -7,7 +7,7 @@ from drake_safety.learning.seeds import MOTION
 from drake_safety.simulation.capabilities import MovesUndisturbed
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.rollouts import MOTION_PIECE_S, run_motion
-from gliding_task import evaluated, gliding
+from toy_tasks import evaluated, gliding
 
 
 @pytest.mark.parametrize("name", ["laikago_balancing", "atlas_reaching", "go2_walking"])

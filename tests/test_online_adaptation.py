@@ -1,4 +1,5 @@
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -70,13 +71,11 @@ def run(duration_s, capacity=400, prior=None, watching=None, **settings):
     adaptation = OnlineAdaptation(None, prior, recorder, assessor, capacity=capacity)
     simulator = Simulator(diagram)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(
-            online_adaptation,
-            "pair_windows",
-            lambda scenario, recorder, windows: [
-                SimpleNamespace(actual=w.episode) for w in windows
-            ],
-        )
+
+        def pairs(_, recorder, windows):
+            return [SimpleNamespace(actual=window.episode) for window in windows]
+
+        patched.setattr(online_adaptation, "pair_windows", pairs)
         adaptation.advance(simulator, duration_s)
     return adaptation, adopted
 
@@ -88,8 +87,7 @@ def test_every_k_u_sets_the_assessor_adopts_what_all_feedback_has_shown(
     # Windows of four steps.
     adaptation, adopted = run(duration_s, update_interval=interval)
     assert len(adaptation.feedback) == duration_s // 0.4
-    assert adaptation.adapted == list(numbers)
-    assert [adapted for _, adapted in adopted] == adaptation.adapted
+    assert [adapted for _, adapted in adopted] == adaptation.adapted == numbers
     # At the last row of a window, and not within a step of the simulator.
     times = [0.4 * number for number in numbers]
     assert [time_s for time_s, _ in adopted] == pytest.approx(times)
@@ -124,13 +122,8 @@ def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterw
     recorder = AddFeedbackRecorder(builder, loop)
     simulator = Simulator(builder.Build())
     assessor = loop.GetSubsystemByName("safety_assessor")
-    adapt, motions = prior.adapt, []
-
-    def adapted(feedback, **options):
-        motions.append(options["motions"])
-        return adapt(feedback, **options)
-
-    monkeypatch.setattr(prior, "adapt", adapted)
+    adapt = mock.Mock(side_effect=prior.adapt)
+    monkeypatch.setattr(prior, "adapt", adapt)
     online = OnlineAdaptation(scenario, prior, recorder, assessor)
     root = simulator.get_mutable_context()
     for index in range(3):
@@ -149,10 +142,11 @@ def test_laikago_adapts_while_it_moves_as_it_would_from_the_same_feedback_afterw
         rows = len(same.true_state) - 1
         np.testing.assert_allclose(same.true_state[:-1], episode.true_state[:rows], atol=1e-9)
         assert same.is_safe == episode.is_safe
-        if index < len(motions[-1]):
+        motions = adapt.call_args.kwargs["motions"]
+        if index < len(motions):
             # Some of the monitor's rows are those of an episode, which may end between two.
             every = round(scenario.step_s / prior.detector_.step_s)
-            seen = motions[-1][index][every - 1 :: every, : episode.state.shape[1]]
+            seen = motions[index][every - 1 :: every, : episode.state.shape[1]]
             rows = min(len(seen), len(episode.state) - 2)
             np.testing.assert_allclose(seen[:rows], episode.state[1 : rows + 1], atol=1e-9)
     assert len(online.adapted) == len(online.feedback) // 2 > 0

@@ -67,27 +67,19 @@ def test_a_network_remembers_only_what_it_is_given(tmp_path, save, num_memories)
 def test_actions_are_those_of_torch_and_onnxruntime(tmp_path):
     onnxruntime = pytest.importorskip("onnxruntime")
     observations = np.random.default_rng(0).normal(size=(3, N_IN)).astype(np.float32)
-
-    def actions(network):
-        memory, rows = network.initial_memory, []
-        for observation in observations:
-            action, memory = network(observation, memory)
-            rows.append(action)
-        return np.array(rows)
-
+    scripted, network = checked(script()(tmp_path)), checked(onnx(memory=LSTM)(tmp_path))
     module = recurrent_module(N_IN, N_OUT, size=SIZE).eval()
-    network = checked(script()(tmp_path))
-    with torch.inference_mode():
-        expected = [module(torch.from_numpy(row[None])).numpy()[0] for row in observations]
-    np.testing.assert_allclose(actions(network), expected, rtol=1e-6)
-    network = checked(onnx(memory=LSTM)(tmp_path))
     session = onnxruntime.InferenceSession(str(network.path))
+    memory, own = scripted.initial_memory, network.initial_memory
     h = c = np.zeros((1, 1, SIZE), dtype=np.float32)
-    expected = []
     for row in observations:
-        action, h, c = session.run(None, {"obs": row[None], "h_in": h, "c_in": c})
-        expected.append(action[0])
-    np.testing.assert_allclose(actions(network), expected, rtol=1e-6)
+        action, memory = scripted(row, memory)
+        with torch.inference_mode():
+            expected = module(torch.from_numpy(row[None])).numpy()[0]
+        np.testing.assert_allclose(action, expected, rtol=1e-6)
+        action, own = network(row, own)
+        expected, h, c = session.run(None, {"obs": row[None], "h_in": h, "c_in": c})
+        np.testing.assert_allclose(action, expected[0], rtol=1e-6)
 
 
 class Hidden(torch.nn.Module):

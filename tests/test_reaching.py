@@ -41,8 +41,7 @@ def plant_state(loop, context):
 
 def first_row(loop, context):
     """An episode that ended as it began."""
-    names = ("state", "true_state", "output", "desired_output", "desired_preview", "features")
-    rows = {name: evaluated(loop, context, name)[None].copy() for name in (*names, "margins")}
+    rows = {name: evaluated(loop, context, name)[None].copy() for name in RECORDED}
     return Episode(index=0, time_s=np.zeros(1), is_safe=True, cause="", **rows)
 
 
@@ -184,14 +183,9 @@ def test_a_robot_of_ones_own_reaches_from_yaml_alone():
     assert episode.is_safe and episode.num_controller_failures == 0
     assert np.linalg.norm(episode.output[-1] - EASY) < 0.02
     assert np.linalg.norm(episode.output - episode.desired_output, axis=1).max() < 0.05
-
-
-@pytest.mark.parametrize("variation", ["rough", "noisy"])
-def test_other_plants_nearly_reach_the_goal(variation):
-    episode = easy_episode(variation)
-    assert episode.cause == ""
-    assert np.linalg.norm(episode.output[-1] - EASY) < 0.04
-    assert np.abs(episode.true_state - easy_episode().true_state).max() > 1e-5
+    other = easy_episode("rough")
+    assert other.is_safe and np.linalg.norm(other.output[-1] - EASY) < 0.04
+    assert np.abs(other.true_state - episode.true_state).max() > 1e-5
 
 
 def test_a_target_in_a_board_ends_in_a_collision():

@@ -5,11 +5,14 @@ import math
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from scipy.linalg import null_space
 
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
 from drake_safety.control.kinematics import fit_stance, planar_pose
 from drake_safety.control.mirror import Mirror
-from drake_safety.control.whole_body_model import WholeBodyModel
+from drake_safety.control.whole_body_model import PointReference, WholeBodyModel
+from drake_safety.control.whole_body_qp import task_errors
+from drake_safety.diagrams.reaching.kinematic_preview import KinematicPreview
 from drake_safety.diagrams.reaching.safe_set import ReachingLimits, ReachingSafeSet
 from drake_safety.plants.obstacles import Clearance, Obstacle
 from legged_robots import robot_kinematics, robot_model
@@ -180,8 +183,7 @@ def test_features_of_motion_are_velocities_and_the_margins_that_they_lead_to():
 def test_features_do_not_depend_on_where_in_the_world_the_robot_stands():
     of = safe_set()
     q = leaning(of.kinematics, [0.01, 0.02, -0.05], [0.02, 0.0, 0.03])
-    hand, v = of.model.reaching_position(q), np.zeros(of.kinematics.num_velocities)
-    preview = in_stance(of.kinematics, q, straight(hand, hand + [0.1, 0.0, 0.1]))
+    preview, v = held_still(of, q), np.zeros(of.kinematics.num_velocities)
     X_WM = RigidTransform(RotationMatrix.MakeZRotation(1.2), [3.0, -2.0, 0.0])
     X_WB = RigidTransform(RotationMatrix(RollPitchYaw(0.02, 0.0, 0.03)), q[4:7])
     moved = of.kinematics.positions_at(X_WM @ X_WB, q[7:])
@@ -205,3 +207,49 @@ def test_mirrored_features_of_the_mirrored_robot_are_those_of_the_other_hand(nam
         preview = in_stance(kinematics, q, straight(hand, hand + rng.uniform(0.0, 0.3, 3)))
         mirrored = right.features(*mirror.plant_state(q, v, np.zeros(3)), mirror.points(preview))
         np.testing.assert_allclose(mirrored, left.features(q, v, preview), rtol=0.0, atol=atol)
+
+
+def easy_paths(preview, num=5, seed=0):
+    """Straight paths of six samples to goals in front of the robot, on its hand's side."""
+    model, rng = preview.model, np.random.default_rng(seed)
+    start = model.reaching_position(model.kinematics.standing_positions())
+    outwards = np.sign(start[1])
+    for _ in range(num):
+        step = rng.uniform([-0.05, -0.1, -0.05], [0.1, 0.05, 0.1]) * [1.0, outwards, 1.0]
+        yield start + np.linspace(1 / 6, 1.0, 6)[:, np.newaxis] * step
+
+
+def gradient(preview, reference, q):
+    """Of half the cost in the motions that leave the feet still, and the hand's share of it."""
+    model, kinematics = preview.model, preview.model.kinematics
+    J_feet = kinematics.contact_jacobian(q)
+    J, error = task_errors(model, reference)
+    slope = (model.task_weights * J).T @ error
+    slope[6:] += model.parameters.posture.weight * (reference.posture - q[7:])
+    still = null_space(J_feet, rcond=1e-9)
+    hand = (model.task_weights * J)[-3:].T @ np.full(3, 0.01)  # As a centimetre amiss would pull.
+    return np.linalg.norm(still.T @ slope), np.linalg.norm(still.T @ hand)
+
+
+@pytest.mark.parametrize(("name", "hand"), [("porter", "right"), ("atlas", "left")])
+def test_the_hand_arrives_with_fixed_feet_where_the_cost_is_minimal(name, hand):
+    preview = KinematicPreview(WholeBodyModel(robot_kinematics(name), hand))
+    kinematics = preview.model.kinematics
+    q = kinematics.standing_positions()
+    before, feet = q.copy(), kinematics.contact_positions(q)
+    reference = preview.model.reference(q)
+    for path in easy_paths(preview, num=3):
+        positions = preview.follow(q, path)
+        for ahead in positions:
+            np.testing.assert_allclose(kinematics.contact_positions(ahead), feet, atol=1e-4)
+        np.testing.assert_allclose(np.linalg.norm(positions[:, :4], axis=1), 1.0, atol=1e-12)
+        reached = preview.model.reaching_position(positions[-1])
+        assert np.linalg.norm(reached - path[-1]) < 5e-3
+        # No motion that leaves the feet still lowers the cost, to first order.
+        reference.reaching = PointReference(position=path[-1])
+        slope, one_centimetre = gradient(preview, reference, positions[-1])
+        assert slope < 0.02 * one_centimetre
+        longer = preview.follow(q, np.vstack([path, np.repeat(path[-1:], 30, axis=0)]))
+        slope, one_centimetre = gradient(preview, reference, longer[-1])
+        assert slope < 1e-4 * one_centimetre
+    np.testing.assert_array_equal(q, before)

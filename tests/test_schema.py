@@ -64,7 +64,7 @@ CASES = {
         "command: {lowest: [2, 0, 0]}": "'command': lowest must not exceed",
     },
     Scenario: {
-        "step_s: 1e-9": "step_s is 1e-09, so that an episode of 2.0 s has more than 10000000 steps",
+        "step_s: 1e-9": "an episode of 2.0 s has more than 10000000 steps of step_s",
         "on_alarm: stop": "'on_alarm' must be 'unknown' or 'report'; got 'stop'",
         "assessment: {horizon: 51}": "horizon of 51 steps .* exceeds the episode",
     },

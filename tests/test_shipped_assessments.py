@@ -13,9 +13,9 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.scenario import load_scenario
-from shuttle_task import SCENARIO, train_shuttle
 from studies.documents import CARD_FILE, EVALUATION_FILE, card_text
 from studies.publish import NUM_EPISODES, check_shipped
+from toy_tasks import SHUTTLING, train_shuttle
 
 NAME = "shuttling"
 
@@ -46,7 +46,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     train_shuttle(folder)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("drake_safety.simulation.scenario._scenario_folder", lambda: folder)
+        patch.setattr("drake_safety.simulation.scenario._FOLDER", folder)
         options = ("--assessment", folder, "--workers", 1)
         calibrated = ("--episodes", 120, "--miss-rate", 0.1)
         assert call(patch, "calibrate", NAME, *options, *calibrated) == 0
@@ -61,14 +61,14 @@ def shipped(run, tmp_path_factory):
     """Where the run's assessments were shipped to; for all to read."""
     into = tmp_path_factory.mktemp("shipped")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("drake_safety.simulation.scenario._scenario_folder", lambda: run)
+        patch.setattr("drake_safety.simulation.scenario._FOLDER", run)
         assert study(patch, "ship", "--assessment", run, "--into", into) == 0
     return into
 
 
 @pytest.fixture
 def scenario(run, monkeypatch):
-    monkeypatch.setattr("drake_safety.simulation.scenario._scenario_folder", lambda: run)
+    monkeypatch.setattr("drake_safety.simulation.scenario._FOLDER", run)
     return load_scenario(NAME)
 
 
@@ -100,7 +100,7 @@ def test_a_shipment_holds_the_run_s_files_and_what_is_known_of_them(run, shipped
 
 @pytest.mark.slow
 def test_another_file_or_scenario_in_its_place_is_noticed(run, package, scenario, tmp_path):
-    (tmp_path / f"{NAME}.yaml").write_text(SCENARIO.replace("duration_s: 0.8", "duration_s: 1.2"))
+    (tmp_path / f"{NAME}.yaml").write_text(SHUTTLING.replace("duration_s: 0.8", "duration_s: 1.2"))
     with pytest.raises(ValueError, match=r"has the hash \w+, '.*' is of \w+: train"):
         check_shipped(package / NAME, load_scenario(tmp_path / f"{NAME}.yaml"), num_workers=1)
     file = assessment_file(package / NAME, "sharpened")

@@ -4,7 +4,7 @@ import pytest
 from drake_safety.learning.segments import EpisodeError
 from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.rollouts import episode_rng
-from gliding_task import gliding
+from toy_tasks import gliding
 
 
 def glide(loop, index, after_leaving_s=np.inf, **options):

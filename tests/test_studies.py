@@ -12,8 +12,8 @@ from command_line import call, study
 from drake_safety.assessments import shipped_folder
 from drake_safety.cli.training_folder import MODES, assessment_file
 from drake_safety.evaluation.results import Results
-from shuttle_task import train_shuttle
 from studies.figures import PICTURES
+from toy_tasks import train_shuttle
 
 ROOT = Path(__file__).resolve().parents[1]
 FRESH = "--episodes 40 --calibration-episodes 30 --seed 100"

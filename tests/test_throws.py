@@ -5,35 +5,34 @@ import numpy as np
 import pytest
 from pydrake.math import RotationMatrix
 
+from balancing_loops import packaged_loop
+from drake_safety import load_assessment
 from drake_safety.control.observation import quaternion_of
 from drake_safety.diagrams.balancing import throw_study
 from drake_safety.diagrams.balancing.throw_study import TriggerRule, evaluate_throws
 from drake_safety.diagrams.balancing.throws import VIOLATIONS, run_throw, run_throws
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.plants.balls import Throw
+from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import load_scenario
 from studies.throws import choose_threshold, classifier_rules
 
 HARD = Throw(time_s=0.3, mass_kg=3.0, speed_m_s=8.0, direction_rad=math.pi / 2)
+HARDER = Throw(time_s=0.4, mass_kg=3.0, speed_m_s=8.0, direction_rad=-1.2)
 IMPACT_S, LEAVE_S, FALL_S = 0.5, 0.8, 1.0
 TIME_S = np.arange(0.0, 1.02, 0.02)
 CALM = Scorer(name="calm", probability=lambda state, *_: state[:, 0])
 
 
 @pytest.fixture(scope="module")
-def scenario():
-    return load_scenario("laikago_balancing")
+def balancing():
+    return packaged_loop("actual", ball=True)
 
 
 @pytest.fixture(scope="module")
-def balancing(scenario):
-    return scenario.make_loop("actual", ball=True)
-
-
-@pytest.fixture(scope="module")
-def recovering(scenario):
-    return scenario.make_loop("actual", ball=True, recovery=True)
+def recovering():
+    return packaged_loop("actual", ball=True, recovery=True)
 
 
 def test_a_hard_throw_makes_balancing_fall_and_the_log_ends_there(balancing):
@@ -74,7 +73,8 @@ def test_recovery_steps_save_the_robot_without_violations(recovering, direction)
         assert np.all((feet[1::2, :2] - feet[0::2, :2]) @ sideways > 0.05)
 
 
-def test_throws_do_not_depend_on_the_workers_and_keep_their_order(scenario):
+def test_throws_do_not_depend_on_the_workers_and_keep_their_order():
+    scenario = load_scenario("laikago_balancing")
     alone = run_throws(scenario, [2, 0, 1], seed=9, num_workers=1)
     workers = {log.index: log for log in run_throws(scenario, [0, 1, 2], seed=9, num_workers=2)}
     assert [log.index for log in alone] == [2, 0, 1]
@@ -102,11 +102,8 @@ def log_of(index, *, leaves=False, falls=False):
 
 def every_third_falls(scenario, indices, *, trigger_times_s=None, **options):
     """In place of `run_throws`: recovery in time saves the robot."""
-    times_s = [math.nan] * len(indices) if trigger_times_s is None else trigger_times_s
-    return [
-        log_of(index, falls=index % 3 == 0 and not time_s < IMPACT_S + 0.1)
-        for index, time_s in zip(indices, times_s, strict=True)
-    ]
+    pairs = zip(indices, trigger_times_s or [math.nan] * len(indices), strict=True)
+    return [log_of(i, falls=i % 3 == 0 and not time_s < IMPACT_S + 0.1) for i, time_s in pairs]
 
 
 def rule(name, threshold, delay_rows=0):
@@ -168,3 +165,38 @@ def test_unknown_rows_trigger_after_their_persistence_and_danger_at_once(
     probability = throw_study.log_probability(log_of(0), scorer, persistence_s)
     time_s = throw_study.trigger_time(log_of(0), probability, 0.6)
     assert math.isnan(time_s) if triggered is None else time_s == TIME_S[triggered]
+
+
+def test_gamma_in_the_diagram_is_gamma_on_the_log():
+    scenario, assessment = load_scenario("laikago_balancing"), load_assessment("laikago_balancing")
+    # Without measurement noise, of which every reading at an instant may be a fresh draw.
+    scenario.variations["quiet"] = PlantVariation(joint_friction_nm=0.4)
+    loop = scenario.make_loop("quiet", assessment=assessment, recovery=False, ball=True)
+    ports = ("safety_probability", "belief")
+    log = run_throw(loop, 0, seed=8, throws=[HARDER], duration_s=1.0, ports=ports)
+    result = assessment.predict(log["state"], log["desired_preview"], log["features"])
+    # Outside the safe set nothing is safe.
+    is_outside = log["margins"].min(axis=1) < 0.0
+    assert is_outside.any() and not is_outside.all()
+    belief = result.belief.copy()
+    belief[is_outside, 1] += belief[is_outside, 0]
+    belief[is_outside, 0] = 0.0
+    probability = result.probability[:, None] * ~is_outside[:, None]
+    # A row shows the state before the updates of its instant: Γ of a row is published in the next.
+    np.testing.assert_allclose(log["safety_probability"][1:], probability[:-1], atol=1e-5)
+    np.testing.assert_allclose(log["belief"][1:], belief[:-1], atol=1e-5)
+    assert np.ptp(result.belief[:, 0]) > 0.35
+
+
+@pytest.mark.slow
+def test_gamma_falls_at_the_hit_and_recovery_saves_the_robot():
+    scenario, assessment = load_scenario("laikago_balancing"), load_assessment("laikago_balancing")
+    alone = scenario.make_loop("actual", assessment=assessment, recovery=False, ball=True)
+    log = run_throw(alone, 0, seed=8, throws=[HARDER], duration_s=2.5)
+    assert log.has_fallen
+    loop = scenario.make_loop("actual", assessment=assessment, ball=True)
+    log = run_throw(loop, 0, seed=8, throws=[HARDER], duration_s=3.0)
+    assert not log.has_fallen
+    assert HARDER.time_s < log.recovery_intervals_s[0][0] < HARDER.time_s + 0.1
+    violated = dict(zip(VIOLATIONS, log["violations"].any(axis=0), strict=True))
+    assert not (violated["legs_collide"] or violated["joint_position"] or violated["joint_effort"])

@@ -8,7 +8,7 @@ from drake_safety.cli.training_folder import MODES, load_assessment
 from drake_safety.learning.change_detector import usual_rows
 from drake_safety.learning.seeds import FALLS, MOTION
 from drake_safety.simulation.dataset import load_episodes
-from shuttle_task import SCENARIO
+from toy_tasks import SHUTTLING
 
 
 def same_detector(one, other):
@@ -19,7 +19,7 @@ def same_detector(one, other):
 @pytest.mark.slow
 def test_the_monitor_is_learned_from_undisturbed_motion_that_is_kept(monkeypatch, capsys, tmp_path):
     file, out = tmp_path / "shuttling.yaml", tmp_path / "run"
-    file.write_text(SCENARIO)
+    file.write_text(SHUTTLING)
     train = ("train", file, "--episodes", 60, "--workers", 1, "--out")
     assert call(monkeypatch, *train, out, "--motion", 0.4) == 0
     printed = capsys.readouterr().out

@@ -5,7 +5,7 @@ import pytest
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate, plan_shape
-from gliding_task import evaluated
+from toy_tasks import evaluated
 
 START, GOAL = np.array([0.0, 0.1, 0.4]), np.array([0.2, -0.1, 0.5])
 DETOUR = np.array([-0.1, 0.15, 0.05])

@@ -18,13 +18,8 @@ from system_doubles import HORIZON, OUTLOOK, Bench, SlowIsSafe, guard
 
 
 @pytest.fixture(scope="module")
-def scenario():
-    return load_scenario("go2_walking")
-
-
-@pytest.fixture(scope="module")
-def loop(scenario):
-    return scenario.make_loop()
+def loop():
+    return load_scenario("go2_walking").make_loop()
 
 
 def walk(loop, command, duration_s):
@@ -147,6 +142,14 @@ def test_the_guard_replaces_a_refused_command_by_the_nearest_accepted_one():
     assert (out["is_changed"][0], out["safety_probability"][0]) == (1.0, 0.0)
 
 
+def test_the_guard_tries_the_nearest_commands_first_as_measured_in_the_policys_ranges():
+    asked = np.array([2.5, 0.4, -3.0])
+    commands = guard(SlowIsSafe()).candidates(asked)
+    distance = np.linalg.norm((commands - asked) / [2.0, 1.0, 2.0], axis=1)
+    np.testing.assert_array_equal(commands[[0, -1]], [asked, np.zeros(3)])
+    assert (np.diff(distance) >= 0.0).all()
+
+
 @pytest.mark.parametrize(
     ("assessment", "state"), [(SlowIsSafe(novelty=2.0), 0.0), (SlowIsSafe(), np.nan)]
 )
@@ -164,9 +167,9 @@ def test_a_guard_that_does_not_act_passes_on_everything(state):
 
 
 @pytest.mark.parametrize("what", ["beliefs", "an alarm"])
-def test_the_guard_judges_by_adopted_beliefs_and_by_none_during_an_alarm(scenario, what):
+def test_the_guard_judges_by_adopted_beliefs_and_by_none_during_an_alarm(what):
     assessment = load_assessment("go2_walking")
-    loop = scenario.make_loop(assessment=assessment, guard=True)
+    loop = load_scenario("go2_walking").make_loop(assessment=assessment, guard=True)
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
     loop.reset_standing(context, np.array([0.3, 0.0, 0.0]))

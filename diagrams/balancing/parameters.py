@@ -26,10 +26,8 @@ from drake_safety.robots.robot_size import (
 class RecoveryParameters:
     """Parameters of trigger and recovery steps."""
 
-    threshold: float = 0.6
-    """Γ_thre, of the probability. The default is the paper's value, which it has for b_safe."""
-    persistence_s: NotNegative = 0.02
-    """Time for which "don't know" must have lasted to trigger [s]. The paper has none."""
+    threshold: float = 0.6  # Γ_thre, of the probability: the paper's value for b_safe.
+    persistence_s: NotNegative = 0.02  # How long "don't know" must last to trigger.
     assessment_period_s: Positive = 0.02
     step: RecoveryStepParameters = field(default_factory=RecoveryStepParameters)
 
@@ -47,8 +45,7 @@ class BalancingParameters:
     start: StartSampling = field(default_factory=StartSampling)
     push: PushSampling = field(default_factory=PushSampling)
     recovery: RecoveryParameters = field(default_factory=RecoveryParameters)
-    demonstration: list[Throw] = field(default_factory=list)
-    """Balls of ``drake-safety run --push ball``."""
+    demonstration: list[Throw] = field(default_factory=list)  # Of `run --push ball`.
 
     @classmethod
     def completed(cls, stated: dict[str, Any], robot: str) -> dict[str, Any]:
@@ -59,6 +56,7 @@ class BalancingParameters:
 
 
 _LEAST_TWIST_RAD = 0.2  # Feet that slip at a smaller twist cannot hold the heading.
+# Physical quantity of each parameter that scales with the robot's size.
 _QUANTITIES: dict[str, Any] = {
     "safe_set": {"support_clearance_m": "height", "height_m": "height", "fall_height_m": "height"},
     "start": {
@@ -91,7 +89,6 @@ _QUANTITIES: dict[str, Any] = {
         }
     },
 }
-"""Physical quantity of each parameter that scales with the robot's size."""
 
 
 def fitted_to_robot(stated: dict[str, Any], kinematics: RobotKinematics) -> dict[str, Any]:

@@ -28,22 +28,17 @@ _USUAL_SHARE = 0.5  # Share of the range of training's plans in which undisturbe
 class StartSampling:
     """Random initial states and plans. Offsets are half-widths about the standing posture."""
 
-    foot_offset_m: float = 0.02
-    """Offset of every contact point, along x and along y."""
+    foot_offset_m: float = 0.02  # Of every contact point, along x and along y.
     base_offset_m: Pair[FiniteFloat] = field(default_factory=lambda: [0.08, 0.05])
-    """Along x and along y of the stance frame."""
     base_height_m: Bounds[FiniteFloat] = field(default_factory=lambda: [0.36, 0.45])
-    tilt_rad: float = 0.1
-    """Half-width of roll, pitch and yaw, each."""
+    tilt_rad: float = 0.1  # Half-width of roll, pitch and yaw, each.
     velocity_std_m_s: Triple = field(default_factory=lambda: [0.5, 0.35, 0.1])
-    """Standard deviation of the base's velocity along x, y and z."""
     angular_velocity_std_rad_s: float = 0.4
     joint_std_rad: float = 0.02
     tracking_offset_m: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Of the base from the plan's start, along x, y and z: the initial tracking error. "We also add
     a random offset to the initial state to simulate the disturbances" (paper)."""
     target_offset_m: Pair[FiniteFloat] = field(default_factory=lambda: [0.20, 0.11])
-    """Where the plan ends, along x and along y of the stance frame."""
     target_height_m: Bounds[FiniteFloat] = field(default_factory=lambda: [0.34, 0.46])
     plan_duration_s: Bounds[Positive] = field(default_factory=lambda: [0.8, 1.6])
 
@@ -75,14 +70,12 @@ class StartSampling:
 class PushSampling:
     """Random balls, and the undisturbed motion during which they are thrown."""
 
-    share: Share = 0.25
-    """Share of nominal episodes that begin with the impact of a ball."""
+    share: Share = 0.25  # Of nominal episodes that begin with the impact of a ball.
     mass_kg: Bounds[Positive] = field(default_factory=lambda: [2.0, 4.0])
     speed_m_s: Bounds[Positive] = field(default_factory=lambda: [2.0, 11.0])
     offset_m: float = 0.0
     height_m: float = 0.03
     target_offset_m: Pair[FiniteFloat] = field(default_factory=lambda: [0.05, 0.03])
-    """Half-widths of the start and goal of the undisturbed motion, about the stance, x and y."""
 
     def sample(self, rng: np.random.Generator, time_s: float) -> Throw:
         """Samples a ball from any horizontal direction."""
@@ -104,10 +97,7 @@ def calm_start(
     plan_duration_s: list[float],
     elapsed_s: float = 0.0,
 ) -> EpisodeStart:
-    """Samples a start on a plan near the standing posture, without tracking error.
-
-    ``half_widths_m`` (2,) are of the plan's ends about the stance; it began ``elapsed_s`` ago.
-    """
+    """Samples a start on a plan about the stance that began ``elapsed_s`` ago, without error."""
     half = np.array([*half_widths_m, 0.0])
     nominal = np.array([*kinematics.nominal_base_offset, kinematics.standing_height])
     start = nominal + rng.uniform(-half, half)
@@ -127,10 +117,7 @@ def undisturbed_start(
     sampling: StartSampling,
     duration_s: float,
 ) -> EpisodeStart:
-    """Samples a start at rest with base motions one after another, for a duration [s].
-
-    Their ends are within half of the range of training's plans, most of which are then safe.
-    """
+    """Samples a start at rest with base motions one after another, for a duration [s]."""
     p_WC = _contacts(kinematics, rng, sampling.foot_offset_m)
     low, high = sampling.target_height_m
     middle = np.array([*kinematics.nominal_base_offset, 0.5 * (low + high)])
@@ -153,7 +140,6 @@ def _rest(point: np.ndarray, start_s: float, duration_s: float) -> PiecewisePoly
 
 
 def _contacts(kinematics: RobotKinematics, rng: np.random.Generator, offset_m: float) -> np.ndarray:
-    """Contact points on the ground near the standing posture's, (n_p, 3) [m]."""
     xy = rng.uniform(-1, 1, (kinematics.num_contacts, 2)) * offset_m
     return np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])
 
@@ -176,7 +162,6 @@ def _start(
     V_WB: np.ndarray,
     joint_offsets: np.ndarray | float = 0.0,
 ) -> EpisodeStart:
-    """A start on given contacts."""
     joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
     v = resting_feet(kinematics, X_WB, joints, V_WB)
     joints = np.clip(joints + joint_offsets, *kinematics.position_limits.T)

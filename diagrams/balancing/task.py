@@ -28,10 +28,8 @@ _LATEST_HIT_S = 1.5  # Latest time of an initial impact in the undisturbed motio
 class Balancing(LeggedLoop):
     """The diagram of the balancing task, for any robot.yaml with feet and joint gains.
 
-    Args:
-        recovery: Whether to add recovery steps; by default if there is an assessment to trigger
-            them. Without one the diagram has an input port ``safety_probability``.
-        ball: Whether the plant has a ball; by default if pushes are sampled.
+    By default, it has recovery steps with an assessment, and a ball if pushes are sampled. With
+    ``recovery`` and without an assessment it has an input port ``safety_probability``.
     """
 
     Parameters = BalancingParameters
@@ -59,30 +57,26 @@ class Balancing(LeggedLoop):
         planner = self._add_planner(
             builder, outlook_s=scenario.episode_duration_s, num_outlook=_NUM_OUTLOOK
         )
-        controller = self._controller = builder.AddNamedSystem(
-            "inverse_kinematics_controller",
-            InverseKinematicsController(
-                kinematics, period_s=period_s, offset_s=self._control_offset_s
-            ),
+        controller = self._controller = InverseKinematicsController(
+            kinematics, period_s=period_s, offset_s=self._control_offset_s
         )
+        builder.AddNamedSystem("inverse_kinematics_controller", controller)
         names = ("desired_output", "desired_preview", "desired_outlook")
         desired = {name: planner.GetOutputPort(name) for name in names}
         self._recovery_switch = switch = None
         if recovery:
-            self._recovery_switch = switch = builder.AddNamedSystem(
-                "recovery_switch",
-                RecoverySwitch(
-                    kinematics,
-                    parameters.recovery.step,
-                    threshold=parameters.recovery.threshold,
-                    persistence_s=parameters.recovery.persistence_s,
-                    initial_uncertainty=scenario.assessment.initial_uncertainty,
-                    period_s=period_s,
-                    offset_s=self.tick_s,
-                    horizon=scenario.assessment.horizon,
-                    num_outlook=_NUM_OUTLOOK,
-                ),
+            self._recovery_switch = switch = RecoverySwitch(
+                kinematics,
+                parameters.recovery.step,
+                threshold=parameters.recovery.threshold,
+                persistence_s=parameters.recovery.persistence_s,
+                initial_uncertainty=scenario.assessment.initial_uncertainty,
+                period_s=period_s,
+                offset_s=self.tick_s,
+                horizon=scenario.assessment.horizon,
+                num_outlook=_NUM_OUTLOOK,
             )
+            builder.AddNamedSystem("recovery_switch", switch)
             builder.Connect(measured, switch.GetInputPort("plant_state"))
             for name, port in desired.items():
                 builder.Connect(port, switch.GetInputPort(f"nominal_{name}"))
@@ -159,7 +153,7 @@ class Balancing(LeggedLoop):
         return replace(super().start_of(context), foot_positions=feet)
 
     def start_control(self, context: Context) -> None:
-        """Sets the command for the present state and plan; see `LeggedLoop`."""
+        """Sets the command for the present state and plan."""
         self._controller.start(self._controller.GetMyMutableContextFromRoot(context))
 
     def advance_control(self, context: Context, time_s: float) -> None:

@@ -18,8 +18,7 @@ from drake_safety.files.progress import StageProgress
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import Scenario
 
-PAPER_THRESHOLD = 0.6
-"""Γ_thre of the paper, on b_safe, the probability in the paper's mode."""
+PAPER_THRESHOLD = 0.6  # Γ_thre, on b_safe, the probability in the paper's mode.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +51,9 @@ def evaluate_throws(
     persistence_s: float = 0.0,
     num_workers: int | None = None,
 ) -> tuple[dict[Key, Estimate], list[Motion]]:
-    """Throws balls at the actual plant and compares the triggers of rules and their outcomes.
-
-    Returns the estimates by key, and the throws without recovery.
-    """
+    """Compares the triggers of rules and their outcomes; also returns throws without recovery."""
+    # The motion before a recovery does not depend on the trigger: a throw is logged once without
+    # recovery, rules are evaluated on the log, and recovery is triggered at the times found.
     throw = partial(run_throws, scenario, seed=seed, num_workers=num_workers)
     logs = throw(range(num_throws), progress=partial(progress, "throws, balancing alone"))
     triggers = {
@@ -88,7 +86,6 @@ def evaluate_throws(
 def _rule_estimates(
     logs: Sequence[Motion], times: np.ndarray, recovered: Mapping[int, Motion]
 ) -> dict[str, Estimate]:
-    """Estimates of a rule from its trigger times (N,), NaN for never, and its recoveries."""
     times = np.where(np.isnan(times), np.inf, times)
     impact = np.array([log.push_time_s for log in logs])
     fall = np.array([log.fall_time_s for log in logs])

@@ -1,9 +1,4 @@
-"""Throws: balls thrown at a balancing robot, and logs of them.
-
-The motion before a recovery does not depend on the trigger. So a throw is logged once without
-recovery, every Γ or baseline is evaluated on the log, and the recovery is simulated from the same
-seed with the trigger at the time found.
-"""
+"""Throws: balls thrown at a balancing robot, and logs of them."""
 
 from __future__ import annotations
 
@@ -31,7 +26,6 @@ from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import Progress, map_items
 
 VIOLATIONS = ("legs_collide", "joint_position", "joint_velocity", "joint_effort")
-"""Physically implausible states; see :class:`Violations`."""
 _FLIGHT_S = 0.1  # From the ball's release to its impact.
 _EARLIEST_S, _LATEST_S = 0.4, 1.2  # Impact of a random ball.
 _AFTER_S = 5.0  # From the first impact to the end.
@@ -50,12 +44,10 @@ class HasBall(Protocol):
 
 
 class Violations:
-    """Tells which of `VIOLATIONS` a state has: it is implausible, which invalidates a success.
+    """Tells which of `VIOLATIONS` make a state implausible, which invalidates a success.
 
-    - ``legs_collide``: two bodies of the robot that are not neighbours penetrate each other;
-    - ``joint_position``: a joint more than 0.02 rad beyond a stop;
-    - ``joint_velocity``: a joint faster than its limit;
-    - ``joint_effort``: the actuation of a joint above its limit.
+    Bodies of the robot penetrate each other, or a joint is more than 0.02 rad beyond a stop, or
+    above its limit of velocity or of actuation.
     """
 
     _POSITION_SLACK_RAD = 0.02
@@ -76,7 +68,7 @@ class Violations:
         self._effort_limits = np.array([limits[each.joint().name()] for each in actuators])
 
     def __call__(self, context: Context) -> list[bool]:
-        """Whether the state of a root Context has each violation."""
+        """Tells whether the state of a root Context has each violation."""
         plant, instance = self._plant, self._instance
         plant_context = plant.GetMyContextFromRoot(context)
         contacts = plant.get_contact_results_output_port().Eval(plant_context)
@@ -113,14 +105,11 @@ def run_throw(
 ) -> Motion:
     """Throws one random ball, or given ones, at a robot in undisturbed motion, until it falls.
 
-    Args:
-        loop: A closed loop with a ball. If it has an input port ``safety_probability`` (recovery
-            without an assessment), recovery is triggered at ``trigger_time_s``; otherwise by Γ.
-        index: Number of the throw; it and the seed determine start, plan and ball.
-        duration_s: End time [s]; by default 5 s after the first impact.
-        ports: Ports to log besides the assessor's inputs, ``margins``, ``plant_state``,
-            ``recovery_active`` if there is one, and ``violations``, (N, 4), of `VIOLATIONS`.
-        **options: As for :func:`~drake_safety.simulation.motion.simulate`.
+    It logs the assessor's inputs, ``margins``, ``plant_state``, ``recovery_active`` if there is
+    one, ``violations`` (N, 4) and further ports; it ends at ``duration_s``, by default 5 s after
+    the first impact. If the loop has an input port ``safety_probability`` (recovery without an
+    assessment), recovery is triggered at ``trigger_time_s``; otherwise by Γ. ``options`` are as for
+    :func:`~drake_safety.simulation.motion.simulate`.
     """
     thrown = require(loop, HasBall)
     if throws is None:

@@ -50,9 +50,8 @@ class PendulumParameters:
 class PendulumSafeSet:
     """Bounds of the pendulum's angle to the front and to the back.
 
-    Features use the capture angle φ + φ̇ √(l/g): beyond the angle that the motor can hold, the
-    pendulum cannot return. Following the plan takes the torque (l/g) φ̈ - sin φ, in units of the
-    torque that holds the pendulum horizontally.
+    Beyond the capture angle φ + φ̇ √(l/g) that the motor can hold, the pendulum cannot return. A
+    plan takes the torque (l/g) φ̈ - sin φ, by that which holds the pendulum horizontally.
     """
 
     names = ("front", "back")
@@ -71,10 +70,7 @@ class PendulumSafeSet:
         return _reserves(self._parameters.largest_angle_rad, q)
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
-        """Margins now, and reserves of angle [rad] and torque [1] along the plan, (n_f,).
-
-        The plan's points are from now to its end, (M, 3) [m].
-        """
+        """Margins now, and reserves of angle [rad] and torque [1] along a plan (M, 3) [m]."""
         hold, capture = self._parameters.hold_angle_rad, q + self._time_s * v
         planned = np.arctan2(preview[:, 0], preview[:, 2])
         rate = np.gradient(planned, self._step_s)
@@ -106,7 +102,7 @@ class PendulumObserver(LeafSystem):
         output_ports: [plant_state, output, features]
 
     ``pendulum_state`` is Drake's, from hanging; ``plant_state`` is [φ, φ̇] from upright [rad,
-    rad/s], and ``output`` the bob's position relative to the hinge, (3,) [m].
+    rad/s], and ``output`` the bob's position relative to the hinge [m].
     """
 
     def __init__(self, length_m: float, safe_set: PendulumSafeSet):
@@ -167,11 +163,7 @@ class PendulumController(LeafSystem):
 
 
 class Pendulum(PlannedLoop):
-    """The diagram of the pendulum: Drake's plant and a controller with limited torque.
-
-    The output is the bob's position relative to the hinge, which follows a plan of points. In a
-    plant variation, mass and damping can vary.
-    """
+    """The diagram of the pendulum, whose bob follows a plan of positions relative to the hinge."""
 
     Parameters = PendulumParameters
     angular_constraints = PendulumSafeSet.names
@@ -190,8 +182,7 @@ class Pendulum(PlannedLoop):
         if varied != plain:
             raise ValueError("pendulum: variations may set mass_scale and joint_damping alone")
         parameters, period_s = scenario.parameters, scenario.control_period_s
-        outlook_s = scenario.episode_duration_s
-        builder = DiagramBuilder()
+        outlook_s, builder = scenario.episode_duration_s, DiagramBuilder()
         pendulum = self._pendulum = builder.AddNamedSystem("pendulum", PendulumPlant())
         planner = self._add_planner(builder, outlook_s=outlook_s, num_outlook=_NUM_OUTLOOK)
         safe_set = PendulumSafeSet(parameters, outlook_s / (_NUM_OUTLOOK - 1))

@@ -25,12 +25,9 @@ _NEAR_M = 0.005  # Tolerance of the hand's position.
 class KinematicPreview:
     """Positions of the whole body along a plan of its hand, with fixed feet.
 
-    The whole-body controller commands K_p e - K_d ė for every task. With equal gains of all tasks
-    and no active torque or friction limit, the robot follows the minimisers of
-
-        Σ w_i |e_i(q)|² + w_posture |q_j - q_posture|²  with fixed feet.
-
-    These are computed by Gauss-Newton steps, more of them while the hand is off the plan.
+    With equal gains of all tasks and no active limit, the whole-body controller follows the
+    minimisers of Σ w_i |e_i(q)|² + w_posture |q_j - q_posture|² with fixed feet. These are computed
+    by Gauss-Newton steps, more of them while the hand is off the plan.
     """
 
     def __init__(self, model: WholeBodyModel):
@@ -75,7 +72,7 @@ class KinematicPreview:
 
 
 def chain_joints(kinematics: RobotKinematics, hand: Hand) -> list[int]:
-    """Returns the joints between base and hand, as indices into the robot's joints, (n_chain,)."""
+    """Finds the joints between base and hand, as indices into the robot's joints."""
     plant = kinematics.plant
     instance = plant.GetModelInstanceByName(kinematics.robot.name)
     return [

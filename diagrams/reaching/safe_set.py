@@ -36,34 +36,24 @@ _SOON_S = 0.1  # Horizon of the extrapolation at constant velocity.
 class ReachingLimits:
     """Limits of :class:`ReachingSafeSet`."""
 
-    joint_margin_rad: NotNegative = 0.03
-    """Least safe distance of a joint from a stop [rad]."""
+    joint_margin_rad: NotNegative = 0.03  # Least safe distance of a joint from a stop.
+    # Height below which a contact point is part of the support polygon.
     support_clearance_m: NotNegative = 0.03
-    """Height below which a contact point is part of the support polygon [m]."""
+    # The robot has fallen below this share of its standing height, or beyond the tilt.
     fall_height_share: Annotated[float, Field(gt=0, lt=1)] = 0.7
-    """Share of the base's standing height below which the robot has fallen."""
     fall_tilt_rad: Annotated[float, Field(gt=0, lt=math.pi)] = 0.6
-    """Angle between the base's z axis and the vertical beyond which it has fallen [rad]."""
 
 
 class ReachingSafeSet:
     """Safe set of a reaching robot: base over its feet, arms clear, joints off their stops.
 
-    The constraints, in the order of :attr:`names`:
-
-    - ``support_polygon``: signed distance of the base's ground projection to the boundary of
-      the polygon of the feet on the ground [m];
-    - ``collision``: distance of the arms to the nearest obstacle, at most the clearance's range
-      [m];
-    - ``joint_limits``: distance of the joint nearest to a stop, at most half a turn, less
-      ``joint_margin_rad`` [rad];
+    - ``support_polygon``: signed distance of the base to the edge of the polygon of the feet [m];
+    - ``collision``: distance of the arms to the nearest obstacle, at most the clearance's range;
+    - ``joint_limits``: distance of the joint nearest to a stop less ``joint_margin_rad`` [rad];
     - ``fall``: the smaller of the height over the lowest height and the height that a rigid
       pendulum of the standing height loses before ``fall_tilt_rad`` [m].
 
     With ``is_mirrored``, the features of a hand are those of the other hand in the mirrored scene.
-
-    Args:
-        model: Tasks and weights of the controller, with the reaching hand.
     """
 
     names = ("support_polygon", "collision", "joint_limits", "fall")
@@ -72,7 +62,6 @@ class ReachingSafeSet:
     watched_features = MappingProxyType(
         {"capture_point_margin": "capture_point_support", "support_margin": "now_support_polygon"}
     )
-    """Features for baseline monitors, by name of the monitor."""
 
     def __init__(
         self,
@@ -120,7 +109,6 @@ class ReachingSafeSet:
         ]
 
     def _joint_margins(self, q: np.ndarray) -> np.ndarray:
-        """Distance of every joint to its nearer stop, less the margin, (..., n_j) [rad]."""
         lowest, highest = self.kinematics.position_limits.T
         joints = q[..., NUM_BASE_POSITIONS:]
         # Finite for joints without stops.
@@ -143,8 +131,8 @@ class ReachingSafeSet:
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
         """Margins (n_f,) [m, rad] now, along the plan, and along a preview of the whole body.
 
-        The preview has the desired positions of the hand from now to the goal, in the stance frame,
-        (M, 3) [m]. All are NaN if an argument is not finite, or the quaternion zero.
+        ``preview`` has the desired positions of the hand from now to the goal, in the stance frame,
+        (M, 3) [m]. Features are NaN if an argument is not finite, or the quaternion zero.
         """
         if not is_state(q, v, preview):
             return np.full(len(self.feature_names), np.nan)
@@ -213,7 +201,6 @@ class ReachingSafeSet:
 
 @functools.cache
 def _previewed(num_samples: int) -> np.ndarray:
-    """The samples of a plan that are previewed: evenly spaced, without the first of several."""
     spaced = np.linspace(0, num_samples - 1, _NUM_PREVIEWED + 1).round().astype(int)
     chosen = np.unique(spaced)
     return chosen[1:] if len(chosen) > 1 else chosen

@@ -20,16 +20,11 @@ class PostureSampling:
 
     base_offset_m: Pair[NotNegative] = field(default_factory=lambda: [0.02, 0.02])
     base_lowering_m: NotNegative = 0.08
-    tilt_rad: NotNegative = 0.03
-    """Half-width of roll, pitch and yaw of the base, each."""
-    joint_offset_rad: NotNegative = 0.1
-    """Offset of every joint that is not of a leg."""
-    clearance_m: NotNegative = 0.02
-    """Least distance of the arms to an obstacle."""
-    joint_margin_rad: NotNegative = 0.0
-    """Least distance of every joint to the end of its safe range."""
-    sink_m: NotNegative = 0.0
-    """Initial penetration of the contact points into the compliant ground, as at rest."""
+    tilt_rad: NotNegative = 0.03  # Half-width of roll, pitch and yaw of the base, each.
+    joint_offset_rad: NotNegative = 0.1  # Of every joint that is not of a leg.
+    clearance_m: NotNegative = 0.02  # Least distance of the arms to an obstacle.
+    joint_margin_rad: NotNegative = 0.0  # Least distance of joints to the end of the safe range.
+    sink_m: NotNegative = 0.0  # Initial penetration into the compliant ground, as at rest.
 
     def sample(
         self, safe_set: ReachingSafeSet, rng: np.random.Generator, mirror: Mirror | None = None
@@ -60,10 +55,8 @@ class PostureSampling:
             margins = safe_set.margins(q, v)
             if margins.min() > 0 and np.all(margins >= least):
                 return q
-        raise RuntimeError(
-            f"reaching: none of {_MAX_TRIES} random postures of robot '{kinematics.robot.name}' is "
-            "in the safe set: narrow 'start'"
-        )
+        text = f"none of {_MAX_TRIES} random postures is in the safe set: narrow 'start'"
+        raise RuntimeError(f"reaching: {text}")
 
 
 @schema(kw_only=True)

@@ -35,12 +35,10 @@ _NUM_OUTLOOK = 31  # Samples of the whole plan: dense enough for thin obstacles.
 class Reaching(LeggedLoop):
     """The diagram of the reaching task, for any robot.yaml with feet and reaching frames.
 
-    For the other hand, ``state``, ``desired_preview`` and ``features`` are those of the mirror
-    image, so that one assessment applies to both hands.
-
-    Args:
-        hand: The hand that reaches; the scenario's by default.
-        exploring: Whether episodes with random goals have the scenario's detours and pushes.
+    For the other hand, ``state``, ``desired_preview`` and ``features`` are mirrored, so that one
+    assessment applies to both hands.
+    ``hand`` reaches, by default the scenario's. If ``exploring``, episodes with random goals have
+    the scenario's detours and pushes.
     """
 
     Parameters = ReachingParameters
@@ -75,21 +73,18 @@ class Reaching(LeggedLoop):
         preview = planner.GetOutputPort("desired_preview")
         if self.mirror is not None:
             reflection = np.tile(self.mirror.points(np.ones(3)), scenario.assessment.horizon)
-            reflected = builder.AddNamedSystem(
-                "preview_reflection", MatrixGain(D=np.diag(reflection))
-            )
+            gain = MatrixGain(D=np.diag(reflection))
+            reflected = builder.AddNamedSystem("preview_reflection", gain)
             builder.Connect(preview, reflected.get_input_port())
             preview = reflected.get_output_port()
-        controller = self._controller = builder.AddNamedSystem(
-            "whole_body_controller",
-            WholeBodyController(
-                kinematics,
-                hand=self.hand,
-                actuation_matrix=physics.actuation_matrix(kinematics.joint_names),
-                period_s=scenario.control_period_s,
-                offset_s=2 * self.tick_s,  # After the update of the noise.
-            ),
+        controller = self._controller = WholeBodyController(
+            kinematics,
+            hand=self.hand,
+            actuation_matrix=physics.actuation_matrix(kinematics.joint_names),
+            period_s=scenario.control_period_s,
+            offset_s=2 * self.tick_s,  # After the update of the noise.
         )
+        builder.AddNamedSystem("whole_body_controller", controller)
         self._connect_controller(builder, controller, measured)
         actuators = map(self.plant.get_joint_actuator, self.plant.GetJointActuatorIndices())
         names = [each.name() for each in actuators if each.model_instance() == self.robot_instance]
@@ -134,21 +129,17 @@ class Reaching(LeggedLoop):
         return {} if purpose == "pairs" else {"exploring": False}
 
     def _mirror_to(self, trained_hand: str) -> Mirror | None:
-        """The reflection to the trained hand's side; None for the trained hand."""
         for name in (trained_hand, self.hand):
             self.robot.reaching_frame(name)
         if self.hand == trained_hand:
             return None
         mirror = Mirror(self.kinematics)
         if (image := mirror.hand(trained_hand)) != self.hand:
-            raise ValueError(
-                f"reaching: hands are '{trained_hand}' and its mirror image '{image}'; got "
-                f"'{self.hand}'"
-            )
+            hands = f"'{trained_hand}' and its mirror image '{image}'"
+            raise ValueError(f"reaching: hands are {hands}; got '{self.hand}'")
         return mirror
 
     def _reflected(self, points: np.ndarray) -> np.ndarray:
-        """Reflects points (..., 3) from the trained hand's side, or to it."""
         return points if self.mirror is None else self.mirror.points(points)
 
     def _reflected_push(self, push: Push) -> Push:
@@ -167,10 +158,7 @@ class Reaching(LeggedLoop):
     def reset(
         self, context: Context, rng: np.random.Generator, goal: np.ndarray | None = None
     ) -> int:
-        """Samples a standing posture and a target, and plans the hand's motion between them.
-
-        Returns the first step after the initial push; 0 without one.
-        """
+        """Samples a standing posture and a target, and plans the hand's motion between them."""
         parameters = self.scenario.parameters
         q = parameters.start.sample(self.safe_set, rng, self.mirror)
         drawn = rng.uniform(*parameters.target.box)
@@ -244,7 +232,6 @@ class Reaching(LeggedLoop):
         self._enter(context, EpisodeStart(q=q, v=v, plan=plan))
 
     def _stance_in_world(self, q: np.ndarray) -> RigidTransform:
-        """The frame of plans."""
         contacts = self.kinematics.contact_positions(q)
         return planar_pose(fit_stance(contacts, self.kinematics.nominal_contacts))
 

@@ -26,17 +26,11 @@ class CommandGuard(LeafSystem):
           is_changed: 1, safety_probability: 1]
 
     Every ``period_s`` the asked command, held from now on, is assessed. It is passed on if its
-    probability reaches the threshold. Otherwise ``desired_output`` is the accepted command nearest
-    to it, measured in the policy's ranges, among commands whose entries are shares of the asked
-    ones; if none is accepted, the one with the largest probability. ``safety_probability`` is that
-    of the asked command. ``learned`` of a
-    :class:`~drake_safety.systems.safety_assessor.SafetyAssessor` replaces the beliefs of the
-    assessment. Whether the guard acts is a parameter of the Context.
-
-    Args:
-        with_commands: Maps features (n_f,) and commands (C, 3) to the features (C, n_f) of these
-            commands.
-        num_outlook: M, samples of the outlook.
+    probability, ``safety_probability``, reaches the threshold. Otherwise ``desired_output`` is the
+    accepted command nearest to it, measured in the policy's ranges, among commands whose entries
+    are shares of the asked ones; if none is accepted, the most probable one. ``learned`` of a
+    :class:`~drake_safety.systems.safety_assessor.SafetyAssessor` replaces the assessment's beliefs.
+    ``with_commands`` maps features (n_f,) and commands (C, 3) to the commands' features (C, n_f).
     """
 
     def __init__(
@@ -89,7 +83,6 @@ class CommandGuard(LeafSystem):
         return commands[np.argsort(distance, kind="stable")]
 
     def _probabilities(self, context: Context, commands: np.ndarray) -> np.ndarray:
-        """Probability of constant commands (C, 3) from now on, (C,); 0 where it is "don't know"."""
         state, features = self._state_port.Eval(context), self._features_port.Eval(context)
         if not (np.isfinite(state).all() and np.isfinite(features).all()):
             return np.zeros(len(commands))
@@ -102,7 +95,6 @@ class CommandGuard(LeafSystem):
         ).probability
 
     def _decide(self, context: Context, asked: np.ndarray) -> tuple[np.ndarray, float]:
-        """The command to pass on, (3,), and the probability of the asked one."""
         if not np.isfinite(asked).all():
             return np.zeros(3), 0.0
         asked_probability = float(self._probabilities(context, asked[None])[0])

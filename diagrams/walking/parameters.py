@@ -20,12 +20,9 @@ _RAMP_S = 0.1  # From one command to the next.
 class CommandSampling:
     """Random velocity profiles."""
 
-    reach: Positive = 3.0
-    """How far commands go beyond the policy's ranges, as a factor on them."""
-    inside_share: Share = 0.3
-    """Share of profiles inside the policy's ranges."""
-    num_segments: Bounds[Count] = field(default_factory=lambda: [1, 3])
-    """Least and largest number of constant commands in an episode."""
+    reach: Positive = 3.0  # Factor on the policy's ranges, beyond which commands go.
+    inside_share: Share = 0.3  # Of profiles inside the policy's ranges.
+    num_segments: Bounds[Count] = field(default_factory=lambda: [1, 3])  # Constant commands.
     standing_share: Share = 0.1
 
     def sample_command(
@@ -65,22 +62,17 @@ def profile(
 class WalkingStart:
     """Random initial states: standing or in mid-stride, some with an offset as after a push."""
 
-    standing_share: Share = 0.25
-    """Share of episodes that begin at rest in the standing posture."""
+    standing_share: Share = 0.25  # Of episodes that begin at rest in the standing posture.
+    # Of the others, the shortest and longest time since the robot stood.
     walked_s: Bounds[NotNegative] = field(default_factory=lambda: [0.2, 1.6])
-    """Shortest and longest time of the others since the robot stood [s]."""
-    push_share: Share = 0.5
-    """Share of episodes with an offset."""
-    velocity_m_s: float = 2.0
-    """Largest horizontal velocity offset of the base."""
-    angular_velocity_rad_s: float = 1.5
-    """Half-width of the base's angular velocity offset, per axis."""
+    push_share: Share = 0.5  # Of episodes with an offset.
+    velocity_m_s: float = 2.0  # Largest horizontal velocity offset of the base.
+    angular_velocity_rad_s: float = 1.5  # Half-width of the base's, per axis.
     tilt_rad: float = 0.15
-    joint_rad: float = 0.05
-    """Standard deviation of the joints' offsets."""
+    joint_rad: float = 0.05  # Standard deviation of the joints' offsets.
 
     def offset_velocities(self, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Returns velocities, of the base in the world and angular first, with a sampled offset."""
+        """Adds a sampled offset to velocities, of the base in the world and angular first."""
         v = v.copy()
         speed, direction = rng.uniform(0, self.velocity_m_s), rng.uniform(-math.pi, math.pi)
         v[:3] += rng.uniform(-1, 1, 3) * self.angular_velocity_rad_s
@@ -88,7 +80,7 @@ class WalkingStart:
         return v
 
     def offset_positions(self, q: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Samples an offset of tilt and joints, and returns the sum."""
+        """Adds a sampled offset of tilt and joints to positions."""
         q = q.copy()
         a, b = 0.5 * rng.uniform(-1, 1, 2) * self.tilt_rad
         w, x, y, z = q[:4]
@@ -105,8 +97,7 @@ class WalkingStart:
 class GuardParameters:
     """The command guard."""
 
-    threshold: Share = 0.9
-    """Lowest probability of a command that is passed on; set after a look at figures."""
+    threshold: Share = 0.9  # Lowest probability of a command that is passed on.
     period_s: Positive = 0.1
 
 
@@ -114,15 +105,11 @@ class GuardParameters:
 class WalkingRecovery:
     """What the robot does when the probability falls below a threshold."""
 
-    branch: Literal["stop", "slower"] = "stop"
-    """``stop``: a command of zero; ``slower``: a share of the command."""
-    threshold: float = 0.5
-    """Γ_thre, of the probability; not tuned."""
+    branch: Literal["stop", "slower"] = "stop"  # A command of zero, or a share of the command.
+    threshold: float = 0.5  # Γ_thre, of the probability; not tuned.
+    # How long "don't know" must last: a single row of a start can be unlike those of training.
     persistence_s: NotNegative = 0.04
-    """Time for which Γ must have been below it while nothing is known [s]: when the robot begins to
-    move, a single row can be unlike those of training."""
     slower_share: float = 0.3
-    """Share of the command for ``slower``."""
 
 
 @schema(kw_only=True)
@@ -145,11 +132,9 @@ class WalkingParameters:
     safe_set: WalkingLimits = field(default_factory=WalkingLimits)
     commands: CommandSampling = field(default_factory=CommandSampling)
     start: WalkingStart = field(default_factory=WalkingStart)
-    named_commands: dict[str, Triple] = field(default_factory=dict)
-    """Named commands (v_x, v_y, ω_z) [m/s, rad/s]."""
+    named_commands: dict[str, Triple] = field(default_factory=dict)  # (v_x, v_y, ω_z).
     pushes: dict[str, Push] = field(default_factory=dict)
-    random_pushes: RandomPushes = field(default_factory=RandomPushes)
-    """Pushes by which alarms and recovery are judged."""
+    random_pushes: RandomPushes = field(default_factory=RandomPushes)  # To judge alarms by.
     view: View = field(default_factory=View)
     guard: GuardParameters = field(default_factory=GuardParameters)
     recovery: WalkingRecovery = field(default_factory=WalkingRecovery)

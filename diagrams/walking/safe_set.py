@@ -19,18 +19,14 @@ _AXES = ("forward", "left", "yaw")
 
 @schema(kw_only=True)
 class WalkingLimits:
-    """Limits of :class:`WalkingSafeSet`."""
+    """Limits of :class:`WalkingSafeSet`; heights are shares of the standing height."""
 
     tilt_rad: Annotated[float, Field(gt=0, lt=math.pi)] = 0.7
-    """Largest angle between the base's z axis and the vertical [rad]."""
     height_share: float = 0.6
-    """Lowest height of the base, as a share of the standing height."""
+    # Least height of the origins of bodies that must not touch the ground, by name.
     clearance_m: dict[str, float] = field(default_factory=dict)
-    """Least height of the origins of bodies that must not touch the ground [m], by name."""
-    stop_rad: float = 0.1
-    """How far a joint may be driven beyond a stop, which in simulation is soft [rad]."""
+    stop_rad: float = 0.1  # How far a joint may be beyond a stop, which in simulation is soft.
     fall_height_share: float = 0.45
-    """Height of the base below which the robot has fallen, as a share of the standing height."""
     fall_tilt_rad: Annotated[float, Field(gt=0, lt=math.pi)] = 1.2
 
     def __post_init__(self) -> None:
@@ -42,8 +38,6 @@ class WalkingLimits:
 
 class WalkingSafeSet:
     """Safe set of a walking robot.
-
-    The constraints, in the order of :attr:`names`:
 
     - ``tilt``: angle left until ``tilt_rad`` [rad];
     - ``height``: height of the base over ``height_share`` of the standing height [m];
@@ -59,7 +53,6 @@ class WalkingSafeSet:
     watched_features = MappingProxyType(
         {"tilt": "tilt_margin", "capture_point_margin": "capture_point_support"}
     )
-    """Features for baseline monitors, by name of the monitor."""
 
     def __init__(self, kinematics: RobotKinematics, limits: WalkingLimits):
         self.kinematics = kinematics
@@ -71,10 +64,7 @@ class WalkingSafeSet:
         self._lowest_m = limits.height_share * kinematics.standing_height
         self._fallen_m = limits.fall_height_share * kinematics.standing_height
         self.feature_names = [
-            "tilt_margin",
-            "height_margin",
-            "clearance_margin",
-            "joint_margin",
+            *("tilt_margin", "height_margin", "clearance_margin", "joint_margin"),
             *(f"command_{axis}" for axis in _AXES),
             *(f"last_command_{axis}" for axis in _AXES),
             *(f"largest_command_{axis}" for axis in _AXES),
@@ -90,11 +80,8 @@ class WalkingSafeSet:
         if not self._clear:
             return self.kinematics.standing_height
         self.kinematics.set_positions(q)
-        context = self.kinematics.context
-        return min(
-            float(body.EvalPoseInWorld(context).translation()[2]) - least
-            for body, least in self._clear
-        )
+        poses = [(body.EvalPoseInWorld(self.kinematics.context), h) for body, h in self._clear]
+        return min(float(pose.translation()[2]) - least for pose, least in poses)
 
     def margins(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Returns the signed margins (5,) of a state; minus infinity without one."""
@@ -116,10 +103,9 @@ class WalkingSafeSet:
         )
 
     def features(self, q: np.ndarray, v: np.ndarray, preview: np.ndarray) -> np.ndarray:
-        """The margins now, the coming commands, the tracking error and the capture point, (n_f,).
+        """Margins, tracking error and capture point now, and the coming commands (M, 3), (n_f,).
 
-        The preview has the commands from now on, (M, 3) [m/s, rad/s]. All are NaN if an argument is
-        not finite, or the quaternion zero.
+        They are NaN if an argument is not finite, or the quaternion zero.
         """
         if not is_state(q, v, preview):
             return np.full(len(self.feature_names), np.nan)
@@ -165,14 +151,12 @@ class WalkingSafeSet:
 
 
 def _tilt(q: np.ndarray) -> float:
-    """The angle between the base's z axis and the vertical [rad]."""
     w, x, y, z = (q[:4] / math.sqrt(q[:4] @ q[:4])).tolist()
     level = math.hypot(2 * (x * z - w * y), 2 * (y * z + w * x))
     return math.atan2(level, 1 - 2 * (x * x + y * y))
 
 
 def _tilt_rate(q: np.ndarray, v: np.ndarray) -> float:
-    """Rate of the angle between the base's z axis and the vertical [rad/s]."""
     w, x, y, z = (q[:4] / math.sqrt(q[:4] @ q[:4])).tolist()
     z_axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x)])
     length = math.hypot(*z_axis)

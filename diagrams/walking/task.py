@@ -21,13 +21,7 @@ from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot
 from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
-from drake_safety.policies.policy import (
-    Policy,
-    load_policy,
-    network_file,
-    read_policy_file,
-    with_policy,
-)
+from drake_safety.policies.policy import load_policy, network_file, read_policy_file, with_policy
 from drake_safety.policies.policy_network import network_files
 from drake_safety.simulation.capabilities import GoalWords
 from drake_safety.simulation.closed_loop import Purpose
@@ -48,16 +42,15 @@ _UNCOMMANDED = "action_change"
 class Walking(LeggedLoop):
     """The diagram of the walking task, for any robot.yaml with feet and a policy.yaml.
 
-    Plans are velocity profiles (v_x, v_y, ω_z) in the heading frame [m/s, rad/s]; the output z is
-    the measured velocity, and a goal is a constant command.
+    Plans are velocity profiles (v_x, v_y, ω_z) in the heading frame [m/s, rad/s]; a goal is a
+    constant command.
 
     Args:
         disturbed: Whether some episodes begin with an offset of the state.
-        command_s: Duration of a goal's command [s], after which it is zero; by default the
-            episode's.
+        command_s: Duration of a goal's command, then zero [s]; by default the episode's.
         guard: Whether a :class:`CommandGuard` passes on commands; requires an assessment.
-        recovery: Whether to recover when Γ falls below a threshold. Without an assessment the
-            diagram then has an input port ``safety_probability``.
+        recovery: Whether to recover when Γ, or without an assessment the input port
+            ``safety_probability``, falls below a threshold.
         starts_of: The scenario whose policy walks before the start, and whose commands and standing
             height count; by default this one.
     """
@@ -108,28 +101,27 @@ class Walking(LeggedLoop):
         safe_set = WalkingSafeSet(standing.kinematics, parameters.safe_set)
         self._guard: CommandGuard | None = None
         if guard and assessment is not None:
-            self._guard = builder.AddNamedSystem(
-                "command_guard",
-                CommandGuard(
-                    assessment,
-                    safe_set.with_commands,
-                    self.policy.parameters.command,
-                    threshold=parameters.guard.threshold,
-                    period_s=parameters.guard.period_s,
-                    offset_s=self.tick_s,
-                    num_outlook=_NUM_OUTLOOK,
-                ),
+            self._guard = CommandGuard(
+                assessment,
+                safe_set.with_commands,
+                self.policy.parameters.command,
+                threshold=parameters.guard.threshold,
+                period_s=parameters.guard.period_s,
+                offset_s=self.tick_s,
+                num_outlook=_NUM_OUTLOOK,
             )
+            builder.AddNamedSystem("command_guard", self._guard)
             builder.Connect(desired["desired_output"], self._guard.GetInputPort("command"))
             desired = {name: self._guard.GetOutputPort(name) for name in names}
         trigger, command = None, desired["desired_output"]
         if recovery:
             trigger, command = self._add_recovery(builder, command)
-        controller = self._controller = builder.AddNamedSystem(
-            "policy_controller",
-            # After guard or trigger.
-            PolicyController(self.kinematics, self.policy, offset_s=2 * self.tick_s),
+        controller = self._controller = PolicyController(
+            self.kinematics,
+            self.policy,
+            offset_s=2 * self.tick_s,  # After guard or trigger.
         )
+        builder.AddNamedSystem("policy_controller", controller)
         builder.Connect(measured, controller.GetInputPort("plant_state"))
         builder.Connect(command, controller.GetInputPort("command"))
         joint_state = self._servo_command(builder, controller.GetOutputPort("desired_joint_state"))
@@ -164,18 +156,15 @@ class Walking(LeggedLoop):
     def _add_recovery(
         self, builder: DiagramBuilder, nominal: OutputPort
     ) -> tuple[RecoveryTrigger, OutputPort]:
-        """The trigger, and the command, or a share of it during recovery."""
         recovery = self.scenario.parameters.recovery
-        trigger = builder.AddNamedSystem(
-            "recovery_trigger",
-            RecoveryTrigger(
-                threshold=recovery.threshold,
-                initial_uncertainty=self.scenario.assessment.initial_uncertainty,
-                persistence_s=recovery.persistence_s,
-                period_s=self.scenario.control_period_s,
-                offset_s=self.tick_s,
-            ),
+        trigger = RecoveryTrigger(
+            threshold=recovery.threshold,
+            initial_uncertainty=self.scenario.assessment.initial_uncertainty,
+            persistence_s=recovery.persistence_s,
+            period_s=self.scenario.control_period_s,
+            offset_s=self.tick_s,
         )
+        builder.AddNamedSystem("recovery_trigger", trigger)
         share = recovery.slower_share if recovery.branch == "slower" else 0.0
         slower = builder.AddNamedSystem("slower_command", Gain(share, nominal.size()))
         switch = builder.AddNamedSystem("command_switch", PortSwitch(nominal.size()))
@@ -228,7 +217,7 @@ class Walking(LeggedLoop):
     def reset(
         self, context: Context, rng: np.random.Generator, goal: np.ndarray | None = None
     ) -> int:
-        """Samples a start, some with an offset, and a velocity profile; a goal is its command."""
+        """Samples a start and a velocity profile; a goal is its command."""
         parameters = self.scenario.parameters
         starter = self if self._starts_of is None else self._rehearsing()
         sampling, limits = parameters.start, starter.policy.parameters.command
@@ -283,7 +272,6 @@ class Walking(LeggedLoop):
         self._guard.set_acting(self._guard.GetMyMutableContextFromRoot(context), is_guarded)
 
     def _above_ground(self, q: np.ndarray) -> np.ndarray:
-        """Joints within their stops, and the feet lifted out of the ground, (n_q,)."""
         kinematics, q = self.kinematics, q.copy()
         lowest, highest = kinematics.position_limits.T
         q[NUM_BASE_POSITIONS:] = np.clip(q[NUM_BASE_POSITIONS:], lowest, highest)
@@ -303,12 +291,9 @@ class Walking(LeggedLoop):
             self._controller.set_state(own_context, start.controller_state)
 
     def rehearse(self, command: np.ndarray, duration_s: float) -> EpisodeStart:
-        """Walks by a command (3,) from the standing posture, undisturbed, by the nominal robot.
-
-        The duration is rounded to the policy's period, so that the controller's next update is due.
-        """
+        """Walks by a command (3,) from standing, undisturbed, for whole periods of the policy."""
         other, period_s = self._rehearsing(), self.policy.parameters.period_s
-        if _remembered(other.policy) != _remembered(self.policy):
+        if other._remembered() != self._remembered():
             raise ValueError(
                 "walking: a policy cannot take over in mid-stride from one with other observations "
                 "or joints, nor a recurrent one: set parameters.start.standing_share: 1"
@@ -326,15 +311,19 @@ class Walking(LeggedLoop):
         q[4:6] = 0.0
         return replace(start, q=q)
 
+    def _remembered(self) -> tuple[Any, ...]:
+        parameters = self.policy.parameters
+        # The memory of a recurrent network is its own.
+        network = parameters.network if len(self.policy.network.initial_memory) else ""
+        return parameters.observation, parameters.history, self.policy.joint_names, network
+
     def _rehearsing(self) -> "Walking":
-        """The nominal loop that walks before the start."""
         if self._rehearsal is None:
             self._rehearsal = type(self)(self._starts_of or self.scenario)
         return self._rehearsal
 
     @cached_property
     def _settled_start(self) -> EpisodeStart:
-        """A start where the policy has stood for a second, with a command of zero."""
         return self.rehearse(np.zeros(3), _SETTLING_S)
 
     def standing_start(self) -> EpisodeStart:
@@ -346,13 +335,6 @@ class Walking(LeggedLoop):
     def _stance_of(self, start: EpisodeStart) -> np.ndarray:
         del start
         return np.zeros(3)  # Commands are in the heading frame, wherever the feet are.
-
-
-def _remembered(policy: Policy) -> tuple[Any, ...]:
-    """What tells the memories of two policies apart: that of a recurrent network is its own."""
-    parameters, is_recurrent = policy.parameters, len(policy.network.initial_memory) > 0
-    network = parameters.network if is_recurrent else ""
-    return parameters.observation, parameters.history, policy.joint_names, network
 
 
 def policy_files(scenario: Scenario) -> tuple[Path, str]:

@@ -14,7 +14,7 @@ from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import cause_words, likely_cause
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import floats
-from drake_safety.simulation.capabilities import HasGoals, goal_words, is_in_box, require
+from drake_safety.simulation.capabilities import HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 
 
@@ -83,7 +83,7 @@ def assess_goal(
     """
     goal, with_goals = checked_goal(goal), require(loop, HasGoals)
     box, words = with_goals.target_box, goal_words(with_goals)
-    if is_in_box(goal, box):
+    if np.all((goal >= box[0]) & (goal <= box[1])):
         return assess_goals(
             loop, assessment, goal[None], threshold=threshold, unsafe_below=unsafe_below
         )[0]

@@ -1,7 +1,4 @@
-"""Protocols of optional features of a task, queried by ``isinstance`` or :func:`require`.
-
-Throughout, ``context`` is the diagram's root Context, which a reset overwrites.
-"""
+"""Protocols of optional features of a task; every ``context`` is the diagram's root Context."""
 
 from __future__ import annotations
 
@@ -28,8 +25,7 @@ class HasGoals(Protocol):
     """Plans lead to a goal: three numbers, a point in the world [m] or what `goal_words` says."""
 
     named_targets: Mapping[str, list[float]]
-    hand: str | None
-    """The reaching frame that moves to the goal; None for another part of the robot."""
+    hand: str | None  # The reaching frame that moves to the goal, if one does.
 
     @property
     def target_box(self) -> np.ndarray:
@@ -66,8 +62,8 @@ class GoalWords:
     def value(self, goal: np.ndarray) -> str:
         """A goal with its units."""
         numbers = [f"{value:.12g}" for value in goal.tolist()]
-        if len(self.units) == 1:
-            return f"{' '.join(numbers)} {self.units[0]}"
+        if self.is_point:
+            return f"{' '.join(numbers)} m"
         return " ".join(f"{n} {u}" for n, u in zip(numbers, self.units, strict=True))
 
     def distance(self, difference: np.ndarray) -> str:
@@ -80,10 +76,9 @@ class GoalWords:
 class CanFall(Protocol):
     """The robot can fall, which ends a motion."""
 
-    fall_name: str
-    """The constraint whose violation is a fall."""
+    fall_name: str  # The constraint whose violation is a fall.
+    # Features that a conventional monitor thresholds, by quantity; larger values are safer.
     watched_features: Mapping[str, str]
-    """Features that a conventional monitor thresholds, by quantity; larger values are safer."""
 
 
 @runtime_checkable
@@ -135,31 +130,15 @@ class CanStartAnywhere(Protocol):
         """State and plan of a Context, as a start for :meth:`reset_to`."""
 
 
-_DESCRIPTIONS = {
-    "HasGoals": "plans with a goal",
-    "HasBall": "ball to throw",
-    "MovesUndisturbed": "long undisturbed motion",
-    "CanFall": "fall",
-    "CanBePushed": "pushes on its robot",
-    "FollowsCommands": "commands that change while it moves",
-    "CanStartAnywhere": "episodes from a given start",
-}
-
-
 def require(loop: object, capability: type[_Capability], who: str = "") -> _Capability:
-    """Returns the loop if it has a capability."""
+    """Returns the loop if it has a capability, a protocol of this module or of a task."""
     if isinstance(loop, capability):
         return loop
-    missing = _DESCRIPTIONS.get(capability.__name__, capability.__name__)
-    raise ValueError(f"{who}{who and ': '}task '{type(loop).__name__}' has no {missing}")
+    who = f"{who}{who and ': '}task '{type(loop).__name__}'"
+    raise ValueError(f"{who} lacks '{capability.__name__}': {capability.__doc__}")
 
 
 def goal_words(loop: HasGoals) -> GoalWords:
     """What the goals of a loop are called: its ``goal_words``, if it has some."""
     words = GoalWords() if loop.hand is None else GoalWords(subject=f"the {loop.hand} hand")
     return getattr(loop, "goal_words", words)
-
-
-def is_in_box(goal: np.ndarray, box: np.ndarray) -> bool:
-    """Whether a goal lies between the lowest and the highest corner of a box, (2, 3) [m]."""
-    return bool(np.all((goal >= box[0]) & (goal <= box[1])))

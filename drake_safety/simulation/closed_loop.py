@@ -14,13 +14,9 @@ from drake_safety.learning.segments import RECORDED, EpisodesInfo
 from drake_safety.systems.monitored_assessor import AddSafetyAssessor, MonitoredSafetyAssessor
 
 REQUIRED_PORTS = (*RECORDED, "safe")
-"""Output ports of every task."""
 ASSESSMENT_PORTS = ("safety_probability", "belief")
-"""Further output ports of a task with an assessment."""
 
 Purpose = Literal["evaluation", "paper", "pairs"]
-"""What a diagram is built for; see :meth:`ClosedLoop.options_for`."""
-
 _NAMES = ("state_names", "output_names", "feature_names", "constraint_names")
 
 
@@ -28,8 +24,7 @@ class ClosedLoop(Diagram):
     """A task's diagram: plant, controller, planner, monitor, and optionally an assessor.
 
     A subclass sets the names of the ports' entries and connects its systems in ``__init__``, calls
-    :meth:`export`, and finally ``builder.BuildInto(self)``. Optional features are the protocols of
-    :mod:`~drake_safety.simulation.capabilities`.
+    :meth:`export`, and finally ``builder.BuildInto(self)``. Optional features are protocols.
 
     ====================== ======= ============================================================
     output port            size    meaning
@@ -51,19 +46,15 @@ class ClosedLoop(Diagram):
     Optional are ``num_controller_failures``, the control periods since the start for which the
     controller found no command, and ``controller_memory``, ``EpisodeStart.controller_state``.
 
-    Attributes:
-        Parameters: Schema of the task's part of the scenario file, a dataclass. It may also have
-            ``online``, names of parameters on which no episode depends, and a class method
-            ``completed(stated, robot)``, which adds defaults that depend on the robot.
-        angular_constraints: Constraints whose margins are angles [rad]; others are lengths [m].
-        fall_name: The constraint whose violation is a fall, which ends a motion; "" for none.
-        monitored: What the change monitor reads: ``states`` that it predicts, and ``features`` by
-            which it predicts them beside the desired preview; by default all.
+    ``Parameters`` is the dataclass of the task's part of the scenario file. It may also have
+    ``online``, names of parameters on which no episode depends, and a class method
+    ``completed(stated, robot)``, which adds defaults that depend on the robot.
     """
 
     Parameters: type
-    angular_constraints: tuple[str, ...] = ()
-    fall_name: str = ""
+    angular_constraints: tuple[str, ...] = ()  # Their margins are angles; others are lengths.
+    fall_name: str = ""  # The constraint whose violation is a fall, which ends a motion.
+    # The "states" that the change monitor predicts, and the "features" by which it does; or all.
     monitored: Mapping[str, list[str]] = {}
     state_names: list[str]
     output_names: list[str]
@@ -78,10 +69,7 @@ class ClosedLoop(Diagram):
 
     @classmethod
     def options_for(cls, purpose: Purpose, scenario: Any, variation: str) -> dict[str, Any]:
-        """Options of the diagram that differ from those of training in the sharpened mode.
-
-        Those for "pairs" let an actual variation and its nominal twin start alike.
-        """
+        """Options of the diagram that differ from training's; in "pairs" twins start alike."""
         del purpose, scenario, variation
         return {}
 
@@ -112,10 +100,7 @@ class ClosedLoop(Diagram):
         return {}
 
     def reset(self, context: Context, rng: np.random.Generator) -> int:
-        """Samples an initial state and a plan into the root Context, at time zero.
-
-        Returns the first step whose future is undisturbed: 0, or later after an initial push.
-        """
+        """Samples a state and a plan; returns the first step whose future is undisturbed."""
         raise TypeError(f"task '{type(self).__name__}' must override reset")
 
     def export(
@@ -129,10 +114,7 @@ class ClosedLoop(Diagram):
     ) -> MonitoredSafetyAssessor | None:
         """Exports output ports by name; adds an assessor and its ports, if there is an assessment.
 
-        Args:
-            period_s: Time between two evaluations of the assessment [s].
-            margins: Measured margins of the safe set; by default the exported ones.
-            hold: See :func:`~drake_safety.systems.monitored_assessor.AddSafetyAssessor`.
+        It reads ``margins``, by default those exported; ``hold`` is as for `AddSafetyAssessor`.
         """
         for name, port in ports.items():
             builder.ExportOutput(port, name)
@@ -153,7 +135,6 @@ class ClosedLoop(Diagram):
         return assessor
 
     def _check_assessment(self, info: EpisodesInfo) -> None:
-        """Checks that an assessment was learned from episodes of this diagram."""
         scenario = self.scenario
         here: dict[str, Any] = {
             "horizon": scenario.assessment.horizon,
@@ -165,10 +146,8 @@ class ClosedLoop(Diagram):
         for name, own in here.items():
             learned = getattr(info, name)
             if (learned := list(learned) if name in _NAMES else learned) != own:
-                raise ValueError(
-                    f"assessment and diagram differ in {name}: the assessment was learned with "
-                    f"{learned}, the diagram has {own}"
-                )
+                text = f"it was learned with {learned}, the diagram has {own}"
+                raise ValueError(f"assessment and diagram differ in {name}: {text}")
 
 
 def port_sizes(diagram: Diagram) -> dict[str, int]:
@@ -189,7 +168,7 @@ def check_ports(loop: ClosedLoop) -> None:
     task = f"task '{type(loop).__name__}'"
     require_ports(loop, REQUIRED_PORTS + (ASSESSMENT_PORTS if loop.assessment else ()))
     if missing := [name for name in _NAMES if not hasattr(loop, name)]:
-        raise ValueError(f"{task} does not set {missing}, lists of names of the ports' entries")
+        raise ValueError(f"{task} does not set {missing}, names of the ports' entries")
     ports = port_sizes(loop)
     states, outputs, features, constraints = (len(getattr(loop, name)) for name in _NAMES)
     sizes = {"state": states, "true_state": states, "output": outputs, "desired_output": outputs}

@@ -19,8 +19,7 @@ class Finding:
     item: str
     is_ok: bool
     message: str
-    remedy: str = ""
-    """How to correct a failure, or what a warning is about; "" if all is well."""
+    remedy: str = ""  # How to correct a failure, or what a warning is about.
 
     @property
     def is_warning(self) -> bool:
@@ -29,21 +28,17 @@ class Finding:
 
 
 def passed(item: str, message: str, remedy: str = "") -> Finding:
-    """The finding of a check that passed; with a warning, if there is a remedy."""
+    """A finding without a problem; a warning if there is a remedy."""
     return Finding(item=item, is_ok=True, message=message, remedy=remedy)
 
 
 def failed(item: str, message: str, remedy: str) -> Finding:
-    """Returns the finding of a check that failed."""
+    """A finding of a problem."""
     return Finding(item=item, is_ok=False, message=message, remedy=remedy)
 
 
 def check_contract(diagram: ClosedLoop, *, seed: int = 0) -> list[Finding]:
-    """Checks that a task's diagram keeps the contract of :class:`ClosedLoop`.
-
-    Its ports exist and have the sizes of its names, `reset` samples a start, and the ports' values
-    are finite at the start and one step later. Checks that depend on a failed one are left out.
-    """
+    """Checks a task's ports and names, its `reset`, and the ports' values over one step."""
     findings = []
     item, remedy = "ports", "set the names and export the ports in __init__; one name per entry"
     try:

@@ -1,8 +1,6 @@
 """Episodes on disk: a folder with an ``info.json`` and Parquet shards, written as they finish.
 
-``info.json`` holds what all episodes share. Each ``episodes-NNNNN.parquet`` has one row per
-(episode, step); arrays are columns of fixed-size lists of float64 in SI units. A file is renamed
-when it is complete: an interrupted run loses at most the episodes that were not flushed.
+A shard has one row per (episode, step); arrays are columns of fixed-size lists of float64.
 """
 
 from __future__ import annotations
@@ -29,10 +27,8 @@ from drake_safety.learning.segments import DIVERGED, LARGEST, Episode, Episodes,
 if TYPE_CHECKING:
     import pyarrow as pa
 
-FLUSH_EPISODES = 64
-"""Number of pending episodes that are written as a shard."""
-FLUSH_S = 10.0
-"""Age of the last shard at which the next episode is written at once, with those pending [s]."""
+FLUSH_EPISODES = 64  # Pending, that are written as a shard.
+FLUSH_S = 10.0  # Age of the last shard at which the next episode is written at once.
 _SCHEMA_VERSION = 1
 _INFO_NAME = "info.json"
 _SHARD_NAME = re.compile(r"episodes-\d{5,}\.parquet")
@@ -44,10 +40,8 @@ _LOGGER = logging.getLogger("drake_safety")
 class EpisodeWriter:
     """Appends episodes to a folder, a shard at a time; a context manager.
 
-    Leaving the ``with`` block writes the pending episodes, after an exception or Ctrl-C too. A
-    folder that holds episodes is continued: ``completed(path)`` gives their indices. The folder is
-    locked until the writer is closed or its process ends. ``extra`` is further content of
-    ``info.json``, as JSON types.
+    Leaving the ``with`` block writes the pending episodes, after an exception or Ctrl-C too. The
+    folder is locked until then. ``extra`` is further content of ``info.json``.
     """
 
     def __init__(
@@ -141,14 +135,12 @@ def read_info(path: str | os.PathLike[str]) -> tuple[EpisodesInfo, dict[str, Any
 
 
 def completed(path: str | os.PathLike[str]) -> set[int]:
-    """Indices of the episodes on disk; empty if nothing was written yet."""
+    """Reads the indices of the episodes on disk."""
     shards = _shards_in(Path(path))
     if shards and not (Path(path) / _INFO_NAME).exists():
         raise ValueError(f"{path} holds {len(shards)} shards but no {_INFO_NAME}")
-    indices: set[int] = set()
-    for shard in shards:
-        indices.update(_read_shard(shard, ["episode"]).column("episode").unique().to_pylist())
-    return indices
+    columns = [_read_shard(shard, ["episode"]).column("episode") for shard in shards]
+    return {index for column in columns for index in column.unique().to_pylist()}
 
 
 def load_episodes(path: str | os.PathLike[str]) -> Episodes:
@@ -157,17 +149,14 @@ def load_episodes(path: str | os.PathLike[str]) -> Episodes:
     episodes: dict[int, Episode] = {}
     for shard in _shards_in(Path(path)):
         with reading(shard):
-            read = _episodes_of(_read_shard(shard), info, shard)
-            Episodes(info, read)  # Checks them.
-        for episode in read:
-            if episode.index in episodes:
-                raise ValueError(f"episode {episode.index} of {shard} is in another shard, too")
-            episodes[episode.index] = episode
+            for episode in Episodes(info, _episodes_of(_read_shard(shard), info, shard)):
+                if episode.index in episodes:
+                    raise ValueError(f"episode {episode.index} of {shard} is in another shard, too")
+                episodes[episode.index] = episode
     return Episodes(info, [episodes[index] for index in sorted(episodes)])
 
 
 def _open_folder(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> None:
-    """Writes what a set shares, or checks that a folder holds the same set."""
     known = None
     if (path / _INFO_NAME).exists():
         stored, known = read_info(path)
@@ -193,16 +182,16 @@ def _open_folder(path: Path, info: EpisodesInfo, extra: Mapping[str, Any]) -> No
 
 def is_same(a: Episode, b: Episode) -> bool:
     """Whether two episodes are the same to the last bit."""
-    for field in dataclasses.fields(Episode):
-        left, right = (np.asarray(getattr(episode, field.name)) for episode in (a, b))
-        # As bytes, NaN equals itself and 0.0 differs from -0.0.
-        if left.shape != right.shape or left.tobytes() != right.tobytes():
-            return False
-    return True
+    # As bytes, NaN equals itself and 0.0 differs from -0.0.
+    left, right = (
+        [(value.shape, value.tobytes()) for value in map(np.asarray, vars(episode).values())]
+        for episode in (a, b)
+    )
+    return left == right
 
 
 def _schema_of(info: EpisodesInfo) -> pa.Schema:
-    """The columns of a set's shards. Parquet has no lists of length 0."""
+    # Parquet has no lists of length 0.
     import pyarrow as pa
 
     arrays = {name: pa.list_(pa.float64(), n) for name, n in info.widths.items() if n}
@@ -213,7 +202,6 @@ def _schema_of(info: EpisodesInfo) -> pa.Schema:
 
 
 def _table_of(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:
-    """The rows of episodes, one after another."""
     import pyarrow as pa
 
     counts = [len(episode.time_s) for episode in episodes]
@@ -229,7 +217,6 @@ def _table_of(episodes: Sequence[Episode], info: EpisodesInfo) -> pa.Table:
 
 
 def _episodes_of(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episode]:
-    """The episodes of a shard's rows; ValueError if they are damaged or of another set."""
     schema, widths, num_rows = _schema_of(info), info.widths, table.num_rows
     is_full = num_rows and not any(column.null_count for column in table.columns)
     if not is_full or not table.schema.equals(schema):
@@ -270,7 +257,6 @@ def _episodes_of(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episo
 
 
 def _shards_in(path: Path) -> list[Path]:
-    """The shards of a folder, in the order of their numbers; none if it does not exist."""
     files = path.glob("episodes-*.parquet")
     return sorted((file for file in files if _SHARD_NAME.fullmatch(file.name)), key=_number)
 
@@ -280,7 +266,6 @@ def _number(shard: Path) -> int:
 
 
 def _read_shard(shard: Path, columns: list[str] | None = None) -> pa.Table:
-    """The rows of a shard, of all columns by default; ValueError if it is damaged."""
     require_extra("train", f"episodes in {shard.parent}", "pyarrow")
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -16,13 +16,10 @@ _DRIFT, _ROUNDING = 0.2, 1e-6  # Of a quaternion's norm.
 class EpisodeStart:
     """A plant state and a plan, from which an episode or its nominal twin starts.
 
-    Attributes:
-        q: Positions in Drake's order: base quaternion (w, x, y, z), base position, joints, (n_q,).
-        v: Velocities: of the base in the world, angular first, then of the joints, (n_v,).
-        plan: Desired output over time since the start, in the stance frame, (n_z, 1) [m].
-        foot_positions: Centres of the contact spheres as the controller assumes them, (n_c, 3)
-            [m]; by default those of ``q``, put on the ground.
-        controller_state: Memory of the controller, such as the phase of a gait.
+    ``q`` and ``v`` are in Drake's order, base first; the plan is of the output since the start, in
+    the stance frame, (n_z, 1) [m]. ``foot_positions`` (n_c, 3) [m] are the centres of the contact
+    spheres as the controller assumes them, by default those of ``q``, put on the ground.
+    ``controller_state`` is the controller's memory, such as the phase of a gait.
     """
 
     q: np.ndarray

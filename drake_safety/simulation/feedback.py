@@ -50,11 +50,7 @@ def run_pairs(
     progress: Progress | bool | None = None,
     **options: Any,
 ) -> EpisodePairs:
-    """Simulates actual episodes and their nominal twins, in worker processes.
-
-    Both episodes of a pair draw from the same generator, so their initial states are the same.
-    ``path`` has a folder for either plant; arguments are as for `run_episodes`.
-    """
+    """Simulates actual episodes and their nominal twins, which start alike, as `run_episodes`."""
     options = scenario.options_for("pairs", variation) | options
     sets = {}
     for i, name in enumerate((variation, _TWINS)):
@@ -72,23 +68,20 @@ def run_pairs(
             progress=report if callable(progress) else progress,
             **options,
         )
-    return EpisodePairs(
-        actual=sets[variation], nominal=sets[_TWINS], nominal_hash=scenario.simulation_hash()
-    )
+    own_hash = scenario.simulation_hash()
+    return EpisodePairs(actual=sets[variation], nominal=sets[_TWINS], nominal_hash=own_hash)
 
 
 def AddFeedbackRecorder(builder: DiagramBuilder, loop: ClosedLoop) -> FeedbackRecorder:
     """Adds a recorder named ``feedback_recorder`` to a diagram, and connects it to a loop."""
-    recorder = builder.AddNamedSystem(
-        "feedback_recorder",
-        FeedbackRecorder(
-            episodes_info(loop, seed=NOT_DRAWN),
-            num_steps=loop.scenario.num_steps,
-            plant_state_size=loop.GetOutputPort("plant_state").size(),
-            watch_period_s=loop.scenario.watch_period_s,
-            controller_memory_size=_memory_size(loop),
-        ),
+    recorder = FeedbackRecorder(
+        episodes_info(loop, seed=NOT_DRAWN),
+        num_steps=loop.scenario.num_steps,
+        plant_state_size=loop.GetOutputPort("plant_state").size(),
+        watch_period_s=loop.scenario.watch_period_s,
+        controller_memory_size=_memory_size(loop),
     )
+    builder.AddNamedSystem("feedback_recorder", recorder)
     for port in map(recorder.get_input_port, range(recorder.num_input_ports())):
         if loop.HasOutputPort(port.get_name()):
             builder.Connect(loop.GetOutputPort(port.get_name()), port)
@@ -96,10 +89,7 @@ def AddFeedbackRecorder(builder: DiagramBuilder, loop: ClosedLoop) -> FeedbackRe
 
 
 def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
-    """Returns initial state and plan of the nominal twin of a recorded window.
-
-    The plan interpolates the desired outputs of the window and of its last preview.
-    """
+    """Makes the start of a window's nominal twin, with a plan through its desired outputs."""
     preview = window.episode.desired_preview
     num_outputs = len(loop.output_names)
     # The first sample of a preview is that of its own row; the last preview reaches beyond.
@@ -117,15 +107,12 @@ def window_start(loop: ClosedLoop, window: RecordedWindow) -> EpisodeStart:
 
 
 def _memory_size(loop: ClosedLoop) -> int:
-    """Size of the memory with which a loop's controller begins a twin; 0 without one."""
     size = port_sizes(loop).get("controller_memory", 0)
     # A window begins at a row, so a row must be a time at which the controller updates.
     period_s, step_s = getattr(loop, "memory_period_s", loop.scenario.step_s), loop.scenario.step_s
     if abs(step_s / period_s - round(step_s / period_s)) > 1e-6:
-        raise ValueError(
-            f"feedback of '{loop.scenario.name}': a row every {step_s:g} s is not when the "
-            f"controller updates, every {period_s:g} s; choose a step_s that is a multiple"
-        )
+        text = f"step_s {step_s:g} is no multiple of the controller's period {period_s:g} s"
+        raise ValueError(f"feedback of '{loop.scenario.name}': {text}")
     return size
 
 
@@ -143,11 +130,8 @@ def pair_starts(
             run_episode(loop, episode.index, seed=seed, start=start)
             for episode, start in zip(actual, starts, strict=True)
         ]
-    return EpisodePairs(
-        actual=actual,
-        nominal=Episodes(episodes_info(loop, seed), twins),
-        nominal_hash=scenario.simulation_hash(),
-    )
+    nominal, own_hash = Episodes(episodes_info(loop, seed), twins), scenario.simulation_hash()
+    return EpisodePairs(actual=actual, nominal=nominal, nominal_hash=own_hash)
 
 
 def pair_windows(
@@ -159,10 +143,8 @@ def pair_windows(
     for window in windows:
         memory = window.controller_memory
         if (got := 0 if memory is None else len(memory)) != size:
-            raise ValueError(
-                f"feedback of '{scenario.name}': a window has {got} entries of the controller's "
-                f"memory, expected {size}: connect the recorder's 'controller_memory'"
-            )
+            text = f"a window has {got} entries of the controller's memory, expected {size}"
+            raise ValueError(f"feedback of '{scenario.name}': {text}")
     actual = Episodes(recorder.info, [window.episode for window in windows])
     starts = [window_start(loop, window) for window in windows]
     return pair_starts(scenario, actual, starts).feedback()

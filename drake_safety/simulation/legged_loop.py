@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,31 +22,25 @@ from drake_safety.plants.pushes import Push
 from drake_safety.robots.robot import ObservationNoise
 from drake_safety.robots.shift import Fault, Shift
 from drake_safety.simulation.episode_start import EpisodeStart
-from drake_safety.simulation.observers import Observers, add_faults, combined
+from drake_safety.simulation.observers import Observers, add_faults
 from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.assessor_inputs import AssessorInputs
 from drake_safety.systems.push_source import PushSource
 
-UPDATE_TICK = 0.25
-"""Time between two systems that update one after the other, as a share of the plant's step.
-
-Drake's discrete updates at one time see the state before any of them. So a system whose input is
-another's new state updates a tick later. Assessor, trigger, step planner and controller are the
-longest chain, done within the plant's step in which it began.
-"""
+# Drake's discrete updates at one time see the state before any of them. So a system whose input is
+# another's new state updates a tick later, a share of the plant's step. Assessor, trigger, step
+# planner and controller are the longest chain, done within the plant's step in which it began.
+_UPDATE_TICK = 0.25
 
 
 @schema(kw_only=True)
 class View:
     """A camera that follows a robot's base over the ground."""
 
-    azimuth_rad: float = math.radians(-42.0)
-    """Direction of the camera from the robot, from the world's x axis [rad]."""
+    azimuth_rad: float = math.radians(-42.0)  # From the world's x axis.
     elevation_rad: Annotated[float, Field(gt=-0.5 * math.pi, lt=0.5 * math.pi)] = math.radians(15.0)
-    """Elevation of the camera above the robot [rad]."""
-    room: Positive = 0.95
-    """Free space in a picture, by the robot's extent."""
+    room: Positive = 0.95  # Free space in a picture, by the robot's extent.
 
     def direction(self) -> np.ndarray:
         """Unit vector from the robot to the camera in the world, (3,)."""
@@ -54,7 +49,7 @@ class View:
 
     def mirrored(self) -> "View":
         """The view mirrored at the x-z plane."""
-        return View(azimuth_rad=-self.azimuth_rad, elevation_rad=self.elevation_rad, room=self.room)
+        return replace(self, azimuth_rad=-self.azimuth_rad)
 
 
 class LeggedLoop(PlannedLoop):
@@ -62,25 +57,19 @@ class LeggedLoop(PlannedLoop):
 
     A subclass calls in this order: :meth:`_add_robot`, :meth:`_add_observers`,
     :meth:`_add_planner`, adds its controller, :meth:`_assess`, and ``builder.BuildInto(self)``. It
-    extends :meth:`_set_state` by the controller's initial state.
-
-    Attributes:
-        plant: A MultibodyPlant with the robot, to be read only, whatever engine simulates it.
-        memory_features: Features that depend on what the controller did before, which a log of the
-            plant lacks.
-        memory_period_s: Time between two updates of a controller with a memory [s].
-        tick_s: Time between two systems that update one after the other [s].
+    extends :meth:`_set_state` by the controller's initial state. ``plant`` is a MultibodyPlant, to
+    be read only.
     """
 
+    # Features that depend on what the controller did before, which a log of the plant lacks.
     memory_features: Sequence[str] = ()
-
     view: View = View()
 
     def __init__(self, scenario: Scenario, variation: str, assessment: SafetyAssessment | None):
         super().__init__(scenario, variation, assessment)
         self.robot = load_robot(scenario.robot)
         self.kinematics = RobotKinematics(self.robot, scenario.variation("nominal"))
-        self.tick_s = UPDATE_TICK * scenario.time_step_s
+        self.tick_s = _UPDATE_TICK * scenario.time_step_s
         self._push_source: PushSource | None = None
 
     @classmethod
@@ -91,7 +80,6 @@ class LeggedLoop(PlannedLoop):
     def _add_robot(
         self, builder: DiagramBuilder, scene: Scene, *, servos: bool, meshcat: Meshcat | None
     ) -> Physics:
-        """Adds the robot, with position servos or torque inputs, and its scene."""
         physics = self._physics = add_physics(
             builder,
             self.robot,
@@ -112,7 +100,11 @@ class LeggedLoop(PlannedLoop):
         noise, state = variation.observation_noise, self._physics.state
         self._observers = Observers(builder, self.kinematics, state, period_s, **options)
         observer = self._observers.add("observer", noise)
-        assessor_noise = combined(noise, variation.input_noise)
+        # The sum of two independent sources.
+        assessor_noise = ObservationNoise(
+            position=math.hypot(noise.position, variation.input_noise.position),
+            velocity=math.hypot(noise.velocity, variation.input_noise.velocity),
+        )
         faults = (variation.shift or Shift()).sensor_faults
         assessor_observer = self._observers.add("assessor_observer", assessor_noise, faults)
         true_observer = self._observers.add("true_observer", ObservationNoise())
@@ -136,11 +128,9 @@ class LeggedLoop(PlannedLoop):
         if not faults:
             return command
         period_s = self.scenario.time_step_s
-        system = add_faults(builder, "command_faults", command, faults, names, period_s=period_s)
-        return system.get_output_port()
+        return add_faults(builder, "command_faults", command, faults, names, period_s)
 
     def _servo_command(self, builder: DiagramBuilder, command: OutputPort) -> OutputPort:
-        """The joint positions and velocities (2 n_j,) that servos receive of those commanded."""
         names = self.kinematics.joint_names
         return self._as_received(builder, command, [*names, *(f"{name}_rate" for name in names)])
 
@@ -160,10 +150,8 @@ class LeggedLoop(PlannedLoop):
     ) -> None:
         """Adds monitor, assessor's inputs and assessor, connects them, and exports all ports.
 
-        ``ports`` are exported but ``desired_outlook``. ``command``, desired joint states (2 n_j,),
-        adds features of the servos' loads, ``memory`` a port with the names of its entries.
-        ``recovery`` reads the assessor, or without one an input port of the diagram; ``guard``
-        reads the assessor's inputs and what it has learned.
+        ``command``, desired joint states (2 n_j,), adds features of the servos' loads, ``memory`` a
+        port with the names of its entries. ``recovery`` reads the assessor, or an input port.
         """
         self.fall_name = safe_set.fall_name
         self.watched_features = safe_set.watched_features
@@ -174,18 +162,16 @@ class LeggedLoop(PlannedLoop):
             "desired_joint_state": command,
             "controller_memory": memory and memory[0],
         }
-        inputs = builder.AddNamedSystem(
-            "assessor_inputs",
-            AssessorInputs(
-                kinematics,
-                safe_set,
-                num_outlook=given["desired_outlook"].size() // 3,
-                gravity=self.plant.gravity_field().gravity_vector() if has_gravity else None,
-                servo_loads=command is not None,
-                memory=memory[1] if memory else (),
-                **self._assessor_options,
-            ),
+        inputs = AssessorInputs(
+            kinematics,
+            safe_set,
+            num_outlook=given["desired_outlook"].size() // 3,
+            gravity=self.plant.gravity_field().gravity_vector() if has_gravity else None,
+            servo_loads=command is not None,
+            memory=memory[1] if memory else (),
+            **self._assessor_options,
         )
+        builder.AddNamedSystem("assessor_inputs", inputs)
         for name, port in given.items():
             if port is not None:
                 builder.Connect(port, inputs.GetInputPort(name))
@@ -216,12 +202,10 @@ class LeggedLoop(PlannedLoop):
                 builder.ExportInput(probability, "safety_probability")
 
     def _add_push_source(self, builder: DiagramBuilder) -> None:
-        """Adds the source of a push on the robot, which :meth:`set_push` sets."""
-        self._push_source = builder.AddNamedSystem(
-            "push_source",
-            PushSource(self.plant, self._physics.instance, period_s=self.scenario.control_period_s),
-        )
-        builder.Connect(self._push_source.get_output_port(), self._physics.applied_spatial_force)
+        period_s = self.scenario.control_period_s
+        source = PushSource(self.plant, self.robot_instance, period_s=period_s)
+        self._push_source = builder.AddNamedSystem("push_source", source)
+        builder.Connect(source.get_output_port(), self._physics.applied_spatial_force)
 
     def set_push(self, context: Context, push: Push) -> None:
         """Sets a push, in place of an earlier one; the monitor waits while it acts."""

@@ -33,39 +33,26 @@ _LOGGER = logging.getLogger("drake_safety")
 class End:
     """When a simulated motion ends, whatever comes first."""
 
-    duration_s: float
-    """Time since the start [s]."""
-    after_leaving_s: float = math.inf
-    """Time outside the safe set [s]; by default it does not end a motion."""
-    after_fall_s: float = 0.0
-    """Time after a fall, a violation of the diagram's ``fall_name`` [s]."""
-    until: str = ""
-    """Constraint whose violation ends the motion."""
-    until_first_row: bool = False
-    """Whether it ends at the first row whose future is undisturbed."""
+    duration_s: float  # Since the start.
+    after_leaving_s: float = math.inf  # Outside the safe set.
+    after_fall_s: float = 0.0  # After a violation of the diagram's `fall_name`.
+    until: str = ""  # Constraint whose violation ends the motion.
+    until_first_row: bool = False  # Whether the first row with an undisturbed future ends it.
 
 
 @dataclass(kw_only=True, eq=False)
 class Motion:
-    """Log of a simulated motion; ``motion[name]`` is a logged port."""
+    """Log of a simulated motion; ``motion[name]`` is a logged port, (N, size)."""
 
-    time_s: np.ndarray
-    """Times of the rows since the start [s], (N,)."""
+    time_s: np.ndarray  # Of the rows, since the start, (N,).
     ports: dict[str, np.ndarray]
-    """The logged output ports by name, (N, size) each."""
-    leave_time_s: float = math.inf
-    """Time at which it left the safe set [s]; infinite if it did not."""
-    cause: str = ""
-    """The constraint that was violated then; "" for none."""
+    leave_time_s: float = math.inf  # When it left the safe set, if it did.
+    cause: str = ""  # The constraint that was violated then.
     fall_time_s: float = math.inf
-    """Time of the fall [s]; infinite without one."""
-    failure: str = ""
-    """Why the simulation ended early; "" if it did not."""
-    first_row: int = 0
-    """First row with an undisturbed future."""
+    failure: str = ""  # Why the simulation ended early, if it did.
+    first_row: int = 0  # The first with an undisturbed future.
     index: int = 0
-    push_time_s: float = math.inf
-    """Start of a push, or impact of the first ball [s]; infinite without one."""
+    push_time_s: float = math.inf  # Start of a push, or impact of the first ball.
 
     def __getitem__(self, port: str) -> np.ndarray:
         return self.ports[port]
@@ -92,10 +79,7 @@ class Motion:
         return [*zip(self.time_s[begins].tolist(), self.time_s[ends].tolist(), strict=True)]
 
     def episode(self, num_features: int = 0) -> Episode:
-        """The motion as an episode, with the defaults of `record_episodes` for what was not logged.
-
-        It is ``diverged`` if the simulation failed.
-        """
+        """The motion as an episode, with the defaults of `record_episodes` for unlogged ports."""
         num_rows, cause = len(self.time_s), DIVERGED if self.failure else self.cause
         rows = {
             "true_state": self["state"],
@@ -130,7 +114,7 @@ class Recorder:
     def record(
         self, context: Context, time_s: float | None = None, *, is_checked: bool = False
     ) -> None:
-        """Appends a row, unless a port raises or, if that is checked, is not finite."""
+        """Appends a row; if ``is_checked``, of finite values alone."""
         row = {name: np.array(port.Eval(context)) for name, port in self._ports.items()}
         time_s = context.get_time() if time_s is None else time_s
         if is_checked:
@@ -180,9 +164,7 @@ def simulate(
         step_s: Time between two rows [s].
         watch_period_s: Sampling period of the safe set [s]; by default it is sampled at rows.
         events: Times [s] and what is done then with the Context.
-        each_row: Called with the Context after each row.
         monitor: Called with the Context after each step of the simulator; it may end it.
-        constraint_names: Names of the margins; by default the diagram's.
         may_fail: Whether a failure of the simulation is a result, ``Motion.failure``, with the rows
             that are finite; otherwise it raises ``EpisodeError``, as an error of a system does.
     """
@@ -306,18 +288,15 @@ _NUMERICAL_FAILURE = re.compile(
 
 
 def _is_divergence(error: BaseException, context: Context, is_finite_at_start: np.ndarray) -> bool:
-    """Whether an error is a numerical failure of the simulation, not a programming error."""
     if isinstance(error, DivergenceError):
         return True
     if type(error) in (RuntimeError, SystemExit) and _NUMERICAL_FAILURE.search(str(error)):
         return True
     # Any error that follows a state that became non-finite, or huge.
-    state = _state(context)
-    return bool((is_finite_at_start & ~(np.abs(state) < LARGEST)).any())
+    return bool((is_finite_at_start & ~(np.abs(_state(context)) < LARGEST)).any())
 
 
 def _state(context: Context) -> np.ndarray:
-    """Continuous and discrete state of a Context."""
     discrete = context.get_discrete_state()
     groups = [discrete.value(i) for i in range(discrete.num_groups())]
     return np.concatenate([context.get_continuous_state_vector().CopyToVector(), *groups])

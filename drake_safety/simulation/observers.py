@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -41,10 +40,9 @@ class Observers:
         if faults:
             measured = self.add(f"{name}_measurement", noise).GetOutputPort("measured_plant_state")
             names = self._kinematics.plant.GetStateNames(add_model_instance_prefix=False)
-            faulty = add_faults(
-                self._builder, f"{name}_faults", measured, faults, names, period_s=self._period_s
-            )
-            return self._added(name, faulty.get_output_port(), ObservationNoise())
+            period_s = self._period_s
+            faulty = add_faults(self._builder, f"{name}_faults", measured, faults, names, period_s)
+            return self._added(name, faulty, ObservationNoise())
         key = (noise.position, noise.velocity)
         if key not in self._observers:
             self._observers[key] = self._added(name, self._plant_state, noise)
@@ -82,19 +80,10 @@ def add_faults(
     port: OutputPort,
     faults: Sequence[Fault],
     names: Sequence[str],
-    *,
     period_s: float,
-) -> SensorFaults:
+) -> OutputPort:
     """Adds faults of a signal, sampled last in each period: after the updates of commands."""
     system = SensorFaults(names, faults, period_s=period_s, offset_s=0.95 * period_s)
     builder.AddNamedSystem(name, system)
     builder.Connect(port, system.get_input_port())
-    return system
-
-
-def combined(first: ObservationNoise, second: ObservationNoise) -> ObservationNoise:
-    """Noise level of the sum of two independent sources."""
-    return ObservationNoise(
-        position=math.hypot(first.position, second.position),
-        velocity=math.hypot(first.velocity, second.velocity),
-    )
+    return system.get_output_port()

@@ -27,21 +27,8 @@ class OnlineAdaptation:
 
     "For computational efficiency, the online adaptation process is performed once every k_u sets of
     feedback data" (paper). Nominal twins of the recorder's windows are simulated; after every k_u
-    windows the prior assessment is adapted to the feedback and the motion of at most ten minutes,
-    and the assessor adopts the result. The simulation waits meanwhile.
-
-    ```python
-    online = OnlineAdaptation(scenario, prior, recorder, assessor)
-    online.advance(simulator, 60.0)  # in place of simulator.AdvanceTo(60.0)
-    ```
-
-    Args:
-        prior: The assessment before feedback.
-        capacity: Largest number of pairs of episodes kept; the oldest are dropped.
-
-    Attributes:
-        feedback: All feedback so far, up to the capacity.
-        adapted: The assessments after the newest eight updates.
+    windows the prior assessment is adapted to the newest ``capacity`` pairs and the motion of at
+    most ten minutes, and the assessor adopts the result. ``adapted`` has the newest eight.
     """
 
     def __init__(
@@ -66,7 +53,7 @@ class OnlineAdaptation:
         self.num_updates = 0
 
     def advance(self, simulator: Simulator, until_s: float) -> SimulatorStatus:
-        """Advances the simulation as `AdvanceTo` does, with the updates that become due."""
+        """Advances the simulation in place of `AdvanceTo`, with the updates that become due."""
         # Events and monitors of a simulation must not change its Context: updates are between two
         # calls of `AdvanceTo`, at the times of the recorder's rows.
         context, step_s = simulator.get_mutable_context(), self._recorder.info.step_s
@@ -79,7 +66,6 @@ class OnlineAdaptation:
             self._update(context)
 
     def _advance_to_row(self, simulator: Simulator, until_s: float) -> SimulatorStatus:
-        """Advances to the recorder's next row, and keeps the monitor's rows until then."""
         context, monitor = simulator.get_mutable_context(), self._assessor.monitor
         step_s = self._prior.detector_.step_s
         while monitor is not None and (row_s := _next_row_s(context, step_s)) <= until_s + 1e-9:
@@ -96,7 +82,6 @@ class OnlineAdaptation:
         return simulator.AdvanceTo(until_s)
 
     def _update(self, root_context: Context) -> None:
-        """Takes finished windows and, after every k_u of them, updates the assessor."""
         # Most rows finish no window; the mutable Context would invalidate caches.
         if not self._recorder.recording(self._recorder.GetMyContextFromRoot(root_context)).windows:
             return
@@ -117,5 +102,4 @@ class OnlineAdaptation:
 
 
 def _next_row_s(context: Context, step_s: float) -> float:
-    """Time of the first row after that of a Context [s]."""
     return step_s * (math.floor(context.get_time() / step_s + 1e-6) + 1)

@@ -19,29 +19,25 @@ from drake_safety.systems.trajectory_planner import TrajectoryPlanner
 class PlannedLoop(ClosedLoop):
     """A closed loop with a planner and a monitor of a safe set; its episodes can begin anywhere.
 
-    A subclass calls :meth:`_add_planner`, adds its plant and controller, calls :meth:`_finish`, and
-    implements :meth:`_set_state`, which sets the plant's state.
+    A subclass calls :meth:`_add_planner`, adds plant and controller, calls :meth:`_finish` with the
+    ports ``plant_state``, ``state``, ``output`` and ``features``, and implements `_set_state`.
     """
 
     def _add_planner(
         self, builder: DiagramBuilder, *, outlook_s: float, num_outlook: int
     ) -> TrajectoryPlanner:
-        """Adds the planner; its outlook has ``num_outlook`` samples over ``outlook_s`` [s]."""
-        self._planner: TrajectoryPlanner = builder.AddNamedSystem(
-            "trajectory_planner",
-            TrajectoryPlanner(
-                horizon=self.scenario.assessment.horizon,
-                step_s=self.scenario.preview_step_s,
-                outlook_s=outlook_s,
-                num_outlook=num_outlook,
-            ),
+        planner = TrajectoryPlanner(
+            horizon=self.scenario.assessment.horizon,
+            step_s=self.scenario.preview_step_s,
+            outlook_s=outlook_s,
+            num_outlook=num_outlook,
         )
+        self._planner: TrajectoryPlanner = builder.AddNamedSystem("trajectory_planner", planner)
         return self._planner
 
     def _connect_controller(
         self, builder: DiagramBuilder, controller: LeafSystem, measured_state: OutputPort
     ) -> None:
-        """Connects a controller that follows the planner's point."""
         builder.Connect(measured_state, controller.GetInputPort("plant_state"))
         for name in ("desired_output", "desired_output_rate"):
             builder.Connect(self._planner.GetOutputPort(name), controller.GetInputPort(name))
@@ -57,11 +53,7 @@ class PlannedLoop(ClosedLoop):
         margins: OutputPort | None = None,
         hold: OutputPort | None = None,
     ) -> MonitoredSafetyAssessor | None:
-        """Adds the monitor of the true state, exports all ports, and adds an assessor.
-
-        ``ports`` has ``plant_state``, of ``sizes`` n_q and n_v, ``state``, ``output`` and
-        ``features``; those of planner and monitor are exported by default.
-        """
+        """Adds the monitor of the true state, exports all ports, and adds an assessor."""
         self.plant_state_sizes = sizes
         monitor = builder.AddNamedSystem("safety_monitor", SafetyMonitor(safe_set, *sizes))
         builder.Connect(ports["plant_state"], monitor.GetInputPort("plant_state"))
@@ -103,7 +95,6 @@ class PlannedLoop(ClosedLoop):
         return self._planner.get_plan(self._planner.GetMyContextFromRoot(context))
 
     def _enter(self, context: Context, start: EpisodeStart) -> None:
-        """Begins at a start, whose plan is in the frame of the stance."""
         # Only the state is reset: parameters such as an assessor's beliefs outlive an episode.
         context.SetTime(0.0)
         own_context = self.GetMyMutableContextFromRoot(context)

@@ -23,11 +23,7 @@ from drake_safety.learning.segments import (
 )
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, port_sizes
 from drake_safety.simulation.motion import End, simulate
-from drake_safety.simulation.rollouts import (
-    collect_episodes,
-    episode_rng,
-    seed_random_sources,
-)
+from drake_safety.simulation.rollouts import collect_episodes, episode_rng, seed_random_sources
 from drake_safety.simulation.worker_processes import CloudPickled, MadeOnce, Progress
 from drake_safety.systems.monitored_assessor import warn_of_sampled_ports
 
@@ -35,7 +31,6 @@ _LOGGER = logging.getLogger("drake_safety")
 _OPTIONAL_PORTS = ("true_state", "desired_output", "features", "safe")
 
 Reset = Callable[[Diagram, Context, np.random.Generator], int | None]
-"""Samples a start into the root Context; see :func:`record_episodes`."""
 
 
 def record_episodes(
@@ -66,8 +61,8 @@ def record_episodes(
     by default the first sample of the preview, ``features`` of the assessor, by default none, and
     ``safe``, below 1 once the state is unsafe, by default where a margin is negative.
 
-    Episode i depends on the diagram, the seed and i alone: its arrays are identical for any number
-    of workers. The first one is simulated again after the second, and must be the same.
+    Episode i depends on the diagram, the seed and i alone; the first one is simulated again after
+    the second, and must be the same.
 
     Args:
         make_diagram: Builds the diagram in each worker; called with ``parameters``.
@@ -77,13 +72,8 @@ def record_episodes(
         step_s: Time between two rows, the unit of H [s].
         ports: The diagram's port names, by those above.
         state_names: Names of the n_s entries of ``state``; numbered by default.
-        name: Name of the set; that of ``make_diagram`` by default.
         monitor_period_s: Sampling period of ``safe`` [s]; a tenth of ``step_s`` by default.
         num_workers, path, progress: As of `run_episodes`.
-
-    Returns:
-        The episodes, for ``SafetyAssessment.fit``. Those whose simulation failed have the cause
-        ``diverged``. An error of a system or of ``reset`` raises ``EpisodeError``.
     """
     name = str(name or getattr(make_diagram, "__name__", type(make_diagram).__name__))
     period_s = step_s / 10 if monitor_period_s is None else monitor_period_s
@@ -151,7 +141,6 @@ def record_episodes(
 
 
 def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str], dict[str, int]]:
-    """The diagram's names of the contract's ports, and their sizes."""
     if unknown := set(given) - set(REQUIRED_PORTS):
         raise ValueError(f"record_episodes: no ports {sorted(unknown)} in {REQUIRED_PORTS}")
     there = port_sizes(diagram)
@@ -161,16 +150,13 @@ def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str]
         if name in given or name in there or name not in _OPTIONAL_PORTS
     }
     if missing := {name: port for name, port in used.items() if port not in there}:
-        raise ValueError(
-            f"record_episodes: the diagram exports no port {sorted(missing.values())} for "
-            f"{sorted(missing)}; it exports {sorted(there)}. Give other names by 'ports'"
-        )
+        named, ports = sorted(missing), sorted(missing.values())
+        text = f"no port {ports} for {named}; it exports {sorted(there)}"
+        raise ValueError(f"record_episodes: the diagram exports {text}")
     sizes = {name: there[port] for name, port in used.items()}
     n_z, n_preview = sizes["output"], sizes["desired_preview"]
     if n_z < 1 or n_preview < 1 or n_preview % n_z:
-        raise ValueError(
-            f"record_episodes: size {n_preview} of desired_preview is not H times {n_z}"
-        )
+        raise ValueError(f"record_episodes: size {n_preview} of desired_preview is not H * {n_z}")
     return used, sizes
 
 

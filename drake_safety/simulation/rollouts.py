@@ -46,8 +46,7 @@ from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import BATCH_SIZE, MadeOnce, Progress, map_items
 from drake_safety.systems.monitored_assessor import leaf_systems
 
-MOTION_PIECE_S = 60.0
-"""Duration of one undisturbed motion [s]."""
+MOTION_PIECE_S = 60.0  # Duration of one undisturbed motion.
 _AFTER_LEAVING_S = 1.0  # Until a robot has fallen, if it does.
 _MANY = 64  # Episodes of which two more are a small share.
 _LOGGER = logging.getLogger("drake_safety")
@@ -62,13 +61,13 @@ def worker_loop(
 ) -> MadeOnce[ClosedLoop]:
     """Makes the loop of a process, once per scenario, variation, options and robot."""
     # The hash covers the robot's files, and the text what the hash leaves out, such as a threshold.
-    hash_ = scenario.simulation_hash(variation)
-    key = (hash_, scenario.to_yaml(), variation, repr(sorted(options.items())))
+    files, text = scenario.simulation_hash(variation), scenario.to_yaml()
+    key = (files, text, variation, repr(sorted(options.items())))
     return MadeOnce(key, partial(scenario.make_loop, variation, **options))
 
 
 def episode_rng(seed: int, index: int) -> np.random.Generator:
-    """Returns the generator of an episode, which depends on the seed and the index alone."""
+    """Makes the generator of an episode, which depends on the seed and the index alone."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
 
 
@@ -124,18 +123,15 @@ def run_episode(
 ) -> Episode:
     """Simulates one episode, which ends when it leaves the safe set or its time is over.
 
+    If the simulation fails, its cause is ``diverged`` and it has the rows that are finite; an error
+    of a system raises ``EpisodeError``.
+
     Args:
-        goal: Goal of the plan, in place of a random one.
-        start: Initial state and plan, in place of random ones.
+        goal, start: Goal of the plan, or initial state and plan, in place of random ones.
         at_start: Called with the root Context at the start.
-        until_fall: Whether it goes on for a second after it leaves the safe set, and only a fall is
-            an unsafe end.
+        until_fall: Whether it goes on for a second outside, and only a fall is an unsafe end.
         monitor: Called with the Context after each step of the simulator.
         **end: Fields of :class:`~drake_safety.simulation.motion.End`.
-
-    Returns:
-        The episode. If the simulation fails, its cause is ``diverged`` and it has the rows that
-        are finite; an error of a system raises ``EpisodeError``.
     """
     if start is not None and goal is not None:
         raise ValueError("run_episode: a start has a plan of its own; leave out the goal")
@@ -155,12 +151,12 @@ def run_episode(
             at_start(context)
         return first_step
 
-    usual: dict[str, Any] = {"after_leaving_s": _AFTER_LEAVING_S if until_fall else 0.0}
+    end = {"after_leaving_s": _AFTER_LEAVING_S if until_fall else 0.0} | end
     motion = simulate(
         loop,
         begin,
         (*RECORDED, *filter(loop.HasOutputPort, ["num_controller_failures"])),
-        End(duration_s=scenario.episode_duration_s, **(usual | end)),
+        End(duration_s=scenario.episode_duration_s, **end),
         step_s=scenario.step_s,
         watch_period_s=scenario.watch_period_s,
         monitor=monitor,
@@ -184,12 +180,10 @@ def run_to_goal(
     ports: Iterable[str] = (),
     **options: Any,
 ) -> Motion:
-    """Simulates the motion from the standing posture to a goal, safe or not, until it falls.
+    """Simulates the motion from the standing posture to a goal (3,), until the robot falls.
 
-    Args:
-        goal: In the world, (3,) [m].
-        ports: Ports to log besides ``output``, ``margins`` and ``plant_state``.
-        **options: As for :func:`~drake_safety.simulation.motion.simulate`.
+    It logs ``output``, ``margins``, ``plant_state`` and further ports; ``options`` are as for
+    :func:`~drake_safety.simulation.motion.simulate`.
     """
 
     def begin(context: Context) -> None:
@@ -197,25 +191,20 @@ def run_to_goal(
         if push is not None:
             require(loop, CanBePushed).set_push(context, push)
 
-    who = f"motion of '{loop.scenario.name}' to a goal (seed {seed})"
+    options = {"who": f"motion of '{loop.scenario.name}' to a goal (seed {seed})"} | options
     end = End(duration_s=duration_s, after_fall_s=after_fall_s)
     logged = ("output", "margins", "plant_state", *ports)
-    motion = simulate(loop, begin, logged, end, **{"who": who} | options)
+    motion = simulate(loop, begin, logged, end, **options)
     motion.push_time_s = math.inf if push is None else push.time_s
     return motion
 
 
 def inputs_at(loop: ClosedLoop, start: EpisodeStart) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the assessment's inputs for a hypothetical state and plan; nothing is simulated.
-
-    They are the state (n_s,) without noise, the desired preview (H n_z,) and the features (n_f,).
-    """
+    """Computes Γ's inputs (n_s,), (H n_z,) and (n_f,) for a hypothetical state and plan."""
     context = loop.CreateDefaultContext()
     require(loop, CanStartAnywhere).reset_to(context, None, start)
-    state, preview, features = (
-        loop.GetOutputPort(name).Eval(context).copy()
-        for name in ("state", "desired_preview", "features")
-    )
+    names = ("state", "desired_preview", "features")
+    state, preview, features = (loop.GetOutputPort(n).Eval(context).copy() for n in names)
     return state, preview, features
 
 
@@ -234,19 +223,14 @@ def run_motions(
 ) -> Episodes:
     """Simulates undisturbed motion for a `ChangeDetector`; arguments are as for `run_episodes`.
 
-    A task that :class:`~drake_safety.simulation.capabilities.MovesUndisturbed` moves for a minute
-    at a time, unless ``are_episodes``; of others these are ordinary episodes. Rows are
-    `scenario.monitor_step_s` apart, and a motion ends when it leaves the safe set.
-
-    Args:
-        duration_s: Duration of all motions together, if none leaves the safe set [s].
+    A task that `MovesUndisturbed` moves for a minute at a time, unless ``are_episodes``; of others
+    these are episodes. ``duration_s`` is of all motions; rows are `scenario.monitor_step_s` apart.
     """
     check_times("run_motions", duration_s=duration_s)
     make = worker_loop(scenario, variation, **loop_options)
-    loop, step_s = make(), scenario.monitor_step_s
-    piece_s = motion_piece_s(loop, are_episodes)
+    step_s, piece_s = scenario.monitor_step_s, motion_piece_s(make(), are_episodes)
     options = {**loop_options, "episodes_s" if are_episodes else "undisturbed_s": piece_s}
-    info = episodes_info(loop, seed, options)
+    info = episodes_info(make(), seed, options)
     return collect_episodes(
         replace(info, step_s=step_s, num_steps=round(piece_s / step_s)),
         range(math.ceil(duration_s / piece_s - 1e-6)),
@@ -280,14 +264,13 @@ def run_motion(
     Features that the monitor does not read are zero, unless ``with_features``.
     """
     scenario, piece_s = loop.scenario, motion_piece_s(loop, is_episode)
-    step_s = scenario.monitor_step_s
 
     def begin(context: Context) -> int | None:
         seed_random_sources(loop, context, seed, index)
         rng = episode_rng(seed, index)
         if isinstance(loop, MovesUndisturbed) and not is_episode:
             return loop.reset_undisturbed(context, rng, piece_s)
-        return math.ceil(loop.reset(context, rng) * scenario.step_s / step_s)
+        return math.ceil(loop.reset(context, rng) * scenario.step_s / scenario.monitor_step_s)
 
     # Features may cost more than the simulation.
     left_out = "features" if loop.monitored.get("features") == [] and not with_features else ""
@@ -296,7 +279,7 @@ def run_motion(
         begin,
         [name for name in RECORDED if name != left_out],
         End(duration_s=min(piece_s, until_s), after_leaving_s=0.0),
-        step_s=step_s,
+        step_s=scenario.monitor_step_s,
         watch_period_s=scenario.watch_period_s,
         may_fail=True,
         index=index,
@@ -319,14 +302,12 @@ def run_episodes(
 ) -> Episodes:
     """Simulates a set of episodes, in worker processes.
 
-    Episode i depends on the scenario, the variation, the seed and i alone: the arrays are
-    identical for any number of workers. A folder with another set, or one that is not the same any
-    more, is refused.
+    Episode i depends on the scenario, the variation, the seed and i alone.
 
     Args:
         num_workers: Number of processes; that of cores by default. 1 runs in this process.
         path: Folder for the episodes. Those that it holds are kept, if one of them, simulated
-            again, is the same to the last bit.
+            again, is the same to the last bit; another set is refused.
         progress: Called with the number done and in all; True shows it.
         extra: Further content of the folder's ``info.json``.
         until_fall: As of `run_episode`.
@@ -367,16 +348,14 @@ def collect_episodes(
     ``run`` returns the episode of a diagram and an index. If ``is_repeated``, the first episode,
     simulated again after the next by a new diagram, must be the same.
     """
-    wanted = set(indices)
     with nullcontext() if path is None else EpisodeWriter(path, info, extra) as writer:
-        episodes: list[Episode] = []
-        if writer is not None:
-            episodes += (e for e in load_episodes(writer.path) if e.index in wanted)
-            if episodes:
-                check_kept(writer.path, episodes, partial(run, make()))
-                _LOGGER.warning(
-                    "%d of %d episodes are kept from %s", len(episodes), len(indices), path
-                )
+        there = [] if writer is None else load_episodes(writer.path)
+        wanted = set(indices)
+        episodes = [episode for episode in there if episode.index in wanted]
+        if writer is not None and episodes:
+            check_kept(writer.path, episodes, partial(run, make()))
+            counts = (len(episodes), len(indices), path)
+            _LOGGER.warning("%d of %d episodes are kept from %s", *counts)
         known = {episode.index for episode in episodes}
         pending = [index for index in indices if index not in known]
         results = map_items(
@@ -391,20 +370,20 @@ def collect_episodes(
         )
         with closing(results):
             for episode in results:
-                if is_repeated and episode.index == pending[0]:
-                    if not is_repeatable(episode, make.make(), run):
-                        who = f"episode {episode.index} of '{info.scenario}'"
-                        raise ValueError(f"{who}, simulated again after the next, {HIDDEN_STATE}")
+                is_judged = is_repeated and episode.index == pending[0]
+                if is_judged and not is_repeatable(episode, make.make(), run):
+                    who = f"episode {episode.index} of '{info.scenario}'"
+                    raise ValueError(f"{who}, simulated again after the next, {HIDDEN_STATE}")
                 episodes.append(episode)
                 if writer is not None:
                     writer.append(episode)
     collected = Episodes(info, sorted(episodes, key=lambda episode: episode.index))
     diverged = [episode.index for episode in collected if episode.cause == DIVERGED]
     failed = [episode.index for episode in collected if episode.num_controller_failures]
-    for problem, numbers in {
-        "diverged and have no safety label": diverged,
-        "held the last action, where the controller found none": failed,
-    }.items():
+    for problem, numbers in (
+        ("diverged and have no safety label", diverged),
+        ("held the last action, where the controller found none", failed),
+    ):
         if numbers:
             counts = (len(numbers), len(indices), info.scenario)
             _LOGGER.warning("%d of %d simulations of '%s' %s: %s", *counts, problem, numbers[:10])
@@ -424,8 +403,6 @@ def check_kept(path: Path, kept: Sequence[Episode], run: Callable[[int], Episode
     with ONE_BLAS_THREAD:
         again = run(chosen.index)
     if not is_same(chosen, again):
-        raise ValueError(
-            f"{path} holds {len(kept)} episodes of this set that are not the same any more: "
-            f"episode {chosen.index}, simulated again, differs, as diagram, code, a package "
-            "or the machine has changed; choose another folder"
-        )
+        text = f"episode {chosen.index}, simulated again, differs; choose another folder"
+        count = f"{path} holds {len(kept)} episodes of this set"
+        raise ValueError(f"{count} that are not the same any more: {text}")

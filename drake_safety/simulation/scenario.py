@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
 
+_FOLDER = Path(str(files("drake_safety.diagrams")))
 _LEAST_MONITOR_STEP_S = 0.02
 _MOST_STEPS = 10_000_000  # Of an episode, of any kind.
 # A folder in a text file: the value of an XML attribute, or of a key or an item in YAML.
@@ -42,49 +43,38 @@ _TEXT_FORMATS = (".yaml", ".yml", ".urdf", ".sdf", ".xml")
 class Scenario:
     """Schema of a scenario file; the fields under ``parameters`` are those of the task."""
 
-    name: str = ""
-    """File name without suffix."""
-    task: str = ""
-    """Import path ``package.module:Class`` of a ClosedLoop."""
+    name: str = ""  # File name without suffix.
+    task: str = ""  # Import path ``package.module:Class`` of a ClosedLoop.
     robot: str = ""
-    """Name of a robot of the package, or the path of a ``robot.yaml``; empty for a task with a
-    plant of its own."""
-    episode_duration_s: Positive = 2.0
-    """T [s]."""
+    """Name of a robot of the package, or the path of a ``robot.yaml``; "" for another plant."""
+    episode_duration_s: Positive = 2.0  # T.
     step_s: Positive = 0.04
     """Time between two rows of an episode [s]; the assessment's ``preview_stride`` rows are the
     paper's step, the unit of H."""
-    time_step_s: Positive = 0.0025
-    """Step of the discrete plant [s]."""
-    control_period_s: Positive = 0.01
-    """Period of the controller and of the safety monitor [s]."""
+    time_step_s: Positive = 0.0025  # Step of the discrete plant.
+    control_period_s: Positive = 0.01  # Of the controller and of the safety monitor.
     on_alarm: OnAlarm = "unknown"
     """What an alarm of the monitor does: ``unknown`` makes every belief "don't know", so that
     plans are refused; ``report`` only reports it. Recovery heeds no alarm."""
     variations: dict[str, PlantVariation] = field(default_factory=dict)
     """Plants by name; training episodes are those of ``nominal``."""
     assessment: AssessmentParameters = field(default_factory=AssessmentParameters)
-    """Parameters of the assessment."""
 
+    # An instance of the task's Parameters.
     parameters: Annotated[Any, Field(exclude=True)] = field(default=None, repr=False)
-    """An instance of the task's Parameters."""
+    # The scenario file's folder, where its task may stand.
     folder: Annotated[str, Field(exclude=True)] = field(default="", repr=False, compare=False)
-    """The scenario file's folder, where its task may stand; "" for none."""
+    # File name to hash instead of the current one, as an assessment was learned under it.
     identity: Annotated[str, Field(exclude=True)] = field(default="", repr=False, compare=False)
-    """File name to hash instead of the current one, as an assessment was learned under it."""
 
     def __post_init__(self) -> None:
+        episode = f"episode of {self.episode_duration_s} s"
         for name in ("step_s", "time_step_s", "control_period_s"):
             if self.episode_duration_s > _MOST_STEPS * getattr(self, name):
-                raise ValueError(
-                    f"{name} is {getattr(self, name)}, so that an episode of "
-                    f"{self.episode_duration_s} s has more than {_MOST_STEPS} steps"
-                )
+                raise ValueError(f"an {episode} has more than {_MOST_STEPS} steps of {name}")
         if self.assessment.horizon * self.assessment.preview_stride > self.num_steps:
-            raise ValueError(
-                f"the assessment horizon of {self.assessment.horizon} steps of "
-                f"{self.preview_step_s:g} s exceeds the episode of {self.episode_duration_s} s"
-            )
+            steps = f"{self.assessment.horizon} steps of {self.preview_step_s:g} s"
+            raise ValueError(f"the assessment horizon of {steps} exceeds the {episode}")
 
     @property
     def preview_step_s(self) -> float:
@@ -110,9 +100,8 @@ class Scenario:
     def variation(self, name: str) -> PlantVariation:
         """A plant variation by name."""
         if name not in self.variations:
-            raise ValueError(
-                f"scenario '{self.name}' has no variation '{name}'; it has {list(self.variations)}"
-            )
+            there = list(self.variations)
+            raise ValueError(f"scenario '{self.name}' has no variation '{name}'; it has {there}")
         return self.variations[name]
 
     @property
@@ -137,10 +126,7 @@ class Scenario:
         meshcat: "Meshcat | None" = None,
         **options: Any,
     ) -> ClosedLoop:
-        """Builds the task's diagram, with options of the task, such as ``recovery=False``.
-
-        A task whose constructor does not take Meshcat draws nothing.
-        """
+        """Builds the task's diagram, with options of the task, such as ``recovery=False``."""
         task: Any = self.task_class()  # Its constructor has options of its own.
         known = inspect.signature(task).parameters
         takes_all = any(p.kind is p.VAR_KEYWORD for p in known.values())
@@ -163,7 +149,6 @@ class Scenario:
         return yaml.safe_dump(self._values(), default_flow_style=None, sort_keys=False)
 
     def _values(self) -> dict[str, Any]:
-        """All values but optional ones that are not set, by the types of the schema."""
         options: Any = {"mode": "json", "exclude_none": True, "warnings": False}
         # By the schema, an integer that Python code set in place of a float is a float.
         values, parameters = (
@@ -173,10 +158,7 @@ class Scenario:
         return values | {"parameters": parameters}
 
     def adopt(self, info: EpisodesInfo) -> bool:
-        """Takes over the identity of what an assessment was learned from, if it simulates the same.
-
-        Returns whether it does.
-        """
+        """Takes over the identity under which an assessment was learned, if it simulates alike."""
         is_same = self.simulation_hash(info.variation, name=info.scenario) == info.scenario_hash
         if is_same:
             self.identity = info.scenario
@@ -185,10 +167,9 @@ class Scenario:
     def simulation_hash(self, variation: str = "nominal", *, name: str = "") -> str:
         """SHA-256 of all parameters that determine a rollout, and of the robot's files.
 
-        Defaults are included, and the nominal plant, because it is the controllers' model. The
-        assessment's parameters except those of the preview, the task's online parameters and the
-        other variations are left out: episodes stay valid when only these change. Source code is
-        not covered. A ``name`` replaces that of the file.
+        It covers defaults and, as the controllers' model, the nominal plant; not source code, the
+        assessment's parameters but the preview's, the task's online ones and other variations. A
+        ``name`` replaces that of the file.
         """
         if variation != "nominal":
             self.variation(variation)
@@ -212,13 +193,11 @@ class Scenario:
 
 
 def _content(path: Path) -> bytes:
-    """The bytes of a file, without the folders of the absolute paths in a text."""
     content = path.read_bytes()
     return _FOLDER_IN_TEXT.sub(rb"\1", content) if path.suffix in _TEXT_FORMATS else content
 
 
 def _without_folders(value: Any) -> Any:
-    """Plain values with the SHA-256 of the files in place of their absolute paths."""
     if isinstance(value, dict):
         return {key: _without_folders(entry) for key, entry in value.items()}
     if isinstance(value, list):
@@ -229,14 +208,12 @@ def _without_folders(value: Any) -> Any:
 
 
 def _unpickled(task: str, name: str, folder: str) -> Scenario:
-    """An empty scenario, whose task is imported if it stands beside the scenario's file."""
     if _file_beside(task.partition(":")[0], folder):
         _import_task(task, name, folder)
     return Scenario.__new__(Scenario)
 
 
 def _file_beside(module_name: str, folder: str) -> Path | None:
-    """The file of a module in a folder, if there is one."""
     if not folder:
         return None
     path = Path(folder, *module_name.split("."))
@@ -245,7 +222,6 @@ def _file_beside(module_name: str, folder: str) -> Path | None:
 
 
 def _imported(module_name: str, folder: str) -> ModuleType:
-    """A task's module, which may stand beside the scenario's file."""
     file = _file_beside(module_name, folder)
     if file is None:
         return importlib.import_module(module_name)
@@ -285,26 +261,21 @@ def _import_task(task: str, scenario_name: str, folder: str) -> type[ClosedLoop]
     return task_class
 
 
-def _scenario_folder() -> Path:
-    return Path(str(files("drake_safety.diagrams")))
-
-
 def scenario_names() -> list[str]:
     """Names of the package's scenarios."""
-    return sorted(path.stem for path in _scenario_folder().glob("*.yaml"))
+    return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
 
 
 def load_scenario(name: str | Path, changes: Mapping[str, Any] | None = None) -> Scenario:
     """Loads a scenario by name, or by the path of a YAML file, and imports its task.
 
     Importing runs the task's code; :func:`read_scenario` does not. The task's module may stand in
-    the scenario file's folder, where modules are searched last. A relative ``robot`` path is
-    relative to that folder. ``changes`` replace values by key, such as ``parameters.policy``.
+    the scenario file's folder; a relative ``robot`` path begins there. ``changes`` replace values
+    by key, such as ``parameters.policy``.
     """
     path = _scenario_file(name)
     with reading(path, errors=ValueError):
-        folder = path.resolve().parent
-        text = path.read_text(encoding="utf-8")
+        folder, text = path.resolve().parent, path.read_text(encoding="utf-8")
         if changes:
             raw = parse_yaml(text, f"scenario '{path.stem}'")
             for key, value in changes.items():
@@ -325,7 +296,7 @@ def read_scenario(name: str | Path) -> Scenario:
 def _scenario_file(name: str | Path) -> Path:
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):
-        path = _scenario_folder() / f"{name}.yaml"
+        path = _FOLDER / f"{name}.yaml"
         if not path.is_file():
             raise ValueError(f"scenario '{name}' does not exist; scenarios are {scenario_names()}")
     if not path.is_file():
@@ -344,7 +315,6 @@ def parse_scenario(text: str, *, name: str, folder: Path, task_folder: str = "")
 
 
 def _parsed(text: str, name: str, folder: Path) -> Scenario:
-    """The scenario with the parameters that stand in the text."""
     raw = parse_yaml(text, f"scenario '{name}'")
     if not isinstance(raw, dict) or "task" not in raw:
         raise ValueError(f"scenario '{name}' must be a mapping with the key 'task'")

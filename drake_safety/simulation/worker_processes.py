@@ -22,16 +22,14 @@ from pydrake.systems.framework import LeafSystem
 from drake_safety.files.progress import shown
 from drake_safety.learning.segments import installed_versions
 
-BATCH_SIZE = 4
-"""Number of items that are sent to a worker at a time."""
+BATCH_SIZE = 4  # Items that are sent to a worker at a time.
 _WATCH_PERIOD_S = 1.0
 _DASK_WORKER_KILLED = "KilledWorker"
 _lock = threading.RLock()
 
 _Made = TypeVar("_Made")
 _Result = TypeVar("_Result")
-Progress = Callable[[int, int], None]
-"""Called with the number done and in all."""
+Progress = Callable[[int, int], None]  # Called with the number done and in all.
 
 
 class MadeOnce(Generic[_Made]):
@@ -66,15 +64,9 @@ def map_items(
 ) -> Generator[_Result, None, None]:
     """Calls a function of each item in worker processes; yields results as batches finish.
 
-    Within ``joblib.parallel_config`` of another backend than loky that backend's workers are used.
-    Every call has one BLAS thread, so that results do not depend on the number of workers. The
-    workers end on Ctrl-C, an error, or soon after this process.
-
-    Args:
-        make: If given, the function is called with the worker's diagram and an item.
-        num_workers: Number of processes; that of cores by default. 1 runs in this process.
-        progress: Called with the number done and in all; True shows it.
-        num_done: Number that had been done before.
+    With ``make`` it is called with the worker's diagram and an item. Within
+    ``joblib.parallel_config`` of another backend than loky that backend's workers are used. Every
+    call has one BLAS thread, so that results do not depend on the number of workers.
     """
     import joblib
     from joblib.externals.loky import get_reusable_executor
@@ -124,10 +116,9 @@ def map_items(
                 warnings.simplefilter("ignore")
                 results.close()
             if is_killed:
-                raise ChildProcessError(
-                    "a worker process was killed, by the system if memory ran out; run the same "
-                    "again to continue (train: with --resume), perhaps with fewer workers"
-                ) from None
+                text = "a worker process was killed, by the system if memory ran out; run the same"
+                text += " again to continue (train: with --resume), perhaps with fewer workers"
+                raise ChildProcessError(text) from None
             raise
 
 
@@ -137,7 +128,6 @@ def _call_batch(
     versions: dict[str, str],
     batch: list[Any],
 ) -> list[_Result]:
-    """Calls the function of a batch's items, in a worker."""
     from threadpoolctl import threadpool_limits
 
     if (own := _versions()) != versions:
@@ -168,11 +158,7 @@ def end_with_parent(parent: int) -> None:
 
 
 class CloudPickled:
-    """A user's function, which reaches workers from a notebook or a script too.
-
-    It is pickled with all that it uses. For that Drake lacks two things: a module of its bound
-    functions, such as StabilizingLQRController, and one of the metaclass of its systems.
-    """
+    """A user's function, which reaches workers from a notebook or a script too."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
@@ -186,6 +172,7 @@ class CloudPickled:
 
         class Pickler(cloudpickle.Pickler):
             def reducer_override(self, sent: Any) -> Any:
+                # Drake's bound functions and the metaclass of its systems lack a module.
                 if sent is type(LeafSystem):
                     return type, (LeafSystem,)
                 module = getattr(sent, "__module__", None) or ""
