@@ -256,10 +256,9 @@ def _from_rl_sar(file: _Entries, path: Path) -> dict[str, Any]:
     if any(file.raw.get(f"clip_actions_{side}") for side in ("lower", "upper")):
         low, high = (file.numbers(f"clip_actions_{side}", count) for side in ("lower", "upper"))
         action_clip = high[0]
-        file.refuse(
-            {*high} | {-x for x in low} != {action_clip},
-            f"limits of actions must be the same for all joints and signs; got {low}, {high}",
-        )
+        is_odd = {*high} | {-x for x in low} != {action_clip}
+        what = "limits of actions must be the same for all joints and signs"
+        file.refuse(is_odd, f"{what}; got {low}, {high}")
     return {
         "network": _network(path, str(file.get("model_name"))),
         "joints": names,
@@ -289,11 +288,9 @@ def _rl_sar_observation(file: _Entries, count: int) -> dict[str, Any]:
             entry["scale"] = _joined(file.numbers(key, widths[-1]))
         observation.append(entry)
     num = file.number("num_observations") if "num_observations" in file else sum(widths)
-    file.refuse(
-        num != sum(widths) and all(widths),
-        f"num_observations is {num:g}, but its observations {file.raw['observations']} have "
-        f"{sum(widths)} entries with {count} joints",
-    )
+    what = f"its observations have {sum(widths)} entries with {count} joints"
+    is_other = num != sum(widths) and all(widths)
+    file.refuse(is_other, f"num_observations is {num:g}, but {what}")
     if file.raw.get("observations_history"):
         converted["history"] = {
             "ages": file.indices("observations_history"),

@@ -51,9 +51,7 @@ def is_mjcf(path: Path) -> bool:
 def mjcf_to_urdf(path: Path, target: Path) -> ModelFacts:
     """Writes the robot of an MJCF as a URDF, with its meshes as STL in folders beside it.
 
-    MuJoCo compiles the file. The robot is the tree of bodies with the most joints. Links and joints
-    have the names, frames and zero positions of bodies and joints. Joints with actuators get
-    transmissions, and those that an equality couples a <mimic>.
+    The robot is the tree of bodies with the most joints, of the same names, frames and zeros.
     """
     require_extra("mujoco", f"'{path}' is MJCF")
     import mujoco

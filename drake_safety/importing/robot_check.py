@@ -32,11 +32,8 @@ def check_urdf(kinematics: RobotKinematics) -> Iterator[Finding]:
     endless = {name for name, is_free in zip(kinematics.joint_names, free, strict=True) if is_free}
     last = [name for foot in robot.feet.values() for name in foot.joints[-1:]]
     if wheels := [name for name in last if name in endless]:
-        yield passed(
-            "wheels",
-            f"joints {wheels} have no stops; if they turn wheels, position servos hold these",
-            "judge by this scenario only a robot whose wheels are braked",
-        )
+        what = f"joints {wheels} have no stops; if they turn wheels, position servos hold these"
+        yield passed("wheels", what, "judge by this scenario only a robot with braked wheels")
     shaped = {link.get("name") for link in root.iter("link") if link.find("collision") is not None}
     bare = [
         name

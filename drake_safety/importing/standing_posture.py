@@ -50,9 +50,8 @@ def _stands(survey: Survey, legs: list[Limb], posture: dict[str, float]) -> bool
 def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]:
     """Solves for joint positions by name [rad] in which the robot can stand.
 
-    Every foot is level and under its hip, or at half the spread of a leg such as a spider's. Of a
-    leg's solutions, one of small angles whose knee bends backwards (bipeds: forwards, spread legs:
-    upwards) is taken. If the centre of mass is not amid the feet, all are moved under it.
+    Feet are level and under the hips, or at half of their spread; if the centre of mass is not amid
+    them, under it. Knees bend backwards (bipeds: forwards, spread legs: upwards).
     """
     survey.set_joints({})
     solvers = [_Leg(survey, leg, len(legs)) for leg in legs]

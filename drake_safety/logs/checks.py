@@ -1,7 +1,6 @@
 """Checks of a log as its map reads it: what is implausible, or contradicts itself, is refused.
 
-Velocities are compared with positions by their changes in short windows, which noise and a low rate
-spoil less than derivatives; feet that stand must not slide. An error names the reading that agrees.
+Velocities and positions are compared by their changes in short windows; standing feet do not slide.
 """
 
 from __future__ import annotations

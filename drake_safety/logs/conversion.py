@@ -99,11 +99,7 @@ def rates(time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def angular_velocities(time_s: np.ndarray, rotations: Rotation) -> np.ndarray:
-    """Differentiates at least three rotations to angular velocities in the world, (N, 3) [rad/s].
-
-    Each is a weighted mean of the finite differences before and after the row, exact for linearly
-    changing angular velocities.
-    """
+    """Angular velocities (N, 3) in the world [rad/s] of rotations, exact where they are linear."""
     step_s = np.diff(time_s)[:, None]
     between = (rotations[1:] * rotations[:-1].inv()).as_rotvec() / step_s
     slope = np.diff(between, axis=0) / (step_s[:-1] + step_s[1:])

@@ -75,10 +75,7 @@ def cut_log(
 def motions_from_log(
     log: RobotLog | Sequence[RobotLog], loop: LeggedLoop | Scenario, *, step_s: float | None = None
 ) -> Episodes:
-    """Converts logs to motions of up to a minute for a `ChangeDetector`, with their times in it.
-
-    Rows are ``step_s`` apart, by default the scenario's ``monitor_step_s``.
-    """
+    """Converts logs to motions for a `ChangeDetector`, at the step of the monitor by default."""
     loop = _loggable_loop(loop)
     step_s = step_s or loop.scenario.monitor_step_s
     cutter = _Cutter(loop, step_s, MOTION_PIECE_S, shortest=2)

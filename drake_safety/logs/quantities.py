@@ -20,10 +20,7 @@ _MANY_SAME, _MANY_RESTARTS = 0.4, 0.1  # Of the rows.
 
 
 def continued(channel: Channel, max_gap_s: float) -> tuple[Channel, dict[str, float]]:
-    """Lets a time that begins anew, as in every episode of a data set, go on after two long gaps.
-
-    Returns also the later times of these rows, by location; many of them are left as they are.
-    """
+    """Lets a time that begins anew go on after two long gaps; returns its times by location."""
     step, gap = np.diff(channel.time), max_gap_s * TIME_UNITS[channel.time_unit]
     rows = np.flatnonzero(step < -gap) + 1
     if not 0 < len(rows) <= _MANY_RESTARTS * len(step):

@@ -63,10 +63,7 @@ TERM_NAMES = {
 
 
 def read_metadata(raw: Mapping[str, str]) -> PolicyMetadata:
-    """Reads the entries of an ONNX file's metadata that describe its policy.
-
-    Numbers are one for all joints, one for each, or by regular expression.
-    """
+    """Reads an ONNX file's metadata: numbers for all joints, for each, or by regular expression."""
     joints = _words(raw.get("dof_names", raw.get("joint_names", "")))
     names = _words(raw.get("observation_names", ""))
     terms: list[dict[str, Any]] = [{"name": TERM_NAMES.get(name, name)} for name in names]
