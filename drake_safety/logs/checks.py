@@ -183,10 +183,8 @@ def _check_desired_output(source: Source, kinematics: RobotKinematics) -> None:
     desired, base = (source.at(n, source.at_s[:1]) for n in ("desired_output", "base_position"))
     distance = float(np.linalg.norm(desired - base))
     if distance > _REACH_SHARE * kinematics.standing_height:
-        raise ValueError(
-            f"{source.where}: the desired output is {distance:.3g} m from the robot's base: check "
-            "its frame and its unit; it is a position, no velocity command"
-        )
+        what = f"the desired output is {distance:.3g} m from the robot's base"
+        raise ValueError(f"{source.where}: {what}; it is a position, no velocity: check its unit")
 
 
 def _check_stance(source: Source, kinematics: RobotKinematics) -> list[str]:

@@ -32,10 +32,9 @@ def _loggable_loop(loop: LeggedLoop | Scenario) -> LeggedLoop:
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")
     if loop.memory_features:
-        raise ValueError(
-            f"scenario '{loop.scenario.name}' reads {sorted(loop.memory_features)}, its policy's "
-            "memory, which no log has; 'monitor' takes .npz files of what the policy observes"
-        )
+        what = "its policy's memory, which no log has: 'monitor' takes .npz files of observations"
+        memory = sorted(loop.memory_features)
+        raise ValueError(f"scenario '{loop.scenario.name}' reads {memory}, {what}")
     return loop
 
 

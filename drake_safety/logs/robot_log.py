@@ -19,13 +19,8 @@ from drake_safety.logs.quantities import MIN_ROWS, continued, cut, in_order, qua
 from drake_safety.logs.tables import read_csv, read_parquet
 from drake_safety.robots.robot_model import RobotModel
 
-_READERS = {
-    ".csv": read_csv,
-    ".tsv": read_csv,
-    ".parquet": read_parquet,
-    ".mcap": read_messages,
-    ".bag": read_messages,
-}
+_READERS = {".csv": read_csv, ".tsv": read_csv, ".parquet": read_parquet}
+_READERS |= {".mcap": read_messages, ".bag": read_messages}
 FORMATS = tuple(_READERS)  # Suffixes of files; a folder is a ROS 2 bag.
 _MOST_CUTS = 3  # In a message.
 

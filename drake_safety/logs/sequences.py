@@ -74,10 +74,9 @@ def _arrays(path: Path, sequence_map: SequenceMap) -> tuple[np.ndarray, list[str
         data = file[sequence_map.data]
         names = file[sequence_map.names].astype(str).ravel().tolist()
     if data.ndim not in (2, 3) or data.shape[-1] != len(names) or data.dtype.kind not in "fiu":
-        raise ValueError(
-            f"sequences '{path}': '{sequence_map.data}' is {data.dtype} of shape {data.shape}, "
-            f"expected numbers (num_sequences, num_steps, {len(names)})"
-        )
+        what = f"expected numbers (num_sequences, num_steps, {len(names)})"
+        got = f"'{sequence_map.data}' is {data.dtype} of shape {data.shape}"
+        raise ValueError(f"sequences '{path}': {got}, {what}")
     return data.reshape(-1, *data.shape[-2:]), names
 
 
