@@ -60,17 +60,10 @@ def run_fresh_episodes(
     **loop_options: str,
 ) -> Episodes:
     """Simulates fresh episodes, and keeps them in a training's folder; existing ones are reused."""
-    options = {**scenario.options_for("evaluation"), **loop_options}
-    return run_episodes(
-        scenario,
-        num_episodes,
-        variation=variation,
-        seed=seed,
-        num_workers=num_workers,
-        path=fresh_episodes_folder(folder, scenario.simulation_hash(variation), seed, options),
-        progress=progress,
-        **options,
-    )
+    options: dict[str, Any] = {**scenario.options_for("evaluation"), **loop_options}
+    kept = fresh_episodes_folder(folder, scenario.simulation_hash(variation), seed, options)
+    options |= {"variation": variation, "seed": seed, "num_workers": num_workers}
+    return run_episodes(scenario, num_episodes, path=kept, progress=progress, **options)
 
 
 def feedback_options(
