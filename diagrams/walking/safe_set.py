@@ -123,7 +123,7 @@ class WalkingSafeSet:
         largest = preview[np.abs(preview).argmax(axis=0), np.arange(preview.shape[1])]
         return np.concatenate(
             [
-                self.margins(q, v)[:4],
+                self.margins(q, v)[:-1],  # All but that of a fall, which is the last.
                 preview[0],
                 preview[-1],
                 largest,

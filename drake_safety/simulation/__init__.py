@@ -1,1 +1,1 @@
-"""Closed loops, scenarios, rollouts, throws, and episodes on disk."""
+"""Closed loops, scenarios, rollouts, and episodes on disk."""
