@@ -67,10 +67,8 @@ class RobotKinematics:
         base = self.plant.GetBodyByName(robot.base)
         num_extra = self.plant.num_positions() - self.plant.num_velocities()
         if not base.is_floating_base_body() or num_extra != 1:
-            raise ValueError(
-                f"robot '{robot.name}': base '{robot.base}' must be the floating body and every "
-                f"joint must have one degree of freedom"
-            )
+            what = f"base '{robot.base}' must be the floating body"
+            raise ValueError(f"robot '{robot.name}': {what}, all joints of one degree of freedom")
         model = self.plant.CreateDefaultContext()
         apply_masses(self.plant, model, robot, variation or PlantVariation())
         self._scratch = Scratch(lambda: _Instant(model.Clone()))
@@ -156,16 +154,14 @@ class RobotKinematics:
 
     def _contacts(self) -> np.ndarray:
         calculate, context, world = self.plant.CalcPointsPositions, self.context, self.world_frame
-        return np.concatenate(
-            [calculate(context, frame, points, world).T for frame, points in self._feet]
-        )
+        parts = [calculate(context, frame, points, world).T for frame, points in self._feet]
+        return np.concatenate(parts)
 
     def _jacobian(self) -> np.ndarray:
         calculate, context = self.plant.CalcJacobianTranslationalVelocity, self.context
         kind, world = JacobianWrtVariable.kV, self.world_frame
-        return np.concatenate(
-            [calculate(context, kind, frame, points, world, world) for frame, points in self._feet]
-        )
+        parts = [calculate(context, kind, frame, p, world, world) for frame, p in self._feet]
+        return np.concatenate(parts)
 
     def stance_pose(self, q: np.ndarray) -> np.ndarray:
         """Returns ``[x, y, yaw]`` of the stance frame S of the feet in the world, (3,)."""

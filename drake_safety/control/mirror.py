@@ -40,11 +40,9 @@ class Mirror:
             if is_revolute:
                 apart = np.append(apart, np.cross(_POLAR * point - partner_point, partner_axis))
             if is_revolute != is_partner_revolute or np.abs(apart).max() > _SAME_AXIS:
-                raise ValueError(
-                    f"robot '{kinematics.robot.name}': mirror pairs joint '{names[i]}' with "
-                    f"'{names[order[i]]}', which is not its reflection: axis {axis} through "
-                    f"{point} against {partner_axis} through {partner_point}"
-                )
+                pair = f"joint '{names[i]}' with '{names[order[i]]}', which is not its reflection"
+                lines = f"axis {axis} through {point}, {partner_axis} through {partner_point}"
+                raise ValueError(f"robot '{kinematics.robot.name}': mirror pairs {pair}: {lines}")
         # Mirrored joint i has the value of joint `order[i]`, times its sign.
         self._joint_order, self._joint_signs = order, signs
         self._state_order = np.concatenate([np.arange(12), 12 + order, 12 + len(order) + order])
@@ -98,7 +96,5 @@ class Mirror:
         for other, frame in robot.reaching_frames.items():
             if set(frame.joints) == wanted:
                 return other
-        raise ValueError(
-            f"robot '{robot.name}': no reaching frame has the joints {sorted(wanted)} opposite "
-            f"hand '{name}'"
-        )
+        what = f"no reaching frame has the joints {sorted(wanted)} opposite hand '{name}'"
+        raise ValueError(f"robot '{robot.name}': {what}")

@@ -52,9 +52,8 @@ def stance_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> n
     R = R_SW.matrix()
     # R_SW R_WB; Drake's product of rotations is wrapped in Python.
     R_SB = R_SW.inverse().InvertAndCompose(RotationMatrix(quaternion_of(q)))
-    return np.concatenate(
-        [R @ (q[4:7] - (x, y, 0.0)), rotation_vector(R_SB), R @ v[:3], R @ v[3:6], q[7:], v[6:]]
-    )
+    pose = R @ (q[4:7] - (x, y, 0.0)), rotation_vector(R_SB)
+    return np.concatenate([*pose, R @ v[:3], R @ v[3:6], q[7:], v[6:]])
 
 
 def walking_state_names(kinematics: RobotKinematics) -> list[str]:

@@ -12,39 +12,28 @@ from drake_safety.robots.robot_size import GRAVITY_M_S2
 class RecoveryStepParameters:
     """Parameters of a recovery step."""
 
-    step_duration_s: Positive = 0.09
-    """Duration of a swing [s]."""
+    step_duration_s: Positive = 0.09  # Duration of a swing [s].
     lift_m: Positive = 0.06
-    velocity_gain_s: float = 0.05
-    """Raibert's gain: distance beyond the neutral point per speed [s]."""
-    velocity_gain_growth: NotNegative = 0.1
-    """Growth of this gain with every swing, as a share of it."""
-    max_reach_m: Positive = 0.18
-    """Largest distance of a foothold from its hip's ground projection [m]."""
-    min_lateral_m: float = 0.11
-    """Smallest distance of a foothold from the base's midline [m]."""
+    velocity_gain_s: float = 0.05  # Raibert's gain: distance past the neutral point per speed [s].
+    velocity_gain_growth: NotNegative = 0.1  # Growth of this gain with every swing, as its share.
+    max_reach_m: Positive = 0.18  # Largest distance of a foothold from its hip's projection [m].
+    min_lateral_m: float = 0.11  # Smallest distance of a foothold from the base's midline [m].
+    # Largest difference of desired and measured base yaw; with 0 no heading is held [rad].
     max_twist_rad: NotNegative = 0.3
-    """Largest difference of desired and measured base yaw; with 0 no heading is held [rad]."""
+    # Offset of the desired base yaw from the heading against the yaw rate, per yaw rate [s].
     yaw_damping_s: float = 0.1
-    """Offset of the desired base yaw from the heading against the yaw rate, per yaw rate [s]."""
     min_steps: Count = 2
-    max_steps: int = 100
-    """Least and largest number of swings. A robot that stops before it can stand falls."""
-    settle_heading_rad: float = 0.35
-    """Largest angle between the base's yaw and the heading for stopping [rad]."""
-    settle_margin_m: float = 0.08
-    """Least distance of the capture point inside the support polygon for stopping [m]."""
-    resume_margin_m: float = 0.02
-    """Distance of the capture point below which a stopped robot steps again [m]."""
-    return_duration_s: Positive = 0.5
-    """Duration of the base's return over its feet before balancing resumes [s]."""
+    max_steps: int = 100  # Of swings; a robot that stops before it can stand falls.
+    settle_heading_rad: float = 0.35  # Largest difference of yaw and heading for stopping [rad].
+    settle_margin_m: float = 0.08  # Least depth of the capture point in the polygon to stop [m].
+    resume_margin_m: float = 0.02  # Its depth below which a stopped robot steps again [m].
+    return_duration_s: Positive = 0.5  # Duration of the base's return over its feet [s].
 
     def __post_init__(self) -> None:
         for low, high in (("resume_margin_m", "settle_margin_m"), ("min_steps", "max_steps")):
-            if not getattr(self, low) <= getattr(self, high):
-                raise ValueError(
-                    f"{low} must not exceed {high}; got {getattr(self, low)}, {getattr(self, high)}"
-                )
+            least, most = getattr(self, low), getattr(self, high)
+            if not least <= most:
+                raise ValueError(f"{low} must not exceed {high}; got {least}, {most}")
 
 
 def gait_groups(foot_positions: np.ndarray) -> list[list[int]]:

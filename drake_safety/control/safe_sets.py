@@ -33,9 +33,7 @@ def convex_hull(points: Iterable[Sequence[float]]) -> list[tuple[float, float]]:
             hull.append((px, py))
         return hull[:-1]
 
-    if len(ordered) <= 1:
-        return ordered
-    return chain(ordered) + chain(ordered[::-1])
+    return chain(ordered) + chain(ordered[::-1]) if len(ordered) > 1 else ordered
 
 
 def signed_distance_to_polygon(
@@ -84,19 +82,15 @@ def fall_margin(
 class BalanceLimits:
     """Limits of :class:`BalanceSafeSet`."""
 
-    support_clearance_m: float = 0.03
-    """Height below which a contact point is part of the support polygon [m]."""
-    height_m: Interval = field(default_factory=lambda: [0.3, 0.5])
-    """Lowest and highest safe height of the base [m]."""
+    support_clearance_m: float = 0.03  # Height below which a contact point supports [m].
+    height_m: Interval = field(default_factory=lambda: [0.3, 0.5])  # Safe heights of the base.
     fall_height_m: float = 0.2
-    fall_tilt_rad: float = 0.8
-    """Angle between the base's z axis and the vertical beyond which it has fallen [rad]."""
+    fall_tilt_rad: float = 0.8  # Tilt of the base's z axis beyond which it has fallen [rad].
 
     def __post_init__(self) -> None:
-        if not self.fall_height_m <= self.height_m[0]:
-            raise ValueError(
-                f"fall_height_m must not exceed {self.height_m[0]}; got {self.fall_height_m}"
-            )
+        fall, lowest = self.fall_height_m, self.height_m[0]
+        if not fall <= lowest:
+            raise ValueError(f"fall_height_m must not exceed {lowest}; got {fall}")
 
 
 class BalanceSafeSet:
@@ -104,11 +98,11 @@ class BalanceSafeSet:
 
     names = ("support_polygon", "height", "fall")
     fall_name = "fall"
+    # Features for baseline monitors, by name of the monitor.
     watched_features: ClassVar[dict[str, str]] = {
         "capture_point_margin": "capture_point_support_distance",
         "support_margin": "base_support_distance",
     }
-    """Features for baseline monitors, by name of the monitor."""
 
     def __init__(self, kinematics: RobotKinematics, limits: BalanceLimits):
         self.kinematics = kinematics

@@ -12,9 +12,7 @@ from pydrake.multibody.tree import Frame, RigidBody
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.robots.robot_model import ReachingFrame
 
-EQUALITY = 5
-"""daqp's value in ``sense`` for rows with equal bounds."""
-
+EQUALITY = 5  # daqp's value in ``sense`` for rows with equal bounds.
 _COINCIDENT_M = 1e-6  # Tolerance of collinear and coincident contact points.
 _REST = np.zeros(3)
 _REST.flags.writeable = False
@@ -24,10 +22,8 @@ _REST.flags.writeable = False
 class PointReference:
     """Reference of a point in the world frame."""
 
-    position: np.ndarray
-    """(3,) [m]."""
-    rate: np.ndarray = field(default_factory=lambda: _REST)
-    """(3,) [m/s]."""
+    position: np.ndarray  # (3,) [m].
+    rate: np.ndarray = field(default_factory=lambda: _REST)  # (3,) [m/s].
 
 
 @dataclass(kw_only=True)
@@ -35,12 +31,9 @@ class WholeBodyReference:
     """References of all tasks, with all feet at rest."""
 
     center_of_mass: PointReference
-    orientations: list[RotationMatrix]
-    """R_WB of every body with an orientation task, in the order of ``model.body_names``."""
-    posture: np.ndarray
-    """Joint positions (n_j,) [rad]."""
-    reaching: PointReference
-    """Reference of the hand."""
+    orientations: list[RotationMatrix]  # R_WB of ``model.body_names``, in that order.
+    posture: np.ndarray  # Joint positions (n_j,) [rad].
+    reaching: PointReference  # Reference of the hand.
 
 
 class Hand:
@@ -55,9 +48,8 @@ class Hand:
 
     def present_position(self, kinematics: RobotKinematics) -> np.ndarray:
         """Returns the reaching point in the world at the scratch Context's positions, (3,) [m]."""
-        p_WH: np.ndarray = kinematics.plant.CalcPointsPositions(
-            kinematics.context, self.frame, self.point, kinematics.world_frame
-        )
+        place = self.frame, self.point, kinematics.world_frame
+        p_WH: np.ndarray = kinematics.plant.CalcPointsPositions(kinematics.context, *place)
         return p_WH[:, 0]
 
 
@@ -164,11 +156,9 @@ class WholeBodyModel:
         sizes = *map(np.shape, vectors), len(reference.orientations), len(reference.posture)
         is_sized = sizes == (*[(3,)] * 4, len(self.bodies), self.num_joints)
         if not (is_sized and np.isfinite(np.concatenate([*vectors, reference.posture])).all()):
-            raise ValueError(
-                f"robot '{self.kinematics.robot.name}': the whole-body reference needs finite "
-                f"points, orientations of {self.body_names} and a posture of {self.num_joints} "
-                f"joints; got {reference}"
-            )
+            parts = f"orientations of {self.body_names}, a posture of {self.num_joints} joints"
+            what = f"the whole-body reference needs finite points, {parts}; got {reference}"
+            raise ValueError(f"robot '{self.kinematics.robot.name}': {what}")
 
     def reaching_position(self, q: np.ndarray) -> np.ndarray:
         """Returns the reaching point in the world, (3,) [m]."""

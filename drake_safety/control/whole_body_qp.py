@@ -15,10 +15,8 @@ from drake_safety.control.observation import rotation_vector
 from drake_safety.control.whole_body_model import WholeBodyModel, WholeBodyReference
 from drake_safety.learning.blas_threads import one_blas_thread
 
-SOLVED = 0
-"""Status of a solved program; other values are daqp's negative exit flags."""
-ITERATION_LIMIT = -4
-"""Status of a program that was given up, as those of a robot that has fallen."""
+SOLVED = 0  # Status of a solved program; other values are daqp's negative exit flags.
+ITERATION_LIMIT = -4  # Status of a program that was given up, as those of a robot that has fallen.
 
 # Before 0.10 daqp has no elimination of equations to switch off.
 _OPTIONS = {"eq_reduction": daqp.EQ_REDUCTION_OFF} if hasattr(daqp, "EQ_REDUCTION_OFF") else {}
@@ -43,16 +41,12 @@ class WholeBodyQP:
     H: np.ndarray
     g: np.ndarray
     A: np.ndarray
-    num_vdot_rows: int
-    """Number of the first rows of A, in which v̇ has nonzero entries."""
+    num_vdot_rows: int  # Number of the first rows of A, in which v̇ has nonzero entries.
     lower: np.ndarray
     upper: np.ndarray
-    sense: np.ndarray
-    """``EQUALITY`` for rows of A with equal bounds, else 0."""
-    bias: np.ndarray
-    """Coriolis and gravity terms h of the equations of motion M v̇ + h = S τ + Jᵀf, (n_v,)."""
-    force_scale: float
-    """s [N]."""
+    sense: np.ndarray  # ``EQUALITY`` for rows of A with equal bounds, else 0.
+    bias: np.ndarray  # h in the equations of motion M v̇ + h = S τ + Jᵀf, (n_v,).
+    force_scale: float  # s [N].
 
     def torques(self, x: np.ndarray) -> np.ndarray:
         """Returns the joint torques (n_j,) [N·m] at x = [v̇; y]."""
@@ -65,8 +59,7 @@ class WholeBodySolution:
     """A solution of the program, valid if its status is ``SOLVED``."""
 
     vdot: np.ndarray
-    forces: np.ndarray
-    """Forces at the contact points in the world, (n_points, 3) [N]."""
+    forces: np.ndarray  # Forces at the contact points in the world, (n_points, 3) [N].
     torques: np.ndarray
     status: int
 

@@ -23,9 +23,8 @@ def replacing(final: Path) -> Iterator[Path]:
         temporary.replace(final)
     except OSError as error:
         why = os.strerror(error.errno) if error.errno else error
-        raise OSError(
-            f"{final} cannot be written: {why}; what had been written before is kept"
-        ) from error
+        text = f"{final} cannot be written: {why}; what had been written before is kept"
+        raise OSError(text) from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -45,8 +44,8 @@ def lock_folder(path: Path) -> BaseFileLock:
         # The operating system unlocks it when the process ends, however that happens.
         lock.acquire(timeout=0)
     except Timeout:
-        raise ValueError(
-            f"{path} is being written by another process, or by another writer of this one: wait "
-            "for it, stop it, or choose another folder"
-        ) from None
+        what = (
+            "is being written by another process or writer: wait for it, or choose another folder"
+        )
+        raise ValueError(f"{path} {what}") from None
     return lock

@@ -20,10 +20,7 @@ _Report = TypeVar("_Report", bound=Callable[..., Any])
 def open_stages(
     console: Console | None = None, *, period_s: float = 10.0
 ) -> Iterator[StageProgress]:
-    """Shows stages while the block runs: bars on a terminal and in a notebook, lines elsewhere.
-
-    It prints to standard error by default, a line at least every `period_s`.
-    """
+    """Shows stages while the block runs: bars on a terminal, else a line every `period_s` [s]."""
     console = console or Console(stderr=True)
     # A log file that is to have colours is no terminal either.
     is_live = console.is_jupyter or (console.is_interactive and console.file.isatty())

@@ -76,28 +76,22 @@ def observation_term(name: str) -> Callable[[Term], Term]:
 class ObservationTerm:
     """A part of the network's input."""
 
-    name: str = ""
-    """One of the registered terms; see :func:`observation_term`."""
-    scale: list[float] = field(default_factory=lambda: [1.0])
-    """Factor, one number or one per entry."""
-    clip: Annotated[float, Field(gt=0)] = 100.0
-    """Largest absolute value after scaling."""
-    history: Count = 1
-    """Number of samples, the oldest first."""
+    name: str = ""  # One of the registered terms; see :func:`observation_term`.
+    scale: list[float] = field(default_factory=lambda: [1.0])  # Factor, one or one per entry.
+    clip: Annotated[float, Field(gt=0)] = 100.0  # Largest absolute value after scaling.
+    history: Count = 1  # Number of samples, the oldest first.
+    # Joints whose positions or rates it has, in its order; by default those that are moved.
     joints: list[str] = field(default_factory=list)
-    """Joints whose positions or rates it has, in its order; by default those that are moved."""
 
 
 @schema(kw_only=True)
 class GaitClock:
     """A clock whose phases are part of the observation."""
 
-    period_s: NotNegative = 0.0
-    """Period of a cycle [s]; 0 for policies without a clock."""
+    period_s: NotNegative = 0.0  # Period of a cycle [s]; 0 for policies without a clock.
+    # Phase of each foot at the start, as a share of the period.
     offsets: list[float] = field(default_factory=lambda: [0.0, 0.5])
-    """Phase of each foot at the start, as a share of the period."""
-    standing_below: float = 0.01
-    """Norm of the command below which every phase is half a period."""
+    standing_below: float = 0.01  # Norm of the command below which every phase is half a period.
 
 
 @schema(kw_only=True)
@@ -119,10 +113,10 @@ class CommandLimits:
 class WholeHistory:
     """Samples of the whole observation in the network's input."""
 
+    # Age of each sample in periods, 0 for the newest, in the network's order.
     ages: list[int] = field(default_factory=list)
-    """Age of each sample in periods, 0 for the newest, in the network's order."""
+    # What is kept together: all terms of a ``time``, or all samples of a ``term``.
     by: Literal["time", "term"] = "time"
-    """What is kept together: all terms of a ``time``, or all samples of a ``term``."""
 
     def __post_init__(self) -> None:
         if sorted(self.ages) != list(range(len(self.ages))):
@@ -134,27 +128,21 @@ class WholeHistory:
 class PolicyParameters:
     """The schema of ``policy.yaml``."""
 
-    network: str = ""
-    """ONNX or TorchScript file: ``package://…`` or a path relative to the YAML file."""
-    requires: Requirement = ""
-    """Requirement by which pip installs the network's package without its dependencies."""
+    network: str = ""  # ONNX or TorchScript file: ``package://…`` or relative to the YAML file.
+    requires: Requirement = ""  # What pip installs for ``network``, without dependencies.
+    # Joints in the network's order; by default those of the network's metadata.
     joints: list[str] = field(default_factory=list)
-    """Joints in the network's order; by default those of the network's metadata."""
+    # Joint positions at zero action [rad], by regular expression; 0 for others. The default of
+    # this, ``action_scale`` and ``gains`` is in the network's metadata.
     default_positions: dict[Pattern, float] = field(default_factory=dict)
-    """Joint positions at zero action [rad], by regular expression; 0 for others. The default of
-    this, ``action_scale`` and ``gains`` is in the network's metadata."""
+    # Joint positions per unit of action [rad], by regular expression.
     action_scale: dict[Pattern, float] = field(default_factory=dict)
-    """Joint positions per unit of action [rad], by regular expression."""
-    action_clip: Annotated[float, Field(gt=0)] = 100.0
-    """Largest absolute action."""
-    gains: dict[Pattern, JointGains] = field(default_factory=dict)
-    """Servo gains, by regular expression."""
+    action_clip: Annotated[float, Field(gt=0)] = 100.0  # Largest absolute action.
+    gains: dict[Pattern, JointGains] = field(default_factory=dict)  # Servo gains, by pattern.
+    # Rotor inertia as the joints feel it [kg·m²], by regular expression.
     rotor_inertia: dict[Pattern, float] = field(default_factory=dict)
-    """Rotor inertia as the joints feel it [kg·m²], by regular expression."""
-    period_s: Positive = 0.02
-    """Time between two actions [s]."""
-    observation: list[ObservationTerm] = field(default_factory=list)
-    """Terms in the network's order."""
+    period_s: Positive = 0.02  # Time between two actions [s].
+    observation: list[ObservationTerm] = field(default_factory=list)  # In the network's order.
     history: WholeHistory = field(default_factory=WholeHistory)
     gait: GaitClock = field(default_factory=GaitClock)
     command: CommandLimits = field(default_factory=CommandLimits)
@@ -363,12 +351,8 @@ def read_policy_file(path: Path, network: str = "") -> PolicyParameters:
 
 def load_policy(path: Path, kinematics: RobotKinematics, network: str = "") -> Policy:
     """Loads a policy for a robot; a network replaces the one that the file names."""
-    return Policy(
-        read_policy_file(path, network),
-        kinematics.joint_names,
-        robot=kinematics.robot.name,
-        folder=str(path.parent),
-    )
+    parameters, robot = read_policy_file(path, network), kinematics.robot.name
+    return Policy(parameters, kinematics.joint_names, robot=robot, folder=str(path.parent))
 
 
 def with_policy(robot: RobotModel, policy: Policy, joint_names: list[str]) -> RobotModel:

@@ -21,8 +21,7 @@ from drake_safety.robots.model_files import model_file
 if TYPE_CHECKING:
     import trimesh
 
-SHOWN_FORMATS = (".gltf", ".obj", ".vtk")
-"""Formats that Drake renders."""
+SHOWN_FORMATS = (".gltf", ".obj", ".vtk")  # That Drake renders.
 CACHE_VARIABLE = "DRAKE_SAFETY_CACHE"
 _TRANSPARENCY = re.compile(r"^\s*Tr\s+(\d+\.?\d*)\s*$", re.MULTILINE)  # In an MTL file.
 _BARE_FACE = re.compile(r"^\s*f\s(?:.*\s)?-?\d+(?:/-?\d*)?(?=\s|$)", re.MULTILINE)

@@ -14,8 +14,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_safety.extras import MissingExtraError, missing_extra
 
-_EXTRAS = {"example-robot-data": "robots"}
-"""Packages of models that an extra installs."""
+_EXTRAS = {"example-robot-data": "robots"}  # Packages of models that an extra installs.
 
 
 def add_to_package_map(package_map: PackageMap, url: str = "") -> None:

@@ -44,10 +44,8 @@ _T = TypeVar("_T")
 class ObservationNoise:
     """Standard deviations of the noise on a measured state."""
 
-    position: NotNegative = 0.0
-    """Base position [m], base orientation and joint positions [rad]."""
-    velocity: NotNegative = 0.0
-    """Base and joint velocities [m/s, rad/s]."""
+    position: NotNegative = 0.0  # Base position [m], base orientation and joint positions [rad].
+    velocity: NotNegative = 0.0  # Base and joint velocities [m/s, rad/s].
 
 
 @schema(kw_only=True)
@@ -55,8 +53,7 @@ class Payload:
     """A small mass fixed to a body of the robot, by default to its base."""
 
     mass_kg: Positive = 1.0
-    position_m: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """Its centre in the body's frame, (3,)."""
+    position_m: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])  # In the body's frame.
     body: str = ""
 
 
@@ -65,22 +62,16 @@ class PlantVariation:
     """Differences of a plant from the published robot."""
 
     engine: Literal["drake", "mujoco"] = "drake"
-    mass_scale: Positive = 1.0
-    """Factor on every body's spatial inertia."""
-    joint_friction_nm: NotNegative = 0.0
-    """Dry (Coulomb) friction torque of every actuated joint [N·m]."""
-    joint_damping: NotNegative = 0.0
-    """Viscous damping added to every actuated joint [N·m·s/rad]."""
-    foot_friction: Positive | None = None
-    """Friction coefficient of the feet; the robot's own by default."""
+    mass_scale: Positive = 1.0  # Factor on every body's spatial inertia.
+    joint_friction_nm: NotNegative = 0.0  # Dry (Coulomb) friction of every actuated joint [N·m].
+    joint_damping: NotNegative = 0.0  # Viscous damping added to every actuated joint [N·m·s/rad].
+    foot_friction: Positive | None = None  # Of the feet; the robot's own by default.
+    # Noise on the measurements of controllers and assessor.
     observation_noise: ObservationNoise = field(default_factory=ObservationNoise)
-    """Noise on the measurements of controllers and assessor."""
+    # Noise on the assessor's inputs alone; the motion does not depend on it.
     input_noise: ObservationNoise = field(default_factory=ObservationNoise)
-    """Noise on the assessor's inputs alone; the motion does not depend on it."""
-    payload: Payload | None = None
-    """A mass that the controllers do not model."""
-    shift: Shift | None = None
-    """Lasting conditions that training does not have."""
+    payload: Payload | None = None  # A mass that the controllers do not model.
+    shift: Shift | None = None  # Lasting conditions that training does not have.
 
 
 PAYLOAD_RADIUS_M = 0.05
@@ -283,10 +274,8 @@ def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
     names = dict.fromkeys(name for limb in robot.limbs() for name in limb.joints)
     # Limbs may leave out their joints; then all joints are checked.
     if without := [name for name in names or servo_joints(plant, robot) if name not in driven]:
-        raise ValueError(
-            f"robot '{robot.name}': joints {without} have no motor: add a transmission to "
-            f"'{robot.urdf}', or their largest torques [N·m] to effort_limits in robot.yaml"
-        )
+        hint = f"add a transmission to '{robot.urdf}', or their largest torques [N·m] to robot.yaml"
+        raise ValueError(f"robot '{robot.name}': joints {without} have no motor: {hint}")
 
 
 def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, float]:

@@ -26,33 +26,27 @@ class Foot:
     """A foot: its contact points with the ground, and the joints of its leg."""
 
     body: str = ""
+    # Centres of the contact spheres in the body's frame, each (3,) [m].
     contact_points: Annotated[list[Triple], Field(min_length=1)]
-    """Centres of the contact spheres in the body's frame, each (3,) [m]."""
     radius_m: float = 0.0
-    joints: list[str] = field(default_factory=list)
-    """Joints of the leg, from the base to the foot."""
+    joints: list[str] = field(default_factory=list)  # Of the leg, from base to foot.
 
 
 @schema(kw_only=True)
 class JointGains:
     """Gains of a joint's position servo."""
 
-    stiffness: float = 0.0
-    """[N·m/rad]"""
-    damping: float = 0.0
-    """[N·m·s/rad]"""
+    stiffness: float = 0.0  # [N·m/rad]
+    damping: float = 0.0  # [N·m·s/rad]
 
 
 @schema(kw_only=True)
 class TaskGains:
     """Weight and feedback gains of a task of the whole-body controller."""
 
-    weight: NotNegative = 1.0
-    """Weight of the squared error of the task's acceleration."""
-    stiffness: NotNegative = 100.0
-    """Gain of the position error [1/s²]."""
-    damping: NotNegative = 20.0
-    """Gain of the rate error [1/s]."""
+    weight: NotNegative = 1.0  # Weight of the squared error of the task's acceleration.
+    stiffness: NotNegative = 100.0  # Gain of the position error [1/s²].
+    damping: NotNegative = 20.0  # Gain of the rate error [1/s].
 
 
 @schema(kw_only=True)
@@ -60,11 +54,10 @@ class ReachingFrame:
     """A hand: its reaching point, its collision sphere and the joints of its arm."""
 
     body: str = ""
+    # Reaching point and centre of the collision sphere in the body's frame, (3,) [m].
     point: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """Reaching point and centre of the collision sphere in the body's frame, (3,) [m]."""
     radius_m: NotNegative = 0.0
-    joints: list[str] = field(default_factory=list)
-    """Joints of the arm, from the torso to the hand."""
+    joints: list[str] = field(default_factory=list)  # Of the arm, from torso to hand.
 
 
 @schema(kw_only=True)
@@ -72,32 +65,24 @@ class WholeBody:
     """Weights and gains of the whole-body controller, by the name of the task."""
 
     center_of_mass: TaskGains = field(default_factory=lambda: TaskGains(weight=10.0))
-    orientation: dict[str, TaskGains] = field(default_factory=dict)
-    """Orientation tasks by body."""
+    orientation: dict[str, TaskGains] = field(default_factory=dict)  # Orientation tasks by body.
     reaching: TaskGains = field(default_factory=lambda: TaskGains(weight=50.0))
     posture: TaskGains = field(default_factory=lambda: TaskGains(weight=0.1))
-    contact_damping: NotNegative = 40.0
-    """Gain K_d of the contact constraints, J v̇ = -J̇v - K_d J v [1/s]."""
-    regularization: Positive = 1e-4
-    """Weight of squared accelerations, including the base's."""
-    force_regularization: Positive = 1e-2
-    """Weight of squared contact forces over the robot's mass, (f/m)² [m²/s⁴]."""
-    friction: Positive = 0.5
-    """Friction coefficient of the planned contact forces, below the ground's own."""
+    contact_damping: NotNegative = 40.0  # K_d in the contacts' J v̇ = -J̇v - K_d J v [1/s].
+    regularization: Positive = 1e-4  # Weight of squared accelerations, including the base's.
+    force_regularization: Positive = 1e-2  # Weight of squared forces over mass, (f/m)² [m²/s⁴].
+    friction: Positive = 0.5  # Coefficient of planned contact forces, below the ground's own.
 
 
 @schema(kw_only=True)
 class CollisionShape:
     """A shape fixed to a body: a box, a sphere, or with ``to_m`` a capsule."""
 
+    # Centre of a box or sphere, centre of a capsule's first end, in the body's frame, (3,).
     position_m: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """Centre of a box or sphere, centre of a capsule's first end, in the body's frame, (3,)."""
-    box_m: Triple | None = None
-    """Edges of a box along the body's axes, (3,)."""
-    radius_m: NotNegative = 0.0
-    """Of a sphere or capsule."""
-    to_m: Triple | None = None
-    """Centre of a capsule's other end, (3,)."""
+    box_m: Triple | None = None  # Edges of a box along the body's axes, (3,).
+    radius_m: NotNegative = 0.0  # Of a sphere or capsule.
+    to_m: Triple | None = None  # Centre of a capsule's other end, (3,).
 
     def __post_init__(self) -> None:
         is_box, is_end = self.box_m is not None, self.to_m == self.position_m
@@ -110,38 +95,32 @@ class RobotModel:
     """The schema of ``robot.yaml``."""
 
     name: str = ""
-    urdf: str = ""
-    """``package://…`` (ours, Drake's or a pip package's) or a path relative to the YAML file."""
-    requires: Requirement = ""
-    """What pip installs for ``urdf`` without dependencies, if no extra does."""
-    base: str = ""
-    """Floating base body."""
+    urdf: str = ""  # ``package://…`` (ours, Drake's, pip's) or a path from the YAML file.
+    requires: Requirement = ""  # What pip installs for ``urdf``, without dependencies, if no extra.
+    base: str = ""  # Floating base body.
+    # Standing joint positions [rad], by regular expression over joint names.
     posture: dict[Pattern, float] = field(default_factory=dict)
-    """Standing joint positions [rad], by regular expression over joint names."""
     feet: dict[str, Foot] = field(default_factory=dict)
-    reaching_frames: dict[str, ReachingFrame] = field(default_factory=dict)
-    """By hand."""
+    reaching_frames: dict[str, ReachingFrame] = field(default_factory=dict)  # By hand.
+    # Mirrored joints: regular expression over joint names -> name of the partner.
     mirror: dict[Pattern, str] = field(default_factory=dict)
-    """Mirrored joints: regular expression over joint names -> name of the partner."""
     whole_body: WholeBody = field(default_factory=WholeBody)
+    # Position servo gains, by regular expression over joint names.
     joint_gains: dict[Pattern, JointGains] = field(default_factory=dict)
-    """Position servo gains, by regular expression over joint names."""
+    # Effort limits [N·m] that the model file lacks, by regular expression.
     effort_limits: dict[Pattern, float] = field(default_factory=dict)
-    """Effort limits [N·m] that the model file lacks, by regular expression."""
+    # Joint speed limits [rad/s] that replace the model file's, by regular expression.
     velocity_limits: dict[Pattern, float] = field(default_factory=dict)
-    """Joint speed limits [rad/s] that replace the model file's, by regular expression."""
+    # Inertia of the motors' rotors as the joints feel it [kg·m²], by regular expression.
     rotor_inertia: dict[Pattern, float] = field(default_factory=dict)
-    """Inertia of the motors' rotors as the joints feel it [kg·m²], by regular expression."""
+    # ``stated``: only the feet's contact points and ``shapes`` (URDF only).
     collision: Literal["model_file", "stated"] = "model_file"
-    """``stated``: only the feet's contact points and ``shapes`` (URDF only)."""
+    # Shapes for ``stated`` collisions, by regular expression over body names.
     shapes: dict[Pattern, list[CollisionShape]] = field(default_factory=dict)
-    """Shapes for ``stated`` collisions, by regular expression over body names."""
+    # Links that lost their collision meshes to ``new`` and have no shape; ``check`` warns.
     without_collision: list[str] = field(default_factory=list)
-    """Links that lost their collision meshes to ``new`` and have no shape; ``check`` warns."""
-    foot_friction: Positive = 0.8
-    """Coulomb friction coefficient of the contact points."""
-    source_dir: str = ""
-    """Folder of the YAML file; set by the loader."""
+    foot_friction: Positive = 0.8  # Coulomb friction coefficient of the contact points.
+    source_dir: str = ""  # Folder of the YAML file; set by the loader.
 
     def __post_init__(self) -> None:
         if self.collision == "model_file" and self.shapes:

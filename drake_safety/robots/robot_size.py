@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass
 from typing import Any
 
-GRAVITY_M_S2 = 9.81
-"""As in Drake."""
+GRAVITY_M_S2 = 9.81  # As in Drake.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,12 +16,9 @@ FAULTS = {"bias": True, "drift": True, "zero": False, "scale": True, "delay": Tr
 class JointShift:
     """A joint that answers differently from the published one."""
 
-    effort_scale: Positive = 1.0
-    """Factor on the motor's largest torque."""
-    stiffness_scale: Positive = 1.0
-    """Factor on the position servo's gains."""
-    is_locked: bool = False
-    """Whether the joint keeps its initial position."""
+    effort_scale: Positive = 1.0  # Factor on the motor's largest torque.
+    stiffness_scale: Positive = 1.0  # Factor on the position servo's gains.
+    is_locked: bool = False  # Whether the joint keeps its initial position.
 
 
 @schema(kw_only=True)
@@ -29,11 +26,10 @@ class Fault:
     """A fault of some entries of a vector signal; ``docs/shifts.md`` lists the kinds."""
 
     kind: Literal[*FAULTS] = "zero"  # type: ignore[valid-type]
+    # By name or pattern; by default all.
     entries: list[str] = field(default_factory=lambda: [".*"])
-    """Names or patterns of the entries; all by default."""
     value: FiniteFloat | None = None
-    start_s: NotNegative = 0.0
-    """Time from which the fault lasts [s]."""
+    start_s: NotNegative = 0.0  # Time from which the fault lasts [s].
 
     def __post_init__(self) -> None:
         if (self.value is not None) != FAULTS[self.kind]:
@@ -47,21 +43,17 @@ class Fault:
 class Shift:
     """Conditions that training does not have; see `PlantVariation` for others."""
 
+    # Inclination of the ground, simulated as gravity that is not normal to it [rad].
     slope_rad: Annotated[float, Field(gt=-0.5 * math.pi, lt=0.5 * math.pi)] = 0.0
-    """Inclination of the ground, simulated as gravity that is not normal to it [rad]."""
-    slope_direction_rad: float = 0.0
-    """Direction in which the ground falls, from the x axis [rad]."""
+    slope_direction_rad: float = 0.0  # Direction in which the ground falls, from the x axis [rad].
+    # Steady force on the base's origin, in the world, (3,) [N].
     base_force_n: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """Steady force on the base's origin, in the world, (3,) [N]."""
-    joints: dict[str, JointShift] = field(default_factory=dict)
-    """Joints that answer differently, by name or pattern."""
-    command_delay_s: NotNegative = 0.0
-    """Age of the command that the joints get [s]."""
+    joints: dict[str, JointShift] = field(default_factory=dict)  # By name or pattern.
+    command_delay_s: NotNegative = 0.0  # Age of the command that the joints get [s].
+    # Faults of the command that the joints get. Entries are joints, their velocities end in
+    # ``_rate``; where the command is torques, they are actuators.
     command_faults: list[Fault] = field(default_factory=list)
-    """Faults of the command that the joints get. Entries are joints, their velocities end in
-    ``_rate``; where the command is torques, they are actuators."""
-    holes_m: dict[str, Positive] = field(default_factory=dict)
-    """Depth of the ground under a foot [m]."""
+    holes_m: dict[str, Positive] = field(default_factory=dict)  # Depth of ground under a foot [m].
+    # Faults of the measured ``[q; v]`` that the assessor reads; the motion does not depend on
+    # them. Entries have Drake's names, such as ``FR_calf_joint_q`` and ``FR_calf_joint_w``.
     sensor_faults: list[Fault] = field(default_factory=list)
-    """Faults of the measured ``[q; v]`` that the assessor reads; the motion does not depend on
-    them. Entries have Drake's names, such as ``FR_calf_joint_q`` and ``FR_calf_joint_w``."""

@@ -12,8 +12,7 @@ from drake_safety.files.reading import is_number
 from drake_safety.robots.meshes import is_shown, shown_mesh
 from drake_safety.robots.model_files import model_file
 
-DRAKE = "http://drake.mit.edu"
-"""Namespace of Drake's elements."""
+DRAKE = "http://drake.mit.edu"  # Namespace of Drake's elements.
 ET.register_namespace("drake", DRAKE)
 _PREFIX = re.compile(rb"""(xmlns:drake\s*=\s*)["'][^"']*["']""")
 _VECTORS = {"xyz", "rpy", "size", "scale", "radius", "length"}

@@ -138,9 +138,8 @@ class ChangeMonitor(LeafSystem):
         if is_lost or is_charted:
             levels, before = detector.levels(charts, part["repeats"], share), part["alarm"][0]
             part["levels"][:] = levels
-            part["alarm"][0], part["below_s"][0] = detector.next_alarm(
-                before, part["below_s"][0], float(levels.max())
-            )
+            below_s, highest = part["below_s"][0], float(levels.max())
+            part["alarm"][0], part["below_s"][0] = detector.next_alarm(before, below_s, highest)
             if part["alarm"][0] > before:
                 part["at_alarm"][:] = np.concatenate([part["charts"], part["repeats"], share])
 

@@ -119,13 +119,9 @@ class InverseKinematicsController(LeafSystem):
         self._command_joints(discrete_state, previous + self._period_s * rate, torques, rate)
 
     def _command_joints(
-        self,
-        discrete_state: DiscreteValues,
-        joints: np.ndarray,
-        torques: np.ndarray,
-        rate: np.ndarray,
+        self, state: DiscreteValues, joints: np.ndarray, torques: np.ndarray, rate: np.ndarray
     ) -> None:
         lowest, highest = self._kinematics.position_limits.T
         positions = np.minimum(np.maximum(joints + torques / self._stiffness, lowest), highest)
-        discrete_state.set_value(self._set_point, joints)
-        discrete_state.set_value(self._command, np.concatenate([positions, rate]))
+        state.set_value(self._set_point, joints)
+        state.set_value(self._command, np.concatenate([positions, rate]))

@@ -50,15 +50,12 @@ class MonitoredSafetyAssessor(Diagram):
         if on_alarm not in ("unknown", "report", None):
             raise ValueError(f"on_alarm must be 'unknown', 'report' or None; got {on_alarm!r}")
         builder = DiagramBuilder()
-        self.assessor = builder.AddNamedSystem(
-            "safety_assessor",
-            SafetyAssessor(
-                assessment,
-                period_s=assessment.info_.step_s if period_s is None else period_s,
-                checks_margins=checks_margins,
-                heeds_alarm=on_alarm == "unknown",
-            ),
+        period_s = assessment.info_.step_s if period_s is None else period_s
+        heeds_alarm = on_alarm == "unknown"
+        assessor = SafetyAssessor(
+            assessment, period_s=period_s, checks_margins=checks_margins, heeds_alarm=heeds_alarm
         )
+        self.assessor = builder.AddNamedSystem("safety_assessor", assessor)
         self.monitor: ChangeMonitor | None = None
         inputs = ["state", "desired_preview", "features"]
         for name in [*inputs, "margins"] if checks_margins else inputs:
@@ -68,7 +65,7 @@ class MonitoredSafetyAssessor(Diagram):
             for name in inputs:
                 builder.ConnectInput(name, self.monitor.GetInputPort(name))
             builder.ExportInput(self.monitor.GetInputPort("hold"), "hold")
-            if on_alarm == "unknown":
+            if heeds_alarm:
                 alarm = self.monitor.GetOutputPort("alarm")
                 builder.Connect(alarm, self.assessor.GetInputPort("alarm"))
         for system in filter(None, (self.assessor, self.monitor)):
@@ -133,9 +130,5 @@ def warn_of_sampled_ports(who: str, systems: Iterable[System]) -> None:
     """Logs which plants show the next state to what updates at the same time."""
     for system in leaf_systems(systems):
         if isinstance(system, MultibodyPlant) and system.has_sampled_output_ports():
-            _LOGGER.warning(
-                "%s: plant '%s' shows a later state than in episodes; make it with "
-                "MultibodyPlantConfig(use_sampled_output_ports=False)",
-                who,
-                system.get_name(),
-            )
+            text = "%s: plant '%s' shows a later state than in episodes; configure it with %s"
+            _LOGGER.warning(text, who, system.get_name(), "use_sampled_output_ports=False")

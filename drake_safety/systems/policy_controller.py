@@ -101,9 +101,8 @@ class PolicyController(LeafSystem):
         change = float(np.abs(next_action - action).max())
         waves = np.sin(phases), np.cos(phases)
         discrete_state.set_value(self._set_point, set_point)
-        discrete_state.set_value(
-            self._action, np.concatenate([next_action, [change], *waves, applied])
-        )
+        action_state = np.concatenate([next_action, [change], *waves, applied])
+        discrete_state.set_value(self._action, action_state)
         if self._num_phases:
             discrete_state.set_value(self._phases, phases)
         discrete_state.set_value(self._applied, applied)

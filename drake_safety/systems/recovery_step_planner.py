@@ -89,14 +89,7 @@ class RecoveryStepPlanner(LeafSystem):
             self.DeclareStateOutputPort(name, self._groups[name])
         ticket = {self.all_state_ticket()}
         for name, num_samples in (("desired_preview", horizon), ("desired_outlook", num_outlook)):
-            self.DeclareVectorOutputPort(
-                name,
-                3 * num_samples,
-                lambda context, output, n=num_samples: output.SetFromVector(
-                    np.tile(self._set_point_in_stance(context), n)
-                ),
-                ticket,
-            )
+            self.DeclareVectorOutputPort(name, 3 * num_samples, self._calc_samples, ticket)
         self.DeclareVectorOutputPort("recovery_done", 1, self._calc_done, ticket)
 
     def set_stance(
@@ -234,21 +227,21 @@ class RecoveryStepPlanner(LeafSystem):
             desired_yaw = yaw + min(max(twist, -parameters.max_twist_rad), parameters.max_twist_rad)
         # The controller solves for a level base at the set point; a swinging foot is given relative
         # to the measured base.
-        X_adjust = (
-            RigidTransform(RotationMatrix.MakeZRotation(desired_yaw), base)
-            @ RigidTransform(R_WB, p_WB).inverse()
-        )
+        X_level = RigidTransform(RotationMatrix.MakeZRotation(desired_yaw), base)
+        X_adjust = X_level @ RigidTransform(R_WB, p_WB).inverse()
         for i in swinging:
             feet[i] = X_adjust @ feet[i]
         now.desired_output, now.desired_foot_positions = base, feet.ravel()
         now.desired_yaw, now.stance_pose = [desired_yaw], stance
 
-    def _set_point_in_stance(self, context: Context) -> np.ndarray:
+    def _calc_samples(self, context: Context, output: BasicVector) -> None:
+        """Repeats the set point, in the stance frame."""
         x, y, yaw = context.get_discrete_state(self._groups["stance_pose"]).get_value()
         p = context.get_discrete_state(self._groups["desired_output"]).get_value()
         c, s = math.cos(yaw), math.sin(yaw)
         dx, dy = p[0] - x, p[1] - y
-        return np.array([c * dx + s * dy, -s * dx + c * dy, p[2]])
+        set_point = [c * dx + s * dy, -s * dx + c * dy, p[2]]
+        output.SetFromVector(np.tile(set_point, output.size() // 3))
 
     def _calc_done(self, context: Context, output: BasicVector) -> None:
         mode = context.get_discrete_state(self._groups["mode"]).GetAtIndex(0)

@@ -65,9 +65,8 @@ class SafetyAssessor(LeafSystem):
         corrections = assessment.correction_, assessment.novelty_
         self._corrections = self.DeclareAbstractParameter(Value(corrections))
         self._state_port = self.DeclareVectorInputPort("state", len(info.state_names))
-        self._preview_port = self.DeclareVectorInputPort(
-            "desired_preview", info.horizon * len(info.output_names)
-        )
+        num_preview = info.horizon * len(info.output_names)
+        self._preview_port = self.DeclareVectorInputPort("desired_preview", num_preview)
         self._features_port = self.DeclareVectorInputPort("features", len(info.feature_names))
         self._margins_port = self._alarm_port = None
         learned_from = {self.all_parameters_ticket()}
@@ -99,9 +98,7 @@ class SafetyAssessor(LeafSystem):
         """Takes over what an assessment adapted from this system's own has learned."""
         own, other = self._assessment.embedding_, adapted.embedding_
         if other is not own and not other.is_same(own):
-            raise ValueError(
-                "safety assessor: the assessment to adopt has other maps; build the diagram anew"
-            )
+            raise ValueError("safety assessor: the assessment has other maps; build a new diagram")
         beliefs = np.asarray(adapted.beliefs_, dtype=float).ravel()
         context.get_mutable_numeric_parameter(self._beliefs).SetFromVector(beliefs)
         corrections = adapted.correction_, adapted.novelty_

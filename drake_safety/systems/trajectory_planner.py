@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from functools import partial
 
 import numpy as np
 from pydrake.common.value import Value
@@ -99,22 +100,17 @@ class TrajectoryPlanner(LeafSystem):
         self._stance_port = self.DeclareVectorInputPort("stance_pose", 3)
         self.DeclareVectorOutputPort("desired_output", 3, self._calc_output)
         self.DeclareVectorOutputPort("desired_output_rate", 3, self._calc_rate)
+        ticket = {self.time_ticket(), self.all_parameters_ticket()}
         for name, offsets in (
             ("desired_preview", step_s * np.arange(horizon)),
             ("desired_outlook", np.linspace(0.0, outlook_s, num_outlook)),
         ):
-            self.DeclareVectorOutputPort(
-                name,
-                3 * len(offsets),
-                lambda context, output, offsets=offsets: output.SetFromVector(
-                    self._samples(context, offsets)
-                ),
-                {self.time_ticket(), self.all_parameters_ticket()},
-            )
+            calc = partial(self._calc_samples, offsets)
+            self.DeclareVectorOutputPort(name, 3 * len(offsets), calc, ticket)
 
-    def _samples(self, context: Context, offsets: np.ndarray) -> np.ndarray:
-        times = context.get_time() + offsets
-        return self.get_plan(context).vector_values(times).ravel(order="F")
+    def _calc_samples(self, offsets: np.ndarray, context: Context, output: BasicVector) -> None:
+        values = self.get_plan(context).vector_values(context.get_time() + offsets)
+        output.SetFromVector(values.ravel(order="F"))
 
     def set_plan(
         self, context: Context, plan: PiecewisePolynomial, stance_pose: np.ndarray | None = None

@@ -51,9 +51,8 @@ class WholeBodyController(LeafSystem):
     ):
         super().__init__()
         self.model = WholeBodyModel(kinematics, hand)
-        self._matrix = np.eye(kinematics.num_joints)
-        if actuation_matrix is not None:
-            self._matrix = np.array(actuation_matrix, dtype=float)
+        identity = np.eye(kinematics.num_joints)
+        self._matrix = identity if actuation_matrix is None else np.array(actuation_matrix, float)
         self._n_q = kinematics.num_positions
         self._state_port = self.DeclareVectorInputPort("plant_state", kinematics.num_states)
         self._desired_port = self.DeclareVectorInputPort("desired_output", 3)
