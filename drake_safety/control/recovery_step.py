@@ -26,7 +26,7 @@ class RecoveryStepParameters:
     max_steps: int = 100  # Of swings; a robot that stops before it can stand falls.
     settle_heading_rad: float = 0.35  # Largest difference of yaw and heading for stopping [rad].
     settle_margin_m: float = 0.08  # Least depth of the capture point in the polygon to stop [m].
-    resume_margin_m: float = 0.02  # Its depth below which a stopped robot steps again [m].
+    resume_margin_m: float = 0.02  # Depth of this point below which a robot steps again [m].
     return_duration_s: Positive = 0.5  # Duration of the base's return over its feet [s].
 
     def __post_init__(self) -> None:

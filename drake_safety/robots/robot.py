@@ -274,8 +274,9 @@ def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
     names = dict.fromkeys(name for limb in robot.limbs() for name in limb.joints)
     # Limbs may leave out their joints; then all joints are checked.
     if without := [name for name in names or servo_joints(plant, robot) if name not in driven]:
-        hint = f"add a transmission to '{robot.urdf}', or their largest torques [N·m] to robot.yaml"
-        raise ValueError(f"robot '{robot.name}': joints {without} have no motor: {hint}")
+        what = f"robot '{robot.name}': joints {without} have no motor"
+        hint = "or their largest torques [N·m] to effort_limits in robot.yaml"
+        raise ValueError(f"{what}: add a transmission to '{robot.urdf}', {hint}")
 
 
 def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, float]:

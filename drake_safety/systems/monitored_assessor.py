@@ -130,5 +130,6 @@ def warn_of_sampled_ports(who: str, systems: Iterable[System]) -> None:
     """Logs which plants show the next state to what updates at the same time."""
     for system in leaf_systems(systems):
         if isinstance(system, MultibodyPlant) and system.has_sampled_output_ports():
-            text = "%s: plant '%s' shows a later state than in episodes; configure it with %s"
-            _LOGGER.warning(text, who, system.get_name(), "use_sampled_output_ports=False")
+            text = "%s: plant '%s' shows a later state than in episodes; make it with %s"
+            config = "MultibodyPlantConfig(use_sampled_output_ports=False)"
+            _LOGGER.warning(text, who, system.get_name(), config)

@@ -50,11 +50,11 @@ class SafetyMonitor(LeafSystem):
         self._safe_set = safe_set
         self._n_q = num_positions
         self.constraint_names = list(safe_set.names)
-        size, n_c = num_positions + num_velocities, len(safe_set.names)
+        size = num_positions + num_velocities
         self._state_port = self.DeclareVectorInputPort("plant_state", size)
         ticket = {self.input_port_ticket(self._state_port.get_index())}
         self._margins_port = self.DeclareVectorOutputPort(
-            "margins", n_c, self._calc_margins, ticket
+            "margins", len(self.constraint_names), self._calc_margins, ticket
         )
         self.DeclareVectorOutputPort("safe", 1, self._calc_safe, ticket)
 
