@@ -18,7 +18,7 @@ def comment_of(obj: griffe.Object) -> str:
     if not obj.is_attribute or not obj.lineno or not obj.endlineno:
         return ""
     lines = obj.lines_collection[obj.filepath]
-    if behind := re.search(r"  # (.*)$", lines[obj.endlineno - 1]):
+    if behind := re.search(r"  # (?!type:|noqa)(.*)$", lines[obj.endlineno - 1]):
         return behind[1]
     first = obj.lineno - 1
     while lines[first - 1].lstrip().startswith("# "):
