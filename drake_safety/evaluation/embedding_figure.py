@@ -76,8 +76,7 @@ def _draw_segments(fig: Figure, axes: Axes, gamma: SafetyAssessment, episodes: E
     parameters = gamma.parameters
     segments = split(episodes, stride=max(parameters.horizon // 2, 1), discount=parameters.discount)
     # Drawn in random order, so that neither class hides the other.
-    order = np.random.default_rng(0).permutation(len(segments))[:_MAX_POINTS]
-    segments = segments.take(order)
+    segments = segments.take(np.random.default_rng(0).permutation(len(segments))[:_MAX_POINTS])
     result = gamma.predict(segments.state, segments.desired_preview, segments.features)
     _draw_grid(axes, gamma.grid_)
     shade = ScalarMappable(Normalize(0.0, 1.0), _SAFETY.reversed())
@@ -110,8 +109,8 @@ def _draw_grid(axes: Axes, grid: Grid) -> None:
     """Draws the lines between the cells, and fits the axes to them."""
     half = grid.half_width
     edges = np.linspace(-half, half, grid.resolution + 1)
-    axes.vlines(edges, -half, half, color="#e3e5e8", linewidth=0.6, zorder=0)
-    axes.hlines(edges, -half, half, color="#e3e5e8", linewidth=0.6, zorder=0)
+    for draw in (axes.vlines, axes.hlines):
+        draw(edges, -half, half, color="#e3e5e8", linewidth=0.6, zorder=0)
     axes.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
 
 

@@ -57,8 +57,7 @@ def evaluate_plans(
     """
     first, others = _first_segments(test), _first_segments(calibration)
     miss_rate = promised_miss_rate(others.is_unsafe)
-    num_unsafe = int(others.is_unsafe.sum())
-    promised = Estimate.exact(1.0 - miss_rate, num_unsafe)
+    promised = Estimate.exact(1.0 - miss_rate, int(others.is_unsafe.sum()))
     estimates = {("plans", "", "promised_unsafe_recall"): promised}
     for scorer in scorers:
         check_unused(scorer.used, [calibration.info.seed, test.info.seed], f"'{scorer.name}'")
@@ -70,8 +69,8 @@ def evaluate_plans(
         estimates |= {("plans", scorer.name, metric): one for metric, one in judged.items()}
     causes = [episode.cause for episode in test]
     for name in ("", *test.info.constraint_names, DIVERGED):
-        share = proportion(causes.count(name), len(causes))
-        estimates["plans", "outcomes", name or "safe"] = share
+        key = "plans", "outcomes", name or "safe"
+        estimates[key] = proportion(causes.count(name), len(causes))
     return estimates
 
 

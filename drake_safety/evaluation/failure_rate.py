@@ -34,8 +34,7 @@ class FailureRate:
     """An estimated failure rate with its 95 % interval, and the episodes that failed, by time."""
 
     rate: Estimate
-    plain_rollouts: float
-    """Number of random episodes whose share of failures has the same variance."""
+    plain_rollouts: float  # Random episodes whose share of failures has the same variance.
     failures: list[Outcome]
 
 
@@ -107,8 +106,7 @@ def in_turns(stratum: np.ndarray) -> list[int]:
     """Starts in the order of simulation, one of each stratum (N,) after the other."""
     order = np.argsort(stratum, kind="stable")
     turn = np.arange(len(order)) - np.searchsorted(stratum[order], stratum[order])
-    starts: list[int] = order[np.argsort(turn, kind="stable")].tolist()
-    return starts
+    return [*map(int, order[np.argsort(turn, kind="stable")])]
 
 
 def stratified_rate(

@@ -30,7 +30,7 @@ def gate_figure(verdicts: Mapping[str, Verdict]) -> Figure:
             ends = [*mean, 0.0, bound, low[-1], high[-1]]
             room = 0.4 * (max(ends) - min(ends))
             axes.set(xlim=(0, None), ylim=(min(ends) - room, max(ends) + room))
-            axes.set(title=f"{name}: {verdict.verdict} after {verdict.pairs} pairs")
-            axes.set_ylabel("candidate − baseline\n[points]")
+            title = f"{name}: {verdict.verdict} after {verdict.pairs} pairs"
+            axes.set(title=title, ylabel="candidate − baseline\n[points]")
         panels[-1].set_xlabel("pairs of episodes")
     return fig

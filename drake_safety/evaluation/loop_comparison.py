@@ -49,8 +49,7 @@ class Verdict:
     verdict: str
     pairs: int
     both: int
-    difference: list[Estimate]
-    """Mean outcome of the candidate minus that of the baseline at each look."""
+    difference: list[Estimate]  # Mean outcome of the candidate minus the baseline's at each look.
     newly_failing: list[Outcome]
     """Episodes in which the candidate does worse, by time, with Γ's belief of the baseline's."""
     no_longer_failing: list[Outcome]
@@ -84,8 +83,7 @@ def compare_loops(
     first, second = (
         ComparedPlant(one) if isinstance(one, Scenario) else one for one in (baseline, candidate)
     )
-    pair = first, second
-    check_pair(pair, metric=metric, seed=seed)
+    check_pair(pair := (first, second), metric=metric, seed=seed)
     hashes = [scenario.simulation_hash(variation) for scenario, variation in pair]
     # The texts say what the hashes leave out.
     texts = (scenario.to_yaml() for scenario, _ in pair)

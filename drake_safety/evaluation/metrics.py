@@ -24,8 +24,7 @@ class Estimate:
     value: float
     low: float
     high: float
-    n: int
-    """Number of independent samples: episodes or throws, never segments."""
+    n: int  # Number of independent samples: episodes or throws, never segments.
 
     @classmethod
     def exact(cls, value: float, n: int) -> Estimate:
@@ -73,7 +72,6 @@ class Bootstrap:
 
 
 _BOOTSTRAP = Bootstrap()
-_MEDIAN_BOOTSTRAP = Bootstrap(num_resamples=2000)
 
 
 def proportion(count: int, n: int) -> Estimate:
@@ -90,7 +88,8 @@ def median(values: np.ndarray) -> Estimate:
     """The median of independent values (N,), some perhaps infinite, with its bootstrap interval."""
     if values.size == 0:
         return Estimate.exact(math.nan, 0)
-    return _MEDIAN_BOOTSTRAP.over_values(partial(np.median, axis=-1), np.sort(values))
+    bootstrap = Bootstrap(num_resamples=2000)
+    return bootstrap.over_values(partial(np.median, axis=-1), np.sort(values))
 
 
 def quantile(values: np.ndarray, share: float, *, bootstrap: Bootstrap) -> Estimate:
@@ -137,8 +136,7 @@ def share(
 ) -> Estimate:
     """The share of samples (N,) that hit, with an interval over their episodes (N,)."""
     num_hits, num_samples = int(is_hit.sum()), len(is_hit)
-    num_episodes = len(np.unique(episode))
-    if num_samples == num_episodes:
+    if num_samples == (num_episodes := len(np.unique(episode))):
         return proportion(num_hits, num_samples)
     if num_hits in (0, num_samples):  # Resampling has no spread.
         return proportion(num_episodes if num_hits else 0, num_episodes)
@@ -174,9 +172,8 @@ def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
     score, label = _checked(unsafe_score, is_unsafe)
     finite = np.unique(score[np.isfinite(score)])
     if label.all() or not label.any() or finite.size == 0:
-        raise ValueError(
-            f"a threshold takes both classes; got {label.sum()} of {len(label)} unsafe"
-        )
+        numbers = f"{label.sum()} of {len(label)}"
+        raise ValueError(f"a threshold takes both classes; got {numbers} unsafe")
     middle = 0.5 * (finite[:-1] + finite[1:])
     # Infinite scores stay above every threshold.
     candidates = np.array([np.nextafter(finite[0], -math.inf), *middle, finite[-1]])
@@ -193,15 +190,13 @@ def _checked(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> tuple[np.ndarra
     """Scores, infinite where they are NaN, and labels."""
     score, label = np.asarray(unsafe_score, dtype=float), np.asarray(is_unsafe)
     if label.dtype != bool or score.ndim != 1 or score.shape != label.shape:
-        raise ValueError(
-            f"expected as many scores as boolean labels; got {score.shape}, {label.shape}"
-        )
+        shapes = f"{score.shape}, {label.shape}"
+        raise ValueError(f"expected as many scores as boolean labels; got {shapes}")
     return np.where(np.isnan(score), math.inf, score), label
 
 
 def _ranked_area(rank: np.ndarray, label: np.ndarray, weight: np.ndarray) -> float:
-    unsafe = np.bincount(rank, weights=weight * label)
-    safe = np.bincount(rank, weights=weight * ~label)
+    unsafe, safe = (np.bincount(rank, weights=weight * one) for one in (label, ~label))
     pairs = unsafe.sum() * safe.sum()
     if pairs == 0.0:
         return math.nan

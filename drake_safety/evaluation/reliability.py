@@ -35,14 +35,11 @@ def verdict_shares(
 
 
 class Reliability(NamedTuple):
-    """Predicted probabilities (B,) against observed shares, in bins of equal numbers of rows.
-
-    The error is the mean distance between the two over all rows.
-    """
+    """Predicted probabilities (B,) against observed shares, in bins of equal numbers of rows."""
 
     expected: np.ndarray
     observed: list[Estimate]
-    error: Estimate
+    error: Estimate  # Mean distance between the two over all rows.
 
 
 def reliability(

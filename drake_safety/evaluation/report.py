@@ -52,8 +52,7 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
         pictures=_pictures(folder),
         versions=versions,
     )
-    file = folder / "report.html"
-    write_file(file, page)
+    write_file(file := folder / "report.html", page)
     return file
 
 

@@ -15,15 +15,11 @@ from drake_safety.learning.segments import Segments
 
 @dataclass(frozen=True, kw_only=True)
 class Scorer:
-    """A source of safety probabilities.
-
-    They are (N,), of states (N, n_s), previews (N, H*n_z) and features (N, n_f); NaN is "don't
-    know". Some take the state without noise in nominal episodes.
-    """
+    """Safety probabilities (N,) of states, previews and features (N, ...); NaN is "don't know"."""
 
     name: str
     probability: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-    uses_true_state: bool = False
+    uses_true_state: bool = False  # Without noise, in nominal episodes.
     used: Sequence[UsedEpisodes] = ()
 
     def unsafe_score(self, segments: Segments) -> np.ndarray:

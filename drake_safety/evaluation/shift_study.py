@@ -1,8 +1,4 @@
-"""Γ and its monitor under shifts: "don't know", rows sure and wrong, alarms.
-
-A row is sure and wrong (a confident error) where it is called safe with at least 0.9 in a motion
-that ends unsafely, with monitor within an episode's duration and outside alarms.
-"""
+"""Γ and its monitor under shifts: "don't know", rows sure and wrong (confident errors), alarms."""
 
 from __future__ import annotations
 
@@ -101,9 +97,8 @@ def run_monitored(
         return {one.index: one for one in motions}
 
     motions = simulated([*range(num_motions)], _FIRST_S)
-    quiet = [
-        i for i, one in motions.items() if one.is_safe and not detector.watch([rows_of(one)])[1]
-    ]
+    safe = {i: rows_of(one) for i, one in motions.items() if one.is_safe}
+    quiet = [i for i, rows in safe.items() if not detector.watch([rows])[1]]
     motions |= simulated(quiet, max(SPANS_S))
     return [motions[i] for i in sorted(motions) if motions[i].cause != DIVERGED]
 

@@ -48,8 +48,7 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     limits = {one.joint().name(): one.effort_limit() for one in motors if one.effort_limit() > 0.0}
     loads = dict(zip(kinematics.joint_names, torques.tolist(), strict=True))
     joint = max((name for name in loads if name in limits), key=loads.__getitem__)
-    key = as_pattern(joint)
-    period_s = scenario.control_period_s
+    key, period_s = as_pattern(joint), scenario.control_period_s
     lasting = {
         "slope": Shift(slope_rad=math.radians(10.0)),
         "side_force": Shift(base_force_n=[0.0, 0.1 * mass_kg * GRAVITY_M_S2, 0.0]),
@@ -61,7 +60,7 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
         lasting["weak_joint"] = Shift(joints={key: JointShift(effort_scale=weak_scale)})
     if robot.gains_of(joint) is not None:
         lasting["soft_joint"] = Shift(joints={key: JointShift(stiffness_scale=0.5)})
-    names = [as_pattern(name) for name in plant.GetStateNames(add_model_instance_prefix=False)]
+    names = [*map(as_pattern, plant.GetStateNames(add_model_instance_prefix=False))]
     n_q = kinematics.num_positions
     faults = {
         "joint_bias": Fault(kind="bias", entries=names[NUM_BASE_POSITIONS:n_q], value=0.05),

@@ -27,8 +27,7 @@ from pydrake.systems.sensors import CameraInfo
 from drake_safety.simulation.legged_loop import LeggedLoop
 
 _LOGGER = logging.getLogger("drake_safety")
-SUPERSAMPLING = 2
-"""Rendered pixels for each of a still, in either direction."""
+SUPERSAMPLING = 2  # Rendered pixels for each of a still, in either direction.
 _RENDERER = "stills"
 _BACKGROUND = [0.80, 0.84, 0.88]
 _FIELD_OF_VIEW_RAD = math.radians(34.0)
@@ -67,14 +66,12 @@ class StillCamera:
             farthest = max(farthest, float(away.max()))
         narrow = 0.5 * _FIELD_OF_VIEW_RAD * min(1.0, width / height)
         self._eye = view.room * farthest / math.sin(narrow) * view.direction()
-        size = width * SUPERSAMPLING, height * SUPERSAMPLING
         clipping = ClippingRange(0.05, 30.0 * max(farthest, 1.0))
-        info = CameraInfo(*size, _FIELD_OF_VIEW_RAD)
+        info = CameraInfo(width * SUPERSAMPLING, height * SUPERSAMPLING, _FIELD_OF_VIEW_RAD)
         core = RenderCameraCore(_RENDERER, info, clipping, RigidTransform())
         self._camera = ColorRenderCamera(core)
         is_physical = any(path.endswith(".gltf") for path in self._meshes().values())
-        brightness = _PBR_BRIGHTNESS if is_physical else 1.0
-        self._add_renderer(_lighting(centre, radius, brightness))
+        self._add_renderer(_lighting(centre, radius, _PBR_BRIGHTNESS if is_physical else 1.0))
 
     def render(self, positions: np.ndarray) -> np.ndarray:
         """Renders all positions (n_q,) of the plant as RGB, (height, width, 3), uint8."""
@@ -123,8 +120,7 @@ class StillCamera:
 
     def _corners(self) -> np.ndarray:
         """Corners of boxes around the visible geometry of the robot in the world, (3, N) [m]."""
-        query = self._query()
-        inspector = query.inspector()
+        inspector = (query := self._query()).inspector()
         signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1)
         corners = []
         for index in self._plant.GetBodyIndices(self._instance):

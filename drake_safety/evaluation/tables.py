@@ -95,10 +95,8 @@ class Table:
                 continue
             is_clear = other.low > mine.high if column.better > 0 else other.high < mine.low
             certainty = "beyond both intervals" if is_clear else "the intervals overlap"
-            described.append(
-                f"{column.title}: {self.rows[first].label}, {column.value_text(other)} against "
-                f"{column.value_text(mine)} ({certainty})"
-            )
+            values = f"{column.value_text(other)} against {column.value_text(mine)} ({certainty})"
+            described.append(f"{column.title}: {self.rows[first].label}, {values}")
         return described
 
     def to_rich(self) -> rich.table.Table:

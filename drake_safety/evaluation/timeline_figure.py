@@ -148,8 +148,8 @@ def _lay_out(
 def _draw_belief(axes: Axes, time_s: np.ndarray, belief: np.ndarray) -> None:
     masses = belief[:, [SAFE, UNCERTAINTY, UNSAFE]].T
     colours = [style.SAFE_COLOUR, style.UNKNOWN_COLOUR, style.UNSAFE_COLOUR]
-    labels = ["safe", "don't know", "unsafe"]
-    axes.stackplot(time_s, *masses, labels=labels, colors=colours, step="post", linewidth=0)
+    look: _Style = {"labels": ["safe", "don't know", "unsafe"], "colors": colours}
+    axes.stackplot(time_s, *masses, **look, step="post", linewidth=0)
     axes.set(ylim=(0.0, 1.0), yticks=[0.0, 1.0], ylabel="belief")
     # The legend lists the layers from the top.
     axes.legend(**_LEGEND, reverse=True)
@@ -177,8 +177,8 @@ def _draw_margins(
     axes.legend(**_LEGEND)
 
 
-def _span(axes: Axes, start_s: float, end_s: float, colour: str, alpha: float = 0.14) -> None:
-    axes.axvspan(start_s, end_s, color=colour, alpha=alpha, linewidth=0, zorder=0)
+def _span(axes: Axes, start_s: float, end_s: float, colour: str) -> None:
+    axes.axvspan(start_s, end_s, color=colour, alpha=0.14, linewidth=0, zorder=0)
 
 
 def _write_names(axes: Axes, events: Sequence[_Event], ends: tuple[float, float]) -> None:

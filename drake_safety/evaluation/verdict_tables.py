@@ -31,8 +31,7 @@ _CALIBRATIONS = (
 )
 _CALIBRATION = "Stored calibrations on fresh motions"
 _RATES = "Promised and observed rates of the thresholds of the probability."
-Kind = tuple[str, str, Sequence[Column]]
-"""Title, explanation and columns of a table."""
+Kind = tuple[str, str, Sequence[Column]]  # Title, explanation and columns of a table.
 _KINDS: dict[str, Kind] = {
     "segments": (
         "Every segment of the motion",
@@ -78,9 +77,8 @@ def verdict_table(
     if methods and (first := results.get((set, methods[0], "auc"))):
         meaning += f" Evaluated on {first.n} fresh motions."
     if alone := results.get((set, "", "falls_without_recovery")):
-        meaning += (
-            f" Of {alone.n} fresh throws, {_SHARE.text(alone)} end in a fall without recovery."
-        )
+        end = f"{_SHARE.text(alone)} end in a fall without recovery."
+        meaning += f" Of {alone.n} fresh throws, {end}"
     labels = {(set, method): label_of(method) for method in methods}
     rows = rows_of(results, labels, columns)
     return Table(corner=corner, columns=columns, rows=rows, title=title, meaning=meaning)
@@ -88,9 +86,8 @@ def verdict_table(
 
 def verdict_tables(results: Results) -> list[Table]:
     """The tables of all judged sets, and of the outcomes of plans."""
-    tables = [
-        verdict_table(results, set) for set in dict.fromkeys(k[0] for k in results) if set in _KINDS
-    ]
+    sets = dict.fromkeys(set for set, _, _ in results if set in _KINDS)
+    tables = [verdict_table(results, set) for set in sets]
     outcomes = [metric for set, method, metric in results if (set, method) == ("plans", "outcomes")]
     columns = [Column(name, label_of(name), "%", digits=1) for name in outcomes]
     rows = rows_of(results, {("plans", "outcomes"): "all targets"}, columns)

@@ -111,8 +111,7 @@ class _Entries:
             values = [by_pattern(values, name, key, self.who) for name in names]
         elif not isinstance(values, list):
             values = [values] * count
-        is_wrong = len(values) != count
-        self.refuse(is_wrong, f"'{key}' must have {count} entries; got {len(values)}")
+        self.refuse(len(values) != count, f"'{key}' must have {count} entries; got {len(values)}")
         return load_typed(list[FiniteFloat], values, f"{self.who}: '{key}'")
 
     def indices(self, key: str, below: int | None = None) -> list[int]:
@@ -279,8 +278,7 @@ def _rl_sar_observation(file: _Entries, count: int) -> dict[str, Any]:
     for name in file.get("observations", list[str]):
         term, key = _RL_SAR_TERMS.get(name, (name, ""))
         if name not in TERMS and re.fullmatch(r"(?!.*mimic)\w+_phase", name):
-            # Its period is in the project's code.
-            term = "gait_phase"
+            term = "gait_phase"  # Its period is in the project's code.
             converted["gait"] = {"offsets": [0.0], "standing_below": 0.0}
         widths.append(_width(term, count))
         entry = {"name": term, "clip": clip}

@@ -22,7 +22,6 @@ from drake_safety.robots.urdf import DRAKE, as_number
 
 _SIZES = ("count", "nrow", "ncol", "width", "height")
 _MOST_CELLS, _MOST_COPIES = 1e8, 1e4  # Of a height field or a picture, and of all replicates.
-_NUM_SHOWN_GROUPS = 3  # MuJoCo shows geoms of the groups 0 to 2.
 _GREY = [0.5, 0.5, 0.5, 1.0]  # MuJoCo's colour of a geom that states none.
 _STL = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
 
@@ -217,9 +216,8 @@ class _Robot:
             self._note(f"shapes of type {kind} are left out", "geom", [geom])
             return []
         origin = _origin(_pose(model.geom_pos[geom], model.geom_quat[geom]))
-        shape = _tag("geometry", known[kind]())
-        shapes = []
-        if model.geom_group[geom] < _NUM_SHOWN_GROUPS:
+        shape, shapes = _tag("geometry", known[kind]()), []
+        if model.geom_group[geom] < 3:  # MuJoCo shows geoms of the groups 0 to 2.
             rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
             if material >= 0 and np.allclose(rgba, _GREY):
                 rgba = model.mat_rgba[material]

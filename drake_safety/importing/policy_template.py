@@ -47,15 +47,14 @@ class PolicyTemplate:
     def yaml(self, robot_joints: list[str], posture: dict[str, float]) -> tuple[str, list[str]]:
         """Returns the text of ``policy.yaml``, and what the user must supply."""
         metadata, known = self.network.metadata, dict(self.stated)
-        lines: list[str] = []
-        asked: list[str] = []
+        lines, asked = list[str](), list[str]()
 
         def ask(line: str, what: str) -> None:
             lines.append(f"# {line}  # ASK {what}")
             asked.append(what)
 
         missing = [name for name in self.joints if name not in robot_joints]
-        _, num_moved = self.network.widths
+        width, num_moved = self.network.widths
         observed, what = list[str](), ""
         if missing:
             what = f"the robot's joints in the network's order; {missing} are none of them"
@@ -98,7 +97,6 @@ class PolicyTemplate:
                 what = f"{' and '.join(unstated)} of the terms of the observation"
                 asked.append(f"{what}; 1 is assumed")
         if "observation" not in known:
-            width, _ = self.network.widths
             entries = "" if width is None else f", {width} entries"
             ask("observation:", f"the terms of the network's input in its order{entries}")
             lines += [

@@ -35,12 +35,8 @@ def check_urdf(kinematics: RobotKinematics) -> Iterator[Finding]:
         what = f"joints {wheels} have no stops; if they turn wheels, position servos hold these"
         yield passed("wheels", what, "judge by this scenario only a robot with braked wheels")
     shaped = {link.get("name") for link in root.iter("link") if link.find("collision") is not None}
-    bare = [
-        name
-        for name in robot.without_collision
-        if name not in shaped and by_pattern(robot.shapes, name, "shapes", robot.name) is None
-    ]
-    if bare:
+    names = [name for name in robot.without_collision if name not in shaped]
+    if bare := [n for n in names if by_pattern(robot.shapes, n, "shapes", robot.name) is None]:
         yield passed(
             "collision shapes",
             f"{len(bare)} links have none, as their meshes were left out; everything passes "

@@ -256,10 +256,8 @@ def _stand(new: NewRobot) -> None:
         raise ValueError(f"new: '{copy.source}': {what}. Are the <origin>s in millimetres?")
     if min(sizes.half_length_m, sizes.half_width_m) < _LEAST_STANCE * sizes.height_m:
         copy.warn("the contact points of the feet lie on a line, on which no posture stands")
-    guessed = [limb.body for limb in new.legs if limb.is_guess]
-    new.asked += [
-        f"where foot '{foot}' touches: the file has no shape there [m]" for foot in guessed
-    ]
+    what = "touches: the file has no shape there [m]"
+    new.asked += [f"where foot '{limb.body}' {what}" for limb in new.legs if limb.is_guess]
     if not any(survey.geometries(survey.welded(survey.base))):  # Balls are thrown at it.
         new.asked.append(f"a <collision> shape of the base '{survey.base}', in {new.name}.urdf [m]")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from drake_safety.files.reading import yaml_text
@@ -124,8 +124,4 @@ parameters:
 """
 
 
-TASKS: dict[str, Callable[[Sizes], str]] = {
-    "balancing": _balancing,
-    "reaching": _reaching,
-    "walking": _walking,
-}
+TASKS = {"balancing": _balancing, "reaching": _reaching, "walking": _walking}

@@ -48,11 +48,7 @@ def _stands(survey: Survey, legs: list[Limb], posture: dict[str, float]) -> bool
 
 
 def solve_standing_posture(survey: Survey, legs: list[Limb]) -> dict[str, float]:
-    """Solves for joint positions by name [rad] in which the robot can stand.
-
-    Feet are level and under the hips, or at half of their spread; if the centre of mass is not amid
-    them, under it. Knees bend backwards (bipeds: forwards, spread legs: upwards).
-    """
+    """Solves for joint positions [rad] of level feet, with the centre of mass amid them."""
     survey.set_joints({})
     solvers = [_Leg(survey, leg, len(legs)) for leg in legs]
     posture = _solved(survey, solvers)
@@ -79,8 +75,7 @@ def _solved(survey: Survey, solvers: list[_Leg]) -> dict[str, float]:
         lowest = min(solver.hip[2] - share * solver.length for solver in solvers)
         solved: dict[str, float] = {}
         for solver in solvers:
-            angles = solver.solve(lowest)
-            if angles is None:
+            if (angles := solver.solve(lowest)) is None:
                 out_of_reach.add(solver.limb.body)
                 break
             solved |= dict(zip(solver.limb.joints, angles.tolist(), strict=True))
@@ -93,8 +88,7 @@ def _solved(survey: Survey, solvers: list[_Leg]) -> dict[str, float]:
 
 class _Leg:
     def __init__(self, survey: Survey, limb: Limb, num_legs: int):
-        self.limb = limb
-        self._survey = survey
+        self.limb, self._survey = limb, survey
         limits = np.array([survey.limits[name] for name in limb.joints])
         limits = np.clip(limits, -_FREE_RAD, _FREE_RAD)
         room = np.minimum(_STOP_RAD, 0.1 * (limits[:, 1] - limits[:, 0]))

@@ -165,7 +165,6 @@ class Survey:
     def legs(self, feet: list[str] | None = None) -> list[Limb]:
         """Returns the limbs that reach lowest, or those that end in the given links."""
         groups = self._groups(feet)
-        ends = [name for group in self.leaves() for name in group]
         if feet is None:
             floor = min(map(self.lowest, groups), default=0.0)
             # Hanging arms end well above the ground.
@@ -173,6 +172,7 @@ class Survey:
             moved = (group for group in groups if len(self.chain(group[0])) >= 2)
             groups = [group for group in moved if self.lowest(group) <= highest]
         if len(groups) < 2:
+            ends = [name for group in self.leaves() for name in group]
             what = f"found {len(groups)} feet, expected at least 2: name them by --feet"
             raise ValueError(f"{what}; limbs end in {ends}")
         limbs = [self._leg(group) for group in groups]
@@ -298,8 +298,7 @@ def _corners(X_WG: RigidTransform, half: np.ndarray) -> tuple[np.ndarray, float]
     axis = int(np.argmax(np.abs(down)))
     # A sole that is longer is flat.
     if np.delete(half, axis).max() < 0.035 and np.linalg.norm(half) < 0.12:
-        radius = float(np.sort(half)[0])
-        point = np.zeros(3)
+        radius, point = float(np.sort(half)[0]), np.zeros(3)
         point[axis] = math.copysign(half[axis] - min(radius, half[axis]), down[axis])
         return (X_WG @ point)[None], radius
     # A thin sole's spheres rise above it.

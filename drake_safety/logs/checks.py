@@ -197,10 +197,9 @@ def _check_stance(source: Source, kinematics: RobotKinematics) -> list[str]:
     for i, measure in enumerate(_MEASURES):
         best, slip = _stillest(others, i) or given, given.slips[i]
         if slip > max(_SLIP_M, _SLIP_FACTOR * best.slips[i]):
-            raise ValueError(
-                f"{source.where} and after it: the feet slide by {slip:.3g} m with the base "
-                f"({measure}), but only by {best.slips[i]:.3g} m if {best.what}"
-            )
+            better = f"only by {best.slips[i]:.3g} m if {best.what}"
+            worse = f"the feet slide by {slip:.3g} m with the base ({measure})"
+            raise ValueError(f"{source.where} and after it: {worse}, but {better}")
     if abs(height := given.height) < _HIGH_M:
         return []
     text = f"{source.where} and after it: the feet rest {_side(height)} the ground z = 0"

@@ -104,6 +104,5 @@ def angular_velocities(time_s: np.ndarray, rotations: Rotation) -> np.ndarray:
     between = (rotations[1:] * rotations[:-1].inv()).as_rotvec() / step_s
     slope = np.diff(between, axis=0) / (step_s[:-1] + step_s[1:])
     inner = between[:-1] + slope * step_s[:-1]
-    first = between[0] - slope[0] * step_s[0]
-    last = between[-1] + slope[-1] * step_s[-1]
-    return np.vstack([first, inner, last])
+    ends = between[0] - slope[0] * step_s[0], between[-1] + slope[-1] * step_s[-1]
+    return np.vstack([ends[0], inner, ends[1]])

@@ -49,9 +49,6 @@ def cut_log(
 
     Args:
         loop: The loop without Γ that evaluates the states, or a scenario with an ``actual`` one.
-
-    Returns:
-        The episodes, and starts for ``run_episode`` on the nominal loop: their twins.
     """
     loop = _loggable_loop(loop)
     scenario, assessment = loop.scenario, loop.scenario.assessment
@@ -129,11 +126,9 @@ class _Cutter:
             if not episode.is_safe and episode.num_steps == 0 and not found:
                 if log.piece:
                     return [], True
-                raise ValueError(
-                    f"log '{log.path}' begins outside the safe set of scenario "
-                    f"'{self.loop.scenario.name}': the margin '{episode.cause}' is "
-                    f"{episode.margins[0].min():.3g}"
-                )
+                where = f"the safe set of scenario '{self.loop.scenario.name}'"
+                what = f"the margin '{episode.cause}' is {episode.margins[0].min():.3g}"
+                raise ValueError(f"log '{log.path}' begins outside {where}: {what}")
             if not episode.is_safe or episode.num_steps >= self.shortest:
                 found.append((episode, start))
             if not episode.is_safe:
@@ -159,12 +154,10 @@ class _Cutter:
         points = values_at(log.time_s, desired, knots).reshape(-1, 3)
         X_SW = planar_pose(start.stance_pose(kinematics)).inverse()
         z = X_SW.multiply(points.T).T.reshape(len(knots), -1)
-        # A shape-preserving interpolation does not overshoot at steps of z*.
-        smooth, linear = (
-            PiecewisePolynomial.CubicShapePreserving,
-            PiecewisePolynomial.FirstOrderHold,
-        )
-        start.plan = (smooth if len(knots) > 2 else linear)(knots - begin_s, z.T)
+        make = PiecewisePolynomial.FirstOrderHold
+        if len(knots) > 2:  # A shape-preserving interpolation does not overshoot at steps of z*.
+            make = PiecewisePolynomial.CubicShapePreserving
+        start.plan = make(knots - begin_s, z.T)
         return start
 
     def _episode(self, log: RobotLog, context: Context, begin_s: float) -> Episode:

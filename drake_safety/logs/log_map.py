@@ -34,16 +34,13 @@ class LogTime:
     column: str = ""
     """The column, or the field of every message (``header.stamp``); empty for the recording time
     of messages."""
-    unit: TimeUnit = "s"
-    """Unit of a number; ignored for ROS stamps, recording times and dates."""
+    unit: TimeUnit = "s"  # Unit of a number; ignored for ROS stamps, recording times and dates.
 
 
 @schema(kw_only=True)
 class _Quantity:
-    topic: str = ""
-    """Topic of the messages; empty for a table."""
-    sign: dict[str, Literal[1, -1]] = field(default_factory=dict)
-    """Factor by column; 1 by default."""
+    topic: str = ""  # Topic of the messages; empty for a table.
+    sign: dict[str, Literal[1, -1]] = field(default_factory=dict)  # Factor by column; 1 by default.
     offset: dict[str, float] = field(default_factory=dict)
     """What is added then by column, in its unit; 0 by default."""
 
@@ -79,8 +76,7 @@ class Orientation(_Columns):
     """The base's orientation in the world, a quaternion."""
 
     multiple: ClassVar[int] = 4
-    order: Order = "wxyz"
-    """Order of the columns."""
+    order: Order = "wxyz"  # Order of the columns.
 
 
 @schema(kw_only=True)
@@ -88,8 +84,7 @@ class LinearVelocity(_Columns):
     """Velocity of the base's origin relative to the world: x, y, z per second."""
 
     unit: LengthUnit = "m"
-    frame: Frame = "world"
-    """Frame of x, y, z: ``world`` or ``body``, the base's own (as in ROS odometry)."""
+    frame: Frame = "world"  # Of x, y, z; ``body``: the base's own (as in ROS odometry).
 
 
 @schema(kw_only=True)
@@ -109,8 +104,7 @@ class Joints(_Quantity):
     names (sensor_msgs/JointState) ``position[{joint}]``."""
     columns: dict[str, str] = field(default_factory=dict)
     """Columns by joint that differ from the template: ``motor[3].q``, ``position[FR_HFE]``."""
-    unit: AngleUnit = "rad"
-    """rad or deg; for velocities per second."""
+    unit: AngleUnit = "rad"  # rad or deg; for velocities per second.
 
     def __post_init__(self) -> None:
         if self.template and "{joint}" not in self.template:
@@ -138,23 +132,19 @@ class LogMap:
     base_angular_velocity: AngularVelocity = field(default_factory=AngularVelocity)
     """By default the derivative of the orientation."""
     joint_positions: Joints = field(default_factory=Joints)
-    joint_velocities: Joints = field(default_factory=Joints)
-    """By default the derivatives of the positions."""
+    joint_velocities: Joints = field(default_factory=Joints)  # By default derivatives of positions.
     desired_output: Position = field(default_factory=Position)
     """z*, the desired position of the base or the hand. Required for episodes."""
     foot_positions: Position = field(default_factory=Position)
     """Desired centres of the contact spheres, in the order of the ``robot.yaml``; by default those
     of the joint positions."""
-    max_gap_s: Positive = 0.1
-    """Largest time between two rows [s]."""
+    max_gap_s: Positive = 0.1  # Largest time between two rows [s].
 
     def __post_init__(self) -> None:
         for name in ("base_position", "base_orientation"):
             if not getattr(self, name).columns:
-                where = "docs/logs.md, 'Logs without a base position'"
-                raise ValueError(
-                    f"'{name}.columns' is missing; a state estimator adds it ({where})"
-                )
+                where = "(docs/logs.md, 'Logs without a base position')"
+                raise ValueError(f"'{name}.columns' is missing; a state estimator adds it {where}")
         for name in ("base_position", "desired_output"):
             if len(columns := getattr(self, name).columns) > 3:
                 raise ValueError(f"'{name}.columns' must be [x, y, z]; got {columns}")

@@ -67,10 +67,9 @@ def _channels(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel]:
             # Some writers of MCAP omit the "msg" of "nav_msgs/msg/Odometry".
             kind = connection.msgtype.replace("/msg/", "/").replace("/", "/msg/")
             message = reader.deserialize(raw, kind)
-            row = [value(name, reads[name]) for name in wanted[topic]]
             stamp = value(time.column, clock) if clock else np.timedelta64(recorded_ns, "ns")
-            rows[topic].append(row)
             stamps[topic].append(stamp)
+            rows[topic].append([value(name, reads[name]) for name in wanted[topic]])
     channels = {}
     for topic, names in wanted.items():
         frame = pd.DataFrame(rows[topic], columns=names, dtype=float)

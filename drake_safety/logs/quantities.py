@@ -32,10 +32,7 @@ def continued(channel: Channel, max_gap_s: float) -> tuple[Channel, dict[str, fl
 
 
 def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
-    """Sorts rows that are a little out of order, joins those of one time, and says what is lost.
-
-    Rows of one time may have values of other columns, as messages that name some joints only.
-    """
+    """Sorts rows that are a little out of order, joins those of one time, and says what is lost."""
     time, clock = channel.time, channel.time_name
     if (is_bad := ~np.isfinite(time)).any():
         row = int(np.argmax(is_bad))
@@ -49,7 +46,7 @@ def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
         return channel, []
     import pandas as pd
 
-    groups = channel.frame.groupby(time)
+    groups = channel.frame.groupby(time)  # Messages may name some joints only.
     num_lost = (groups.count() - 1).clip(lower=0).sum().max()
     lost = []
     if num_lost:

@@ -20,16 +20,12 @@ Motion = tuple[np.ndarray, np.ndarray]  # Times (K,) [s] of consecutive rows (K,
 class SequenceMap:
     """The schema of the map of an ``.npz`` file."""
 
-    step_s: NotNegative = 0.0
-    """Time between two steps [s], required: the detector's, or an integer fraction of it."""
-    data: str = "observations"
-    """Array of sequences, (num_sequences, num_steps, n), or of one, (num_steps, n)."""
-    names: str = "observation_names"
-    """Array of the n names of observations."""
+    step_s: NotNegative = 0.0  # Required: the detector's step, or an integer fraction of it [s].
+    data: str = "observations"  # Sequences (num_sequences, num_steps, n), or one (num_steps, n).
+    names: str = "observation_names"  # Array of the n names of observations.
     columns: dict[str, str] = field(default_factory=dict)
     """Observation that is an input of the detector, where its name differs."""
-    scale: dict[str, float] = field(default_factory=dict)
-    """Factor of an input's observation; 1 by default."""
+    scale: dict[str, float] = field(default_factory=dict)  # Factor by input; 1 by default.
     offset: dict[str, float] = field(default_factory=dict)
     """What is added then, such as a joint's default position; 0 by default."""
 
@@ -53,10 +49,8 @@ def read_sequences(
     data, names = _arrays(path, sequence_map)
     columns = {name: sequence_map.columns.get(name, name) for name in inputs}
     if missing := [column for column in dict.fromkeys(columns.values()) if column not in names]:
-        what = f"{missing}, which the monitor reads; they have {listed(names)}"
-        raise ValueError(
-            f"sequences '{path}' have no observations {what}: see 'columns' of the map"
-        )
+        what = f"observations {missing}, which the monitor reads; they have {listed(names)}"
+        raise ValueError(f"sequences '{path}' have no {what}: see 'columns' of the map")
     rows = np.zeros((*data[:, ::stride].shape[:2], len(every)))
     for name, column in columns.items():
         values = data[:, ::stride, names.index(column)] * scale.get(name, 1.0)

@@ -22,20 +22,16 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 class GoalVerdict:
     """The verdict of an assessment on a goal, before the robot moves."""
 
-    goal: np.ndarray
-    """In the world, (3,) [m]."""
+    goal: np.ndarray  # In the world, (3,) [m].
     belief: np.ndarray = field(default_factory=lambda: np.array(EMPTY, dtype=float))
     """(safe, unsafe, don't know), (3,); its first entry is the paper's Γ."""
-    probability: float = math.nan
-    """The probability of staying safe; NaN outside the region sampled in training."""
+    probability: float = math.nan  # Of staying safe; NaN outside the region sampled in training.
     threshold: float
     constraint_names: tuple[str, ...]
     cause_probability: np.ndarray
-    predicted_margins: np.ndarray
-    """Smallest margin predicted for each constraint [m, rad], (n_c,), or NaN."""
+    predicted_margins: np.ndarray  # Smallest margin of each constraint [m, rad], (n_c,), or NaN.
     margin_unit: float = 1.0  # Scale by which margins are compared [m, rad].
-    reason: str = ""
-    """Why the verdict is "don't know"; "" otherwise."""
+    reason: str = ""  # Why the verdict is "don't know"; "" otherwise.
 
     @property
     def verdict(self) -> str:
@@ -122,17 +118,13 @@ def assess_goals(
         probability = prediction.probability[i]
         if prediction.novelty[i] > 1.0:
             name, deviation = assessment.strangest_input(*(part[i] for part in inputs))
-            return (
-                f"the input is unlike those of training: '{name}' differs by {abs(deviation):.0f} "
-                "standard deviations from what the other entries say"
-            )
+            by = f"{abs(deviation):.0f} standard deviations from what the other entries say"
+            return f"the input is unlike those of training: '{name}' differs by {by}"
         if has_no_data[i]:
             return f"too little training data near this {noun}'s embedding"
         if unsafe_below <= probability < threshold:
-            return (
-                f"the probability {probability:.3f} lies between {unsafe_below:.3f} and "
-                f"{threshold:.3f}, where safe and unsafe {noun}s cannot be distinguished"
-            )
+            where = f"{threshold:.3f}, where safe and unsafe {noun}s cannot be distinguished"
+            return f"the probability {probability:.3f} lies between {unsafe_below:.3f} and {where}"
         return ""
 
     return [

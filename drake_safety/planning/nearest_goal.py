@@ -43,10 +43,8 @@ def nearest_accepted_goal(
     With reserve: probability ≥ threshold + reserve (p - threshold), where p is the largest
     probability: 1, or 1 - mu_ini without heads, as in the paper's mode.
 
-    Descent along the gradient of the safety head's logit finds an accepted goal with few
-    evaluations, but often not the nearest one. It bounds the radius of a search in all directions.
-    If it finds nothing, or the maps have no safety head, the search covers the whole region. All
-    candidates lie on a grid of ``resolution_m``, so that rounding does not change a verdict.
+    Descent along the gradient of the safety head's logit, if any, bounds a search in all
+    directions, on a grid of ``resolution_m``, so that rounding does not change a verdict.
     """
     unknown = assessment.parameters.initial_uncertainty if assessment.base_logit_ is None else 0.0
     stricter = threshold + reserve * max(1.0 - unknown - threshold, 0.0)
@@ -55,8 +53,8 @@ def nearest_accepted_goal(
         return None
     box = require(loop, HasGoals).target_box
     near = _Search(loop, assessment, goal, box, stricter, resolution_m)
-    best = near.descend() if assessment.embedding_.has_heads else None
-    best = near.search(best, rng, num_candidates)
+    known = near.descend() if assessment.embedding_.has_heads else None
+    best = near.search(known, rng, num_candidates)
     return None if best is None else replace(best, threshold=threshold)
 
 
@@ -104,14 +102,12 @@ class _Search:
             if here is None and logit[0] <= aim + 0.1:
                 aim = logit[0] - _MARGIN
             best = self.nearest((best, here))
-            steepness = float(slope @ slope)
-            if steepness < 1e-12:
+            if (steepness := float(slope @ slope)) < 1e-12:
                 break
             # The nearest point on the plane where the linearised logit has the value aimed at.
             ahead = goal + slope * (slope @ (point - goal) - (logit[0] - aim)) / steepness
             step = np.clip(ahead, *box) - point
-            length = float(np.linalg.norm(step))
-            if length < self.resolution_m:
+            if (length := float(np.linalg.norm(step))) < self.resolution_m:
                 break
             point = point + step * min(1.0, _LONGEST_STEP_M / length)
         return None if best is None else self.bisect(best)
@@ -134,12 +130,11 @@ class _Search:
         best = self.nearest((best, known))
         if best is None:
             best = self.accepted(rng.uniform(box[0], box[1], (_LAST_CHANCE * num_candidates, 3)))
-            if best is None:
-                return None
+        if best is None:
+            return None
         for _ in range(num_rounds):
             best = self.bisect(best)
-            distance = self.distance(best.goal)
-            if distance < self.resolution_m:
+            if (distance := self.distance(best.goal)) < self.resolution_m:
                 break
             about = best.goal + _SPREAD * distance * _in_unit_ball(rng, num_candidates // 2)
             ball = goal + distance * _in_unit_ball(rng, num_candidates - num_candidates // 2)
@@ -153,8 +148,7 @@ class _Search:
         refused = centre = np.clip(self.goal, *self.box)
         while np.linalg.norm(best.goal - refused) > self.resolution_m:
             between = 0.5 * (best.goal + refused)
-            nearer = self.accepted(between[None])
-            if nearer is None:
+            if (nearer := self.accepted(between[None])) is None:
                 refused = between
             elif np.linalg.norm(nearer.goal - centre) < np.linalg.norm(best.goal - centre):
                 best = nearer

@@ -25,17 +25,12 @@ _PARKED = np.array([50.0, 50.0, 0.0])  # Far from the robot [m].
 class Throw:
     """A thrown ball."""
 
-    time_s: NotNegative = 0.0
-    """Time of impact [s]."""
+    time_s: NotNegative = 0.0  # Time of impact [s].
     mass_kg: Positive = 2.0
-    speed_m_s: Positive = 6.0
-    """Horizontal speed at impact [m/s]."""
-    direction_rad: float = math.pi / 2
-    """Direction of flight, as an angle from the world's x axis [rad]."""
-    offset_m: float = 0.0
-    """Lateral offset of the line of flight from the base's origin [m]."""
-    height_m: float = 0.0
-    """Height of the line of flight over the base's origin [m]."""
+    speed_m_s: Positive = 6.0  # Horizontal speed at impact [m/s].
+    direction_rad: float = math.pi / 2  # Angle of flight from the world's x axis [rad].
+    offset_m: float = 0.0  # Lateral offset of the line of flight from the base's origin [m].
+    height_m: float = 0.0  # Height of the line of flight over the base's origin [m].
 
 
 def add_ball(plant: MultibodyPlant) -> ModelInstanceIndex:
@@ -70,11 +65,7 @@ class Ball:
         return float(self._body.get_mass(context))
 
     def throw(self, context: Context, throw: Throw, lead_s: float) -> None:
-        """Starts the ball's flight so that it touches the robot after ``lead_s``.
-
-        The impact point is the first one of the robot's collision geometry, in its present pose,
-        along the line of flight. The ball arrives horizontally.
-        """
+        """Starts a flight that touches the robot's present pose horizontally after ``lead_s``."""
         inertia = SpatialInertia.SolidSphereWithMass(throw.mass_kg, self.radius_m)
         self._body.SetSpatialInertiaInBodyFrame(context, inertia)
         direction = np.array([math.cos(throw.direction_rad), math.sin(throw.direction_rad), 0.0])
@@ -94,12 +85,10 @@ class Ball:
                 p = p + distance * direction
         velocity = throw.speed_m_s * direction - _GRAVITY_W * lead_s
         start = p - velocity * lead_s - 0.5 * _GRAVITY_W * lead_s**2
-        is_hit = distance < _TOUCH_M
-        if not is_hit or start[2] < self.radius_m:
+        if not (is_hit := distance < _TOUCH_M) or start[2] < self.radius_m:
             self.park(context)
             fault = f"cannot fly for {lead_s} s to {p[2]:.3f} m" if is_hit else "misses the robot"
             raise ValueError(f"throw: the ball of {throw} {fault}")
         self._plant.SetFreeBodyPose(context, self._body, RigidTransform(start))
-        self._plant.SetFreeBodySpatialVelocity(
-            context, self._body, SpatialVelocity(np.zeros(3), velocity)
-        )
+        V_WB = SpatialVelocity(np.zeros(3), velocity)
+        self._plant.SetFreeBodySpatialVelocity(context, self._body, V_WB)

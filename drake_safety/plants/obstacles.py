@@ -23,10 +23,8 @@ from drake_safety.robots.robot_model import RobotModel
 class Obstacle:
     """A static model in the world; without collision geometry it is a decoration."""
 
-    model: str = ""
-    """``package://…`` or an absolute path of a model file with one root link."""
-    position: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """Position of the root link in the world, (3,) [m]."""
+    model: str = ""  # ``package://…`` or an absolute path of a model file with one root link.
+    position: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])  # Root link in the world [m].
     yaw_rad: FiniteFloat = 0.0
 
 

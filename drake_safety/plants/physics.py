@@ -51,8 +51,7 @@ class Scene:
     obstacles: Sequence[Obstacle] | None = None
     """With a list, even an empty one, only contacts of arms with obstacles and of other bodies with
     the ground are simulated; with None, those of the model file."""
-    decorations: Sequence[Obstacle] = ()
-    """Models without collision geometry."""
+    decorations: Sequence[Obstacle] = ()  # Models without collision geometry.
     has_ball: bool = False
 
 

@@ -12,8 +12,7 @@ class Push:
     """A push on a body at its centre of mass."""
 
     body: str = ""
-    force_n: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """The force in the world, (3,) [N]."""
+    force_n: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])  # Force in the world [N].
     time_s: NotNegative = 1.0
     duration_s: Positive = 0.1
 
@@ -27,14 +26,11 @@ class Push:
 class RandomPushes:
     """Random pushes at the start of episodes; only the rows after a push are training data."""
 
-    share: ShareBelowOne = 0.0
-    """Share of the episodes with a push."""
-    body: str = ""
-    """The pushed body; the robot's base by default."""
+    share: ShareBelowOne = 0.0  # Share of the episodes with a push.
+    body: str = ""  # The pushed body; the robot's base by default.
     force_n: Bounds[NotNegative] = field(default_factory=lambda: [100.0, 800.0])
     """Lowest and highest force, in a random horizontal direction [N]."""
-    time_s: Bounds[NotNegative] = field(default_factory=lambda: [0.1, 1.5])
-    """Earliest and latest start [s]."""
+    time_s: Bounds[NotNegative] = field(default_factory=lambda: [0.1, 1.5])  # Range of starts [s].
     duration_s: Positive = 0.2
 
     def sample(self, rng: np.random.Generator, body: str) -> Push | None:
