@@ -95,7 +95,8 @@ class TrajectoryPlanner(LeafSystem):
         outlook_s = step_s * (horizon - 1) if outlook_s is None else outlook_s
         check_times("planner", or_zero=["outlook_s"], step_s=step_s, outlook_s=outlook_s)
         checked = None if plan is None else _checked(plan)
-        self._plan_index = self.DeclareAbstractParameter(Value[object](checked))
+        # In a tuple, as Drake 1.58 makes no Value of None.
+        self._plan_index = self.DeclareAbstractParameter(Value((checked,)))
         self._stance_index = self.DeclareNumericParameter(BasicVector(np.zeros(3)))
         self._stance_port = self.DeclareVectorInputPort("stance_pose", 3)
         self.DeclareVectorOutputPort("desired_output", 3, self._calc_output)
@@ -116,13 +117,13 @@ class TrajectoryPlanner(LeafSystem):
         self, context: Context, plan: PiecewisePolynomial, stance_pose: np.ndarray | None = None
     ) -> None:
         """Sets the plan, (n_z, 1) [m], and for an unconnected input the stance pose (3,)."""
-        context.get_mutable_abstract_parameter(self._plan_index).set_value(_checked(plan))
+        context.get_mutable_abstract_parameter(self._plan_index).set_value((_checked(plan),))
         if stance_pose is not None:
             context.get_mutable_numeric_parameter(self._stance_index).SetFromVector(stance_pose)
 
     def get_plan(self, context: Context) -> PiecewisePolynomial:
         """Returns the plan in a Context, in the stance frame."""
-        plan = context.get_abstract_parameter(self._plan_index).get_value()
+        (plan,) = context.get_abstract_parameter(self._plan_index).get_value()
         if plan is None:
             raise ValueError("planner: no plan; give one by plan= or set_plan(context, plan)")
         return plan
