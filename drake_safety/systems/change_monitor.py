@@ -82,7 +82,7 @@ class ChangeMonitor(LeafSystem):
         begin, end = self._value(context, "expected_s")
         if context.get_time() < end + SETTLING_S:
             begin_s, end_s = min(begin_s, begin), max(end_s, end)
-        context.SetDiscreteState(self._groups["expected_s"], [begin_s, end_s])
+        context.SetDiscreteState(self._groups["expected_s"], np.array([begin_s, end_s]))
 
     def row(self, context: Context) -> np.ndarray:
         """State, preview and features at the ports, (n,); features not read are 0."""

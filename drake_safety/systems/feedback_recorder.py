@@ -110,7 +110,7 @@ class FeedbackRecorder(LeafSystem):
         return list(recording.windows)
 
     def _calc_num_finished(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([self.recording(context).num_finished])
+        output.SetFromVector(np.array([self.recording(context).num_finished], dtype=float))
 
     def _is_safe(self, context: Context) -> bool:
         return bool(self._ports["safe"].Eval(context)[0] >= 1.0)

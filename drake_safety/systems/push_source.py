@@ -47,7 +47,8 @@ class PushSource(LeafSystem):
         """Sets the push; it replaces an earlier one."""
         if push.body not in self._bodies:
             raise ValueError(f"push: no body '{push.body}'; there are {list(self._bodies)}")
-        values = [self._bodies[push.body].index(), *push.force_n, push.time_s, push.duration_s]
+        body = float(self._bodies[push.body].index())
+        values = np.array([body, *push.force_n, push.time_s, push.duration_s])
         context.get_mutable_numeric_parameter(self._parameter).SetFromVector(values)
 
     def push(self, context: Context) -> np.ndarray:
