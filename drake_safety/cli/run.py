@@ -251,8 +251,11 @@ def _timeline(loop: Any, shown: _Shown) -> Figure:
         states = {loop.robot.name: motion["plant_state"]}
         if "ball_state" in motion.ports:
             states["ball"] = motion["ball_state"]
-        instants = sorted(at_s + _AFTER_EVENT_S for at_s, _ in shown.events if at_s)[:_MOST_EVENTS]
-        times_s = still_times(motion.time_s, instants, num_stills=_NUM_STILLS)
+        instants: list[float] = []
+        for at_s in sorted(at_s + _AFTER_EVENT_S for at_s, _ in shown.events if at_s):
+            if at_s - max(instants, default=0.0) > _AFTER_EVENT_S:
+                instants.append(at_s)
+        times_s = still_times(motion.time_s, instants[:_MOST_EVENTS], num_stills=_NUM_STILLS)
         positions = stack_positions(loop, states)
         options["stills"] = render_stills(loop, motion.time_s, positions, times_s)
     return timeline_figure(
