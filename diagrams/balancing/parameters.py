@@ -27,7 +27,7 @@ class RecoveryParameters:
     """Parameters of trigger and recovery steps."""
 
     threshold: float = 0.6  # Γ_thre, of the probability: the paper's value for b_safe.
-    persistence_s: NotNegative = 0.02  # How long "don't know" must last to trigger.
+    persistence_s: NotNegative = 0.02  # Time for which "don't know" lasts before a trigger.
     assessment_period_s: Positive = 0.02
     step: RecoveryStepParameters = field(default_factory=RecoveryStepParameters)
 

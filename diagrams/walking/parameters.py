@@ -107,7 +107,7 @@ class WalkingRecovery:
 
     branch: Literal["stop", "slower"] = "stop"  # A command of zero, or a share of the command.
     threshold: float = 0.5  # Γ_thre, of the probability; not tuned.
-    # How long "don't know" must last: a single row of a start can be unlike those of training.
+    # Time for which "don't know" lasts before a trigger: one row of a start can be unlike training.
     persistence_s: NotNegative = 0.04
     slower_share: float = 0.3
 

@@ -1,4 +1,4 @@
-"""What others read: ``drake-safety export`` and ``report``."""
+"""``drake-safety export`` and ``report``: files for readers without this package."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ _WITH_BALLS_S = 5.0  # Duration of a run with balls.
 _AFTER_EPISODE_S = 1.0  # Beyond an episode, to show whether the robot stays at the target.
 _AFTER_LEAVING_S = 0.5  # Time for which a motion without a goal goes on outside the safe set.
 _AFTER_EVENT_S = 0.15  # Time of a still: when the effect of a push or a trigger is visible.
-_NUM_STILLS, _MOST_EVENTS = 3, 5  # Stills besides those of events, and of events at most.
+_NUM_STILLS, _MOST_EVENTS = 3, 5  # Stills of the motion, and the most stills of events.
 _GAMMA = ("safety_probability", "belief", "cause_probability", "predicted_margins")
 _WITHOUT_ALARM = ("probability_without_alarm", "belief_without_alarm")  # What recovery heeds.
 _COLUMNS = ("time [s]", "event", "probability")  # Of events.
@@ -114,7 +114,7 @@ _Events = list[tuple[float, str]]  # Times [s] and words.
 
 
 class _Shown(NamedTuple):
-    """What is shown of a motion: its threshold also in words, and more arguments of a timeline."""
+    """A motion with its events, its threshold (also in words), and arguments of a timeline."""
 
     motion: Motion
     events: _Events

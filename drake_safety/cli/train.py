@@ -54,7 +54,7 @@ def train(
         raise ValueError(f"train: mode must be one of {[*MODES, 'both']}; got '{mode}'")
     modes = MODES if mode == "both" else (mode,)
     loaded = load_scenario(scenario)
-    sets = {}  # Options of the diagram by folder of episodes, which modes may share.
+    sets = {}  # Options of the diagram by folder of episodes; modes may share a folder.
     for name in modes:
         options = {} if name == MODES[0] else loaded.options_for("paper")
         sets[out / (f"episodes_{name}" if options else "episodes")] = options
