@@ -129,7 +129,7 @@ def run_app(commands: Callable[..., Any], program: str) -> None:
 
     SIGTERM stops it as Ctrl-C does.
     """
-    # What reads a pipe gets results alone.
+    # A program that reads a pipe gets results alone.
     log = console.console if console.console.is_terminal else Console(stderr=True)
     handler = RichHandler(console=log, show_path=False)
     logging.getLogger("drake_safety").addHandler(handler)

@@ -25,7 +25,7 @@ def calibrate(
     miss_rate: Annotated[
         float, Option(help="Promised share of unsafe episodes called safe.")
     ] = 0.01,
-    false_alarm_rate: Annotated[float, Option(help="And of safe ones called unsafe.")] = 0.05,
+    false_alarm_rate: Annotated[float, Option(help="Share of safe episodes called unsafe.")] = 0.05,
     confidence: Annotated[
         float | None, Option(help="Confidence of the promise, such as 0.95; on average by default.")
     ] = None,

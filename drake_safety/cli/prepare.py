@@ -18,7 +18,7 @@ from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.simulation.scenario import load_scenario, scenario_names
 from drake_safety.simulation.scenario_check import check_scenario
 
-_NUM_EPISODES = 16  # For the share of unsafe ones.
+_NUM_EPISODES = 16  # For the share of unsafe episodes.
 
 
 def scenarios() -> None:

@@ -16,7 +16,7 @@ from drake_safety.control.whole_body_model import WholeBodyModel, WholeBodyRefer
 from drake_safety.learning.blas_threads import one_blas_thread
 
 SOLVED = 0  # Status of a solved program; other values are daqp's negative exit flags.
-ITERATION_LIMIT = -4  # Status of a program that was given up, as those of a robot that has fallen.
+ITERATION_LIMIT = -4  # Status of a program that was given up, as of a fallen robot.
 
 # Before 0.10 daqp has no elimination of equations to switch off.
 _OPTIONS = {"eq_reduction": daqp.EQ_REDUCTION_OFF} if hasattr(daqp, "EQ_REDUCTION_OFF") else {}

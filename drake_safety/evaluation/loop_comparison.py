@@ -44,7 +44,7 @@ class ComparedPlant(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What is known of a candidate after a number of pairs, in some of which both fail alike."""
+    """Estimates for a candidate after a number of pairs, in some of which both fail alike."""
 
     verdict: str
     pairs: int

@@ -27,10 +27,10 @@ values in [0, 1]. Episodes of the first and the last end where they leave the sa
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """How bad an episode is, when it failed or ended, and what it violated first.
+    """Badness of an episode, the time of its failure or end, and its first violation.
 
     The desired output ``commanded`` (n_z,), as far ahead as Γ sees, and Γ's belief, None without Γ,
-    are those of the first undisturbed row.
+    belong to the first undisturbed row.
     """
 
     episode: int

@@ -150,7 +150,7 @@ def stack_positions(loop: LeggedLoop, states: Mapping[str, np.ndarray]) -> np.nd
 def still_times(
     time_s: np.ndarray, events_s: Iterable[float] = (), *, num_stills: int = 2
 ) -> list[float]:
-    """Logged instants [s] of stills: those of events, and ``num_stills`` others apart from them."""
+    """Logged instants [s] of stills: at events, and at ``num_stills`` other times."""
     kept = [*events_s]
     for instant in np.linspace(time_s[0], time_s[-1], num_stills).tolist():
         if all(abs(instant - event) >= _LEAST_GAP_S for event in kept):
@@ -169,7 +169,7 @@ def render_stills(
 ) -> list[tuple[float, np.ndarray]]:
     """Logged instants [s] and RGB images (height, width, 3) nearest to the times of stills [s].
 
-    ``positions`` (N, n_q) are those of the loop's whole plant.
+    ``positions`` (N, n_q) describe the loop's whole plant.
     """
     rows = _nearest_rows(time_s, still_times_s)
     shown = np.array([positions[row] for row in (0, *rows)])

@@ -225,7 +225,7 @@ def _unitree_observation(terms: _Entries, count: int) -> dict[str, Any]:
 
 
 def _rl_sar_entries(sections: Any, path: Path) -> _Entries:
-    """The entries of a policy, and those of its robot's ``base.yaml``, up to two folders above."""
+    """The entries of a policy and of its robot's ``base.yaml``, up to two folders above."""
     section, own = "", None
     if isinstance(sections, dict) and len(sections) == 1:
         ((section, own),) = sections.items()

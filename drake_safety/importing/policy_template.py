@@ -20,7 +20,7 @@ from drake_safety.robots.robot_model import as_pattern
 
 @dataclass(kw_only=True)
 class PolicyTemplate:
-    """What the files of a policy tell."""
+    """The statements of a policy's files."""
 
     network: policy_network.PolicyNetwork
     stated: dict[str, Any] = field(default_factory=dict)  # By key of ``policy.yaml``.

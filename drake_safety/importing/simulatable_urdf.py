@@ -73,7 +73,7 @@ def _simplify_joints(copy: UrdfCopy) -> None:
 
 
 def _fix_inertias(copy: UrdfCopy) -> None:
-    """Corrects impossible inertias, and removes those of bodies without mass."""
+    """Corrects impossible inertias, and removes inertias of bodies without mass."""
     for link in copy.root.iter("link"):
         inertia = link.find("inertial/inertia")
         mass = urdf.number(link.find("inertial/mass"), "value")

@@ -184,7 +184,7 @@ class Survey:
         return [limbs[i] for i in np.lexsort([[y for _, y, _ in places], [-p[0] for p in places]])]
 
     def arms(self, legs: list[Limb], named: list[str] | None = None) -> list[Limb]:
-        """Returns other limbs that end in named links, by default those of four joints or more."""
+        """Returns other limbs that end in named links, by default limbs of four joints or more."""
         feet = {limb.body for limb in legs}
         # Ends of limbs by their first four joints: chains and bodies. Fingers are no limbs.
         hands: dict[tuple[str, ...], list[tuple[list[str], str]]] = {}

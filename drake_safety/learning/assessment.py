@@ -84,7 +84,7 @@ class SafetyAssessment:
     base_logit_: BaseLogit | None  # None in the paper's mode.
     trees_: Trees | None
     fall_logit_: FallLogit | None  # Of `fit_falls`.
-    correction_: Correction  # What feedback adds to the base logit.
+    correction_: Correction  # A term that feedback adds to the base logit.
     adaptation_: Adaptation | None
     used_: list[UsedEpisodes]  # Evaluation needs other episodes.
     calibrations_: dict[str, Calibration]  # By kind.
@@ -314,7 +314,7 @@ class SafetyAssessment:
         features: np.ndarray | None = None,
         **learned: Any,
     ) -> Prediction:
-        """Assesses N inputs; novel ones and those that are not finite get the empty belief.
+        """Assesses N inputs; novel inputs and inputs that are not finite get the empty belief.
 
         A row has the same bits whatever the others are.
 

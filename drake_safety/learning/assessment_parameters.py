@@ -70,7 +70,7 @@ class AssessmentParameters:
     # tslearn gives the same values in about twenty times the time.
     distance_backend: Backend = "dtaidistance"
     perplexity: Annotated[float, Field(ge=1)] = 30.0  # Effective number of neighbours in t-SNE.
-    # Segments among which each of t-SNE's neighbours is sought, those with the smallest bounds of
+    # Segments among which each of t-SNE's neighbours is sought, by the smallest bounds of
     # Omega; 0 for all segments, with the cost N².
     candidates_per_neighbour: Annotated[int, Field(ge=0)] = 2
     # Factor of t-SNE's attraction after its early phase; 1 is plain t-SNE.

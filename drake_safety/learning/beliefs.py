@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-SAFE, UNSAFE, UNCERTAINTY = 0, 1, 2  # Columns; those from 3 on split `UNSAFE` by cause.
+SAFE, UNSAFE, UNCERTAINTY = 0, 1, 2  # Columns; columns from 3 on split `UNSAFE` by cause.
 EMPTY = np.array([0.0, 0.0, 1.0])  # B_0: no safety estimate can be made.
 EMPTY.setflags(write=False)
 

@@ -152,7 +152,7 @@ class Correction:
 
 
 class Evaluation(NamedTuple):
-    """What maps and trees say of N inputs; heads and logit are None for maps without heads."""
+    """Outputs of maps and trees for N inputs; heads and logit are None for maps without heads."""
 
     maps: EmbeddingOutput
     margins: np.ndarray  # Mean of the maps' predicted margins, (N, n_c); NaN without heads.
@@ -162,7 +162,7 @@ class Evaluation(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """All that a prediction is made from; the attributes are those of `SafetyAssessment`."""
+    """All that a prediction is made from; the attributes are learned by `SafetyAssessment`."""
 
     embedding: Embedding
     grid: Grid
