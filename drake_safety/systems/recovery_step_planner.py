@@ -119,16 +119,19 @@ class RecoveryStepPlanner(LeafSystem):
             self.set_stance(discrete_state, p_WC, stance)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        now = self._values(discrete_state)
+        mode = discrete_state.get_value(self._groups["mode"])[0]
         nominal = self._nominal_port.Eval(context)
         is_active = self._active_port.Eval(context)[0] > 0
-        if now.mode == _DONE or (now.mode == _IDLE and not is_active):
-            now.mode, now.desired_output = [_DONE if is_active else _IDLE], nominal
-        else:
-            q, v = np.split(self._state_port.Eval(context), [self._kinematics.num_positions])
-            if is_state(q, v):  # Otherwise the set points are held.
-                self._recover(now, q, v, context.get_time(), nominal)
-        self._set_values(discrete_state, now)
+        if mode == _DONE or (mode == _IDLE and not is_active):
+            # The usual case, without copies of all states.
+            discrete_state.set_value(self._groups["mode"], [_DONE if is_active else _IDLE])
+            discrete_state.set_value(self._groups["desired_output"], nominal)
+            return
+        q, v = np.split(self._state_port.Eval(context), [self._kinematics.num_positions])
+        if is_state(q, v):  # Otherwise the set points are held.
+            now = self._values(discrete_state)
+            self._recover(now, q, v, context.get_time(), nominal)
+            self._set_values(discrete_state, now)
 
     def _recover(
         self, now: SimpleNamespace, q: np.ndarray, v: np.ndarray, time_s: float, nominal: np.ndarray
