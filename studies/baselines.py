@@ -26,8 +26,8 @@ class DirectClassifier:
     """Predicts from x whether an episode ends unsafely, without embedding or beliefs.
 
     It learns from the segments that the assessment learns from (every start row, labelled by the
-    end of its episode), with early stopping on a held-out tenth of the *episodes*. It runs on one
-    thread, so that the same seed gives the same bits.
+    end of its episode), with early stopping on a held-out tenth of the *episodes* and plants. It
+    runs on one thread, so that the same seed gives the same bits.
     """
 
     def __init__(
@@ -85,14 +85,14 @@ class DirectClassifier:
         return np.concatenate([np.asarray(part, dtype=np.float32) for part in parts], axis=1)
 
     def _held_out(self, segments: Segments) -> np.ndarray:
-        """Mask of the segments of held-out episodes, (N,)."""
+        """Mask of the segments of held-out episodes and plants, (N,)."""
         rng = np.random.default_rng(self.seed)
         chosen = []
         for is_class in (~segments.is_unsafe, segments.is_unsafe):
-            members = np.unique(segments.episode[is_class])
+            members = np.unique(segments.group[is_class])
             count = max(1, round(_VALIDATION_SHARE * len(members)))
             chosen.append(rng.choice(members, size=count, replace=False))
-        return np.isin(segments.episode, np.concatenate(chosen))
+        return np.isin(segments.group, np.concatenate(chosen))
 
     def _boost(
         self, x: np.ndarray, label: np.ndarray, x_held_out: np.ndarray, label_held_out: np.ndarray

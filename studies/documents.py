@@ -23,6 +23,7 @@ from drake_safety.evaluation.tables import Column, Row, Table
 from drake_safety.evaluation.verdict_tables import INPUTS, verdict_table
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import use_of
+from drake_safety.robots.family import PlantFamily
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.scenario import Scenario
 
@@ -177,19 +178,22 @@ def card_text(folder: Path, scenario: Scenario) -> str:
         },
         info=info,
         differences=yaml.safe_dump(changed, default_flow_style=True, width=1000).strip(),
-        commands=_commands(results, assessments),
+        commands=_commands(results, assessments, scenario.family),
         CONFIDENT=CONFIDENT,
     )
     return f"{text}\n"
 
 
-def _commands(results: Results, assessments: Mapping[str, SafetyAssessment]) -> list[str]:
+def _commands(
+    results: Results, assessments: Mapping[str, SafetyAssessment], family: PlantFamily | None
+) -> list[str]:
     """The commands that make a shipped folder, as far as its files tell."""
+    plants = " --plants 0" if family and not assessments["sharpened"].knows_family else ""
     entries = results.entries
     name, evaluate = entries["scenario"], entries["command"]
     (folder,) = re.findall(r"--assessment[ =](\S+)", evaluate)
     training = {
-        mode: f"--episodes {one.num_episodes} --seed {one.seed} --out {folder}"
+        mode: f"--episodes {one.num_episodes} --seed {one.seed}{plants} --out {folder}"
         for mode, assessment in assessments.items()
         for one in assessment.used_
         if one.purpose == "training"
@@ -201,6 +205,8 @@ def _commands(results: Results, assessments: Mapping[str, SafetyAssessment]) -> 
     ]
     for assessment in assessments.values():
         for one in assessment.calibrations_.values():
+            if one.plants:
+                continue  # Chosen beside those of the nominal plant.
             confidence = "" if one.confidence is None else f"--confidence {one.confidence:g} "
             commands.append(
                 f"drake-safety calibrate {name} --assessment {folder} --miss-rate "

@@ -27,7 +27,7 @@ from drake_safety.cli.evaluate import (
     add_verdicts,
     evaluating,
 )
-from drake_safety.cli.training_folder import check_writable, episodes_folder
+from drake_safety.cli.training_folder import check_writable, training_episodes
 from drake_safety.diagrams.balancing.throws import HasBall, run_throws
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Key, Results
@@ -40,7 +40,6 @@ from drake_safety.simulation.capabilities import (
     require,
 )
 from drake_safety.simulation.closed_loop import ClosedLoop
-from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import load_scenario
 from studies.alarms import (
@@ -80,14 +79,15 @@ def evaluate(
     loop = loaded.make_loop()
     if throws:
         require(loop, HasBall)
-    training = load_episodes(episodes_folder(assessment))
     with evaluating(
         loaded, assessment, folder, EVALUATION, first, workers, _tables, _PROGRAM
     ) as evaluation:
         evaluation.entries["calibration_episodes"] = calibration_episodes
         test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
         other = evaluation.fresh("calibration episodes", calibration_episodes, "thresholds")
-        shortest = evaluation.assessments["sharpened"].parameters.shortest_segment or None
+        gamma = evaluation.assessments["sharpened"]
+        training = training_episodes(assessment, gamma)
+        shortest = gamma.parameters.shortest_segment or None
         trained = classifier_scorers(
             training, evaluation.stages, shortest=shortest, seeds=_CLASSIFIER_SEEDS
         )

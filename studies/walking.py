@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption, say
-from drake_safety.cli.training_folder import MODES, assessment_file, episodes_folder
+from drake_safety.cli.training_folder import MODES, assessment_file, training_episodes
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.results import Key
@@ -22,7 +22,6 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.seeds import WALKING
 from drake_safety.simulation.capabilities import CanFall, require
-from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import Scenario
 from studies.alarm_curves import EARLY_S, Watched, alarm_figure, equal_cost_estimates
@@ -106,7 +105,7 @@ def walking(
                 progress=partial(study.stages, name),
             )
 
-        train_set = load_episodes(episodes_folder(assessment))
+        train_set = training_episodes(assessment, gamma)
         classifiers = classifier_scorers(train_set, study.stages, seeds=_CLASSIFIER_SEEDS)
         alarms = walking_alarms(walker, gamma, classifiers)
         study.entries |= {"variation": variation, "seeds": seeds_of, "assessment_sha256": sha256}

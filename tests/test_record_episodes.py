@@ -308,3 +308,26 @@ def test_a_margin_of_infinity_is_an_error_that_names_its_constraint():
     told = "constraint 'gap' has a margin of inf at 0 s; cap it at a finite distance"
     with pytest.raises(EpisodeError, match=told):
         record(1, parameters={"wall_m": np.inf}, constraint_names=["gap", "wall"])
+
+
+def make_between_walls(wall_m=1.0):
+    return make_glider(wall_m=wall_m)
+
+
+def draw_wall(rng):
+    return rng.uniform(1.0, 3.0)
+
+
+def test_a_sampler_draws_plants_for_episodes_in_turn(tmp_path):
+    drawn = {"make": make_between_walls, "draw_plant": draw_wall, "plants": 3, "seed": 5}
+    family, nominal = record(9, **drawn), record(9, make=make_between_walls, seed=4)
+    assert (family.info.variation, nominal.info.variation) == ("family", "nominal")
+    assert [one.plant for one in family] == [1, 2, 3] * 3 and {one.plant for one in nominal} == {0}
+    walls = [one.margins[0, 0] + one.state[0, 0] for one in family]
+    assert walls[:3] == pytest.approx(walls[3:6]) and len({round(wall, 6) for wall in walls}) == 3
+    assert all(1.0 <= wall <= 3.0 for wall in walls)
+    stored = record(9, **drawn, path=tmp_path, num_workers=2)
+    for others in (stored, load_episodes(tmp_path)):
+        assert_identical(family, others)
+        assert [one.plant for one in others] == [1, 2, 3] * 3
+    assert len(nominal.joined(family)) == 18

@@ -33,7 +33,7 @@ def paired(seed, num=12):
 
 
 def calibrated(assessment, seed):
-    assessment.adopt_calibrations([calibration()], make_episodes(1, seed=seed).info, 20)
+    assessment.adopt_calibrations([calibration()], make_episodes(20, seed=seed))
 
 
 @pytest.fixture

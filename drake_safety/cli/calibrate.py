@@ -15,7 +15,8 @@ from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.calibration import KINDS, check_share, episode_scores
 from drake_safety.learning.calibration import calibrate as choose
 from drake_safety.learning.seeds import CALIBRATION, NOT_DRAWN
-from drake_safety.learning.segments import split
+from drake_safety.learning.segments import joined, split
+from drake_safety.robots.family import FAMILY
 from drake_safety.simulation.scenario import load_scenario
 
 
@@ -37,10 +38,11 @@ def calibrate(
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
 ) -> None:
-    """Choose thresholds with a promised miss rate on fresh episodes.
+    """Choose the temperature, and thresholds with a promised miss rate, on fresh episodes.
 
-    The promise holds for the plant of the episodes: calibrate again after `adapt`. Episodes are
-    kept in ASSESSMENT: a stopped calibration continues, and another promise reuses them.
+    The promise holds for the plant of the episodes: calibrate again after `adapt`. Γ of a family
+    gets a second promise over the family's plants, a fresh one for each episode. Episodes are kept
+    in ASSESSMENT: a stopped calibration continues, and another promise reuses them.
     """
     check_share("--miss-rate", miss_rate)
     check_share("--false-alarm-rate", false_alarm_rate)
@@ -57,40 +59,56 @@ def calibrate(
             f"calibrate: no plant simulates the robot of the logs that '{folder.path}' is adapted "
             f"to: a promise holds for a simulated plant, --variation {plant}"
         )
+    plants = {plant: seed}
+    if plant == "nominal" and learned[MODES[0]].knows_family:
+        plants[FAMILY] = CALIBRATION.seeds(seed)["calibration over the family"]
     for gamma in learned.values():
         folders.check_fresh(gamma, loaded)
-        gamma.check_unused(seed, purpose="calibration")
+        gamma.check_unused(*plants.values(), purpose="calibration")
     folders.check_writable(folder.out)
+    fresh = {}
     with console.open_stages() as stages:
-        progress = partial(stages, "calibration episodes")
-        options = loaded.options_for("pairs", plant)
-        fresh = folders.run_fresh_episodes(
-            loaded, folder.out, episodes, seed, progress, workers, plant, **options
-        )
-    segments = split(fresh, stride=1, discount=1.0, shortest=1)
-    promised = partial(
-        choose,
-        miss_rate=miss_rate,
-        false_alarm_rate=false_alarm_rate,
-        confidence=confidence,
-        seed=seed,
-        scenario_hash=loaded.simulation_hash(plant),
-        variation=f"simulated {plant}" if is_of_logs else plant,
-    )
-    chosen = {}
-    for mode, gamma in learned.items():
-        score = assessment_scorer(mode, gamma).unsafe_score(segments)
-        chosen[mode] = [promised(*episode_scores(segments, score, k), kind=k) for k in KINDS]
+        for name, its_seed in plants.items():
+            progress = partial(stages, f"{name} calibration episodes")
+            options = loaded.options_for("pairs", name)
+            if name == FAMILY:
+                options["plants"] = episodes
+            fresh[name] = folders.run_fresh_episodes(
+                loaded, folder.out, episodes, its_seed, progress, workers, name, **options
+            )
+    segments = {name: split(one, stride=1, discount=1.0, shortest=1) for name, one in fresh.items()}
     rows = []
     for mode, gamma in learned.items():
-        gamma.adopt_calibrations(chosen[mode], fresh.info, len(fresh))
-        gamma.save(folders.assessment_file(folder.out, mode))
-        for one in chosen[mode]:
+        sets = {name: fresh[name] for name in plants if name != FAMILY or gamma.knows_family}
+        temperature = gamma.temper(joined([segments[name] for name in sets]))
+        chosen = []
+        for name, one_set in sets.items():
+            score = assessment_scorer(mode, gamma).unsafe_score(segments[name])
+            chosen += [
+                choose(
+                    *episode_scores(segments[name], score, kind),
+                    kind=kind,
+                    miss_rate=miss_rate,
+                    false_alarm_rate=false_alarm_rate,
+                    confidence=confidence,
+                    seed=one_set.info.seed,
+                    scenario_hash=loaded.simulation_hash(name),
+                    variation=f"simulated {name}" if is_of_logs else name,
+                    plants=one_set.info.plants,
+                )
+                for kind in KINDS
+            ]
+        gamma.adopt_calibrations(chosen, *sets.values())
+        for one in chosen:
             thresholds = f"{one.threshold:.4f}", f"{one.unsafe_below:.4f}"
             missed = f"{one.num_missed} of {one.num_unsafe}"
-            rows.append((label_of(f"{mode}.{one.kind}"), *thresholds, missed))
-    columns = ("score", "safe from probability", "unsafe below", "misses")
-    title = f"Promised: {chosen[MODES[0]][0].promise}"
-    console.show(console.new_table(*columns, rows=rows, title=title))
+            score_name = label_of(f"{mode}.{one.kind}")
+            rows.append((score_name, one.variation, *thresholds, missed, f"{temperature:.2f}"))
+    for mode, gamma in learned.items():
+        gamma.save(folders.assessment_file(folder.out, mode))
+    columns = ("score", "plant", "safe from probability", "unsafe below", "misses", "temperature")
+    console.show(console.new_table(*columns, rows=rows))
+    for promise in dict.fromkeys(one.promise for one in learned[MODES[0]].calibrations_.values()):
+        console.say("promised  ", promise)
     for mode in learned:
         console.say("calibrated", folders.assessment_file(folder.out, mode))

@@ -39,10 +39,13 @@ from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import PLAN, episode_scores
 from drake_safety.learning.seeds import EVALUATION, FRESH_MOTION, SHIFTS, SeedBlock, use_of
 from drake_safety.learning.segments import Episodes, split
+from drake_safety.robots.family import FAMILY
 from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
+
+_FAMILY_PLANTS = 20  # Fresh ones.
 
 
 @dataclass
@@ -142,13 +145,13 @@ def evaluating(
         evaluation = Evaluation(scenario, assessments, run_folder, folder, seeds, workers, stages)
         yield evaluation
     sharpened = assessments[MODES[0]]
-    trained = next(one for one in sharpened.used_ if one.purpose == "training")
+    trained = [one for one in sharpened.used_ if one.purpose.startswith("training")]
     made = console.made_by(scenario.name, program) | {
         "scenario_hash": sharpened.info_.scenario_hash,
         "seed": next(iter(seeds.values())),
         "seed_use": use_of(next(iter(seeds.values()))),
-        "training_seed": trained.seed,
-        "training_episodes": trained.num_episodes,
+        "training_seed": trained[0].seed,
+        "training_episodes": sum(one.num_episodes for one in trained),
         "assessment_sha256": hashes,
     }
     results = Results(evaluation.estimates, made | evaluation.entries)
@@ -186,9 +189,9 @@ def add_reliability(evaluation: Evaluation, test: Episodes) -> None:
         curves[f"{mode}, every row"] = rows
         estimates["calibration", mode, "expected_calibration_error"] = first.error
         estimates["calibration.rows", mode, "expected_calibration_error"] = rows.error
-        for kind, one in evaluation.assessments[mode].calibrations_.items():
-            shares = verdict_shares(one, *episode_scores(segments, score, kind))
-            estimates |= {(f"calibration.{kind}", mode, what): n for what, n in shares.items()}
+        for one in evaluation.assessments[mode].calibrations_.values():
+            shares = verdict_shares(one, *episode_scores(segments, score, one.kind))
+            estimates |= {(f"calibration.{one.key}", mode, what): n for what, n in shares.items()}
     evaluation.add(estimates, reliability=reliability_figure(curves))
 
 
@@ -220,6 +223,16 @@ def _add_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> N
     shifts = plant_shifts(scenario, scenario.make_loop())
     nominal = evaluation.fresh("nominal motions", num_nominal, "shifts")
     judged = {"nominal": shift_study.shift_estimates(names, nominal[:1000])}
+    kinds: dict[str, str] = {"nominal": "nominal"}
+    if scenario.family is not None:
+        number = _FAMILY_PLANTS * max(num_motions // 4, 1)
+        options = {**scenario.options_for("evaluation"), "plants": _FAMILY_PLANTS}
+        report = partial(stages, "motions on the family's plants")
+        drawn = folders.run_fresh_episodes(
+            scenario, evaluation.run_folder, number, seed, report, workers, FAMILY, **options
+        )
+        judged[FAMILY] = shift_study.shift_estimates(names, drawn)
+        kinds[FAMILY] = "family"
     for i, (name, shift) in enumerate(shifts.items()):
         stages("shifted motions", i, len(shifts))
         shifted = shifted_scenario(scenario, name, shift.variation)
@@ -245,5 +258,4 @@ def _add_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> N
     judged["nominal"]["monitor", "false_alarms_per_hour"] = alarms
     for name, each in judged.items():
         evaluation.add({(f"shifts.{name}", *key): one for key, one in each.items()})
-    kinds = {name: shift.kind for name, shift in shifts.items()}
-    evaluation.entries["kinds"] = {"nominal": "nominal"} | kinds
+    evaluation.entries["kinds"] = kinds | {name: shift.kind for name, shift in shifts.items()}

@@ -1,4 +1,4 @@
-"""``drake-safety train``: simulates the nominal closed loop and trains Γ."""
+"""``drake-safety train``: simulates the closed loop of nominal and random plants, trains Γ."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from typer import Option
 
@@ -18,6 +18,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.seeds import FALLS, TRAINING
 from drake_safety.learning.segments import Episodes, training_segments
+from drake_safety.robots.family import FAMILY
 from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.dataset import completed, load_episodes
@@ -31,6 +32,10 @@ def train(
     scenario: console.ScenarioArgument,
     out: Annotated[Path, Option(help="Folder for episodes and assessments.")],
     episodes: Annotated[int, Option(help="Nominal training episodes.", min=1)] = 2048,
+    plants: Annotated[
+        int | None,
+        Option(help="Random plants; by default as many as the scenario's family has.", min=0),
+    ] = None,
     seed: Annotated[int, Option(help="Seed of the episodes.")] = TRAINING.first,
     motion: Annotated[
         float | None,
@@ -46,18 +51,30 @@ def train(
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
 ) -> None:
-    """Simulate the nominal closed loop and train Γ.
+    """Simulate the closed loop of the nominal and of random plants, and train Γ.
 
-    Episodes are kept as they finish: a stopped run continues with --resume.
+    The scenario's family says which plants, and how many episodes they get beside the nominal ones;
+    `paper` learns from the nominal plant alone. Episodes are kept as they finish: a stopped run
+    continues with --resume.
     """
     if mode not in (*MODES, "both"):
         raise ValueError(f"train: mode must be one of {[*MODES, 'both']}; got '{mode}'")
     modes = MODES if mode == "both" else (mode,)
     loaded = load_scenario(scenario)
-    sets = {}  # Options of the diagram by folder of episodes; modes may share a folder.
+    seeds, family = TRAINING.seeds(seed), loaded.family
+    if plants and family is None:
+        raise ValueError(f"train: scenario '{loaded.name}' has no `family:` to draw plants of")
+    if plants == 0 or MODES[0] not in modes:
+        family = None
+    num_drawn = round(family.share * episodes) if family else 0
+    drawn = folders.family_folder(out)
+    # Number and arguments of a set by its folder; modes may share one.
+    sets: dict[Path, tuple[int, dict[str, Any]]] = {}
     for name in modes:
         options = {} if name == MODES[0] else loaded.options_for("paper")
-        sets[out / (f"episodes_{name}" if options else "episodes")] = options
+        sets[out / (f"episodes_{name}" if options else "episodes")] = episodes, options
+    if num_drawn:
+        sets[drawn] = num_drawn, {"variation": FAMILY, "plants": plants}
     for folder in sets:
         if not resume and folder.exists() and (kept := completed(folder)):
             raise ValueError(f"{folder} already holds {len(kept)} episodes: pass --resume")
@@ -70,14 +87,14 @@ def train(
             f"train: --motion {motion_s / 60.0:g} is too little: give 2 or more, or 0 for none"
         )
     with console.open_stages() as stages:
-        for folder, options in sets.items():
+        for folder, (number, options) in sets.items():
             run_episodes(
                 loaded,
-                episodes,
-                seed=seed,
+                number,
+                seed=seeds["training on the family" if folder == drawn else "training"],
                 num_workers=workers,
                 path=folder,
-                progress=partial(stages, f"nominal {folder.name}"),
+                progress=partial(stages, folder.name),
                 extra={"command": console.command_line(), "scenario_yaml": loaded.to_yaml()},
                 **options,
             )
@@ -119,13 +136,17 @@ def train(
             started = time.process_time()
             parameters = replace(loaded.assessment, mode=name)  # type: ignore[arg-type]  # Checked.
             data = load_episodes(folders.episodes_folder(out, name))
+            on_family = load_episodes(drawn) if name == MODES[0] and num_drawn else None
             # Γ is that of the scenario's diagram, whatever the options of its training episodes.
             data.info = replace(data.info, scenario_hash=loaded.simulation_hash())
             gamma = SafetyAssessment(parameters).fit(
                 data,
                 lambda stage, *counts, name=name: stages(f"{name}: {stage}", *counts),
+                family=on_family,
                 detector=detector,
             )
+            if on_family is not None:
+                data = data.joined(on_family)
             if fallen is not None and name == MODES[0]:
                 _fit_falls(gamma, fallen, loop)
             gamma.save(folders.assessment_file(out, name))

@@ -11,6 +11,7 @@ from drake_safety.assessments import assessed_scenarios, shipped_folder
 from drake_safety.cli import console
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.segments import Episodes
+from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario, load_scenario
 from drake_safety.simulation.worker_processes import Progress
@@ -41,8 +42,19 @@ def episodes_folder(folder: Path, mode: str = MODES[0]) -> Path:
     return own if own.is_dir() else folder / "episodes"
 
 
+def family_folder(folder: Path) -> Path:
+    """Folder of the training episodes on the plants of a family."""
+    return folder / "episodes_family"
+
+
+def training_episodes(folder: Path, gamma: SafetyAssessment) -> Episodes:
+    """The episodes that Γ has learned from: nominal ones, and those of the family if any."""
+    nominal = load_episodes(episodes_folder(folder, gamma.parameters.mode))
+    return nominal.joined(load_episodes(family_folder(folder))) if gamma.knows_family else nominal
+
+
 def fresh_episodes_folder(
-    folder: Path, scenario_hash: str, seed: int, loop_options: dict[str, str]
+    folder: Path, scenario_hash: str, seed: int, loop_options: dict[str, Any]
 ) -> Path:
     """Folder of fresh episodes, by the hash and the options of their diagram."""
     options = [f"{name}-{value}" for name, value in sorted(loop_options.items())]
@@ -57,7 +69,7 @@ def run_fresh_episodes(
     progress: Progress | None = None,
     num_workers: int | None = None,
     variation: str = "nominal",
-    **loop_options: str,
+    **loop_options: Any,
 ) -> Episodes:
     """Simulates fresh episodes, and keeps them in a training's folder; existing ones are reused."""
     options: dict[str, Any] = {**scenario.options_for("evaluation"), **loop_options}

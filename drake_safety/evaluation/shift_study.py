@@ -15,6 +15,7 @@ from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.evaluation.tables import Column, Row, Table
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.calibration import MOTION, PLAN
 from drake_safety.learning.causes import is_outside
 from drake_safety.learning.change_detector import ChangeDetector, rows_of, usual_rows
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes
@@ -33,6 +34,8 @@ _AUC = Column("auc", "AUC", "=")
 _COLUMNS = (
     ("", Column("unsafe", "unsafe", "=%", digits=1)),
     *(("gamma", one) for one in (_UNKNOWN, _ERROR, _AUC)),
+    ("gamma", Column("missed_motion", "alarm missed", "=%", digits=1)),
+    ("gamma", Column("missed_motion.family", "by the family's threshold", "=%", digits=1)),
     ("paper", Column("unknown", "paper: don't know", "=%", digits=1)),
     *(("paper", one) for one in (_ERROR, _AUC)),
     ("monitor", Column("alarmed", "alarms", "=%", digits=0)),
@@ -61,7 +64,10 @@ def safety_probability(
 def shift_estimates(
     assessments: Mapping[str, SafetyAssessment], episodes: Episodes
 ) -> dict[tuple[str, str], Estimate]:
-    """Shares of rows sure and wrong and "don't know", and the AUC, by name of Γ and metric."""
+    """Shares of rows sure and wrong and "don't know", and the AUC, by name of Γ and metric.
+
+    "missed_KEY" is the share of unsafe episodes that the thresholds of a calibration call safe.
+    """
     kept = [one for one in episodes if one.cause != DIVERGED]
     motion = np.repeat(np.arange(len(kept)), [len(one.state) - one.first_step for one in kept])
     is_unsafe = np.array([not one.is_safe for one in kept])
@@ -72,6 +78,12 @@ def shift_estimates(
         is_wrong = (probability >= CONFIDENT) & is_unsafe[motion]
         estimates[name, "confident_error"] = mean(is_wrong, motion, bootstrap=BOOTSTRAP)
         estimates[name, "unknown"] = mean(np.isnan(probability), motion, bootstrap=BOOTSTRAP)
+        # The last row of an unsafe episode is outside the safe set.
+        inside = [one[: max(len(one) - 1, 1)] for one in rows]
+        least = {PLAN: [one[0] for one in rows], MOTION: [one.min() for one in inside]}
+        for key, one in gamma.calibrations_.items() if is_unsafe.any() else ():
+            is_missed = (np.array(least[one.kind]) >= one.threshold)[is_unsafe]  # False for NaN.
+            estimates[name, f"missed_{key}"] = proportion(int(is_missed.sum()), len(is_missed))
         if 0 < is_unsafe.sum() < len(is_unsafe):
             score = 1.0 - np.nan_to_num(probability)
             estimates[name, "auc"] = metrics.auc(score, is_unsafe[motion], motion)

@@ -39,7 +39,18 @@ def _variations(sizes: Sizes, mass_scale: float, position: float, velocity: floa
     reason = "Γ learns from the masses of the URDF"
     if mass_scale < 1:
         reason = "Γ learns from lighter links, a reality gap as the paper's; 1: those of the URDF"
-    return f"""variations:
+    load = _numbers([0.02 * sizes.mass_kg, 0.12 * sizes.mass_kg])
+    return f"""family:  # random plants around the nominal one; Γ learns on them too
+  ranges:  # ASK how widely your robot, its load and its ground differ; `check` says if it falls
+    mass_scale: {{uniform: {_numbers([0.85 * mass_scale, 1.3 * mass_scale])}}}
+    joint_friction_nm: {{uniform: {_numbers([0.0, 1.25 * friction])}}}  # [N·m]
+    foot_friction: {{share: 0.5, log_uniform: [0.35, 1.0]}}  # in half of the plants
+    payload: {{share: 0.3, mass_kg: {{uniform: {load}}}}}  # on the base [kg]
+    shift:
+      slope_rad: {{share: 0.5, uniform: [0.0, 0.08]}}  # of the ground [rad]
+      slope_direction_rad: {{uniform: [-3.14, 3.14]}}
+      joints: {{share: 0.3, .*: {{effort_scale: {{uniform: [0.8, 1.0]}}}}}}  # weaker motors
+variations:
   nominal:  # the model that Γ is trained on
     mass_scale: {mass_scale:g}  # DECIDED {reason}
     input_noise: {noise}

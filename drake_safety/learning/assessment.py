@@ -21,7 +21,7 @@ from drake_safety.learning.adaptation import Adaptation, paper_beliefs
 from drake_safety.learning.assessment_parameters import AdaptationParameters, AssessmentParameters
 from drake_safety.learning.beliefs import empty
 from drake_safety.learning.blas_threads import one_blas_thread
-from drake_safety.learning.calibration import Calibration
+from drake_safety.learning.calibration import Calibration, fitted_temperature
 from drake_safety.learning.change_detector import ChangeDetector, usual_rows
 from drake_safety.learning.fall_logit import FallLogit
 from drake_safety.learning.feedback import (
@@ -104,6 +104,11 @@ class SafetyAssessment:
         return self.parameters.mode != "paper"
 
     @property
+    def knows_family(self) -> bool:
+        """Whether it has learned from a family of plants beside the nominal one."""
+        return any(one.purpose == "training on the family" for one in self.used_)
+
+    @property
     def feature_names(self) -> list[str]:
         """Names of the features that the training episodes have, in their order, (n_f,)."""
         return self.info_.feature_names
@@ -120,10 +125,11 @@ class SafetyAssessment:
         episodes: Episodes,
         progress: StageProgress | bool | None = None,
         *,
+        family: Episodes | None = None,
         detector: ChangeDetector | None = None,
         motions: Episodes | None = None,
     ) -> SafetyAssessment:
-        """Learns embedding and beliefs from nominal episodes.
+        """Learns embedding and beliefs from nominal episodes, and from those of a plant family.
 
         Without a detector it learns one from long undisturbed motions of the same diagram; without
         them from the episodes, whose motion rarely suffices for its limits. `progress` is called
@@ -131,6 +137,8 @@ class SafetyAssessment:
         """
         require_extra("train", "SafetyAssessment.fit")
         self.parameters.check()
+        if family is not None and self.settings.is_paper:
+            raise ValueError("SafetyAssessment.fit: mode 'paper' learns from one plant, no family")
         episodes.warn()
         # The order of sums depends on the number of threads, and the last bits with it.
         with (
@@ -141,14 +149,20 @@ class SafetyAssessment:
                 sets = (episodes, None) if motions is None else (motions, episodes)
                 of_monitor = stage_of(report, "monitor")
                 detector = ChangeDetector.fit(sets[0], of_monitor, episodes=sets[1])
-            vars(self).update(self._learned(episodes, report), detector_=detector)
+            vars(self).update(self._learned(episodes, family, report), detector_=detector)
         if math.isinf(detector.alarm_level):
             _LOGGER.warning("SafetyAssessment.fit: %s", detector.describe())
         return self
 
-    def _learned(self, episodes: Episodes, progress: StageProgress | None) -> dict[str, Any]:
+    def _learned(
+        self, nominal: Episodes, family: Episodes | None, progress: StageProgress | None
+    ) -> dict[str, Any]:
         """The learned attributes but the detector, stage by stage."""
-        parameters, info = self.parameters, episodes.info
+        parameters, info = self.parameters, nominal.info
+        episodes = nominal if family is None else nominal.joined(family)
+        used = [UsedEpisodes.of("training", info, len(nominal))]
+        if family is not None:
+            used.append(UsedEpisodes.of("training on the family", family.info, len(family)))
         segments = training_segments(episodes, parameters)
         grid, columns = Grid.of(parameters), InputColumns(info, parameters)
         points = embedded_points(segments, grid, parameters, progress)
@@ -186,7 +200,7 @@ class SafetyAssessment:
             "training_": training,
             "adaptation_": None,
             "calibrations_": {},
-            "used_": [UsedEpisodes.of("training", info, len(episodes))],
+            "used_": used,
         }
 
     def fit_falls(self, episodes: Episodes, features: Sequence[str]) -> SafetyAssessment:
@@ -284,13 +298,27 @@ class SafetyAssessment:
         self._check_fitted()
         check_unused([used for used in self.used_ if used.purpose != purpose], seeds, self._who)
 
-    def adopt_calibrations(
-        self, calibrations: Sequence[Calibration], info: EpisodesInfo, num_episodes: int
-    ) -> None:
-        """Replaces the calibrations."""
-        self.check_unused(info.seed, purpose="calibration")
-        self.calibrations_ = {calibration.kind: calibration for calibration in calibrations}
-        self._replace_used("calibration", [UsedEpisodes.of("calibration", info, num_episodes)])
+    def temper(self, segments: Segments) -> float:
+        """Divides the base logit by the temperature at which it predicts fresh episodes best.
+
+        Training starts are disturbed more than others, so that its logit may be too sure, or not
+        sure enough. Returns the temperature: 1 in the paper's mode and after an adaptation.
+        """
+        if self.base_logit_ is None or self.adaptation_ is not None:
+            return 1.0
+        probability = self.predict_rows(segments).probability
+        temperature = fitted_temperature(probability, segments.is_unsafe)
+        self.base_logit_ = self.base_logit_.at(temperature)
+        if self.fall_logit_ is not None:
+            self.fall_logit_ = self.fall_logit_.at(temperature)
+        return temperature
+
+    def adopt_calibrations(self, calibrations: Sequence[Calibration], *sets: Episodes) -> None:
+        """Replaces the calibrations, which were chosen on some sets of episodes."""
+        self.check_unused(*(one.info.seed for one in sets), purpose="calibration")
+        self.calibrations_ = {calibration.key: calibration for calibration in calibrations}
+        used = [UsedEpisodes.of("calibration", one.info, len(one)) for one in sets]
+        self._replace_used("calibration", used)
 
     def inputs_of(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None

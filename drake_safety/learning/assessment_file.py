@@ -276,7 +276,7 @@ def _learned(
         items = value if isinstance(value, list) else [] if value is None else [value]
         objects: list[Any] = [_made(made, item) for item in items]
         learned[f"{name}_"] = objects if isinstance(value, list) else next(iter(objects), None)
-    learned["calibrations_"] = {c.kind: c for c in learned["calibrations_"]}
+    learned["calibrations_"] = {c.key: c for c in learned["calibrations_"]}
     # Layers that do not fit together raise an error.
     names = "embedding grid beliefs correction base_logit novelty trees fall_logit"
     model = Model(

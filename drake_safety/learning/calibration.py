@@ -27,6 +27,7 @@ PLAN: Kind = "plan"
 MOTION: Kind = "motion"
 KINDS = (PLAN, MOTION)
 
+_TEMPERATURES = (math.log(0.25), math.log(4.0))
 _BELOW_ALL = 1e-6  # Distance of a threshold below the lowest score, robust against rounding.
 # Below the lowest score, or above the highest one.
 _Threshold = Annotated[float, Field(ge=-2.0 * _BELOW_ALL, le=1.0 + 2.0 * _BELOW_ALL)]
@@ -54,10 +55,16 @@ class Calibration:
     seed: int
     scenario_hash: str
     variation: str = "nominal"
+    plants: _Number = 0  # Random plants, a fresh one for each episode; 0 for one plant.
 
     def __post_init__(self) -> None:
         if not self.unsafe_below <= self.threshold:
             raise ValueError(f"unsafe_below {self.unsafe_below} exceeds {self.threshold}")
+
+    @property
+    def key(self) -> str:
+        """The kind, with ``.family`` for thresholds over a family's plants."""
+        return f"{self.kind}.family" if self.plants else self.kind
 
     @property
     def promise(self) -> str:
@@ -65,9 +72,11 @@ class Calibration:
         basis = "on average"
         if self.confidence is not None:
             basis = f"{100 * self.confidence:g} % confidence"
+        where = f"on the plant '{self.variation}' as long as it behaves as in its episodes"
+        if self.plants:
+            where = "over plants drawn as the scenario's family draws them"
         return (
-            f"at most {100 * self.miss_rate:g} % of unsafe episodes called safe, {basis}, "
-            f"on the plant '{self.variation}' as long as it behaves as in its episodes"
+            f"at most {100 * self.miss_rate:g} % of unsafe episodes called safe, {basis}, {where}"
         )
 
     @property
@@ -96,6 +105,7 @@ def calibrate(
     seed: int = 0,
     scenario_hash: str = "",
     variation: str = "nominal",
+    plants: int = 0,
 ) -> Calibration:
     """Chooses both thresholds on episodes that were not used for training, by scores (N,).
 
@@ -120,7 +130,29 @@ def calibrate(
         seed=seed,
         scenario_hash=scenario_hash,
         variation=variation,
+        plants=plants,
     )
+
+
+def fitted_temperature(probability: np.ndarray, is_unsafe: np.ndarray) -> float:
+    """The temperature T, at which ``logit / T`` predicts the labels (N,) best (Guo et al., 2017).
+
+    The probabilities (N,) are of a safe end; rows with "don't know", which are 0, do not count.
+    """
+    from scipy.optimize import minimize_scalar
+
+    is_used = (probability > 0.0) & (probability < 1.0)
+    p, label = probability[is_used], is_unsafe[is_used]
+    if not 0 < label.sum() < len(label):
+        return 1.0
+    logit = np.log1p(-p) - np.log(p)
+
+    def loss(log_temperature: float) -> float:
+        z = logit * math.exp(-log_temperature)
+        return float(np.mean(np.logaddexp(0.0, z) - label * z))
+
+    found = minimize_scalar(loss, bounds=_TEMPERATURES, method="bounded")
+    return float(math.exp(found.x))
 
 
 def score_threshold(

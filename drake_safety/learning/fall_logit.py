@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -48,6 +48,12 @@ class FallLogit:
         weights = model.coef_[0] / scaler.scale_
         offset = model.intercept_[0] - weights @ scaler.mean_
         return cls(columns=tuple(columns), weights=tuple(weights.tolist()), offset=float(offset))
+
+    def at(self, temperature: float) -> FallLogit:
+        """The same logit, of an unsafe logit that is divided by a temperature."""
+        weights, place = list(self.weights), -1 - len(self.columns)
+        weights[place] *= temperature
+        return replace(self, weights=tuple(weights))
 
     def of(self, margins: np.ndarray, unsafe_logit: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Returns the logit (N,) of margins (N, n_c), unsafe logit (N,) and inputs (N, n_x)."""

@@ -148,7 +148,7 @@ def feedback_segments(
         segments = rows.take(
             (since_start % settings.stride == 0) & (left >= settings.shortest * sample)
         )
-        segments.episode = np.full(len(segments), position)
+        segments.episode = segments.group = np.full(len(segments), position)
         segments.score = unsafety_score(
             segments.remaining_steps / sample, segments.is_unsafe, discount
         )

@@ -85,7 +85,7 @@ def learned_maps(
         # A first ensemble is evaluated on the held-out episodes, the final one is trained on all.
         tried = _train(data.take(~is_held_out), parameters, lambda done: progress(0.5 * done))
         embedding = _train(data, parameters, lambda done: progress(0.5 * (1 + done)))
-        tried_trees, trees = learned_trees(data, segments.episode, is_held_out, parameters.seed)
+        tried_trees, trees = learned_trees(data, segments.group, is_held_out, parameters.seed)
     judged = x[is_held_out]
     trees_logit = None if tried_trees is None else tried_trees.evaluate(judged)
     base_logit = fitted_base_logit(
@@ -96,11 +96,11 @@ def learned_maps(
 
 
 def learned_trees(
-    data: MapData, episode: np.ndarray, is_held_out: np.ndarray, seed: int
+    data: MapData, group: np.ndarray, is_held_out: np.ndarray, seed: int
 ) -> tuple[Trees, Trees] | tuple[None, None]:
     """Trees without the held-out inputs, and as many of all; None if the others have one label."""
-    # A tenth of the other episodes, on which their number is chosen.
-    is_stopping = np.isin(episode, np.unique(episode[~is_held_out])[::10])
+    # A tenth of the other episodes and plants, on which their number is chosen.
+    is_stopping = np.isin(group, np.unique(group[~is_held_out])[::10])
     label = data.is_unsafe[~is_held_out & ~is_stopping]
     if label.all() or not label.any():
         return None, None
@@ -115,11 +115,15 @@ def learned_trees(
 
 
 def held_out_segments(segments: Segments, parameters: AssessmentParameters) -> np.ndarray:
-    """Returns which segments are held out for the base logit, (N,), by whole episodes."""
-    settings, episodes = mode_settings(parameters), np.unique(segments.episode)
+    """Returns which segments, (N,), are held out for the base logit: whole episodes and plants."""
+    settings, groups = mode_settings(parameters), np.unique(segments.group)
     seed = np.random.SeedSequence(parameters.seed, spawn_key=(settings.num_maps,))
-    drawn = np.random.default_rng(seed).permutation(episodes)
-    return np.isin(segments.episode, drawn[: int(min(settings.held_out, 0.5) * len(episodes))])
+    rng, share = np.random.default_rng(seed), min(settings.held_out, 0.5)
+    drawn = [
+        rng.permutation(part)[: int(share * len(part))]
+        for part in (groups[groups >= 0], groups[groups < 0])
+    ]
+    return np.isin(segments.group, np.concatenate(drawn))
 
 
 def _sample_weight(segments: Segments, settings: ModeSettings) -> np.ndarray:

@@ -91,6 +91,11 @@ class BaseLogit:
     margin_slope: FiniteFloat = 1.0
     trees_slope: FiniteFloat = 0.0
 
+    def at(self, temperature: float) -> BaseLogit:
+        """The base logit divided by a temperature."""
+        names = ("offset", "safety_slope", "margin_slope", "trees_slope")
+        return replace(self, **{name: getattr(self, name) / temperature for name in names})
+
     @property
     def slopes(self) -> tuple[float, float, float]:
         """The slopes of the values of `heads`."""

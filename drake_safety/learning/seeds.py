@@ -35,12 +35,12 @@ class SeedBlock(NamedTuple):
         return self.first + _RELEASES.get(_version(seed), 0)
 
 
-TRAINING = SeedBlock(0, ("training",))
+TRAINING = SeedBlock(0, ("training", "training on the family"))
 # Thresholds are chosen on other episodes, throws and pushes than the evaluated ones.
 EVALUATION = SeedBlock(
     1_000_000, ("evaluation", "disturbances", "disturbance thresholds", "thresholds")
 )
-CALIBRATION = SeedBlock(2_000_000, ("calibration",))
+CALIBRATION = SeedBlock(2_000_000, ("calibration", "calibration over the family"))
 PLANNING = SeedBlock(3_000_000, ("planning",))
 # Nominal twins have the seed of their actual episodes.
 ADAPTATION = SeedBlock(4_000_000, ("adaptation", "evaluation of the adaptation"))

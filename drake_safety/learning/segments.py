@@ -63,6 +63,7 @@ class EpisodesInfo:
     monitored_features: list[str] | None = None  # By which it predicts them; None for all.
     robot: str = ""
     until: str = ""  # The only constraint whose violation ends an episode; empty for every one.
+    plants: int = 0  # Of a family, in turn those of the episodes; 0 for one plant.
 
     def __post_init__(self) -> None:
         is_known = 1 <= self.horizon <= MOST_SAMPLES and self.preview_stride >= 1
@@ -74,6 +75,10 @@ class EpisodesInfo:
     def preview_step_s(self) -> float:
         """Time between two samples of a preview, the paper's step [s]."""
         return self.preview_stride * self.step_s
+
+    def plant_of(self, index: int) -> int:
+        """Number of the plant of an episode, from 1 on; 0 where there is no family."""
+        return 1 + index % self.plants if self.plants else 0
 
     @property
     def columns(self) -> dict[str, list[str]]:
@@ -122,6 +127,7 @@ class Episode:
     cause: str  # "" when safe, else the name of the violated constraint, or "diverged".
     first_step: int = 0  # First row with an undisturbed future; earlier ones are not learned.
     num_controller_failures: int = 0
+    plant: int = 0  # Number of the plant in its family; 0 for the only plant of a set.
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -168,6 +174,14 @@ class Episodes(Sequence[Episode]):
         if isinstance(key, slice):
             return Episodes(self.info, self._episodes[key])
         return self._episodes[key]
+
+    def joined(self, other: Episodes) -> Episodes:
+        """This set followed by episodes of other plants with the same columns and steps."""
+        names = ("columns", "step_s", "horizon", "preview_stride")
+        if wrong := [n for n in names if getattr(self.info, n) != getattr(other.info, n)]:
+            sets = f"'{self.info.scenario}' and '{other.info.scenario}'"
+            raise ValueError(f"Episodes.joined: the sets of {sets} differ in {wrong}")
+        return Episodes(self.info, [*self, *other])
 
     @property
     def num_safe(self) -> int:
@@ -231,6 +245,7 @@ class Segments:
     """
 
     episode: np.ndarray  # Position of the episode in its set.
+    group: np.ndarray  # That of the episode, or -k for plant k of a family: held out as a whole.
     start_row: np.ndarray
     is_first: np.ndarray  # Whether the segment starts at its episode's `first_step`.
     remaining_steps: np.ndarray  # Rows until the episode ends.
@@ -298,6 +313,7 @@ def split(
         error = episode.desired_output - episode.output
         part = Segments(
             episode=np.full(rows.size, position),
+            group=np.full(rows.size, -episode.plant or position),
             start_row=rows,
             is_first=rows == episode.first_step,
             remaining_steps=remaining,

@@ -252,7 +252,7 @@ def _episodes_of(table: pa.Table, info: EpisodesInfo, shard: Path) -> list[Episo
             if is_wrong:
                 raise ValueError(f"{shard}: episode {index}: {what}")
         copies: dict[str, Any] = {name: part[name].copy() for name in ("time_s", *widths)}
-        episodes.append(Episode(index=index, **copies, **labels))
+        episodes.append(Episode(index=index, plant=info.plant_of(index), **copies, **labels))
     return episodes
 
 

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import Simulator, SimulatorStatus
@@ -81,7 +82,7 @@ class Motion:
     def episode(self, num_features: int = 0) -> Episode:
         """The motion as an episode, with the defaults of `record_episodes` for unlogged ports."""
         num_rows, cause = len(self.time_s), DIVERGED if self.failure else self.cause
-        rows = {
+        rows: dict[str, Any] = {
             "true_state": self["state"],
             "desired_output": self["desired_preview"][:, : self["output"].shape[1]],
             "features": np.zeros((num_rows, num_features)),

@@ -21,9 +21,16 @@ from drake_safety.learning.segments import (
     EpisodesInfo,
     installed_versions,
 )
+from drake_safety.robots.family import FAMILY, plant_rng
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, port_sizes
 from drake_safety.simulation.motion import End, simulate
-from drake_safety.simulation.rollouts import collect_episodes, episode_rng, seed_random_sources
+from drake_safety.simulation.rollouts import (
+    PlantLoops,
+    collect_episodes,
+    episode_rng,
+    run_on_plant,
+    seed_random_sources,
+)
 from drake_safety.simulation.worker_processes import CloudPickled, MadeOnce, Progress
 from drake_safety.systems.monitored_assessor import warn_of_sampled_ports
 
@@ -41,6 +48,8 @@ def record_episodes(
     duration_s: float,
     step_s: float,
     parameters: Mapping[str, Any] | None = None,
+    draw_plant: Callable[[np.random.Generator], Any] | None = None,
+    plants: int = 48,
     ports: Mapping[str, str] | None = None,
     state_names: Sequence[str] | None = None,
     output_names: Sequence[str] | None = None,
@@ -65,11 +74,15 @@ def record_episodes(
     the second, and must be the same.
 
     Args:
-        make_diagram: Builds the diagram in each worker; called with ``parameters``.
+        make_diagram: Builds the diagram in each worker; called with ``parameters``, after the plant
+            if there is ``draw_plant``.
         reset: Called with diagram, root Context and generator; samples a start into the Context,
             the diagram's default one with seeded random sources of Drake; rows count from its time.
             It may return the first row whose future is undisturbed, if that is not 0.
         step_s: Time between two rows, the unit of H [s].
+        draw_plant: Draws a random plant by a generator; the set is of a family then, for the
+            argument ``family`` of `SafetyAssessment.fit`.
+        plants: Number of the family's plants, in turn those of the episodes.
         ports: The diagram's port names, by those above.
         state_names: Names of the n_s entries of ``state``; numbered by default.
         monitor_period_s: Sampling period of ``safe`` [s]; a tenth of ``step_s`` by default.
@@ -83,9 +96,18 @@ def record_episodes(
         raise ValueError("record_episodes: duration_s must be at least step_s")
     # The diagram is built anew for each call: a function does not tell whether its result changed.
     key = uuid.uuid4().hex
-    make = MadeOnce(key, CloudPickled(partial(make_diagram, **dict(parameters or {}))))
-    warn_of_sampled_ports("record_episodes", [make()])
-    used, sizes = _used_ports(make(), dict(ports or {}))
+    build = partial(make_diagram, **dict(parameters or {}))
+    make: MadeOnce[Any] = MadeOnce(key, CloudPickled(build))
+    if draw_plant is not None:
+        sampler = draw_plant
+
+        def build_on(number: int) -> Diagram:
+            return build(sampler(plant_rng(seed, number)))
+
+        make = MadeOnce(key, partial(PlantLoops, CloudPickled(build_on)))
+    first = make() if draw_plant is None else make().of(1)
+    warn_of_sampled_ports("record_episodes", [first])
+    used, sizes = _used_ports(first, dict(ports or {}))
     # As the hash has always been made of it, so that kept sets stay valid.
     timing = f"EpisodeTiming({step_s=}, {num_steps=}, monitor_period_s={period_s!r})"
     identity = f"({name!r}, {timing}, {used}, {sorted((parameters or {}).items())})"
@@ -93,7 +115,7 @@ def record_episodes(
     info = EpisodesInfo(
         scenario=name,
         scenario_hash=hashlib.sha256(identity.encode()).hexdigest(),
-        variation="nominal",
+        variation="nominal" if draw_plant is None else FAMILY,
         seed=seed,
         step_s=step_s,
         horizon=horizon,
@@ -103,6 +125,7 @@ def record_episodes(
         constraint_names=_names("constraint", constraint_names, sizes["margins"]),
         versions=installed_versions("drake", "numpy"),
         num_steps=num_steps,
+        plants=0 if draw_plant is None else plants,
     )
     start = CloudPickled(reset)
 
@@ -130,7 +153,8 @@ def record_episodes(
         ).episode()
 
     options: dict[str, Any] = {"num_workers": num_workers, "path": path, "progress": progress}
-    episodes = collect_episodes(info, range(num_episodes), make, run, is_repeated=True, **options)
+    call = run if draw_plant is None else partial(run_on_plant, run, info)
+    episodes = collect_episodes(info, range(num_episodes), make, call, is_repeated=True, **options)
     episodes.warn()
     if ended := [e.index for e in episodes if e.is_safe and e.num_steps < num_steps]:
         _LOGGER.warning(

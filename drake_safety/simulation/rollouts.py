@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from drake_safety.learning.segments import (
     installed_versions,
 )
 from drake_safety.plants.pushes import Push
+from drake_safety.robots.family import FAMILY
 from drake_safety.simulation.capabilities import (
     CanBePushed,
     CanFall,
@@ -43,12 +44,19 @@ from drake_safety.simulation.dataset import EpisodeWriter, is_same, load_episode
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.motion import End, Motion, simulate
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.simulation.worker_processes import BATCH_SIZE, MadeOnce, Progress, map_items
+from drake_safety.simulation.worker_processes import (
+    BATCH_SIZE,
+    CloudPickled,
+    MadeOnce,
+    Progress,
+    map_items,
+)
 from drake_safety.systems.monitored_assessor import leaf_systems
 
 MOTION_PIECE_S = 60.0  # Duration of one undisturbed motion.
 _AFTER_LEAVING_S = 1.0  # Until a robot has fallen, if it does.
 _MANY = 64  # Episodes of which two more are a small share.
+_KEPT_LOOPS = 64  # Of plants, in a process.
 _LOGGER = logging.getLogger("drake_safety")
 HIDDEN_STATE = (
     "differs: the diagram, or its reset, keeps state outside its Context, such as a memory, a "
@@ -64,6 +72,30 @@ def worker_loop(
     files, text = scenario.simulation_hash(variation), scenario.to_yaml()
     key = (files, text, variation, repr(sorted(options.items())))
     return MadeOnce(key, partial(scenario.make_loop, variation, **options))
+
+
+class PlantLoops:
+    """The loops of a process for the plants of a family, each made when it is first needed."""
+
+    def __init__(self, make: Callable[[int], Any]) -> None:
+        self.of = lru_cache(_KEPT_LOOPS)(make)  # Called with the number of a plant, from 1 on.
+
+
+def run_on_plant(
+    run: Callable[..., Episode], info: EpisodesInfo, loops: PlantLoops, index: int
+) -> Episode:
+    """Runs the episode of an index with the loop of its plant."""
+    number = info.plant_of(index)
+    return replace(run(loops.of(number), index), plant=number)
+
+
+def _family_loops(scenario: Scenario, seed: int, options: dict[str, Any]) -> MadeOnce[PlantLoops]:
+    def make_loop(number: int) -> ClosedLoop:
+        return scenario.with_plant(seed, number).make_loop(FAMILY, **options)
+
+    files, text = scenario.simulation_hash(FAMILY), scenario.to_yaml()
+    key = (files, text, FAMILY, seed, repr(sorted(options.items())))
+    return MadeOnce(key, partial(PlantLoops, CloudPickled(make_loop)))
 
 
 def episode_rng(seed: int, index: int) -> np.random.Generator:
@@ -292,6 +324,7 @@ def run_episodes(
     num_episodes: int,
     *,
     variation: str = "nominal",
+    plants: int | None = None,
     seed: int = 0,
     num_workers: int | None = None,
     path: str | PathLike[str] | None = None,
@@ -302,9 +335,11 @@ def run_episodes(
 ) -> Episodes:
     """Simulates a set of episodes, in worker processes.
 
-    Episode i depends on the scenario, the variation, the seed and i alone.
+    Episode i depends on the scenario, the variation, the seed and i alone. With the variation
+    ``family`` its plant is number i modulo ``plants`` of those that the seed draws.
 
     Args:
+        plants: Number of the family's plants; that of the scenario by default.
         num_workers: Number of processes; that of cores by default. 1 runs in this process.
         path: Folder for the episodes. Those that it holds are kept, if one of them, simulated
             again, is the same to the last bit; another set is refused.
@@ -313,15 +348,22 @@ def run_episodes(
         until_fall: As of `run_episode`.
         **loop_options: Options of the task; part of the set's hash.
     """
-    make = worker_loop(scenario, variation, **loop_options)
-    info = episodes_info(make(), seed, loop_options | ({"until_fall": True} if until_fall else {}))
+    make: MadeOnce[Any] = worker_loop(scenario, variation, **loop_options)
+    if is_family := variation == FAMILY:
+        make = _family_loops(scenario, seed, loop_options)
+    loop = make().of(1) if is_family else make()
+    info = episodes_info(loop, seed, loop_options | ({"until_fall": True} if until_fall else {}))
+    run: Callable[..., Episode] = partial(run_episode, seed=seed, until_fall=until_fall)
     if until_fall:
-        info.until = require(make(), CanFall).fall_name
+        info.until = require(loop, CanFall).fall_name
+    if is_family and scenario.family is not None:
+        info.plants = scenario.family.plants if plants is None else plants
+        run = partial(run_on_plant, run, info)
     return collect_episodes(
         info,
         range(num_episodes),
         make,
-        partial(run_episode, seed=seed, until_fall=until_fall),
+        run,
         num_workers=num_workers,
         path=path,
         progress=progress,

@@ -1,5 +1,6 @@
 """Scenarios: YAML files that combine a robot and a task."""
 
+import copy
 import hashlib
 import importlib
 import inspect
@@ -21,6 +22,7 @@ from drake_safety.files.reading import parse_yaml, reading
 from drake_safety.files.schema import Positive, load_typed, schema
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.segments import EpisodesInfo
+from drake_safety.robots.family import FAMILY, PlantFamily
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.robots.robot_model import load_robot_file
 from drake_safety.robots.robot_size import overlaid
@@ -57,7 +59,9 @@ class Scenario:
     """What an alarm of the monitor does: ``unknown`` makes every belief "don't know", so that
     plans are refused; ``report`` only reports it. Recovery heeds no alarm."""
     variations: dict[str, PlantVariation] = field(default_factory=dict)
-    """Plants by name; training episodes are those of ``nominal``."""
+    """Plants by name; training episodes are of ``nominal`` and of the family."""
+    family: PlantFamily | None = None
+    """Random plants around the nominal one, on which Γ learns beside it."""
     assessment: AssessmentParameters = field(default_factory=AssessmentParameters)
 
     # An instance of the task's Parameters.
@@ -68,6 +72,10 @@ class Scenario:
     identity: Annotated[str, Field(exclude=True)] = field(default="", repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        if FAMILY in self.variations:
+            raise ValueError(
+                f"no variation can have the name '{FAMILY}', that of the random plants"
+            )
         episode = f"episode of {self.episode_duration_s} s"
         for name in ("step_s", "time_step_s", "control_period_s"):
             if self.episode_duration_s > _MOST_STEPS * getattr(self, name):
@@ -98,11 +106,22 @@ class Scenario:
         return round(self.episode_duration_s / self.step_s)
 
     def variation(self, name: str) -> PlantVariation:
-        """A plant variation by name."""
+        """A plant variation by name; that of ``family`` is its first plant of seed 0."""
+        if name == FAMILY and name not in self.variations:
+            return self.with_plant(0, 0).variations[name]
         if name not in self.variations:
             there = list(self.variations)
             raise ValueError(f"scenario '{self.name}' has no variation '{name}'; it has {there}")
         return self.variations[name]
+
+    def with_plant(self, seed: int, number: int) -> "Scenario":
+        """The scenario whose variation ``family`` is a random plant of the family."""
+        if self.family is None:
+            raise ValueError(f"scenario '{self.name}' has no family of plants: add `family:`")
+        drawn = copy.copy(self)
+        plant = self.family.plant(self.variation("nominal"), seed, number)
+        drawn.variations = {**self.variations, FAMILY: plant}
+        return drawn
 
     @property
     def robot_name(self) -> str:
@@ -168,16 +187,19 @@ class Scenario:
         """SHA-256 of all parameters that determine a rollout, and of the robot's files.
 
         It covers defaults and, as the controllers' model, the nominal plant; not source code, the
-        assessment's parameters but the preview's, the task's online ones and other variations. A
-        ``name`` replaces that of the file.
+        assessment's parameters but the preview's, the task's online ones and other variations, and
+        the family only as its own variation. A ``name`` replaces that of the file.
         """
         if variation != "nominal":
             self.variation(variation)
         text = self._values()
         del text["on_alarm"]  # No episode depends on it.
+        family = text.pop(FAMILY, {})
+        if variation == FAMILY:
+            text[FAMILY] = family.get("ranges")
         preview = ("horizon", "preview_stride")
         text["assessment"] = {key: getattr(self.assessment, key) for key in preview}
-        plants = [key for key in ("nominal", variation) if key in self.variations]
+        plants = [k for k in ("nominal", variation) if k in self.variations and k != FAMILY]
         text["variations"] = {key: text["variations"][key] for key in plants}
         text["name"] = name or self.identity or self.name
         # Files are hashed; their folders are irrelevant.

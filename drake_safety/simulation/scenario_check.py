@@ -23,13 +23,14 @@ from drake_safety.learning.causes import describe_margin, is_outside
 from drake_safety.learning.segments import DIVERGED
 from drake_safety.models import load_robot, robot_files
 from drake_safety.policies.policy_network import network_kinds
+from drake_safety.robots.family import FAMILY
 from drake_safety.robots.plausibility import effort_unit, odd_inertias, odd_limits
 from drake_safety.simulation.capabilities import FollowsCommands
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.motion import End, simulate
-from drake_safety.simulation.rollouts import HIDDEN_STATE, is_repeatable, run_episode
+from drake_safety.simulation.rollouts import HIDDEN_STATE, is_repeatable, run_episode, run_episodes
 from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
 
 _Check = Generator[Finding, None, None]
@@ -96,6 +97,8 @@ def check_scenario(
     yield from _guarded("contract", partial(check_contract, seed=seed), loop)
     if num_episodes:
         yield from _guarded("episodes", _episodes, loop, num_episodes, seed, progress, remedy)
+    if num_episodes and scenario.family is not None:
+        yield from _guarded("family", _family, scenario, num_episodes, seed, progress)
 
 
 def _guarded(
@@ -352,6 +355,27 @@ def _walks(loop: Any) -> Generator[Finding, None, str]:
         return ""
     yield failed(_WALKS, message, _POLICY_REMEDY)
     return f"correct '{_WALKS}' first: the policy does not walk"
+
+
+def _family(scenario: Scenario, num_episodes: int, seed: int, report: StageProgress) -> _Check:
+    episodes = run_episodes(
+        scenario,
+        num_episodes,
+        variation=FAMILY,
+        plants=num_episodes,
+        seed=seed,
+        num_workers=1,
+        progress=partial(report, "plants of the family"),
+    )
+    share = episodes.num_unsafe / num_episodes
+    message = f"{100 * share:.0f} % of {num_episodes} episodes, each on a random plant"
+    yield _judged(
+        "share of unsafe episodes in the family",
+        share <= 0.9,
+        message,
+        f"{message}; expected at most 90 %: Γ learns most from plants that the robot can stand",
+        "narrow the ranges of `family`",
+    )
 
 
 def _episodes(

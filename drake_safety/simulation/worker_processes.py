@@ -78,6 +78,8 @@ def map_items(
     if not is_local and num_workers is not None:
         raise ValueError(f"joblib's {backend} has its own number of workers: leave out num_workers")
     num_workers = num_workers or joblib.cpu_count()
+    # Loops of many plants make a worker so large that joblib replaces it, and loses nothing.
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs")
     pending = list(items)
     batches = [pending[i : i + batch_size] for i in range(0, len(pending), batch_size)]
     call = partial(_call_batch, function, make, _versions())
