@@ -26,7 +26,7 @@ class PlantFamily:
     share of the plants. Entries that are left out are the nominal plant's.
     """
 
-    plants: Count = 48  # Of training.
+    plants: Count = 64  # Of training.
     share: Share = 0.5  # Training episodes on these plants for each nominal one.
     ranges: dict[str, Any] = field(default_factory=dict)
 

@@ -49,7 +49,7 @@ def record_episodes(
     step_s: float,
     parameters: Mapping[str, Any] | None = None,
     draw_plant: Callable[[np.random.Generator], Any] | None = None,
-    plants: int = 48,
+    plants: int = 64,
     ports: Mapping[str, str] | None = None,
     state_names: Sequence[str] | None = None,
     output_names: Sequence[str] | None = None,
