@@ -13,6 +13,7 @@ from studies.figures import figures
 from studies.gate import gate
 from studies.monitor import monitor
 from studies.publish import readme, ship, store
+from studies.rapt import rapt
 from studies.walking import walking
 
 app = typer.Typer(
@@ -23,7 +24,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
-    *(evaluate, adaptation, gate, monitor, walking),
+    *(evaluate, adaptation, gate, monitor, rapt, walking),
     *(figures, store, readme, ship),
 )
 for _command in _COMMANDS:
