@@ -1,7 +1,7 @@
 """Shifts: the catalogue, Γ's confident errors, and the minutes that its monitor watches."""
 
 import math
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -42,6 +42,9 @@ class Gamma:
     """An assessment whose probability is the second state, above one "don't know"."""
 
     used_ = ()
+    calibrations_ = MappingProxyType(
+        {kind: SimpleNamespace(kind=kind, threshold=0.9) for kind in ("plan", "motion")}
+    )
     parameters = SimpleNamespace(initial_uncertainty=0.3)
     settings = SimpleNamespace(is_paper=False)
     detector_ = Detector()
@@ -79,6 +82,10 @@ def test_a_confident_error_is_a_row_called_safe_in_a_motion_that_ends_unsafely()
     assert found["gamma", "confident_error"].value == pytest.approx(0.1)
     assert found["gamma", "unknown"].value == pytest.approx(0.4)
     assert found["", "unsafe"].value == 0.75
+    # Of the three unsafe motions one is called safe; "don't know" is no miss.
+    for kind in ("plan", "motion"):
+        missed = found["gamma", f"missed_{kind}"]
+        assert (missed.value, missed.n) == (pytest.approx(1 / 3), 3)
     assert found["gamma", "confident_error"].n == 4
     # "Don't know" is the least safe: of 20 safe rows, each is above 70 and equal to 10.
     assert found["gamma", "auc"].value == pytest.approx((70 + 0.5 * 10) / 80)

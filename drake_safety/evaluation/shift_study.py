@@ -35,7 +35,7 @@ _COLUMNS = (
     ("", Column("unsafe", "unsafe", "=%", digits=1)),
     *(("gamma", one) for one in (_UNKNOWN, _ERROR, _AUC)),
     ("gamma", Column("missed_motion", "alarm missed", "=%", digits=1)),
-    ("gamma", Column("missed_motion.family", "by the family's threshold", "=%", digits=1)),
+    ("gamma", Column("missed_motion.family", "family's missed", "=%", digits=1)),
     ("paper", Column("unknown", "paper: don't know", "=%", digits=1)),
     *(("paper", one) for one in (_ERROR, _AUC)),
     ("monitor", Column("alarmed", "alarms", "=%", digits=0)),
