@@ -19,6 +19,7 @@ from drake_safety.robots.robot import Payload, PlantVariation
 from drake_safety.simulation.dataset import is_same, load_episodes
 from drake_safety.simulation.scenario_check import check_scenario
 
+pytestmark = pytest.mark.train
 RANGES = {
     "mass_scale": {"uniform": [0.9, 1.2]},
     "foot_friction": {"log_uniform": [0.2, 1.0], "share": 0.5},

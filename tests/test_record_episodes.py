@@ -318,6 +318,7 @@ def draw_wall(rng):
     return rng.uniform(1.0, 3.0)
 
 
+@pytest.mark.train
 def test_a_sampler_draws_plants_for_episodes_in_turn(tmp_path):
     drawn = {"make": make_between_walls, "draw_plant": draw_wall, "plants": 3, "seed": 5}
     family, nominal = record(9, **drawn), record(9, make=make_between_walls, seed=4)
