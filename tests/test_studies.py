@@ -84,7 +84,7 @@ def test_a_study_of_a_run_writes_its_figures(monkeypatch, run, line):
 def test_walking_is_judged_on_tours_pushes_commands_and_engines(monkeypatch, tmp_path):
     shutil.copy(assessment_file(shipped_folder("go2_walking"), MODES[0]), tmp_path)
     # Baselines need training episodes, which do not ship.
-    monkeypatch.setattr("studies.walking.load_episodes", lambda path: None)
+    monkeypatch.setattr("studies.walking.training_episodes", lambda *of: None)
     monkeypatch.setattr("studies.walking.classifier_scorers", lambda *_, **__: [])
     monkeypatch.setattr("studies.walking._DURATIONS_S", {"tour": 0.4, "push": 0.4, "command": 0.4})
     monkeypatch.setattr("studies.walking._SPEED_S", 0.4)
