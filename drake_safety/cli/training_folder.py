@@ -48,7 +48,7 @@ def family_folder(folder: Path) -> Path:
 
 
 def training_episodes(folder: Path, gamma: SafetyAssessment) -> Episodes:
-    """The episodes that Γ has learned from: nominal ones, and those of the family if any."""
+    """Loads the nominal episodes that Γ has learned from, and the episodes of its family."""
     nominal = load_episodes(episodes_folder(folder, gamma.parameters.mode))
     return nominal.joined(load_episodes(family_folder(folder))) if gamma.knows_family else nominal
 

@@ -129,7 +129,7 @@ class SafetyAssessment:
         detector: ChangeDetector | None = None,
         motions: Episodes | None = None,
     ) -> SafetyAssessment:
-        """Learns embedding and beliefs from nominal episodes, and from those of a plant family.
+        """Learns embedding and beliefs from nominal episodes, and from episodes of a plant family.
 
         Without a detector it learns one from long undisturbed motions of the same diagram; without
         them from the episodes, whose motion rarely suffices for its limits. `progress` is called

@@ -63,7 +63,7 @@ class EpisodesInfo:
     monitored_features: list[str] | None = None  # By which it predicts them; None for all.
     robot: str = ""
     until: str = ""  # The only constraint whose violation ends an episode; empty for every one.
-    plants: int = 0  # Of a family, in turn those of the episodes; 0 for one plant.
+    plants: int = 0  # Size of the family whose plants the episodes have in turn; 0 for one plant.
 
     def __post_init__(self) -> None:
         is_known = 1 <= self.horizon <= MOST_SAMPLES and self.preview_stride >= 1

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import cache, partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -56,7 +56,6 @@ from drake_safety.systems.monitored_assessor import leaf_systems
 MOTION_PIECE_S = 60.0  # Duration of one undisturbed motion.
 _AFTER_LEAVING_S = 1.0  # Until a robot has fallen, if it does.
 _MANY = 64  # Episodes of which two more are a small share.
-_KEPT_LOOPS = 64  # Of plants, in a process.
 _LOGGER = logging.getLogger("drake_safety")
 HIDDEN_STATE = (
     "differs: the diagram, or its reset, keeps state outside its Context, such as a memory, a "
@@ -78,7 +77,7 @@ class PlantLoops:
     """The loops of a process for the plants of a family, each made when it is first needed."""
 
     def __init__(self, make: Callable[[int], Any]) -> None:
-        self.of = lru_cache(_KEPT_LOOPS)(make)  # Called with the number of a plant, from 1 on.
+        self.of = cache(make)  # Called with the number of a plant, from 1 on.
 
 
 def run_on_plant(
@@ -348,15 +347,18 @@ def run_episodes(
         until_fall: As of `run_episode`.
         **loop_options: Options of the task; part of the set's hash.
     """
-    make: MadeOnce[Any] = worker_loop(scenario, variation, **loop_options)
-    if is_family := variation == FAMILY:
+    make: MadeOnce[Any]
+    if variation == FAMILY:
         make = _family_loops(scenario, seed, loop_options)
-    loop = make().of(1) if is_family else make()
+        loop = make().of(1)
+    else:
+        make = worker_loop(scenario, variation, **loop_options)
+        loop = make()
     info = episodes_info(loop, seed, loop_options | ({"until_fall": True} if until_fall else {}))
     run: Callable[..., Episode] = partial(run_episode, seed=seed, until_fall=until_fall)
     if until_fall:
         info.until = require(loop, CanFall).fall_name
-    if is_family and scenario.family is not None:
+    if variation == FAMILY and scenario.family is not None:
         info.plants = scenario.family.plants if plants is None else plants
         run = partial(run_on_plant, run, info)
     return collect_episodes(
