@@ -59,16 +59,16 @@ def calibrate(
             f"calibrate: no plant simulates the robot of the logs that '{folder.path}' is adapted "
             f"to: a promise holds for a simulated plant, --variation {plant}"
         )
-    plants = {plant: seed}
+    seeds = {plant: seed}  # By plant.
     if plant == "nominal" and learned[MODES[0]].knows_family:
-        plants[FAMILY] = CALIBRATION.seeds(seed)["calibration over the family"]
+        seeds[FAMILY] = CALIBRATION.seeds(seed)["calibration over the family"]
     for gamma in learned.values():
         folders.check_fresh(gamma, loaded)
-        gamma.check_unused(*plants.values(), purpose="calibration")
+        gamma.check_unused(*seeds.values(), purpose="calibration")
     folders.check_writable(folder.out)
     fresh = {}
     with console.open_stages() as stages:
-        for name, its_seed in plants.items():
+        for name, its_seed in seeds.items():
             progress = partial(stages, f"{name} calibration episodes")
             options = loaded.options_for("pairs", name)
             if name == FAMILY:
@@ -79,7 +79,7 @@ def calibrate(
     segments = {name: split(one, stride=1, discount=1.0, shortest=1) for name, one in fresh.items()}
     rows = []
     for mode, gamma in learned.items():
-        sets = {name: fresh[name] for name in plants if name != FAMILY or gamma.knows_family}
+        sets = {name: fresh[name] for name in seeds if name != FAMILY or gamma.knows_family}
         temperature = gamma.temper(joined([segments[name] for name in sets]))
         chosen = []
         for name, one_set in sets.items():
