@@ -34,7 +34,7 @@ class Bench:
         """Input and output at a later time, as a system with an event then reads them."""
         self.simulator.AdvanceTo(time_s)
         output = self.system.get_output_port().Eval(self.own)
-        return self.system.get_input_port().Eval(self.own), output
+        return self.system.GetInputPort("input").Eval(self.own), output
 
 
 def true(time_s):
@@ -67,6 +67,8 @@ def test_without_faults_and_before_their_start_the_bits_pass(faults):
         # Samples at multiples of 0.1 s; a reader between two finds the earlier one.
         (Fault(kind="delay", value=0.3), true(1.0)),
         (Fault(kind="freeze", start_s=0.85), true(0.8)),
+        (Fault(kind="fade", value=2.5, entries=["slow"]), true(1.25) * [0.5, 1.0, 1.0]),
+        (Fault(kind="fade", value=1.0), np.zeros(3)),
     ],
 )
 def test_each_fault_by_hand(fault, expected):
@@ -95,6 +97,17 @@ def test_a_delay_between_two_samples_and_an_entry_that_is_not_there_are_refused(
     with pytest.raises(ValueError, match=r"multiple of the period 0\.01 s"):
         Bench(delay, period_s=0.01)
     np.testing.assert_allclose(Bench(delay, period_s=0.002).at(1.0)[1], true(0.996))
+
+
+def test_a_fade_ends_at_the_rest():
+    system = SensorFaults(NAMES, [Fault(kind="fade", value=4.0)], period_s=PERIOD_S)
+    context = system.CreateDefaultContext()
+    context.SetTime(1.0)
+    system.GetInputPort("input").FixValue(context, np.zeros(3))
+    system.GetInputPort("rest").FixValue(context, RATES)
+    np.testing.assert_allclose(system.get_output_port().Eval(context), 0.25 * RATES)
+    with pytest.raises(ValueError, match="value of 'fade' must be positive; got 0"):
+        Fault(kind="fade", value=0.0)
 
 
 def test_faults_act_one_after_the_other():

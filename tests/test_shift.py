@@ -92,6 +92,54 @@ def test_feet_over_holes_find_the_ground_lower():
     assert rolls[0] > 1e-3 > -1e-3 > rolls[1]
 
 
+def test_a_foot_on_ice_has_the_stated_friction_with_the_ground():
+    robot = load_robot("laikago")
+    ground, coefficients = robot.foot_friction, {}
+    loop = loop_with(Shift(foot_friction={"FR": 0.1, "FL": ground}))
+    inspector = loop.scene_graph.model_inspector()
+    for name, foot in robot.feet.items():
+        body = loop.plant.GetBodyByName(foot.body)
+        for geometry in loop.plant.GetCollisionGeometriesForBody(body):
+            properties = inspector.GetProximityProperties(geometry)
+            mu = properties.GetProperty("material", "coulomb_friction").static_friction()
+            coefficients.setdefault(name, []).append(2.0 * mu * ground / (mu + ground))
+    assert min(coefficients.pop("FR")) == pytest.approx(0.1)
+    for others in coefficients.values():
+        assert max(others) == pytest.approx(ground)
+    with pytest.raises(ValueError, match="foot for friction"):
+        loop_with(Shift(foot_friction={"paw": 0.1}))
+
+
+def test_gravity_is_scaled():
+    gravity = loop_with(Shift(gravity_scale=1.1)).plant.gravity_field().gravity_vector()
+    np.testing.assert_allclose(gravity, [0.0, 0.0, -1.1 * 9.81], atol=1e-12)
+
+
+def test_a_motor_that_weakens_ends_without_torque():
+    knee = loop_with(None).kinematics.joint_names.index(KNEE)
+    entries = [KNEE, f"{KNEE}_rate"]
+    fade = Shift(command_faults=[Fault(kind="fade", entries=entries, value=0.1)])
+    loop, context = standing(fade, 0.2)
+    system = loop.GetSubsystemByName("command_faults")
+    received = system.get_output_port().Eval(system.GetMyContextFromRoot(context))
+    states = loop.GetOutputPort("plant_state").Eval(context)
+    num_joints = loop.kinematics.num_joints
+    assert received[knee] == states[7 + knee]
+    assert received[num_joints + knee] == states[loop.kinematics.num_positions + 6 + knee]
+    # Half of the way, half of the torque.
+    loop, context = standing(
+        dataclasses.replace(fade, command_faults=[Fault(kind="fade", entries=entries, value=0.4)]),
+        0.2,
+    )
+    system = loop.GetSubsystemByName("command_faults")
+    own = system.GetMyContextFromRoot(context)
+    sent, received = (
+        p.Eval(own)[knee] for p in (system.GetInputPort("input"), system.get_output_port())
+    )
+    measured = loop.GetOutputPort("plant_state").Eval(context)[7 + knee]
+    assert received - measured == pytest.approx(0.5 * (sent - measured))
+
+
 def command(shift, time_s):
     """The joint states that the controller sends, and those that the servos receive."""
     loop, context = standing(shift, time_s)

@@ -164,6 +164,7 @@ def test_the_catalogue_is_scaled_to_the_robot():
     mass_kg = shifts["payload"].variation.payload.mass_kg / 0.3
     assert math.isclose(force_n[1], 0.1 * 9.81 * mass_kg)
     assert {"slope", "hole", "weak_joint", "frozen", "variation actual"} <= set(shifts)
+    assert {"icy_foot", "weakening_motor", "gravity_and_payload", "joint_drift"} <= set(shifts)
     shifted = shifted_scenario(scenario, "slope", shifts["slope"].variation)
     assert "slope" in shifted.variations
     assert "slope" not in scenario.variations

@@ -49,11 +49,16 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     loads = dict(zip(kinematics.joint_names, torques.tolist(), strict=True))
     joint = max((name for name in loads if name in limits), key=loads.__getitem__)
     key, period_s = as_pattern(joint), scenario.control_period_s
+    # Of a servo the desired position and velocity, otherwise the torque.
+    actuators = [one.name() for one in motors if one.joint().name() == joint]
+    motor = ["|".join(map(as_pattern, [joint, f"{joint}_rate", *actuators]))]
     lasting = {
         "slope": Shift(slope_rad=math.radians(10.0)),
         "side_force": Shift(base_force_n=[0.0, 0.1 * mass_kg * GRAVITY_M_S2, 0.0]),
         "locked_joint": Shift(joints={key: JointShift(is_locked=True)}),
         "late_command": Shift(command_delay_s=_whole(5 * period_s, scenario.time_step_s)),
+        "icy_foot": Shift(foot_friction={kinematics.foot_names[0]: 0.1}),
+        "weakening_motor": Shift(command_faults=[Fault(kind="fade", entries=motor, value=40.0)]),
         "hole": Shift(holes_m={kinematics.foot_names[0]: 0.07 * kinematics.standing_height}),
     }
     if 0.0 < (weak_scale := 0.9 * loads[joint] / limits[joint]):  # Too weak to stand.
@@ -64,6 +69,7 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     n_q = kinematics.num_positions
     faults = {
         "joint_bias": Fault(kind="bias", entries=names[NUM_BASE_POSITIONS:n_q], value=0.05),
+        "joint_drift": Fault(kind="drift", entries=names[NUM_BASE_POSITIONS:n_q], value=0.02),
         "dead_velocities": Fault(kind="zero", entries=names[n_q:]),
         "stale": Fault(kind="delay", value=_whole(0.2, period_s)),
         "frozen": Fault(kind="freeze"),
@@ -76,6 +82,9 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
         "payload": replace(nominal, payload=Payload(mass_kg=0.3 * mass_kg)),
         "heavy": replace(nominal, mass_scale=1.5 * nominal.mass_scale),
         "slippery": replace(nominal, foot_friction=0.1),
+        "gravity_and_payload": replace(
+            nominal, payload=Payload(mass_kg=0.15 * mass_kg), shift=Shift(gravity_scale=1.1)
+        ),
     }
     sensors = {n: replace(nominal, shift=Shift(sensor_faults=[f])) for n, f in faults.items()}
     sensors["noisy_velocities"] = replace(nominal, input_noise=noisy)

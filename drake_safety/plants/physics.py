@@ -250,9 +250,10 @@ def _add_robot_and_scene(
     shift = variation.shift or Shift()
     if shift.holes_m:
         _add_holes(plant, scene_graph, robot, instance, shift.holes_m, friction)
-    if slope := shift.slope_rad:  # Gravity inclines: the ground stays at z = 0.
-        gravity, direction = plant.mutable_gravity_field(), shift.slope_direction_rad
-        magnitude = np.linalg.norm(gravity.gravity_vector())
+    slope, direction = shift.slope_rad, shift.slope_direction_rad
+    if slope or shift.gravity_scale != 1.0:  # Gravity inclines: the ground stays at z = 0.
+        gravity = plant.mutable_gravity_field()
+        magnitude = shift.gravity_scale * np.linalg.norm(gravity.gravity_vector())
         downhill = math.sin(slope) * np.array([math.cos(direction), math.sin(direction)])
         gravity.set_gravity_vector(magnitude * np.append(downhill, -math.cos(slope)))
     obstacles = add_obstacles(plant, scene.obstacles or ())

@@ -100,13 +100,21 @@ def servo_joints(plant: MultibodyPlant, robot: RobotModel) -> list[str]:
 
 
 def _set_friction(
-    scene_graph: SceneGraph, plant: MultibodyPlant, robot: RobotModel, mu: float
+    scene_graph: SceneGraph, plant: MultibodyPlant, robot: RobotModel, variation: PlantVariation
 ) -> None:
+    ground = variation.foot_friction or robot.foot_friction
+    of_feet = variation.shift.foot_friction if variation.shift else {}
+    _require(robot, "foot for friction", of_feet, list(robot.feet))
     inspector = scene_graph.model_inspector()
     instance = plant.GetModelInstanceByName(robot.name)
     source = plant.get_source_id()
-    for foot in robot.feet.values():
+    for name, foot in robot.feet.items():
         body = plant.GetBodyByName(foot.body, instance)
+        # Drake combines the coefficients of foot and ground, 2 m n / (m + n).
+        mu = ground
+        if name in of_feet:
+            mu = min(of_feet[name], 1.9 * ground)
+            mu = mu * ground / (2.0 * ground - mu)
         for geometry in plant.GetCollisionGeometriesForBody(body):
             centre = inspector.GetPoseInFrame(geometry).translation()
             offsets = np.linalg.norm(np.array(foot.contact_points) - centre, axis=1)
@@ -259,7 +267,7 @@ def add_robot(
             friction = plant.AddJointActuator(f"{name}{_FRICTION_SUFFIX}", joint, most)
             friction.set_controller_gains(PdControllerGains(p=0.0, d=_FRICTION_DAMPING))
     if scene_graph is not None:
-        _set_friction(scene_graph, plant, robot, variation.foot_friction or robot.foot_friction)
+        _set_friction(scene_graph, plant, robot, variation)
         _ignore_neighbours(plant, scene_graph, instance)
     for joint_name, position in posture_positions(plant, robot).items():
         plant.GetJointByName(joint_name, instance).set_default_positions([position])

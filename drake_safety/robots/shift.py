@@ -8,7 +8,15 @@ from pydantic import Field, FiniteFloat
 
 from drake_safety.files.schema import NotNegative, Positive, Triple, schema
 
-FAULTS = {"bias": True, "drift": True, "zero": False, "scale": True, "delay": True, "freeze": False}
+FAULTS = {
+    "bias": True,
+    "drift": True,
+    "zero": False,
+    "scale": True,
+    "delay": True,
+    "freeze": False,
+    "fade": True,
+}
 """Kinds of faults, and whether they have a value."""
 
 
@@ -35,8 +43,10 @@ class Fault:
         if (self.value is not None) != FAULTS[self.kind]:
             needs = "needs a value" if FAULTS[self.kind] else "has no value"
             raise ValueError(f"'{self.kind}' {needs}; got {self.value}")
-        if self.kind == "delay" and (self.value or 0.0) < 0:
-            raise ValueError(f"value of 'delay' must not be negative; got {self.value}")
+        value = self.value or 0.0
+        if (self.kind == "delay" and value < 0) or (self.kind == "fade" and value <= 0):
+            least = "be positive" if self.kind == "fade" else "not be negative"
+            raise ValueError(f"value of '{self.kind}' must {least}; got {self.value}")
 
 
 @schema(kw_only=True)
@@ -46,6 +56,7 @@ class Shift:
     # Inclination of the ground, simulated as gravity that is not normal to it [rad].
     slope_rad: Annotated[float, Field(gt=-0.5 * math.pi, lt=0.5 * math.pi)] = 0.0
     slope_direction_rad: float = 0.0  # Direction in which the ground falls, from the x axis [rad].
+    gravity_scale: Positive = 1.0  # Factor on gravity.
     # Steady force on the base's origin, in the world, (3,) [N].
     base_force_n: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
     joints: dict[str, JointShift] = field(default_factory=dict)  # By name or pattern.
@@ -54,6 +65,8 @@ class Shift:
     # ``_rate``; where the command is torques, they are actuators.
     command_faults: list[Fault] = field(default_factory=list)
     holes_m: dict[str, Positive] = field(default_factory=dict)  # Depth of ground under a foot [m].
+    # Friction coefficient of some feet on the ground.
+    foot_friction: dict[str, Positive] = field(default_factory=dict)
     # Faults of the measured ``[q; v]`` that the assessor reads; the motion does not depend on
     # them. Entries have Drake's names, such as ``FR_calf_joint_q`` and ``FR_calf_joint_w``.
     sensor_faults: list[Fault] = field(default_factory=list)

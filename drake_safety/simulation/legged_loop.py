@@ -10,9 +10,14 @@ import numpy as np
 from pydantic import Field
 from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort, System
+from pydrake.systems.primitives import MatrixGain
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.kinematics import RobotKinematics
+from drake_safety.control.kinematics import (
+    NUM_BASE_POSITIONS,
+    NUM_BASE_VELOCITIES,
+    RobotKinematics,
+)
 from drake_safety.files.schema import Positive, schema
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot, robot_files
@@ -118,7 +123,11 @@ class LeggedLoop(PlannedLoop):
         return observer.GetOutputPort("measured_plant_state")
 
     def _as_received(
-        self, builder: DiagramBuilder, command: OutputPort, names: Sequence[str]
+        self,
+        builder: DiagramBuilder,
+        command: OutputPort,
+        names: Sequence[str],
+        is_servo: bool = False,
     ) -> OutputPort:
         """Adds the variation's delay and faults of the command between controller and robot."""
         shift = self._plant_variation.shift or Shift()
@@ -127,12 +136,20 @@ class LeggedLoop(PlannedLoop):
             faults.append(Fault(kind="delay", value=shift.command_delay_s))
         if not faults:
             return command
+        rest = None
+        if is_servo:  # Without torque where it should be.
+            num_q, num_states = self.kinematics.num_positions, self.kinematics.num_states
+            joints = np.r_[NUM_BASE_POSITIONS:num_q, num_q + NUM_BASE_VELOCITIES : num_states]
+            gain = builder.AddNamedSystem("joint_state", MatrixGain(D=np.eye(num_states)[joints]))
+            builder.Connect(self._physics.state, gain.get_input_port())
+            rest = gain.get_output_port()
         period_s = self.scenario.time_step_s
-        return add_faults(builder, "command_faults", command, faults, names, period_s)
+        return add_faults(builder, "command_faults", command, faults, names, period_s, rest)
 
     def _servo_command(self, builder: DiagramBuilder, command: OutputPort) -> OutputPort:
         names = self.kinematics.joint_names
-        return self._as_received(builder, command, [*names, *(f"{name}_rate" for name in names)])
+        entries = [*names, *(f"{name}_rate" for name in names)]
+        return self._as_received(builder, command, entries, is_servo=True)
 
     def _assess(
         self,

@@ -81,9 +81,12 @@ def add_faults(
     faults: Sequence[Fault],
     names: Sequence[str],
     period_s: float,
+    rest: OutputPort | None = None,
 ) -> OutputPort:
     """Adds faults of a signal, sampled last in each period: after the updates of commands."""
     system = SensorFaults(names, faults, period_s=period_s, offset_s=0.95 * period_s)
     builder.AddNamedSystem(name, system)
-    builder.Connect(port, system.get_input_port())
+    builder.Connect(port, system.GetInputPort("input"))
+    if rest is not None and system.HasInputPort("rest"):
+        builder.Connect(rest, system.GetInputPort("rest"))
     return system.get_output_port()

@@ -20,11 +20,12 @@ class SensorFaults(LeafSystem):
     .. pydrake_system::
 
         name: SensorFaults
-        input_ports: [input: n]
+        input_ports: [input: n, rest: n (of fades, optional)]
         output_ports: [output: n]
 
     Delays and ``freeze`` hold samples, taken every ``period_s`` [s]: a delay's output is the input
-    of ``value / period_s`` samples ago, or the first sample until that is so old.
+    of ``value / period_s`` samples ago, or the first sample until that is so old. ``fade`` moves
+    the entries to those of ``rest``, zero by default, in ``value`` seconds.
     """
 
     def __init__(
@@ -39,6 +40,8 @@ class SensorFaults(LeafSystem):
         check_times("sensor faults", or_zero=["offset_s"], period_s=period_s, offset_s=offset_s)
         self._period_s = period_s
         self._input = self.DeclareVectorInputPort("input", len(names))
+        if any(fault.kind == "fade" for fault in faults):
+            self._rest = self.DeclareVectorInputPort("rest", len(names))
         self._faults = [(fault, _indices(fault, list(names))) for fault in faults]
         # Of each fault the samples that it holds, the latest first; NaN before the first one.
         self._shapes = [(self._num_held(fault), len(entries)) for fault, entries in self._faults]
@@ -83,6 +86,10 @@ class SensorFaults(LeafSystem):
                 return np.zeros_like(x)
             case "scale":
                 return value * x
+            case "fade":
+                has_rest, entries = self._rest.HasValue(context), self._faults[index][1]
+                rest = self._rest.Eval(context)[entries] if has_rest else np.zeros_like(x)
+                return x + min(elapsed_s / value, 1.0) * (rest - x)
         held = self._held(context, index)
         return x if not len(held) or np.isnan(held).any() else held[-1]
 
