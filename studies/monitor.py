@@ -28,7 +28,8 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.causes import is_outside
 from drake_safety.learning.seeds import FRESH_MOTION, SHIFTS
 from drake_safety.learning.segments import Episode
-from drake_safety.simulation.rollouts import run_motions
+from drake_safety.robots.family import FAMILY
+from drake_safety.simulation.rollouts import MOTION_PIECE_S, run_motions
 from drake_safety.simulation.scenario import Scenario
 from studies.harness import Arrays, ReleaseOption, fingerprint, kept, open_study
 
@@ -38,6 +39,9 @@ def monitor(
     assessment: TrainingOption,
     motions: Annotated[int, typer.Option(help="Undisturbed motions of each shift.", min=2)] = 24,
     hours: Annotated[float, typer.Option(help="Hours of other nominal motion.", min=0.0)] = 5.0,
+    family_hours: Annotated[
+        float, typer.Option(help="Hours of motion on random plants, one each.", min=0.0)
+    ] = 2.0,
     seed: Annotated[int, typer.Option(help="Seed of the shifts' motions.")] = SHIFTS.first,
     release: ReleaseOption = False,
     workers: WorkersOption = None,
@@ -70,17 +74,23 @@ def monitor(
         )
         for name, arrays in found.items():
             study.add("monitor", name, _estimates(arrays, promise))
-        if hours:
-            usual = run_motions(
-                loaded,
-                3600.0 * hours,
-                seed=fresh_seed,
-                num_workers=workers,
-                path=fresh_episodes_folder(study.folder, "motion", fresh_seed, {}),
-                progress=partial(study.stages, "hours of nominal motion"),
-            )
-            alarms = {"false_alarms_per_hour": false_alarms(usual, gamma.detector_)}
-            study.add("monitor", "nominal", alarms)
+        plants = math.ceil(3600.0 * family_hours / MOTION_PIECE_S)
+        lasting: dict[str, tuple[float, dict[str, Any]]] = {"nominal": (hours, {})}
+        if loaded.family is not None:
+            lasting[FAMILY] = family_hours, {"variation": FAMILY, "plants": plants}
+        for name, (duration_h, plants_of) in lasting.items():
+            if duration_h:
+                usual = run_motions(
+                    loaded,
+                    3600.0 * duration_h,
+                    seed=fresh_seed,
+                    num_workers=workers,
+                    path=fresh_episodes_folder(study.folder, "motion", fresh_seed, plants_of),
+                    progress=partial(study.stages, f"hours of motion, {name}"),
+                    **plants_of,
+                )
+                alarms = {"false_alarms_per_hour": false_alarms(usual, gamma.detector_)}
+                study.add("monitor", name, alarms)
         study.entries |= {
             "monitor": gamma.detector_.describe(),
             "kinds": {name.replace(" ", "_"): shift.kind for name, shift in shifts.items()},

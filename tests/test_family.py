@@ -10,6 +10,7 @@ from drake_safety import (
     load_scenario,
     run_episode,
     run_episodes,
+    run_motions,
 )
 from drake_safety.cli import training_folder
 from drake_safety.learning.maps import held_out_segments
@@ -17,6 +18,7 @@ from drake_safety.learning.segments import split, training_segments
 from drake_safety.robots.family import PlantFamily
 from drake_safety.robots.robot import Payload, PlantVariation
 from drake_safety.simulation.dataset import is_same, load_episodes
+from drake_safety.simulation.rollouts import run_motion
 from drake_safety.simulation.scenario_check import check_scenario
 
 pytestmark = pytest.mark.train
@@ -85,6 +87,14 @@ def test_a_plant_depends_on_seed_and_number_alone_and_not_on_the_shares_of_other
 def test_ranges_that_no_plant_can_have_are_refused(ranges, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         load_scenario("pendulum", {"family": {"ranges": ranges}})
+
+
+def test_undisturbed_motions_are_on_the_plants_in_turn(scenario):
+    options = {"variation": "family", "seed": 4, "num_workers": 1}
+    motions = run_motions(scenario, 5.0 * scenario.episode_duration_s, plants=2, **options)
+    assert [one.plant for one in motions] == [1, 2, 1, 2, 1]
+    alone = run_motion(scenario.with_plant(4, 2).make_loop("family"), 1, seed=4)
+    np.testing.assert_array_equal(motions[1].state, alone.state)
 
 
 def test_a_family_leaves_the_nominal_sets_as_they_are(scenario):

@@ -97,6 +97,27 @@ def _family_loops(scenario: Scenario, seed: int, options: dict[str, Any]) -> Mad
     return MadeOnce(key, partial(PlantLoops, CloudPickled(make_loop)))
 
 
+def _loops(
+    scenario: Scenario, variation: str, seed: int, options: dict[str, Any]
+) -> tuple[MadeOnce[Any], ClosedLoop]:
+    """What makes the loops of a process, of a variation or of a family's plants, and one loop."""
+    if variation == FAMILY:
+        make: MadeOnce[Any] = _family_loops(scenario, seed, options)
+        return make, make().of(1)
+    make = worker_loop(scenario, variation, **options)
+    return make, make()
+
+
+def _with_plants(
+    info: EpisodesInfo, scenario: Scenario, plants: int | None, run: Callable[..., Episode]
+) -> Callable[..., Episode]:
+    """Runs each episode of a family on its plant."""
+    if info.variation != FAMILY or scenario.family is None:
+        return run
+    info.plants = scenario.family.plants if plants is None else plants
+    return partial(run_on_plant, run, info)
+
+
 def episode_rng(seed: int, index: int) -> np.random.Generator:
     """Makes the generator of an episode, which depends on the seed and the index alone."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
@@ -244,6 +265,7 @@ def run_motions(
     duration_s: float,
     *,
     variation: str = "nominal",
+    plants: int | None = None,
     seed: int = MOTION.first,
     are_episodes: bool = False,
     num_workers: int | None = None,
@@ -258,15 +280,18 @@ def run_motions(
     these are episodes. ``duration_s`` is of all motions; rows are `scenario.monitor_step_s` apart.
     """
     check_times("run_motions", duration_s=duration_s)
-    make = worker_loop(scenario, variation, **loop_options)
-    step_s, piece_s = scenario.monitor_step_s, motion_piece_s(make(), are_episodes)
+    make, loop = _loops(scenario, variation, seed, loop_options)
+    step_s, piece_s = scenario.monitor_step_s, motion_piece_s(loop, are_episodes)
     options = {**loop_options, "episodes_s" if are_episodes else "undisturbed_s": piece_s}
-    info = episodes_info(make(), seed, options)
+    info = episodes_info(loop, seed, options)
+    info = replace(info, step_s=step_s, num_steps=round(piece_s / step_s))
+    run: Callable[..., Episode] = partial(run_motion, seed=seed, is_episode=are_episodes)
+    run = _with_plants(info, scenario, plants, run)
     return collect_episodes(
-        replace(info, step_s=step_s, num_steps=round(piece_s / step_s)),
+        info,
         range(math.ceil(duration_s / piece_s - 1e-6)),
         make,
-        partial(run_motion, seed=seed, is_episode=are_episodes),
+        run,
         num_workers=num_workers,
         path=path,
         progress=progress,
@@ -347,20 +372,12 @@ def run_episodes(
         until_fall: As of `run_episode`.
         **loop_options: Options of the task; part of the set's hash.
     """
-    make: MadeOnce[Any]
-    if variation == FAMILY:
-        make = _family_loops(scenario, seed, loop_options)
-        loop = make().of(1)
-    else:
-        make = worker_loop(scenario, variation, **loop_options)
-        loop = make()
+    make, loop = _loops(scenario, variation, seed, loop_options)
     info = episodes_info(loop, seed, loop_options | ({"until_fall": True} if until_fall else {}))
     run: Callable[..., Episode] = partial(run_episode, seed=seed, until_fall=until_fall)
     if until_fall:
         info.until = require(loop, CanFall).fall_name
-    if variation == FAMILY and scenario.family is not None:
-        info.plants = scenario.family.plants if plants is None else plants
-        run = partial(run_on_plant, run, info)
+    run = _with_plants(info, scenario, plants, run)
     return collect_episodes(
         info,
         range(num_episodes),
