@@ -11,7 +11,6 @@ from studies.adaptation import adaptation
 from studies.evaluate import evaluate
 from studies.figures import figures
 from studies.gate import gate
-from studies.monitor import monitor
 from studies.publish import readme, ship, store
 from studies.rapt import rapt
 from studies.walking import walking
@@ -24,7 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
-    *(evaluate, adaptation, gate, monitor, rapt, walking),
+    *(evaluate, adaptation, gate, rapt, walking),
     *(figures, store, readme, ship),
 )
 for _command in _COMMANDS:

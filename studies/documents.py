@@ -31,7 +31,7 @@ RESULTS_FOLDER = Path("docs/results")
 EVALUATION_FILE, CARD_FILE = "evaluation.json", "README.md"
 """Of a shipped folder."""
 _TEMPLATES = Path(__file__).with_name("templates")
-_KINDS = "results|summary|monitor|walking"
+_KINDS = "results|summary|shifts|walking"
 _OPEN = rf"<!-- (?P<kind>{_KINDS}): (?P<name>[\w-]+) -->\n"
 _BLOCK = re.compile(rf"(?P<start>{_OPEN}).*?(?P<end><!-- end -->)", re.DOTALL)
 SAFE_RECALL, UNSAFE_RECALL = 0.952, 0.987

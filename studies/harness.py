@@ -6,12 +6,10 @@ long is kept in the folder of the training as it finishes: a stopped study conti
 
 from __future__ import annotations
 
-import hashlib
-import json
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -170,10 +168,3 @@ def _loaded(file: Path) -> Arrays:
             return dict(arrays)
     except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"{file} is damaged ({error!r}): remove it") from error
-
-
-def fingerprint(*things: Any) -> str:
-    """Hash of what determines a result; dataclasses count by their fields."""
-    plain = [asdict(one) if is_dataclass(one) else one for one in things]  # type: ignore[arg-type]
-    text = json.dumps(plain, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -36,7 +36,7 @@ from studies.documents import CARD_FILE, EVALUATION_FILE, card_text, generate
 NUM_EPISODES = 6
 """Number of fresh episodes whose verdicts are stored."""
 # Stored beside the evaluation.
-_STUDIES = ("shifts", "monitor", "walking")
+_STUDIES = ("shifts", "walking")
 DOCUMENTS = [
     Path("README.md"),
     *(Path("docs") / f"{name}.md" for name in ("results", "shifts", "walking")),

@@ -69,7 +69,8 @@ def count_episodes(monkeypatch):
 @pytest.mark.slow
 def test_under_shifts_the_given_seed_is_used_whatever_it_is(monkeypatch, capsys, shuttle_run):
     file, folder = shuttle_run
-    words = ("evaluate", file, "--assessment", folder, "--shifts", 6, "--episodes", 12)
+    words = ("evaluate", file, "--assessment", folder, "--shifts", 8, "--episodes", 12)
+    words += ("--hours", 0.01)
     # The default of evaluations without shifts is a seed like any other.
     for seed, given in ((1_000_000, ("--seed", 1_000_000)), (SHIFTS.first, ())):
         out = folder / f"shifts-{seed}"
@@ -86,7 +87,9 @@ def test_under_shifts_the_given_seed_is_used_whatever_it_is(monkeypatch, capsys,
     for method in ("gamma", "paper"):
         for metric in ("unknown", "confident_error"):
             assert (f"shifts.{shifted[0]}", method, metric) in results
-    assert (f"shifts.{shifted[0]}", "monitor", "delay_s") in results
+    for metric in ("delay_s", "leaves", "confident_error_10s", "silent_confident_error_10s"):
+        assert (f"shifts.{shifted[0]}", "monitor", metric) in results
+    assert results["shifts.nominal", "monitor", "false_alarms_per_hour"].value >= 0.0
 
 
 @pytest.mark.slow

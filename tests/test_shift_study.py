@@ -19,7 +19,6 @@ from drake_safety.evaluation.shift_study import (
 from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
 from drake_safety.learning.change_detector import Alarm
 from drake_safety.learning.segments import Episodes
-from studies.monitor import _estimates
 
 STEP_S = 0.5
 
@@ -112,20 +111,6 @@ def test_a_minute_goes_on_with_the_next_motions_and_an_alarm_is_dont_know():
     found = monitored(late, Gamma())
     assert [one.alarm_s for one in found] == [math.inf, math.inf, 25.0]
     assert [one.leave_s for one in found] == [math.inf, 50.0, math.inf]
-
-
-def test_a_promise_is_missed_where_neither_threshold_nor_alarm_announces_the_end():
-    arrays = {
-        "alarm_s": np.array([30.0, 2.0, 1.0, np.inf, 9.0]),
-        "leave_s": np.array([20.0, 4.0, 5.0, 60.0, 9.5]),
-        "error_s": np.zeros((5, 2)),
-        "silent_error_s": np.zeros((5, 2)),
-        "least": np.array([0.8, 0.7, 0.3, 0.3, np.nan]),
-    }
-    assert "missed" not in _estimates(arrays, None)
-    found = _estimates(arrays, SimpleNamespace(threshold=0.7))
-    assert (found["silent_missed"].value, found["missed"].value) == (0.5, 0.25)
-    assert (found["missed"].n, found["leaves"].value) == (4, 1.0)
 
 
 def test_false_alarms_are_those_of_undisturbed_motion():

@@ -23,10 +23,6 @@ STUDIES = {
         "evaluation",
         "plans.mlp.auc, plans.gradient_boosting.safe_recall, difference.first.mlp.brier",
     ),
-    "monitor --motions 2 --hours 0.001": (
-        "monitor",
-        "monitor.variation_actual.confident_error_60s, monitor.nominal.false_alarms_per_hour",
-    ),
     "adaptation --feedback 40 --evaluate 20 --pools 2 --scratch": (
         "adapted-actual/study",
         "sharpened.calibrated.adapted 40.brier, paper.grid.scratch 40.auc, "

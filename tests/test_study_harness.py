@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from drake_safety.evaluation.results import Results
-from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.learning.seeds import RELEASE
-from studies.harness import fingerprint, kept, open_study
+from studies.harness import kept, open_study
 
 CALLS = []
 
@@ -47,9 +46,3 @@ def test_a_study_says_whether_its_seeds_are_those_of_the_release(tmp_path):
             assert study.seeds["evaluation"] == study.seed == 5 + RELEASE * release
         entries = Results.read(tmp_path / "tried.json").entries
         assert entries["seed"] == study.seed and entries["seed_use"].split()[0] == use
-
-
-def test_a_fingerprint_is_of_all_that_determines_a_result():
-    one, other = AssessmentParameters(), AssessmentParameters(min_count=7)
-    assert fingerprint(one, 3) == fingerprint(AssessmentParameters(), 3)
-    assert len({fingerprint(one, 3), fingerprint(other, 3), fingerprint(one, 4)}) == 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -42,7 +43,7 @@ from drake_safety.learning.segments import Episodes, split
 from drake_safety.robots.family import FAMILY
 from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.motion import Motion
-from drake_safety.simulation.rollouts import run_motions
+from drake_safety.simulation.rollouts import MOTION_PIECE_S, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
 _FAMILY_PLANTS = 20  # Fresh ones.
@@ -91,8 +92,11 @@ def evaluate(
         int | None, Option(help="Throws at the actual plant; 600 for tasks with recovery.", min=0)
     ] = None,
     shifts: Annotated[
-        int, Option(help="Evaluate changed plants and sensors instead, by so many motions.", min=0)
+        int, Option(help="Evaluate changed plants and sensors instead, by so many episodes.", min=0)
     ] = 0,
+    hours: Annotated[
+        float, Option(help="Hours of undisturbed motion for false alarms, with --shifts.", min=0.0)
+    ] = 0.2,
     seed: Annotated[int | None, Option(help="First seed; another with --shifts.")] = None,
     out: Annotated[Path | None, Option(help="Folder of results; by default ASSESSMENT.")] = None,
     workers: console.WorkersOption = None,
@@ -112,7 +116,7 @@ def evaluate(
         require(loop, HasBall, "evaluate: pass --throws 0")
     with evaluating(loaded, assessment, folder, block, seed, workers) as evaluation:
         if shifts:
-            _add_shifts(evaluation, shifts, episodes)
+            _add_shifts(evaluation, shifts, episodes, hours)
             return
         evaluation.entries["calibration_episodes"] = calibration_episodes
         test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
@@ -215,7 +219,7 @@ def add_throws(
     return logs
 
 
-def _add_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> None:
+def _add_shifts(evaluation: Evaluation, num_episodes: int, num_nominal: int, hours: float) -> None:
     """Evaluates both modes on changed plants and faulty sensors, and on nominal motions."""
     scenario, seed, stages = evaluation.scenario, evaluation.seeds["shifts"], evaluation.stages
     workers, gamma = evaluation.workers, evaluation.assessments[MODES[0]]
@@ -225,7 +229,7 @@ def _add_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> N
     judged = {"nominal": shift_study.shift_estimates(names, nominal[:1000])}
     kinds: dict[str, str] = {"nominal": "nominal"}
     if scenario.family is not None:
-        number = _FAMILY_PLANTS * max(num_motions // 4, 1)
+        number = _FAMILY_PLANTS * max(num_episodes // 4, 1)
         options = {**scenario.options_for("evaluation"), "plants": _FAMILY_PLANTS}
         report = partial(stages, "motions on the family's plants")
         drawn = folders.run_fresh_episodes(
@@ -238,24 +242,41 @@ def _add_shifts(evaluation: Evaluation, num_motions: int, num_nominal: int) -> N
         shifted = shifted_scenario(scenario, name, shift.variation)
         options = {**scenario.options_for("evaluation"), **shift.options}
         episodes = folders.run_fresh_episodes(
-            shifted, evaluation.run_folder, num_motions, seed, None, workers, name, **options
+            shifted, evaluation.run_folder, num_episodes, seed, None, workers, name, **options
         )
         motions = shift_study.run_monitored(
-            shifted, name, num_motions, seed, gamma.detector_, options=options, num_workers=workers
+            shifted,
+            name,
+            max(num_episodes // 4, 2),
+            seed,
+            gamma.detector_,
+            options=options,
+            num_workers=workers,
         )
         watched = shift_study.monitor_estimates(shift_study.monitored(motions, gamma))
         judged[name] = shift_study.shift_estimates(names, episodes)
         judged[name] |= {("monitor", metric): one for metric, one in watched.items()}
     stages("shifted motions", len(shifts), len(shifts))
     fresh_seed = FRESH_MOTION.first_beside(seed)
-    duration_s = num_nominal * scenario.episode_duration_s
-    folder = folders.fresh_episodes_folder(evaluation.run_folder, "motion", fresh_seed, {})
-    report = partial(stages, "undisturbed nominal motion")
-    usual = run_motions(
-        scenario, duration_s, seed=fresh_seed, num_workers=workers, path=folder, progress=report
-    )
-    alarms = shift_study.false_alarms(usual, gamma.detector_)
-    judged["nominal"]["monitor", "false_alarms_per_hour"] = alarms
+    lasting: dict[str, dict[str, Any]] = {"nominal": {}}
+    if scenario.family is not None:
+        plants = math.ceil(3600.0 * hours / MOTION_PIECE_S)
+        lasting[FAMILY] = {"variation": FAMILY, "plants": plants}
+    for name, of_plants in lasting.items():
+        if hours:
+            usual = run_motions(
+                scenario,
+                3600.0 * hours,
+                seed=fresh_seed,
+                num_workers=workers,
+                path=folders.fresh_episodes_folder(
+                    evaluation.run_folder, "motion", fresh_seed, of_plants
+                ),
+                progress=partial(stages, f"undisturbed motion, {name}"),
+                **of_plants,
+            )
+            alarms = shift_study.false_alarms(usual, gamma.detector_)
+            judged[name]["monitor", "false_alarms_per_hour"] = alarms
     for name, each in judged.items():
         evaluation.add({(f"shifts.{name}", *key): one for key, one in each.items()})
     evaluation.entries["kinds"] = kinds | {name: shift.kind for name, shift in shifts.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from drake_safety.learning.calibration import MOTION, PLAN
 from drake_safety.learning.causes import is_outside
 from drake_safety.learning.change_detector import ChangeDetector, rows_of, usual_rows
 from drake_safety.learning.segments import DIVERGED, Episode, Episodes
+from drake_safety.robots.family import FAMILY
 from drake_safety.simulation.rollouts import run_motion, worker_loop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import map_items
@@ -165,9 +167,13 @@ def last_rows(motion: Episode, assessment: SafetyAssessment, every: int) -> np.n
 
 
 def monitor_estimates(minutes: Sequence[Minute]) -> dict[str, Estimate]:
-    """Alarms, their delay, and Γ's confident errors outside alarms."""
+    """Alarms, their delay, and Γ's confident errors outside alarms, and without a monitor."""
     delay_s = np.array([one.alarm_s for one in minutes])
+    num_leaving = sum(math.isfinite(one.leave_s) for one in minutes)
+    silent = error_estimates([one.silent_error_s for one in minutes])
     return {
+        "leaves": proportion(num_leaving, len(minutes)),
+        **{f"silent_{metric}": one for metric, one in silent.items()},
         "alarmed": proportion(int(np.isfinite(delay_s).sum()), len(delay_s)),
         "delay_s": quantile(delay_s, 0.5, bootstrap=BOOTSTRAP),
         "delay_95_s": quantile(delay_s, 0.95, bootstrap=BOOTSTRAP),
@@ -185,7 +191,7 @@ def error_estimates(error_s: Sequence[Sequence[float]]) -> dict[str, Estimate]:
 
 
 def false_alarms(motions: Episodes, detector: ChangeDetector) -> Estimate:
-    """False alarms per hour on motions of the nominal plant, not shortly before they leave it."""
+    """False alarms per hour on undisturbed motions, not shortly before they leave the safe set."""
     rows = [one for one in usual_rows(motions) if len(one)]
     count = sum(len(detector.watch([one])[1]) for one in rows)
     return metrics.rate_per_hour(count, sum(map(len, rows)) * detector.step_s, len(rows))
@@ -195,11 +201,12 @@ def shifts_tables(results: Results) -> list[Table]:
     """The table of all shifts, if there are any."""
     sets = dict.fromkeys(set for set, _, metric in results if metric == "unsafe")
     meaning = _MEANING
-    if false := results.get(("shifts.nominal", "monitor", "false_alarms_per_hour")):
-        meaning += (
-            f" On {false.n} undisturbed nominal motions the monitor gives {false.value:.2f} "
-            f"({false.low:.2f}–{false.high:.2f}) false alarms an hour."
-        )
+    for name in ("nominal", FAMILY):
+        if false := results.get((f"shifts.{name}", "monitor", "false_alarms_per_hour")):
+            meaning += (
+                f" On {false.n} undisturbed motions, {name}, the monitor gives {false.value:.2f} "
+                f"({false.low:.2f}–{false.high:.2f}) false alarms an hour."
+            )
     there = {(method, metric) for _, method, metric in results}
     shown = [(method, one) for method, one in _COLUMNS if (method, one.key) in there]
     rows, columns = [], [column for _, column in shown]
