@@ -1,3 +1,5 @@
+from copy import copy
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -54,3 +56,10 @@ def test_the_map_shows_every_segment_at_its_point_and_every_count(assessment, fr
     points = assessment.training_.points[0]
     inside = np.abs(points).max(axis=1) < assessment.grid_.half_width
     assert sum(int(count) for count in [text.get_text() for text in middle.texts]) == inside.sum()
+
+
+def test_an_assessment_from_which_no_segment_was_left_out_has_the_same_map(assessment, fresh):
+    texts = [text.get_text() for text in embedding_figure(assessment, fresh).axes[1].texts]
+    whole = copy(assessment)
+    whole.training_ = replace(assessment.training_, count=None)
+    assert [one.get_text() for one in embedding_figure(whole, fresh).axes[1].texts] == texts

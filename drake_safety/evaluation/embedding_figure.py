@@ -31,8 +31,12 @@ _SAFETY = LinearSegmentedColormap.from_list(
 def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure:
     """Plots the first map: segments, beliefs of the cells, and causes if two have 5 % or more."""
     cells, grid = assessment.beliefs_[0], assessment.grid_
-    assert assessment.training_.count is not None
-    count = assessment.training_.count[0]
+    training = assessment.training_
+    if training.count is None:  # No segment was left out.
+        inside = grid.locate(training.points[0])
+        count = np.bincount(inside[inside >= 0], minlength=grid.num_cells)
+    else:
+        count = training.count[0]
     unsafe = (count[:, None] * cells[:, 3:]).sum(axis=0)  # By cause; see `learning.beliefs`.
     has_causes = (unsafe >= _LEAST_CAUSE * unsafe.sum()).sum() > 1
     with style.drawing_style():
