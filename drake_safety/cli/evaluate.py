@@ -155,7 +155,8 @@ def evaluating(
         "seed": next(iter(seeds.values())),
         "seed_use": use_of(next(iter(seeds.values()))),
         "training_seed": trained[0].seed,
-        "training_episodes": sum(one.num_episodes for one in trained),
+        "training_episodes": trained[0].num_episodes,
+        "family_episodes": sum(one.num_episodes for one in trained[1:]),
         "assessment_sha256": hashes,
     }
     results = Results(evaluation.estimates, made | evaluation.entries)
