@@ -190,10 +190,12 @@ def test_metadata_are_the_contract(tmp_path):
     expected = {"scenario": "laikago_balancing", "mode": "sharpened", "plant": "nominal"}
     expected |= {"adaptation": None, "schema_version": 1, "constraint_names": info.constraint_names}
     assert {name: contract[name] for name in expected} == expected
-    stored = {entry["kind"]: entry for entry in contract["calibrations"]}
-    for kind, calibration in assessment.calibrations_.items():
-        for name in ("threshold", "variation", "promise"):
-            assert stored[kind][name] == getattr(calibration, name)
+    assert len(contract["calibrations"]) == 4  # Of plans and motions, nominal and of the family.
+    for stored, one in zip(
+        contract["calibrations"], assessment.calibrations_.values(), strict=True
+    ):
+        for name in ("kind", "threshold", "variation", "promise"):
+            assert stored[name] == getattr(one, name)
     unsure = np.array([[0.0, 0.0, contract["unknown_above"]]])
     assert not is_unknown(unsure, assessment.parameters.initial_uncertainty)
     assert is_unknown(unsure + 1e-9, assessment.parameters.initial_uncertainty)

@@ -20,12 +20,12 @@ class SensorFaults(LeafSystem):
     .. pydrake_system::
 
         name: SensorFaults
-        input_ports: [input: n, rest: n (of fades, optional)]
+        input_ports: [input: n]
         output_ports: [output: n]
 
     Delays and ``freeze`` hold samples, taken every ``period_s`` [s]: a delay's output is the input
     of ``value / period_s`` samples ago, or the first sample until that is so old. ``fade`` moves
-    the entries to those of ``rest``, zero by default, in ``value`` seconds.
+    the entries to those of a further input port ``rest``, zero by default, in ``value`` seconds.
     """
 
     def __init__(
