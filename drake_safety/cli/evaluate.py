@@ -245,15 +245,9 @@ def _add_shifts(evaluation: Evaluation, num_episodes: int, num_nominal: int, hou
         episodes = folders.run_fresh_episodes(
             shifted, evaluation.run_folder, num_episodes, seed, None, workers, name, **options
         )
-        motions = shift_study.run_monitored(
-            shifted,
-            name,
-            max(num_episodes // 4, 2),
-            seed,
-            gamma.detector_,
-            options=options,
-            num_workers=workers,
-        )
+        few = max(num_episodes // 4, 2)
+        with_: dict[str, Any] = {"options": options, "num_workers": workers}
+        motions = shift_study.run_monitored(shifted, name, few, seed, gamma.detector_, **with_)
         watched = shift_study.monitor_estimates(shift_study.monitored(motions, gamma))
         judged[name] = shift_study.shift_estimates(names, episodes)
         judged[name] |= {("monitor", metric): one for metric, one in watched.items()}

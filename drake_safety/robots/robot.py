@@ -113,8 +113,10 @@ def _set_friction(
         # Drake combines the coefficients of foot and ground, 2 m n / (m + n).
         mu = ground
         if name in of_feet:
-            mu = min(of_feet[name], 1.9 * ground)
-            mu = mu * ground / (2.0 * ground - mu)
+            if (wanted := of_feet[name]) >= 2.0 * ground:
+                text = f"friction of foot '{name}' must be below twice the ground's {ground:g}"
+                raise ValueError(f"robot '{robot.name}': {text}; got {wanted:g}")
+            mu = wanted * ground / (2.0 * ground - wanted)
         for geometry in plant.GetCollisionGeometriesForBody(body):
             centre = inspector.GetPoseInFrame(geometry).translation()
             offsets = np.linalg.norm(np.array(foot.contact_points) - centre, axis=1)

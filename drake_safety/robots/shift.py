@@ -8,15 +8,8 @@ from pydantic import Field, FiniteFloat
 
 from drake_safety.files.schema import NotNegative, Positive, Triple, schema
 
-FAULTS = {
-    "bias": True,
-    "drift": True,
-    "zero": False,
-    "scale": True,
-    "delay": True,
-    "freeze": False,
-    "fade": True,
-}
+FAULTS = {one: True for one in ("bias", "drift", "scale", "delay", "fade")}
+FAULTS |= {"zero": False, "freeze": False}
 """Kinds of faults, and whether they have a value."""
 
 

@@ -82,7 +82,7 @@ def record_episodes(
         step_s: Time between two rows, the unit of H [s].
         draw_plant: Draws a random plant by a generator; the set is of a family then, for the
             argument ``family`` of `SafetyAssessment.fit`.
-        plants: Number of the family's plants, which the episodes have in turn.
+        plants: Number of the family's plants; the episodes take turns on them.
         ports: The diagram's port names, by those above.
         state_names: Names of the n_s entries of ``state``; numbered by default.
         monitor_period_s: Sampling period of ``safe`` [s]; a tenth of ``step_s`` by default.

@@ -100,7 +100,7 @@ def _family_loops(scenario: Scenario, seed: int, options: dict[str, Any]) -> Mad
 def _loops(
     scenario: Scenario, variation: str, seed: int, options: dict[str, Any]
 ) -> tuple[MadeOnce[Any], ClosedLoop]:
-    """What makes the loops of a process, of a variation or of a family's plants, and one loop."""
+    """Makes a process's loops, of a variation or of a family's plants; also returns one loop."""
     if variation == FAMILY:
         make: MadeOnce[Any] = _family_loops(scenario, seed, options)
         return make, make().of(1)

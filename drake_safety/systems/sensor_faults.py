@@ -25,7 +25,7 @@ class SensorFaults(LeafSystem):
 
     Delays and ``freeze`` hold samples, taken every ``period_s`` [s]: a delay's output is the input
     of ``value / period_s`` samples ago, or the first sample until that is so old. ``fade`` moves
-    the entries to those of a further input port ``rest``, zero by default, in ``value`` seconds.
+    the entries in ``value`` seconds to the same entries of a port ``rest``, by default to zero.
     """
 
     def __init__(
