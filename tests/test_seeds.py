@@ -6,7 +6,7 @@ import pytest
 import typer
 
 from drake_safety import __version__
-from drake_safety.cli import adapt, calibrate, gate, play, run, train
+from drake_safety.cli import adapt, calibrate, gate, play, pushes, rate, run, train
 from drake_safety.evaluation.episode_study import evaluate_episodes
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.learning import seeds
@@ -61,7 +61,8 @@ def test_the_seeds_of_a_release_are_far_from_those_of_development():
 
 def test_every_command_takes_its_default_seed_from_the_table():
     blocks = {train.train: seeds.TRAINING, calibrate.calibrate: seeds.CALIBRATION}
-    blocks |= {adapt.adapt: seeds.ADAPTATION, gate.gate: seeds.GATE, gate.rate: seeds.RATE}
+    blocks |= {adapt.adapt: seeds.ADAPTATION, gate.gate: seeds.GATE, rate.rate: seeds.RATE}
+    blocks |= {pushes.pushes: seeds.PUSHES}
     blocks |= dict.fromkeys((run.run, play.play), seeds.DEMONSTRATION)
     for command, block in blocks.items():
         assert inspect.signature(command).parameters["seed"].default == block.first

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import PortDataType
 from pydrake.trajectories import PiecewisePolynomial
 
@@ -13,13 +14,15 @@ from drake_safety import load_assessment
 from drake_safety.control.recovery_step import RecoveryStepParameters
 from drake_safety.control.safe_sets import BalanceLimits, BalanceSafeSet
 from drake_safety.diagrams.walking.safe_set import WalkingLimits, WalkingSafeSet
-from drake_safety.robots.robot import ObservationNoise
+from drake_safety.models import load_robot
+from drake_safety.robots.robot import ObservationNoise, add_robot
 from drake_safety.robots.shift import Fault
 from drake_safety.systems.assessor_inputs import AssessorInputs
 from drake_safety.systems.change_monitor import ChangeMonitor
 from drake_safety.systems.feedback_recorder import FeedbackRecorder
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
 from drake_safety.systems.monitored_assessor import MonitoredSafetyAssessor
+from drake_safety.systems.motor_curves import MotorCurves
 from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
 from drake_safety.systems.recovery_switch import RecoverySwitch
 from drake_safety.systems.recovery_trigger import RecoveryTrigger
@@ -47,12 +50,26 @@ SIZES = {"n_s": 36, "n_w": 36, "n_z": 3, "H": LEARNED.info_.horizon, "n_c": 3}
 SIZES["n_f"] = len(LEARNED.info_.feature_names)
 DOUBLE = {"n_s": 2, "n_z": 3, "H": 2, "n_f": 3, "n_c": 2}
 RECORDED = {"n_s": 1, "n_z": 3, "H": 3, "n_f": 1, "n_c": 2, "n_q": 1, "n_v": 1, "n": 4}
+
+
+def motor_curves():
+    plant = MultibodyPlant(0.001)
+    instance = add_robot(plant, load_robot("laikago"))
+    plant.Finalize()
+    return MotorCurves(plant, instance, ["FR_hip_joint", "FR_calf_joint"])
+
+
 # What makes a system, the symbols in its docstring, and its direct feedthrough.
 CASES = {
     SensorFaults: (
         lambda: SensorFaults(["a", "b"], [Fault(kind="delay", value=0.2)], **PERIOD),
         {"n": 2},
         ["input output"],
+    ),
+    MotorCurves: (
+        motor_curves,
+        {"n_j": 2},
+        [f"{port} desired_joint_state" for port in ("desired_joint_state", "joint_state")],
     ),
     RecoveryTrigger: (lambda: RecoveryTrigger(**PERIOD), {}, []),
     TrajectoryPlanner: (

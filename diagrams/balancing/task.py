@@ -90,6 +90,7 @@ class Balancing(LeggedLoop):
         joint_state = controller.GetOutputPort("desired_joint_state")
         received = self._servo_command(builder, joint_state)
         physics.connect_servos(builder, kinematics.joint_names, received)
+        self._add_push_source(builder)
         self._assess(
             builder,
             BalanceSafeSet(kinematics, parameters.safe_set),

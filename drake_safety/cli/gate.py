@@ -1,4 +1,4 @@
-"""``drake-safety gate`` and ``rate``: how often loops fail, in as few episodes as it takes."""
+"""``drake-safety gate``: whether a loop fails more often than another one."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import contextlib
 import html
 import math
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+from pydrake.geometry import Meshcat
 from typer import Argument, Exit, Option
 
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
-from drake_safety.evaluation.failure_rate import estimate_failure_rate
 from drake_safety.evaluation.figure_style import save, spoken
 from drake_safety.evaluation.gate_figure import gate_figure
 from drake_safety.evaluation.loop_comparison import (
@@ -34,7 +34,7 @@ from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.tables import Column
 from drake_safety.files.atomic import write_file
 from drake_safety.files.reading import parse_yaml
-from drake_safety.learning.seeds import GATE, RATE
+from drake_safety.learning.seeds import GATE
 from drake_safety.live.following_camera import follow
 from drake_safety.policies.policy_network import network_kinds
 from drake_safety.simulation.rollouts import run_episode
@@ -90,7 +90,11 @@ def gate(
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
     if replay is not None:
-        return _record(first, others, replay, seed, folder / f"episode-{replay}.html")
+        motions = {
+            name: partial(_record_episode, (first, plant), replay, seed)
+            for name, plant in {"baseline": first, **others}.items()
+        }
+        return record_motions(motions, folder / f"episode-{replay}.html")
     gamma = None
     with contextlib.suppress(ValueError):  # That of this very scenario, if one is shipped.
         shipped = folders.assessment_folder(first.scenario, None)
@@ -119,56 +123,11 @@ def gate(
             _report(first, verdicts, metric, alpha / len(others), worse_by)
             candidates_ = {name: asdict(one) for name, one in verdicts.items()}
             entries = {"seed": seed, "metric": metric, "candidates": candidates_}
-            _write(folder / "gate.json", first, Results({}, entries))
+            write_results(folder / "gate.json", first, Results({}, entries))
             for picture in save(gate_figure(verdicts), folder / "gate"):
                 console.say("picture", picture)
     known = {one.verdict for one in verdicts.values()}
     raise Exit(1 if WORSE in known else 2 if UNDECIDED in known else 0)
-
-
-def rate(
-    scenario: console.ScenarioArgument,
-    assessment: console.AssessmentOption = None,
-    variation: console.VariationOption = "actual",
-    metric: MetricOption = UNSAFE,
-    starts: Annotated[int, Option(help="Starts of which Γ is asked.", min=10)] = 10_000,
-    episodes: Annotated[int, Option(help="Starts that are simulated.", min=10)] = 500,
-    out: OutOption = None,
-    seed: Annotated[int, Option(help="Seed of the episodes.")] = RATE.first,
-    workers: console.WorkersOption = None,
-    cluster: console.ClusterOption = None,
-) -> None:
-    """Estimate a failure rate from few episodes, chosen where Γ says that they tell most.
-
-    The estimate is unbiased however wrong Γ is. Episodes are kept in OUT: the same command
-    continues.
-    """
-    loaded, _, gamma = folders.open_assessment(scenario, assessment)
-    gamma.check_unused(seed)
-    folder = out or Path("runs") / f"{loaded.name}-rate"
-    folders.check_writable(folder)
-    with console.open_stages() as stages:
-        estimated = estimate_failure_rate(
-            loaded,
-            gamma,
-            variation=variation,
-            metric=metric,
-            num_starts=starts,
-            num_rollouts=episodes,
-            seed=seed,
-            num_workers=workers,
-            path=folder / "episodes",
-            progress=stages,
-        )
-    failures = estimated.failures
-    text = Column("", "", "%", digits=2).text(estimated.rate)
-    row = (text, estimated.rate.n, len(failures), round(estimated.plain_rollouts))
-    columns = ("failure rate", "episodes", "failures", "random episodes of the same variance")
-    _show(f"{loaded.name}, {variation}: {metric}", columns, [row])
-    _show_episodes("Failures", failures, metric)
-    figures = {("", "", "failure_rate"): estimated.rate}
-    entries = {"seed": seed, "metric": metric} | asdict(estimated)
-    _write(folder / "rate.json", ComparedPlant(loaded, variation), Results(figures, entries))
 
 
 def changed_plant(scenario: str, changes: str) -> ComparedPlant:
@@ -190,24 +149,30 @@ def changed_plant(scenario: str, changes: str) -> ComparedPlant:
     return ComparedPlant(loaded, variation)
 
 
-def _record(
-    first: ComparedPlant, others: Mapping[str, ComparedPlant], index: int, seed: int, file: Path
-) -> None:
-    """Writes recordings of one episode in all loops, side by side."""
+def record_motions(motions: Mapping[str, Callable[[Meshcat], str]], file: Path) -> None:
+    """Writes recordings of motions by name, side by side; each returns how it ends."""
     panels = [_PANELS]
-    for side, (name, plant) in enumerate({"baseline": first, **others}.items()):
+    for name, move in motions.items():
         viewer = console.open_viewer()
-        loop = make_paired((first, plant), min(side, 1), meshcat=viewer)
-        viewer.StartRecording()
-        camera = follow(loop, viewer)
-        episode = run_episode(loop, index, seed=seed, after_leaving_s=math.inf, monitor=camera)
+        end = move(viewer)
         viewer.StopRecording()
         viewer.PublishRecording()
-        end = f"leaves the safe set: {spoken(episode.cause)}"
-        console.say(f"{name}: {'stays in the safe set' if episode.is_safe else end}")
+        console.say(f"{name}: {end}")
         panels.append(f'<iframe srcdoc="{html.escape(viewer.StaticHtml())}"></iframe>')
     write_file(file, "\n".join(panels))
     console.say("recording, in this order:", file)
+
+
+def _record_episode(
+    pair: tuple[ComparedPlant, ComparedPlant], index: int, seed: int, viewer: Meshcat
+) -> str:
+    """Records one episode of a pair's second loop; returns how it ends."""
+    loop = make_paired(pair, int(pair[0] is not pair[1]), meshcat=viewer)
+    viewer.StartRecording()
+    camera = follow(loop, viewer)
+    episode = run_episode(loop, index, seed=seed, after_leaving_s=math.inf, monitor=camera)
+    end = f"leaves the safe set: {spoken(episode.cause)}"
+    return "stays in the safe set" if episode.is_safe else end
 
 
 def _report(
@@ -224,11 +189,11 @@ def _report(
         rows.append((name, one.verdict, one.pairs, counts, points.text(one.difference[-1])))
     failing = "fail: both, only baseline, only candidate"
     columns = ("candidate", "verdict", "pairs", failing, "difference [points]")
-    _show(f"{first.scenario.name}, {first.variation}: {metric}", columns, rows)
+    show_rows(f"{first.scenario.name}, {first.variation}: {metric}", columns, rows)
     for name, one in verdicts.items():
         new, old = one.newly_failing, one.no_longer_failing
-        _show_episodes(f"{name}: episodes that newly fail", new, metric)
-        _show_episodes(f"{name}: episodes that fail no longer", old, metric)
+        show_episodes(f"{name}: episodes that newly fail", new, metric)
+        show_episodes(f"{name}: episodes that fail no longer", old, metric)
         for each in [*new, *old][:1]:
             replay = f"--replay={each.episode}"
             console.say("to see one:", console.command_line("drake-safety", replay))
@@ -238,7 +203,7 @@ def _report(
     )
 
 
-def _show_episodes(title: str, episodes: Sequence[Outcome], metric: str) -> None:
+def show_episodes(title: str, episodes: Sequence[Outcome], metric: str) -> None:
     """Prints episodes that failed, the first ones in full."""
     if len(episodes) > _MOST_SHOWN:
         title += f": the first {_MOST_SHOWN} of {len(episodes)}"
@@ -248,17 +213,17 @@ def _show_episodes(title: str, episodes: Sequence[Outcome], metric: str) -> None
         belief = ", ".join(f"{mass:.2f}" for mass in one.belief or ()) or "–"
         cause = spoken(one.cause or metric)
         rows.append((one.episode, cause, f"{one.time_s:.2f}", commanded, belief))
-    _show(title, ("episode", "cause", "at [s]", "commanded", "Γ: safe, unsafe, unknown"), rows)
+    show_rows(title, ("episode", "cause", "at [s]", "commanded", "Γ: safe, unsafe, unknown"), rows)
 
 
-def _show(title: str, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
+def show_rows(title: str, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
     """Prints a table, unless it is empty."""
     cells = [[*map(str, row)] for row in rows]
     if cells:
         console.show(console.new_table(*columns, rows=cells, title=title))
 
 
-def _write(file: Path, plant: ComparedPlant, results: Results) -> None:
+def write_results(file: Path, plant: ComparedPlant, results: Results) -> None:
     """Writes results, and what made them."""
     made = console.made_by(plant.scenario.name) | {"variation": plant.variation}
     results.entries = made | results.entries

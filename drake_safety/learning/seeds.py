@@ -53,6 +53,7 @@ FRESH_MOTION = SeedBlock(9_100_000, ("fresh motion",))
 ANOMALIES = SeedBlock(10_000_000, ("unperturbed", "perturbed", "thresholds"))
 GATE = SeedBlock(11_000_000, ("pairs of two loops",))
 RATE = SeedBlock(12_000_000, ("failure rate",))
+PUSHES = SeedBlock(14_000_000, ("pushes",))  # Of the card.
 FALLS = SeedBlock(13_000_000, ("falls",))  # Episodes that go on outside the safe set.
 
 

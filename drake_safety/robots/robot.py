@@ -72,6 +72,8 @@ class PlantVariation:
     input_noise: ObservationNoise = field(default_factory=ObservationNoise)
     payload: Payload | None = None  # A mass that the controllers do not model.
     shift: Shift | None = None  # Lasting conditions that training does not have.
+    # ``dc``: the torque of servos falls with speed; by default it is constant. See `MotorCurves`.
+    motors: Literal["dc"] | None = None
 
 
 PAYLOAD_RADIUS_M = 0.05

@@ -31,6 +31,7 @@ from drake_safety.simulation.observers import Observers, add_faults
 from drake_safety.simulation.planned_loop import PlannedLoop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.assessor_inputs import AssessorInputs
+from drake_safety.systems.motor_curves import MotorCurves
 from drake_safety.systems.push_source import PushSource
 
 # Drake's discrete updates at one time see the state before any of them. So a system whose input is
@@ -85,6 +86,8 @@ class LeggedLoop(PlannedLoop):
     def _add_robot(
         self, builder: DiagramBuilder, scene: Scene, *, servos: bool, meshcat: Meshcat | None
     ) -> Physics:
+        if self._plant_variation.motors and not servos:
+            raise ValueError(f"variation '{self.variation}': motors: dc needs position servos")
         physics = self._physics = add_physics(
             builder,
             self.robot,
@@ -136,20 +139,30 @@ class LeggedLoop(PlannedLoop):
             faults.append(Fault(kind="delay", value=shift.command_delay_s))
         if not faults:
             return command
-        rest = None
-        if is_servo:  # Without torque where it should be.
-            num_q, num_states = self.kinematics.num_positions, self.kinematics.num_states
-            joints = np.r_[NUM_BASE_POSITIONS:num_q, num_q + NUM_BASE_VELOCITIES : num_states]
-            gain = builder.AddNamedSystem("joint_state", MatrixGain(D=np.eye(num_states)[joints]))
-            builder.Connect(self._physics.state, gain.get_input_port())
-            rest = gain.get_output_port()
+        # A servo without torque wants the joint where it is.
+        rest = self._joint_state(builder, "joint_state") if is_servo else None
         period_s = self.scenario.time_step_s
         return add_faults(builder, "command_faults", command, faults, names, period_s, rest)
+
+    def _joint_state(self, builder: DiagramBuilder, name: str) -> OutputPort:
+        num_q, num_states = self.kinematics.num_positions, self.kinematics.num_states
+        joints = np.r_[NUM_BASE_POSITIONS:num_q, num_q + NUM_BASE_VELOCITIES : num_states]
+        gain = builder.AddNamedSystem(name, MatrixGain(D=np.eye(num_states)[joints]))
+        builder.Connect(self._physics.state, gain.get_input_port())
+        return gain.get_output_port()
 
     def _servo_command(self, builder: DiagramBuilder, command: OutputPort) -> OutputPort:
         names = self.kinematics.joint_names
         entries = [*names, *(f"{name}_rate" for name in names)]
-        return self._as_received(builder, command, entries, is_servo=True)
+        received = self._as_received(builder, command, entries, is_servo=True)
+        if self._plant_variation.motors is None:
+            return received
+        curves = MotorCurves(self.plant, self.robot_instance, names)
+        builder.AddNamedSystem("motor_curves", curves)
+        builder.Connect(received, curves.GetInputPort("desired_joint_state"))
+        state = self._joint_state(builder, "motor_state")
+        builder.Connect(state, curves.GetInputPort("joint_state"))
+        return curves.get_output_port()
 
     def _assess(
         self,

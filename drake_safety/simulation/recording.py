@@ -27,7 +27,6 @@ from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.rollouts import (
     PlantLoops,
     collect_episodes,
-    episode_rng,
     run_on_plant,
     seed_random_sources,
 )
@@ -88,6 +87,57 @@ def record_episodes(
         monitor_period_s: Sampling period of ``safe`` [s]; a tenth of ``step_s`` by default.
         num_workers, path, progress: As of `run_episodes`.
     """
+    options: dict[str, Any] = {"num_workers": num_workers, "path": path, "progress": progress}
+    info, make, run = prepare_recording(
+        make_diagram,
+        reset=reset,
+        duration_s=duration_s,
+        step_s=step_s,
+        parameters=parameters,
+        draw_plant=draw_plant,
+        plants=plants,
+        ports=ports,
+        state_names=state_names,
+        output_names=output_names,
+        feature_names=feature_names,
+        constraint_names=constraint_names,
+        name=name,
+        monitor_period_s=monitor_period_s,
+        seed=seed,
+    )
+    call = run if draw_plant is None else partial(run_on_plant, run, info)
+    episodes = collect_episodes(info, range(num_episodes), make, call, is_repeated=True, **options)
+    episodes.warn()
+    if ended := [e.index for e in episodes if e.is_safe and e.num_steps < info.num_steps]:
+        _LOGGER.warning(
+            "a system of '%s' ended %d of %d episodes early, as episode %d, and they count as safe",
+            *(info.scenario, len(ended), len(episodes), ended[0]),
+        )
+    return episodes
+
+
+def prepare_recording(
+    make_diagram: Callable[..., Diagram],
+    *,
+    reset: Reset,
+    duration_s: float,
+    step_s: float,
+    parameters: Mapping[str, Any] | None = None,
+    draw_plant: Callable[[np.random.Generator], Any] | None = None,
+    plants: int = 64,
+    ports: Mapping[str, str] | None = None,
+    state_names: Sequence[str] | None = None,
+    output_names: Sequence[str] | None = None,
+    feature_names: Sequence[str] | None = None,
+    constraint_names: Sequence[str] | None = None,
+    name: str | None = None,
+    monitor_period_s: float | None = None,
+    seed: int = 0,
+) -> tuple[EpisodesInfo, MadeOnce[Any], Callable[..., Episode]]:
+    """What `record_episodes` simulates by: metadata, the diagram, and its run of an episode.
+
+    The run is called with the diagram, an index and perhaps ``draws``; see `run_episode`.
+    """
     name = str(name or getattr(make_diagram, "__name__", type(make_diagram).__name__))
     period_s = step_s / 10 if monitor_period_s is None else monitor_period_s
     check_times("record_episodes", duration_s=duration_s, step_s=step_s, monitor_period_s=period_s)
@@ -129,13 +179,13 @@ def record_episodes(
     )
     start = CloudPickled(reset)
 
-    def run(diagram: Diagram, index: int) -> Episode:
+    def run(diagram: Diagram, index: int, draws: np.random.Generator | None = None) -> Episode:
         who = f"episode {index} of '{name}' (seed {seed})"
 
         def begin(context: Context) -> int | None:
-            seed_random_sources(diagram, context, seed, index)
+            rng = seed_random_sources(diagram, context, seed, index, draws)
             try:
-                return start(diagram, context, episode_rng(seed, index))
+                return start(diagram, context, rng)
             except Exception as error:
                 raise EpisodeError(f"{who}, reset: {type(error).__name__}: {error}") from error
 
@@ -152,16 +202,7 @@ def record_episodes(
             who=who,
         ).episode()
 
-    options: dict[str, Any] = {"num_workers": num_workers, "path": path, "progress": progress}
-    call = run if draw_plant is None else partial(run_on_plant, run, info)
-    episodes = collect_episodes(info, range(num_episodes), make, call, is_repeated=True, **options)
-    episodes.warn()
-    if ended := [e.index for e in episodes if e.is_safe and e.num_steps < num_steps]:
-        _LOGGER.warning(
-            "a system of '%s' ended %d of %d episodes early, as episode %d, and they count as safe",
-            *(name, len(ended), len(episodes), ended[0]),
-        )
-    return episodes
+    return info, make, run
 
 
 def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str], dict[str, int]]:

@@ -123,13 +123,23 @@ def episode_rng(seed: int, index: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
 
 
-def seed_random_sources(diagram: Diagram, context: Context, seed: int, index: int) -> None:
-    """Seeds Drake's random sources by seed and index, apart from the generator of the start."""
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index, 0)))
+def seed_random_sources(
+    diagram: Diagram,
+    context: Context,
+    seed: int,
+    index: int,
+    draws: np.random.Generator | None = None,
+) -> np.random.Generator:
+    """Seeds Drake's random sources, and returns the generator of the start.
+
+    Both draw from ``draws``; by default each has a generator that depends on seed and index alone.
+    """
+    own = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index, 0)))
     for system in leaf_systems([diagram]):
         if isinstance(system, RandomSource):
-            generator = RandomGenerator(int(rng.integers(2**31)))
+            generator = RandomGenerator(int((draws or own).integers(2**31)))
             system.SetRandomContext(system.GetMyMutableContextFromRoot(context), generator)
+    return draws or episode_rng(seed, index)
 
 
 def episodes_info(
@@ -171,6 +181,7 @@ def run_episode(
     at_start: Callable[[Context], object] | None = None,
     until_fall: bool = False,
     monitor: Callable[[Context], object] | None = None,
+    draws: np.random.Generator | None = None,
     **end: Any,
 ) -> Episode:
     """Simulates one episode, which ends when it leaves the safe set or its time is over.
@@ -183,6 +194,7 @@ def run_episode(
         at_start: Called with the root Context at the start.
         until_fall: Whether it goes on for a second outside, and only a fall is an unsafe end.
         monitor: Called with the Context after each step of the simulator.
+        draws: Generator of all random numbers, in place of those of seed and index.
         **end: Fields of :class:`~drake_safety.simulation.motion.End`.
     """
     if start is not None and goal is not None:
@@ -191,8 +203,7 @@ def run_episode(
     scenario = loop.scenario
 
     def begin(context: Context) -> int:
-        rng, first_step = episode_rng(seed, index), 0
-        seed_random_sources(loop, context, seed, index)
+        rng, first_step = seed_random_sources(loop, context, seed, index, draws), 0
         if start is not None:
             require(loop, CanStartAnywhere).reset_to(context, rng, start)
         elif goal is None:
@@ -322,8 +333,7 @@ def run_motion(
     scenario, piece_s = loop.scenario, motion_piece_s(loop, is_episode)
 
     def begin(context: Context) -> int | None:
-        seed_random_sources(loop, context, seed, index)
-        rng = episode_rng(seed, index)
+        rng = seed_random_sources(loop, context, seed, index)
         if isinstance(loop, MovesUndisturbed) and not is_episode:
             return loop.reset_undisturbed(context, rng, piece_s)
         return math.ceil(loop.reset(context, rng) * scenario.step_s / scenario.monitor_step_s)

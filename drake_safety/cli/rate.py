@@ -1,0 +1,163 @@
+"""``drake-safety rate``: how often a loop fails, in as few episodes as it takes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from typer import Option
+
+from drake_safety.cli import console
+from drake_safety.cli import training_folder as folders
+from drake_safety.cli.gate import (
+    MetricOption,
+    OutOption,
+    record_motions,
+    show_episodes,
+    show_rows,
+    write_results,
+)
+from drake_safety.evaluation.failure_rate import estimate_failure_rate
+from drake_safety.evaluation.figure_style import save, spoken
+from drake_safety.evaluation.loop_comparison import ComparedPlant
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.outcomes import UNSAFE
+from drake_safety.evaluation.rare_failures import RareFailures, Sample, estimate_rare_failure
+from drake_safety.evaluation.rare_figure import rare_figure, telling_facts
+from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.tables import Column
+from drake_safety.learning.seeds import RATE
+from drake_safety.live.following_camera import follow
+from drake_safety.simulation.normal_space import NormalGenerator, NormalPoint
+from drake_safety.simulation.rollouts import run_episode
+from drake_safety.simulation.scenario import Scenario, load_scenario
+
+_MOST_SHOWN = 8  # Kinds of failures.
+
+
+def rate(
+    scenario: console.ScenarioArgument,
+    assessment: console.AssessmentOption = None,
+    variation: console.VariationOption = "actual",
+    metric: MetricOption = UNSAFE,
+    starts: Annotated[int, Option(help="Starts of which Γ is asked.", min=10)] = 10_000,
+    episodes: Annotated[int, Option(help="Starts that are simulated.", min=10)] = 500,
+    rare: Annotated[
+        bool, Option("--rare", help="Search rare failures, without Γ; for rates below 1 %.")
+    ] = False,
+    samples: Annotated[int, Option(help="With --rare, episodes of a level.", min=40)] = 256,
+    replay: Annotated[
+        int | None, Option(help="With --rare, only record this failure.", min=1)
+    ] = None,
+    out: OutOption = None,
+    seed: Annotated[int, Option(help="Seed of the episodes.")] = RATE.first,
+    workers: console.WorkersOption = None,
+    cluster: console.ClusterOption = None,
+) -> None:
+    """Estimate a failure rate from few episodes, chosen where they tell most.
+
+    By default Γ divides starts into strata, which saves episodes where it is sharp. With --rare the
+    episodes approach failures level by level, which saves most where random ones hardly ever fail.
+    The estimate is unbiased either way. Episodes are kept in OUT: the same command continues.
+    """
+    if rare or replay is not None:
+        loaded = load_scenario(scenario)
+        folder = out or Path("runs") / f"{loaded.name}-rare"
+        folders.check_writable(folder)
+        with console.open_stages() as stages:
+            found = estimate_rare_failure(
+                loaded,
+                variation=variation,
+                metric=metric,
+                samples=samples,
+                seed=seed,
+                num_workers=workers,
+                path=folder,
+                progress=partial(stages, "episodes"),
+            )
+        if replay is not None:
+            if replay > len(found.failures):
+                raise ValueError(f"rate: failures are 1 to {len(found.failures)}; got {replay}")
+            motion = partial(_record, loaded, variation, found.failures[replay - 1])
+            return record_motions({f"failure {replay}": motion}, folder / f"failure-{replay}.html")
+        return _report_rare(loaded, variation, metric, found, folder, seed)
+    loaded, _, gamma = folders.open_assessment(scenario, assessment)
+    gamma.check_unused(seed)
+    folder = out or Path("runs") / f"{loaded.name}-rate"
+    folders.check_writable(folder)
+    with console.open_stages() as stages:
+        estimated = estimate_failure_rate(
+            loaded,
+            gamma,
+            variation=variation,
+            metric=metric,
+            num_starts=starts,
+            num_rollouts=episodes,
+            seed=seed,
+            num_workers=workers,
+            path=folder / "episodes",
+            progress=stages,
+        )
+    failures = estimated.failures
+    text = Column("", "", "%", digits=2).text(estimated.rate)
+    row = (text, estimated.rate.n, len(failures), round(estimated.plain_rollouts))
+    columns = ("failure rate", "episodes", "failures", "random episodes of the same variance")
+    show_rows(f"{loaded.name}, {variation}: {metric}", columns, [row])
+    show_episodes("Failures", failures, metric)
+    if estimated.rate.value < 0.01:
+        console.say("a rate below 1 %: --rare needs fewer episodes")
+    figures = {("", "", "failure_rate"): estimated.rate}
+    entries = {"seed": seed, "metric": metric} | asdict(estimated)
+    write_results(folder / "rate.json", ComparedPlant(loaded, variation), Results(figures, entries))
+
+
+def _report_rare(
+    loaded: Scenario, variation: str, metric: str, found: RareFailures, folder: Path, seed: int
+) -> None:
+    """Prints a rate and the kinds of failures that make it, and writes them with a picture."""
+    plain = "" if math.isnan(found.plain_rollouts) else str(round(found.plain_rollouts))
+    row = (_exponent(found.rate), f"{found.search_rate:.1e}", found.simulations, plain)
+    columns = ("failure rate", "by the search", "episodes", "random ones of the same variance")
+    title = f"{loaded.name}, {variation}: {metric}"
+    show_rows(title, columns, [row])
+    names = telling_facts(found)
+    kinds = [
+        (i + 1, f"{100 * one.weight:.0f} %", spoken(one.cause or metric), f"{one.time_s:.2f}")
+        + tuple(f"{one.facts[name]:.3g}" for name in names)
+        for i, one in enumerate(found.failures[:_MOST_SHOWN])
+    ]
+    headings = ("failure", "share", "cause", "at [s]", *map(spoken, names))
+    show_rows("Kinds of failures, by their share of the rate", headings, kinds)
+    figures = {("", "", "failure_rate"): found.rate}
+    kept: dict[str, Any] = {"failures": [asdict(one) for one in found.failures[:_MOST_SHOWN]]}
+    kept |= {"search_rate": found.search_rate, "simulations": found.simulations}
+    entries = {"seed": seed, "metric": metric, "plain_rollouts": found.plain_rollouts} | kept
+    write_results(folder / "rare.json", ComparedPlant(loaded, variation), Results(figures, entries))
+    if found.failures:
+        for picture in save(rare_figure(found, title), folder / "rare"):
+            console.say("picture", picture)
+        console.say("to see one:", console.command_line("drake-safety", "--replay=1"))
+
+
+def _exponent(rate: Estimate) -> str:
+    return f"{rate.value:.1e} ({rate.low:.1e} to {rate.high:.1e})"
+
+
+def _record(scenario: Scenario, variation: str, sample: Sample, viewer: Meshcat) -> str:
+    """Records a failure; returns its cause."""
+    options = scenario.options_for("pairs", variation)
+    loop = scenario.make_loop(variation, meshcat=viewer, **options)
+    point = NormalPoint(np.random.default_rng(sample.seed), np.array(sample.z))
+    viewer.StartRecording()
+    episode = run_episode(
+        loop,
+        draws=NormalGenerator(point),
+        after_leaving_s=math.inf,
+        monitor=follow(loop, viewer),
+    )
+    return f"leaves the safe set: {spoken(episode.cause)}"
