@@ -96,6 +96,13 @@ def test_a_robot_that_nothing_pushes_over_has_an_impulse_beyond_the_largest_one(
     assert all(cell.is_too_fast)
 
 
+def test_a_robot_that_any_push_fells_survives_none(monkeypatch):
+    monkeypatch.setattr(Island, "try_push", lambda *_: (True, False))
+    cell = Island().cell((0, 0))
+    assert (cell.survived_n_s, cell.num_islands) == (0.0, 0)
+    assert 0.0 < cell.critical_n_s < 0.01
+
+
 class Doubtful(Island):
     """A robot whose Γ expects a failure from 7 N·s on."""
 

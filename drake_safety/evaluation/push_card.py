@@ -18,6 +18,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 from pydrake.systems.framework import Context
 
+from drake_safety.control.kinematics import NUM_BASE_POSITIONS
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.outcomes import Metric, OutcomeReader
 from drake_safety.files.atomic import write_file
@@ -36,7 +37,7 @@ _BEFORE_S, _AFTER_S = 2.0, 3.0  # Of motion before the first phase, and from a p
 _PERIODS_S = 0.2, 1.5  # Shortest and longest of gaits.
 _STANDING_RAD = 0.01  # Largest spread of the joints of a robot that stands.
 _PERIODIC = 0.3  # Least correlation of a gait with itself, a period later.
-_LARGEST = 32.0  # Impulse beyond which none is tried, in units of mass · sqrt(g · height).
+_LARGEST, _SMALLEST = 32.0, 0.01  # Impulses that are tried, in units of mass · sqrt(g · height).
 _RETRIED = 2  # Impulses below the critical one that are tried at random in a cell.
 _OF_LOW = 0.3, 0.95  # Their range, by the largest survived one.
 _ASKED = np.geomspace(0.2, 2.0, 8)  # Impulses after which Γ is asked, by the critical one.
@@ -160,8 +161,8 @@ class PushRig:
         motion = self._moved(_BEFORE_S + 2 * _PERIODS_S[1], step_s=step_s)
         if self._reader.read(motion.episode(len(self.loop.feature_names))).value:
             raise ValueError(f"pushes: the robot fails without a push, at {motion.time_s[-1]:g} s")
-        joints = slice(self.loop.kinematics.num_positions)
-        q = motion["plant_state"][round(_BEFORE_S / step_s) :, joints][:, 7:]
+        first_row, num_q = round(_BEFORE_S / step_s), self.loop.kinematics.num_positions
+        q = motion["plant_state"][first_row:, NUM_BASE_POSITIONS:num_q]
         q = q - q.mean(axis=0)
         if np.abs(q).max() < _STANDING_RAD:
             return 0.0
@@ -282,7 +283,7 @@ class PushRig:
         rng = episode_rng(self.plan.seed, 2 + place[0] * self.num_phases + place[1])
         num_islands = 0
         for attempt in range(1 + _RETRIED):
-            while high - low > self.plan.precision * high:
+            while high - low > self.plan.precision * max(high, _SMALLEST * self.unit_n_s):
                 middle = 0.5 * (low + high)
                 low, high = (low, middle) if fails(middle) else (middle, high)
             if attempt < _RETRIED and low > 0.0 and fails(lower := low * rng.uniform(*_OF_LOW)):

@@ -18,6 +18,7 @@ from pydrake.systems.framework import Diagram
 
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.outcomes import UNSAFE, OutcomeReader
+from drake_safety.extras import require_extra
 from drake_safety.files.atomic import write_file
 from drake_safety.learning.seeds import RATE
 from drake_safety.learning.segments import DIVERGED, Episode
@@ -158,6 +159,7 @@ def estimate_rare_failure(
         raise ValueError(f"metric of a rare failure: expected one of {known}; got '{metric}'")
     if is_task:
         run = partial(run_episode, **OutcomeReader(make(), metric).simulated)
+    require_extra("train", "a search for rare failures")
     column = None if name == UNSAFE else names.index(name)
     facts = [f"initial {one}" for one in of_state], [f"desired {one}" for one in of_output]
     call = partial(_simulated, run, is_task, column, facts)
