@@ -21,6 +21,8 @@ from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.interval_figure import interval_figure
+from drake_safety.evaluation.push_card import PushCard
+from drake_safety.evaluation.push_figure import push_figure
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import DEMONSTRATION
@@ -34,6 +36,7 @@ _SEED = DEMONSTRATION.first
 _REACHING: dict[str, Any] = {"target": "blue_box", "push": ["torso"], "force": True}
 _WALKING: dict[str, Any] = {"target": "0.5 0 0", "push": ["side"], "force": True}
 _WALKING |= {"variation": "nominal"}  # On another one the monitor may alarm before the push.
+_ENGINES = {"baseline": "Drake", "variation=mujoco variations.mujoco.motors=dc": "MuJoCo"}
 _ELSEWHERE = (
     "adaptation.png and region.png, of commit f358026; compose.svg, which "
     "`python docs/generator/diagram_picture.py` draws by GraphViz; alarms_*.png of "
@@ -88,6 +91,12 @@ def _shifts(name: str, folder: Path) -> Figure:
     return interval_figure(rows)
 
 
+def _pushes(file: str, names: dict[str, str], folder: Path) -> Figure:
+    """Pushes that loops survive, by the names that they have in the picture."""
+    cards = Results.read(_ROOT / f"docs/results/{file}.json").entries["cards"]
+    return push_figure({new: PushCard.of(cards[name]) for name, new in names.items()})
+
+
 def _adaptation_study(folder: Path) -> Figure:
     results = Results.read(_ROOT / "docs/results/adaptation/laikago-payload-pools.json")
     kinds = "sharpened.calibrated", "paper.grid"
@@ -107,6 +116,7 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
     "adaptation_study": _adaptation_study,
     "shifts_laikago": partial(_shifts, "laikago"),
     "shifts_atlas": partial(_shifts, "atlas"),
+    "pushes_go2": partial(_pushes, "pushes_go2", _ENGINES),
 }
 """Draws a picture, or writes it into a folder, by name."""
 

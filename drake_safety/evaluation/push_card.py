@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
@@ -92,6 +92,12 @@ class PushCard:
     unit_n_s: float  # mass · sqrt(g · standing height), which makes robots comparable.
     period_s: float  # Of the gait; 0 of a robot that stands.
     cells: list[PushCell]
+
+    @classmethod
+    def of(cls, stored: Mapping[str, Any]) -> PushCard:
+        """Makes a card of its fields, as in ``pushes.json``."""
+        parts = {"plan": PushPlan(**stored["plan"])}
+        return cls(**{**stored, **parts, "cells": [PushCell(**one) for one in stored["cells"]]})
 
     def grid(self, name: str) -> np.ndarray:
         """A value of the cells, (directions, phases), NaN where it is unknown."""
