@@ -37,6 +37,7 @@ _REACHING: dict[str, Any] = {"target": "blue_box", "push": ["torso"], "force": T
 _WALKING: dict[str, Any] = {"target": "0.5 0 0", "push": ["side"], "force": True}
 _WALKING |= {"variation": "nominal"}  # On another one the monitor may alarm before the push.
 _ENGINES = {"baseline": "Drake", "variation=mujoco variations.mujoco.motors=dc": "MuJoCo"}
+_POLICIES = {"baseline": "fastsac", "policy=ppo_g1_29dof.onnx": "ppo"}
 _ELSEWHERE = (
     "adaptation.png and region.png, of commit f358026; compose.svg, which "
     "`python docs/generator/diagram_picture.py` draws by GraphViz; alarms_*.png of "
@@ -117,6 +118,7 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
     "shifts_laikago": partial(_shifts, "laikago"),
     "shifts_atlas": partial(_shifts, "atlas"),
     "pushes_go2": partial(_pushes, "pushes_go2", _ENGINES),
+    "pushes_g1": partial(_pushes, "pushes_g1", _POLICIES),
 }
 """Draws a picture, or writes it into a folder, by name."""
 

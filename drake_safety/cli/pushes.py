@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
@@ -62,7 +63,9 @@ def pushes(
     first = changed_plant(scenario, f"variation={variation}")
     loops: dict[str, tuple[ComparedPlant, dict[str, Any]]] = {_BASELINE: (first, {})}
     for text in candidate or []:
-        loops[text] = changed_plant(scenario, f"variation={variation} {text}"), {}
+        # A file by its name alone.
+        name = " ".join(key + sign + Path(one).name for key, sign, one in _pairs(text))
+        loops[name] = changed_plant(scenario, f"variation={variation} {text}"), {}
     gamma = None
     with contextlib.suppress(*([] if recovery or assessment else [ValueError])):
         # Without a wish, Γ of this very scenario, if one is shipped.
@@ -110,6 +113,10 @@ def pushes(
     for picture in save(push_figure(cards), out / "pushes"):
         console.say("picture", picture)
     console.say("to see the weakest:", console.command_line("drake-safety", "--replay"))
+
+
+def _pairs(changes: str) -> list[tuple[str, str, str]]:
+    return [text.partition("=") for text in shlex.split(changes)]
 
 
 def _move(
