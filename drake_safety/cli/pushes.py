@@ -64,7 +64,8 @@ def pushes(
     loops: dict[str, tuple[ComparedPlant, dict[str, Any]]] = {_BASELINE: (first, {})}
     for text in candidate or []:
         # A file by its name alone.
-        name = " ".join(key + sign + Path(one).name for key, sign, one in _pairs(text))
+        pairs = [one.partition("=") for one in shlex.split(text)]
+        name = " ".join(key + sign + Path(value).name for key, sign, value in pairs)
         loops[name] = changed_plant(scenario, f"variation={variation} {text}"), {}
     gamma = None
     with contextlib.suppress(*([] if recovery or assessment else [ValueError])):
@@ -115,10 +116,6 @@ def pushes(
     console.say("to see the weakest:", console.command_line("drake-safety", "--replay"))
 
 
-def _pairs(changes: str) -> list[tuple[str, str, str]]:
-    return [text.partition("=") for text in shlex.split(changes)]
-
-
 def _move(
     plant: ComparedPlant,
     options: Mapping[str, Any],
@@ -164,10 +161,7 @@ def _report(cards: Mapping[str, PushCard], first: ComparedPlant) -> None:
     for name, other in cards.items():
         ratio = other.grid("survived_n_s").min(axis=1) / np.maximum(worst, 1e-9)
         if name != _BASELINE:
-            counts = {
-                "stronger": ratio > _STRONGER,
-                "weaker": ratio < 1.0 / _STRONGER,
-            }
+            counts = {"stronger": ratio > _STRONGER, "weaker": ratio < 1.0 / _STRONGER}
             angles = 360.0 * np.arange(len(ratio)) / len(ratio)
             words = [
                 f"{word} in {is_so.sum()} of {len(ratio)} directions "

@@ -46,7 +46,7 @@ _PORTS = ("state", "output", "desired_preview", "margins", "safe", "plant_state"
 
 @dataclass(frozen=True, kw_only=True)
 class PushPlan:
-    """What is tried on a robot."""
+    """The pushes to try on a robot."""
 
     body: str = ""  # That of the scenario's random pushes by default, else the base.
     duration_s: float = 0.1
@@ -148,9 +148,9 @@ class PushRig:
             raise ValueError(f"pushes: task '{type(loop).__name__}' is no LeggedLoop")
         self.loop, self._assessment = loop, assessment
         random = getattr(scenario.parameters, "random_pushes", None)
-        self._body = plan.body or (random and random.body) or loop.robot.base
+        body = plan.body or (random and random.body) or loop.robot.base
         metric = plan.metric or ("fall" if loop.fall_name else "unsafe")
-        self.plan = replace(plan, body=self._body, metric=metric)
+        self.plan = replace(plan, body=body, metric=metric)
         self._reader = OutcomeReader(loop, self.plan.metric)
         self.goal = None
         if isinstance(loop, HasGoals):
@@ -221,7 +221,7 @@ class PushRig:
         strength_n = impulse_n_s / self.plan.duration_s
         force_n = [strength_n * math.cos(angle), strength_n * math.sin(angle), 0.0]
         durations = {"time_s": time_s, "duration_s": self.plan.duration_s}
-        return Push(body=self._body, force_n=force_n, **durations), saved
+        return Push(body=self.plan.body, force_n=force_n, **durations), saved
 
     def pushed(
         self,

@@ -17,7 +17,7 @@ from drake_safety.evaluation.push_card import PushCard
 def push_figure(cards: Mapping[str, PushCard]) -> Figure:
     """Plots impulses over directions: of the first card all phases, of others the worst one.
 
-    Angles are those of the force, ahead at the top, to the left at the left.
+    The angle is the force's direction: ahead is at the top, left is at the left.
     """
     first = next(iter(cards.values()))
     with style.drawing_style():

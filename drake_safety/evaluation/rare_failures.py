@@ -426,8 +426,8 @@ def _mixture(z: np.ndarray) -> GaussianMixture:
 def _rate(values: np.ndarray, search_rate: float) -> tuple[Estimate, float]:
     """The mean of weighted failures (N,), and as many random episodes as have its variance.
 
-    The interval is that of Student's t of the logarithm, by Kish's effective number of failures,
-    extended to the rate of the search, which also counts modes that the proposal lacks.
+    The interval is that of Student's t of the logarithm, by Kish's effective number of failures. It
+    reaches to the search's rate, because the search also counts modes that the proposal lacks.
     """
     from scipy.stats import t
 
@@ -443,9 +443,9 @@ def _rate(values: np.ndarray, search_rate: float) -> tuple[Estimate, float]:
 
 
 def _widened(variance: np.ndarray, size: Any) -> np.ndarray:
-    """Variances for a proposal, of those of so many samples.
+    """Variances of a proposal, from the variances of so many samples.
 
-    Smaller ones than 1 make some weights large, and pay only where failures are in a narrow range.
+    A variance below 1 makes some weights large, and pays only where failures are in a narrow range.
     """
     shrunk = (size * variance + _PRIOR) / (size + _PRIOR)
     return np.where(shrunk < _NARROW, shrunk, np.maximum(shrunk, 1.0))

@@ -1,4 +1,4 @@
-"""What rare failures have in common, beside random episodes."""
+"""Rare failures beside random episodes, in one picture."""
 
 from __future__ import annotations
 
