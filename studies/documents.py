@@ -17,6 +17,7 @@ import yaml
 from jinja2 import Environment, FileSystemLoader
 
 from drake_safety.evaluation.figure_style import label_of
+from drake_safety.evaluation.push_card import COLUMNS, PushCard
 from drake_safety.evaluation.results import Results
 from drake_safety.evaluation.shift_study import CONFIDENT
 from drake_safety.evaluation.tables import Column, Row, Table
@@ -31,7 +32,12 @@ RESULTS_FOLDER = Path("docs/results")
 EVALUATION_FILE, CARD_FILE = "evaluation.json", "README.md"
 """Of a shipped folder."""
 _TEMPLATES = Path(__file__).with_name("templates")
-_KINDS = "results|summary|shifts|walking"
+_KINDS = "pushes|results|summary|shifts|walking"
+CARDS = {
+    "pushes_go2": ["Drake", "MuJoCo"],
+    "pushes_g1": ["fastsac", "ppo"],
+}
+"""Loops of stored push cards, in their order."""
 _OPEN = rf"<!-- (?P<kind>{_KINDS}): (?P<name>[\w-]+) -->\n"
 _BLOCK = re.compile(rf"(?P<start>{_OPEN}).*?(?P<end><!-- end -->)", re.DOTALL)
 SAFE_RECALL, UNSAFE_RECALL = 0.952, 0.987
@@ -70,6 +76,12 @@ def render(kind: str, results: Results, **more: Any) -> str:
     }
     text = environment.get_template(f"{kind}.md").render(**more)
     return re.sub(r"\n{3,}", "\n\n", text).strip()
+
+
+def cards_of(name: str, results: Results) -> dict[str, PushCard]:
+    """Push cards by the names of `CARDS`."""
+    cards = results.entries["cards"].values()
+    return dict(zip(CARDS[name], map(PushCard.of, cards), strict=True))
 
 
 def origin(seed: int) -> str:
@@ -151,7 +163,9 @@ def generate(text: str, folder: Path = RESULTS_FOLDER) -> str:
                 f"there are no results '{match['name']}' in {folder}; there are {there}: "
                 "`python -m studies store RUN` writes them"
             )
-        return f"{match['start']}{render(match['kind'], Results.read(file))}\n{match['end']}"
+        results, name = Results.read(file), match["name"]
+        more = {"cards": cards_of(name, results), "COLUMNS": COLUMNS} if name in CARDS else {}
+        return f"{match['start']}{render(match['kind'], results, **more)}\n{match['end']}"
 
     return _BLOCK.sub(block, text)
 

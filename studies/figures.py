@@ -21,13 +21,13 @@ from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.interval_figure import interval_figure
-from drake_safety.evaluation.push_card import PushCard
 from drake_safety.evaluation.push_figure import push_figure
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
+from studies.documents import CARDS, cards_of
 from studies.moving_pictures import recovery, walking
 from studies.path_figure import path_figure
 
@@ -36,8 +36,6 @@ _SEED = DEMONSTRATION.first
 _REACHING: dict[str, Any] = {"target": "blue_box", "push": ["torso"], "force": True}
 _WALKING: dict[str, Any] = {"target": "0.5 0 0", "push": ["side"], "force": True}
 _WALKING |= {"variation": "nominal"}  # On another one the monitor may alarm before the push.
-_ENGINES = {"baseline": "Drake", "variation=mujoco variations.mujoco.motors=dc": "MuJoCo"}
-_POLICIES = {"baseline": "fastsac", "policy=ppo_g1_29dof.onnx": "ppo"}
 _ELSEWHERE = (
     "adaptation.png and region.png, of commit f358026; compose.svg, which "
     "`python docs/generator/diagram_picture.py` draws by GraphViz; alarms_*.png of "
@@ -92,10 +90,8 @@ def _shifts(name: str, folder: Path) -> Figure:
     return interval_figure(rows)
 
 
-def _pushes(file: str, names: dict[str, str], folder: Path) -> Figure:
-    """Pushes that loops survive, by the names that they have in the picture."""
-    cards = Results.read(_ROOT / f"docs/results/{file}.json").entries["cards"]
-    return push_figure({new: PushCard.of(cards[name]) for name, new in names.items()})
+def _pushes(name: str, folder: Path) -> Figure:
+    return push_figure(cards_of(name, Results.read(_ROOT / f"docs/results/{name}.json")))
 
 
 def _adaptation_study(folder: Path) -> Figure:
@@ -117,8 +113,7 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
     "adaptation_study": _adaptation_study,
     "shifts_laikago": partial(_shifts, "laikago"),
     "shifts_atlas": partial(_shifts, "atlas"),
-    "pushes_go2": partial(_pushes, "pushes_go2", _ENGINES),
-    "pushes_g1": partial(_pushes, "pushes_g1", _POLICIES),
+    **{name: partial(_pushes, name) for name in CARDS},
 }
 """Draws a picture, or writes it into a folder, by name."""
 

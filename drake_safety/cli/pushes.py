@@ -18,14 +18,19 @@ from typer import Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.ask import parse_target
-from drake_safety.cli.gate import changed_plant, record_motions, write_results
+from drake_safety.cli.gate import changed_plant, record_motions, show_rows, write_results
 from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.loop_comparison import ComparedPlant
-from drake_safety.evaluation.push_card import PushCard, PushPlan, PushRig, make_push_card
+from drake_safety.evaluation.push_card import (
+    COLUMNS,
+    PushCard,
+    PushPlan,
+    PushRig,
+    make_push_card,
+)
 from drake_safety.evaluation.push_figure import push_figure
 from drake_safety.evaluation.results import Results
-from drake_safety.evaluation.tables import Column
 from drake_safety.learning.seeds import PUSHES
 from drake_safety.live.following_camera import follow
 
@@ -136,19 +141,9 @@ def _move(
 
 def _report(cards: Mapping[str, PushCard], first: ComparedPlant) -> None:
     """Prints the weakest directions, and which loop is stronger where."""
-    rows, percent = [], Column("", "", "%", digits=0)
-    for name, card in cards.items():
-        impulses, weakest = card.grid("survived_n_s"), card.weakest
-        worst, middle, best = np.quantile(impulses, [0.0, 0.5, 1.0])
-        angle = 360.0 * weakest.direction / card.plan.directions
-        phase = f", phase {weakest.phase + 1} of {impulses.shape[1]}" if card.period_s else ""
-        of_unit = f"{worst:.0f} ({worst / card.unit_n_s:.2f})"
-        numbers = of_unit, f"{middle:.0f}", f"{best:.0f}"
-        shares = percent.text(card.islands), percent.text(card.too_fast)
-        rows.append([name, f"{angle:.0f}°{phase}", *numbers, *shares])
-    columns = ["loop", "weakest", "worst [N·s]", "median", "best", "islands", "too fast"]
+    rows = [(name, *card.summary) for name, card in cards.items()]
     title = f"{first.scenario.name}, {first.variation}: largest survived impulses"
-    console.show(console.new_table(*columns, rows=rows, title=title))
+    show_rows(title, ("loop", *COLUMNS), rows)
     card = cards[_BASELINE]
     period = f"a gait of {card.period_s:.2f} s" if card.period_s else "a robot that stands"
     console.say(

@@ -21,6 +21,7 @@ from pydrake.systems.framework import Context
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS
 from drake_safety.evaluation.metrics import Estimate, proportion
 from drake_safety.evaluation.outcomes import Metric, OutcomeReader
+from drake_safety.evaluation.tables import Column
 from drake_safety.files.atomic import write_file
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import PUSHES
@@ -41,6 +42,9 @@ _LARGEST, _SMALLEST = 32.0, 0.01  # Impulses that are tried, in units of mass ·
 _RETRIED = 2  # Impulses below the critical one that are tried at random in a cell.
 _OF_LOW = 0.3, 0.95  # Their range, by the largest survived one.
 _ASKED = np.geomspace(0.2, 2.0, 8)  # Impulses after which Γ is asked, by the critical one.
+COLUMNS = ("weakest", "worst [N·s]", "median", "best", "islands", "too fast")
+"""Titles of `PushCard.summary`."""
+_SHARE = Column("", "", "%", digits=0)
 _PORTS = ("state", "output", "desired_preview", "margins", "safe", "plant_state")
 
 
@@ -124,6 +128,21 @@ class PushCard:
         pairs = (zip(cell.has_failed, cell.is_too_fast, strict=True) for cell in self.cells)
         survived = [fast for pair in pairs for failed, fast in pair if not failed]
         return proportion(sum(survived), len(survived))
+
+    @property
+    def summary(self) -> tuple[str, ...]:
+        """The weakest place, impulses and shares, as `COLUMNS` says."""
+        impulses, cell = self.grid("survived_n_s"), self.weakest
+        worst, middle, best = np.quantile(impulses, [0.0, 0.5, 1.0])
+        phase = f", phase {cell.phase + 1} of {impulses.shape[1]}" if self.period_s else ""
+        return (
+            f"{360.0 * cell.direction / self.plan.directions:.0f}°{phase}",
+            f"{worst:.0f} ({worst / self.unit_n_s:.2f})",
+            f"{middle:.0f}",
+            f"{best:.0f}",
+            _SHARE.text(self.islands),
+            _SHARE.text(self.too_fast),
+        )
 
     @property
     def num_pushes(self) -> int:
