@@ -75,7 +75,7 @@ class Island(PushRig):
     num_phases = 1
 
     def try_push(self, impulse_n_s, direction, phase):
-        return impulse_n_s >= 10.0 or 5.0 <= impulse_n_s < 6.0, False
+        return impulse_n_s >= 10.0 or 5.0 <= impulse_n_s < 6.0, 0.5
 
 
 def test_failures_below_the_smallest_that_bisection_finds_are_looked_for():
@@ -89,15 +89,15 @@ def test_failures_below_the_smallest_that_bisection_finds_are_looked_for():
 
 
 def test_a_robot_that_nothing_pushes_over_has_an_impulse_beyond_the_largest_one(monkeypatch):
-    monkeypatch.setattr(Island, "try_push", lambda *_: (False, True))
+    monkeypatch.setattr(Island, "try_push", lambda *_: (False, 1.5))
     cell = Island().cell((0, 0))
     assert (cell.critical_n_s, cell.num_islands) == (math.inf, 0)
     assert cell.survived_n_s == 128.0
-    assert all(cell.is_too_fast)
+    assert set(cell.speeds) == {1.5}
 
 
 def test_a_robot_that_any_push_fells_survives_none(monkeypatch):
-    monkeypatch.setattr(Island, "try_push", lambda *_: (True, False))
+    monkeypatch.setattr(Island, "try_push", lambda *_: (True, 0.5))
     cell = Island().cell((0, 0))
     assert (cell.survived_n_s, cell.num_islands) == (0.0, 0)
     assert 0.0 < cell.critical_n_s < 0.01
@@ -163,7 +163,7 @@ def test_the_figure_has_a_curve_for_each_loop_and_for_gamma():
             phase=k,
             impulses_n_s=[10.0 + i + k, 30.0],
             has_failed=[False, True],
-            is_too_fast=[False, True],
+            speeds=[0.5, 1.5],
             num_islands=0,
             foreseen_n_s=float(rng.uniform(20, 40)),
         )
@@ -178,6 +178,7 @@ def test_the_figure_has_a_curve_for_each_loop_and_for_gamma():
     assert "policy=new.onnx, worst phase of the gait" in labels
     assert any(label.startswith("Γ") for label in labels)
     np.testing.assert_allclose(figure.axes[0].lines[0].get_ydata(), [10, 11, 12, 13, 10])
+    assert one.summary == ("0°, phase 1 of 2", "10 (0.50)", "12", "14", "0 % (0–21)", "0.50")
 
 
 @pytest.mark.slow
