@@ -13,6 +13,7 @@ from studies.figures import figures
 from studies.gate import gate
 from studies.publish import readme, ship, store
 from studies.rapt import rapt
+from studies.rare import rare
 from studies.walking import walking
 
 app = typer.Typer(
@@ -23,7 +24,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
-    *(evaluate, adaptation, gate, rapt, walking),
+    *(evaluate, adaptation, gate, rapt, rare, walking),
     *(figures, store, readme, ship),
 )
 for _command in _COMMANDS:

@@ -32,7 +32,7 @@ RESULTS_FOLDER = Path("docs/results")
 EVALUATION_FILE, CARD_FILE = "evaluation.json", "README.md"
 """Of a shipped folder."""
 _TEMPLATES = Path(__file__).with_name("templates")
-_KINDS = "pushes|results|summary|shifts|walking"
+_KINDS = "pushes|rare|results|summary|shifts|walking"
 CARDS = {
     "pushes_go2": ["Drake", "MuJoCo"],
     "pushes_g1": ["fastsac", "ppo"],
@@ -47,10 +47,13 @@ _FORMATS = {
     "share": {},
     "plain": {"digits": 2},
     "value": {"unit": "=", "digits": 2},
-    "seconds": {"unit": "=", "digits": 1},
     "fine": {"digits": 4},
     "percent": {"unit": "%", "digits": 1},
     "points": {"unit": "points", "digits": 1},
+    "fine_percent": {"unit": "%", "digits": 3},
+    "share_of": {"unit": "of"},
+    "whole": {"unit": "=", "digits": 0},
+    "tenths": {"unit": "=", "digits": 1},
 }
 """How columns write an estimate, by name."""
 

@@ -39,7 +39,7 @@ NUM_EPISODES = 6
 _STUDIES = ("shifts", "walking")
 DOCUMENTS = [
     Path("README.md"),
-    *(Path("docs") / f"{name}.md" for name in ("pushes", "results", "shifts", "walking")),
+    *(Path("docs") / f"{name}.md" for name in ("pushes", "rate", "results", "shifts", "walking")),
 ]
 _HASHES, _VERDICTS = "assessment_sha256", "first_episodes"
 _TOLERANCE = 1e-3  # Of Γ; above differences between processors, below those of assessments.

@@ -4,14 +4,19 @@ import itertools
 import math
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from command_line import call, study
 from drake_safety.assessments import shipped_folder
 from drake_safety.cli.training_folder import MODES, assessment_file
+from drake_safety.evaluation.metrics import Estimate
+from drake_safety.evaluation.rare_failures import RareFailures
 from drake_safety.evaluation.results import Results
+from studies import rare
 from studies.figures import PICTURES
 from toy_tasks import train_shuttle
 
@@ -93,6 +98,46 @@ def test_walking_is_judged_on_tours_pushes_commands_and_engines(monkeypatch, tmp
     assert study(monkeypatch, "walking", *arguments) == 0
     results_of(tmp_path / "walking.json", rows)
     assert (tmp_path / "walking_alarms.png").is_file()
+
+
+@pytest.mark.slow
+def test_rates_of_rare_failures_stand_beside_random_episodes(monkeypatch, tmp_path):
+    (name, system), *_ = rare.SYSTEMS.items()
+    few = replace(system, episodes=60, repetitions=3)
+    monkeypatch.setattr("studies.rare.SYSTEMS", {name: few})
+    assert study(monkeypatch, "rare", "--samples", 40, "--workers", 1, "--out", tmp_path) == 0
+    found = Results.read(tmp_path / "rare.json")
+    assert {key[2]: row.n for key, row in found.items()} == {
+        "random_rate": 60,
+        "mean_rate": 3,
+        "held": 3,
+        "episodes": 3,
+        "saved": 3,
+    }
+    assert found[name, "rare", "episodes"].value >= 40
+
+
+def test_saved_episodes_are_of_the_error_about_the_share_of_random_episodes():
+    found = [
+        RareFailures(
+            rate=Estimate(rate, rate - 0.004, rate + 0.004, 40),
+            search_rate=rate,
+            simulations=100,
+            plain_rollouts=1.0,
+            failures=[],
+            random=[],
+        )
+        for rate in (0.008, 0.012, 0.016)
+    ]
+    failed = np.repeat([1, 0], [20, 1980])
+    rows = rare.judged(found, failed)
+    assert rows["random_rate"].value == 0.01
+    assert rows["mean_rate"].value == pytest.approx(0.012)
+    assert rows["mean_rate"].low < 0.01 < rows["mean_rate"].high
+    assert rows["held"].value == pytest.approx(2 / 3)
+    error = (0.002**2 + 0.002**2 + 0.006**2) / 3
+    assert rows["saved"].value == pytest.approx(0.01 * 0.99 / error / 100)
+    assert rare.judged(found, failed[1:])["saved"].value > rows["saved"].value  # About the mean.
 
 
 def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypatch, tmp_path):

@@ -162,6 +162,7 @@ class PushRig:
         in_loop: SafetyAssessment | None = None,
         **options: Any,
     ):
+        options = scenario.options_for("pairs", variation) | options
         loop = scenario.make_loop(variation, assessment=in_loop, **options)
         if not isinstance(loop, LeggedLoop):
             raise ValueError(f"pushes: task '{type(loop).__name__}' is no LeggedLoop")
