@@ -21,6 +21,7 @@ from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.interval_figure import interval_figure
+from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.push_figure import push_figure
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.prediction import is_unknown
@@ -80,13 +81,20 @@ def _embedding(folder: Path) -> Figure:
 def _shifts(name: str, folder: Path) -> Figure:
     """How often Γ is sure and wrong and says "don't know", and when the monitor alarms."""
     results = Results.read(_ROOT / f"docs/results/{name}.json")
-    shown = ("gamma", "confident_error"), ("gamma", "unknown"), ("monitor", "delay_s")
-    rows = {
-        ("", set.removeprefix("shifts."), metric): results[set, method, metric]
-        for pair in shown
-        for set, method, metric in results
-        if (method, metric) == pair and set.startswith("shifts.")
+    shown = {
+        ("gamma", "confident_error"): ("Γ alone", "sure and wrong [%]", 100.0),
+        ("monitor", "confident_error_10s"): ("with the monitor", "sure and wrong [%]", 100.0),
+        ("gamma", "unknown"): ("Γ alone", "don't know [%]", 100.0),
+        ("monitor", "delay_s"): ("with the monitor", "alarm after [s]", 1.0),
     }
+    changes = [k.removeprefix("shifts.") for k in results.entries["shifts"]["kinds"]]
+    rows = {}
+    for place, (set, metric, scale) in shown.items():
+        for change in changes:
+            one = results.get((f"shifts.{change}", *place))
+            if one and (f"shifts.{change}", "monitor", "delay_s") in results:
+                ends = (scale * end for end in (one.value, one.low, one.high))
+                rows[set, change, metric] = Estimate(*ends, one.n)
     return interval_figure(rows)
 
 
@@ -113,6 +121,7 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
     "adaptation_study": _adaptation_study,
     "shifts_laikago": partial(_shifts, "laikago"),
     "shifts_atlas": partial(_shifts, "atlas"),
+    "shifts_go2_walking": partial(_shifts, "go2_walking"),
     **{name: partial(_pushes, name) for name in CARDS},
 }
 """Draws a picture, or writes it into a folder, by name."""

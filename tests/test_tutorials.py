@@ -23,8 +23,8 @@ def tutorial(request):
     return request.param
 
 
-def test_there_are_eight_tutorials_in_order():
-    assert [int(path.stem.split("_")[0]) for path in TUTORIALS] == list(range(1, 9))
+def test_there_are_nine_tutorials_in_order():
+    assert [int(path.stem.split("_")[0]) for path in TUTORIALS] == list(range(9))
 
 
 def test_a_tutorial_begins_with_prose_is_short_and_holds_no_outputs(tutorial):

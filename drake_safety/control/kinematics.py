@@ -23,7 +23,7 @@ from drake_safety.robots.robot_model import ReachingFrame, RobotModel
 
 try:
     from scipy.linalg.lapack import dposv
-except ImportError:  # Online environments do not need scipy: see docs/online.md.
+except ImportError:  # Online environments do not need scipy: see docs/start.md.
 
     def dposv(a: np.ndarray, b: np.ndarray) -> tuple[None, np.ndarray, int]:
         """Replaces LAPACK's routine, a few microseconds slower."""

@@ -18,7 +18,7 @@ def interval_figure(estimates: Mapping[Key, Estimate]) -> Figure:
     """Plots a panel for each metric: methods below each other, sets side by side in colours."""
     sets, methods, metrics = ([*dict.fromkeys(names)] for names in zip(*estimates, strict=True))
     with style.drawing_style():
-        height = 1.1 + 0.18 * len(methods) * (1 + len(sets))
+        height = 1.1 + 0.13 * len(methods) * (1 + len(sets))
         fig = style.new_figure(2.2 + 2.6 * len(metrics), height)
         panels = np.atleast_1d(fig.subplots(1, len(metrics), sharey=True))
         for axes, metric in zip(panels, metrics, strict=True):
