@@ -36,10 +36,10 @@ from studies.documents import CARD_FILE, EVALUATION_FILE, card_text, generate
 NUM_EPISODES = 6
 """Number of fresh episodes whose verdicts are stored."""
 # Stored beside the evaluation.
-_STUDIES = ("shifts", "walking")
+_STUDIES = ("shifts", "walking_results")
 DOCUMENTS = [
     Path("README.md"),
-    *(Path("docs") / f"{name}.md" for name in ("pushes", "rate", "results", "shifts", "walking")),
+    *(Path("docs") / f"{name}.md" for name in ("monitoring", "pushes", "rate", "results", "shifts", "walking_results")),
 ]
 _HASHES, _VERDICTS = "assessment_sha256", "first_episodes"
 _TOLERANCE = 1e-3  # Of Γ; above differences between processors, below those of assessments.

@@ -153,7 +153,6 @@ def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypat
         "path",
         "compose",
         "alarms_go2_walking",
-        "alarms_g1_walking",
     }
     text = "".join(path.read_text() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
     assert set(re.findall(r"pictures/(\w+)\.", text)) == there
