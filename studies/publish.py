@@ -39,7 +39,10 @@ NUM_EPISODES = 6
 _STUDIES = ("shifts", "walking_results")
 DOCUMENTS = [
     Path("README.md"),
-    *(Path("docs") / f"{name}.md" for name in ("monitoring", "pushes", "rate", "results", "shifts", "walking_results")),
+    *(
+        Path("docs") / f"{name}.md"
+        for name in ("monitoring", "pushes", "rate", "results", "shifts", "walking_results")
+    ),
 ]
 _HASHES, _VERDICTS = "assessment_sha256", "first_episodes"
 _TOLERANCE = 1e-3  # Of Γ; above differences between processors, below those of assessments.
