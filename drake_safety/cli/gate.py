@@ -7,10 +7,10 @@ import html
 import math
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, NoReturn
 
 from pydrake.geometry import Meshcat
 from typer import Argument, Exit, Option
@@ -28,6 +28,12 @@ from drake_safety.evaluation.loop_comparison import (
     check_pair,
     compare_loops,
     make_paired,
+)
+from drake_safety.evaluation.outcome_files import (
+    FAILED,
+    compare_outcomes,
+    read_outcomes,
+    write_outcomes,
 )
 from drake_safety.evaluation.outcomes import UNSAFE, Outcome
 from drake_safety.evaluation.results import Results
@@ -59,7 +65,12 @@ def gate(
         ),
     ] = None,
     baseline: Annotated[str, Option(metavar="KEY=VALUE", help="The same for all loops.")] = "",
-    metric: MetricOption = UNSAFE,
+    metric: Annotated[
+        str, Option(help="unsafe, fall, a constraint, tracking=BOUND; a column of --outcomes.")
+    ] = "",
+    outcomes: Annotated[
+        bool, Option("--outcomes", help="Compare files of outcomes, simulated elsewhere.")
+    ] = False,
     worse_by: Annotated[float, Option(help="Difference of the failure rates that matters.")] = 0.02,
     alpha: Annotated[float, Option(help="Probability that any verdict is wrong.")] = 0.05,
     episodes: Annotated[int, Option(help="Most pairs of episodes a candidate.", min=1)] = 2000,
@@ -73,8 +84,20 @@ def gate(
 
     It stops when it knows, and says worse, better, not worse by --worse-by, or undecided. Exit
     code: 3 after an error, 1 if a candidate is worse, 2 if one is undecided, else 0; 130 after
-    Ctrl-C. Episodes are kept in OUT: the same command continues.
+    Ctrl-C. Episodes are kept in OUT: the same command continues. With --outcomes it compares CSV
+    files, or LeRobot's eval_info.json: the baseline's, then the candidates'.
     """
+    if outcomes:
+        if candidate or baseline or replay is not None or not candidates:
+            raise ValueError("gate: --outcomes takes files alone: the baseline's, the candidates'")
+        metric, alpha = metric or FAILED, alpha / len(candidates)
+        reference = read_outcomes(Path(scenario), metric)
+        levels: dict[str, Any] = {"worse_by": worse_by, "alpha": alpha, "seed": seed}
+        read = {name: read_outcomes(Path(name), metric) for name in candidates}
+        found = {name: compare_outcomes(reference, one, **levels) for name, one in read.items()}
+        _report(scenario, found, metric, alpha, worse_by)
+        _end(found)
+    metric = metric or UNSAFE
     given = {Path(one).stem: (one, baseline) for one in candidates or []}
     given |= {text: (scenario, f"{baseline} {text}") for text in candidate or []}
     if len(given) < max(replay is None, len(candidates or []) + len(candidate or [])):
@@ -120,12 +143,22 @@ def gate(
                 stages(f"pairs, {name}", verdicts[name].pairs, verdicts[name].pairs)
     finally:  # After Ctrl-C too.
         if verdicts:
-            _report(first, verdicts, metric, alpha / len(others), worse_by)
-            candidates_ = {name: asdict(one) for name, one in verdicts.items()}
+            title = f"{first.scenario.name}, {first.variation}"
+            _report(title, verdicts, metric, alpha / len(others), worse_by, is_replayed=True)
+            candidates_ = {n: asdict(replace(one, outcomes=[])) for n, one in verdicts.items()}
             entries = {"seed": seed, "metric": metric, "candidates": candidates_}
             write_results(folder / "gate.json", first, Results({}, entries))
             for picture in save(gate_figure(verdicts), folder / "gate"):
                 console.say("picture", picture)
+            for k, one in enumerate(verdicts.values(), start=1):
+                files = [folder / f"outcomes-{k}" / f"{s}.csv" for s in ("baseline", "candidate")]
+                for file, of_side in zip(files, zip(*one.outcomes, strict=True), strict=True):
+                    write_outcomes(file, of_side)
+                console.say("outcomes", *files)
+    _end(verdicts)
+
+
+def _end(verdicts: Mapping[str, Verdict]) -> NoReturn:
     known = {one.verdict for one in verdicts.values()}
     raise Exit(1 if WORSE in known else 2 if UNDECIDED in known else 0)
 
@@ -176,25 +209,31 @@ def _record_episode(
 
 
 def _report(
-    first: ComparedPlant,
+    title: str,
     verdicts: Mapping[str, Verdict],
     metric: str,
     alpha: float,
     worse_by: float,
+    *,
+    is_replayed: bool = False,
 ) -> None:
     """Prints what is known, and the episodes that end differently."""
     rows, points = [], Column("", "", "points", digits=1)
     for name, one in verdicts.items():
         counts = f"{one.both}, {len(one.no_longer_failing)}, {len(one.newly_failing)}"
-        rows.append((name, one.verdict, one.pairs, counts, points.text(one.difference[-1])))
+        pairs = f"{one.pairs}{', unpaired' * (not one.is_paired)}"
+        rows.append((name, one.verdict, pairs, counts, points.text(one.difference[-1])))
     failing = "fail: both, only baseline, only candidate"
     columns = ("candidate", "verdict", "pairs", failing, "difference [points]")
-    show_rows(f"{first.scenario.name}, {first.variation}: {metric}", columns, rows)
+    show_rows(f"{title}: {metric}", columns, rows)
     for name, one in verdicts.items():
+        if not one.is_paired:
+            console.say(f"{name}: it names other episodes than the baseline; pairs are drawn")
+            continue
         new, old = one.newly_failing, one.no_longer_failing
         show_episodes(f"{name}: episodes that newly fail", new, metric)
         show_episodes(f"{name}: episodes that fail no longer", old, metric)
-        for each in [*new, *old][:1]:
+        for each in [*new, *old][:is_replayed]:
             replay = f"--replay={each.episode}"
             console.say("to see one:", console.command_line("drake-safety", replay))
     console.say(
@@ -212,7 +251,8 @@ def show_episodes(title: str, episodes: Sequence[Outcome], metric: str) -> None:
         commanded = ", ".join(f"{value:.3g}" for value in one.commanded)
         belief = ", ".join(f"{mass:.2f}" for mass in one.belief or ()) or "–"
         cause = spoken(one.cause or metric)
-        rows.append((one.episode, cause, f"{one.time_s:.2f}", commanded, belief))
+        time = "–" if math.isnan(one.time_s) else f"{one.time_s:.2f}"
+        rows.append((one.episode, cause, time, commanded or "–", belief))
     show_rows(title, ("episode", "cause", "at [s]", "commanded", "Γ: safe, unsafe, unknown"), rows)
 
 

@@ -79,7 +79,7 @@ def estimate_failure_rate(
     order = in_turns(stratum)[:num_rollouts]
     simulated = collected("episodes", order, **reader.simulated)
     outcomes = [reader.read(one) for one in simulated]
-    chosen = stratum[[one.episode for one in outcomes]]
+    chosen = stratum[[one.index for one in simulated]]
     failures = np.bincount(chosen, [one.value for one in outcomes])
     rate, plain_rollouts = stratified_rate(np.bincount(stratum), np.bincount(chosen), failures)
     failed = sorted((one for one in outcomes if one.value), key=lambda one: one.time_s)

@@ -54,6 +54,8 @@ class Verdict:
     """Episodes in which the candidate does worse, by time, with Γ's belief of the baseline's."""
     no_longer_failing: list[Outcome]
     worse_by: float
+    outcomes: list[tuple[Outcome, Outcome]]  # Of all pairs, the baseline's first.
+    is_paired: bool = True  # Whether both outcomes of a pair belong to the same episode.
 
 
 def compare_loops(
@@ -78,8 +80,7 @@ def compare_loops(
     each kind is wrong with probability alpha: with k candidates pass alpha / k. Episodes are kept
     in the folder ``path``. Γ of the baseline's scenario says whether a change was foreseen.
     """
-    if not (0.0 < worse_by < 1.0 and 0.0 < alpha < 1.0):
-        raise ValueError(f"worse_by and alpha must be in (0, 1); got {worse_by} and {alpha}")
+    check_levels(worse_by, alpha)
     first, second = (
         ComparedPlant(one) if isinstance(one, Scenario) else one for one in (baseline, candidate)
     )
@@ -128,11 +129,17 @@ def compare_loops(
             pairs = [(runs[0][index], runs[1][index]) for index in range(number)]
             apart = [after.value - before.value for before, after in pairs]
             looks.append(interim_estimate(apart, looks, alpha))
-            verdict = _verdict(pairs, looks, worse_by)
+            verdict = verdict_of(pairs, looks, worse_by)
             each_look(verdict)
             if verdict.verdict != UNDECIDED:
                 break
     return verdict
+
+
+def check_levels(worse_by: float, alpha: float) -> None:
+    """Checks the difference that matters and the probability of an error."""
+    if not (0.0 < worse_by < 1.0 and 0.0 < alpha < 1.0):
+        raise ValueError(f"worse_by and alpha must be in (0, 1); got {worse_by} and {alpha}")
 
 
 def check_pair(
@@ -159,10 +166,10 @@ def check_pair(
     _check_alike(0, loop, *starts)
 
 
-def _verdict(
+def verdict_of(
     pairs: Sequence[tuple[Outcome, Outcome]], looks: Sequence[Estimate], worse_by: float
 ) -> Verdict:
-    """What is known of all pairs so far."""
+    """What is known of all pairs so far, the baseline's outcomes first."""
     low, high = looks[-1].low, looks[-1].high
     known = WORSE if low > 0.0 else BETTER if high < 0.0 else NOT_WORSE
     newly = [replace(two, belief=one.belief) for one, two in pairs if two.value > one.value]
@@ -175,6 +182,7 @@ def _verdict(
         newly_failing=sorted(newly, key=lambda one: one.time_s),
         no_longer_failing=sorted(no_longer, key=lambda one: one.time_s),
         worse_by=worse_by,
+        outcomes=[*pairs],
     )
 
 

@@ -33,7 +33,7 @@ class Outcome:
     belong to the first undisturbed row.
     """
 
-    episode: int
+    episode: int | str  # A name in files of other simulators.
     value: float
     time_s: float
     cause: str
