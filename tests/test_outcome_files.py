@@ -101,12 +101,27 @@ def test_lerobots_evaluations_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "metric", "message"),
     [
-        ("a.csv", "", "failed", r"expected one column each of \['episode', 'failed'\]; it has \[\]"),
-        ("a.csv", "episode,fail\n1,0\n", "failed", r"of \['failed'\]; it has \['episode', 'fail'\]"),
+        (
+            "a.csv",
+            "",
+            "failed",
+            r"expected one column each of \['episode', 'failed'\]; it has \[\]",
+        ),
+        (
+            "a.csv",
+            "episode,fail\n1,0\n",
+            "failed",
+            r"of \['failed'\]; it has \['episode', 'fail'\]",
+        ),
         ("a.csv", "episode,failed,failed\n1,0,1\n", "failed", r"each of \['failed'\]"),
         ("a.csv", "episode,failed\n", "failed", "it has no episodes"),
         ("a.csv", "episode,failed\n1,0\n1,1\n", "failed", "line 3: episode '1' stands twice"),
-        ("a.csv", "episode,failed\n1,0\n2,2\n", "failed", "line 3: 'failed' must be 0 or 1; got '2'"),
+        (
+            "a.csv",
+            "episode,failed\n1,0\n2,2\n",
+            "failed",
+            "line 3: 'failed' must be 0 or 1; got '2'",
+        ),
         ("a.csv", "episode,failed\n1\n", "failed", "line 2: 'failed' must be 0 or 1; got ''"),
         ("a.csv", "episode,failed\n,1\n", "failed", "line 2: 'episode' is empty"),
         ("a.csv", "episode,m\n1,-1\n", "m", "line 2: 'm' must be 0 to 1; got '-1'"),
@@ -147,7 +162,12 @@ def test_the_command_says_whether_it_pairs_and_ends_as_the_simulated_gate(
 
 @pytest.mark.train
 def test_the_simulated_gate_writes_outcomes_that_give_its_verdict(monkeypatch, capsys, tmp_path):
-    changes = ("--candidate", "parameters.effort_share=0.2", "--candidate", "parameters.damping=0.06")
+    changes = (
+        "--candidate",
+        "parameters.effort_share=0.2",
+        "--candidate",
+        "parameters.damping=0.06",
+    )
     levels = ("--worse-by", 0.2, "--out", tmp_path)
     assert call(monkeypatch, "gate", "pendulum", "--workers", 1, *changes, *levels) == 1
     assert '"outcomes"' not in (tmp_path / "gate.json").read_text().replace('"outcomes": []', "")

@@ -6,7 +6,6 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ from typing import Any
 import numpy as np
 from pydrake.geometry import Sphere
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context
 
 from drake_safety.control.kinematics import NUM_BASE_VELOCITIES, RobotKinematics
 from drake_safety.control.safe_sets import convex_hull, signed_distance_to_polygon
@@ -28,14 +26,14 @@ from drake_safety.robots.plausibility import effort_unit, odd_inertias, odd_limi
 from drake_safety.simulation.capabilities import FollowsCommands
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.contract import Finding, check_contract, failed, passed
+from drake_safety.simulation.hand_over import ITEM as HAND_OVER
+from drake_safety.simulation.hand_over import POLICY_REMEDY, check_hand_over
 from drake_safety.simulation.legged_loop import LeggedLoop
-from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.rollouts import HIDDEN_STATE, is_repeatable, run_episode, run_episodes
 from drake_safety.simulation.scenario import Scenario, load_scenario, read_scenario
 
 _Check = Generator[Finding, None, None]
 _STANDS = "stands for 1 s"
-_WALKS = "walks for 2 s at half the command"
 _LEVEL_M = 2e-3  # Largest difference of the feet's heights.
 _MATCH_M = 1e-3
 _LINE_REMEDY = (
@@ -43,11 +41,6 @@ _LINE_REMEDY = (
     "under 'feet' in robot.yaml [m], or take a policy (new --task walking)"
 )
 _GAINS_REMEDY = "if it sinks, raise 'joint_gains' in robot.yaml; if it trembles, halve them"
-_POLICY_REMEDY = (
-    "compare policy.yaml with the policy's training: order of 'joints' and of the terms of "
-    "'observation', their 'scale' and 'history', 'default_positions', 'action_scale', "
-    "'action_clip', 'gains', 'period_s', and a normalizer of observations"
-)
 _EFFORT_REMEDY = "state their largest torques under 'effort_limits' in robot.yaml [N·m]"
 
 
@@ -63,7 +56,8 @@ def check_scenario(
     """Checks a scenario item by item, the cheap ones first; no error in its files is raised.
 
     Args:
-        num_episodes: Episodes by which the share of unsafe ones is estimated.
+        num_episodes: Episodes by which the share of unsafe ones is estimated; with none the margins
+            of a policy are left out too.
         is_imported: Whether the task is imported, which runs its code; else files are checked.
         check_robot: Further checks of the robot.
     """
@@ -93,7 +87,8 @@ def check_scenario(
         progress(_STANDS, 1, 1)
     remedy = ""
     if isinstance(loop, FollowsCommands):
-        remedy = yield from _guarded(_WALKS, _walks, loop)
+        check = partial(check_hand_over, has_margins=num_episodes > 0, progress=progress)
+        remedy = yield from _guarded(HAND_OVER, check, loop)
     yield from _guarded("contract", partial(check_contract, seed=seed), loop)
     if num_episodes:
         yield from _guarded("episodes", _episodes, loop, num_episodes, seed, progress, remedy)
@@ -326,35 +321,10 @@ def _stands(loop: LeggedLoop) -> _Check:
     standing = kinematics.contact_positions(kinematics.standing_positions())
     remedy = _GAINS_REMEDY
     if isinstance(loop, FollowsCommands):
-        remedy = _POLICY_REMEDY
+        remedy = POLICY_REMEDY
     elif len(convex_hull(standing[:, :2].tolist())) < 3:
         remedy = _LINE_REMEDY
     yield _judged(_STANDS, is_still and touching > 0, message, message, remedy)
-
-
-def _walks(loop: Any) -> Generator[Finding, None, str]:
-    command = 0.5 * np.array(loop.policy.parameters.command.highest) * (1.0, 0.0, 0.0)
-
-    def begin(context: Context) -> None:
-        plan = loop.command_plan(command)
-        loop.reset_to(context, None, replace(loop.standing_start(), plan=plan))
-
-    ports = ("output", "margins", "controller_status")
-    motion = simulate(loop, begin, ports, End(duration_s=2.0), may_fail=True)
-    mean = motion["output"][len(motion.time_s) // 2 :].mean(axis=0)
-    message = f"asked for {command[0]:.2f} m/s, it moves at {mean[0]:.2f} m/s"
-    if motion.failure:
-        message = f"the simulation fails: {motion.failure}"
-    elif motion["controller_status"].any():
-        message += "; the network returns actions that are not finite, and the last one is held"
-    elif motion.has_left:
-        message += f"; it leaves the safe set at {motion.leave_time_s:.2f} s: {motion.cause}"
-    else:
-        is_slow = bool(np.linalg.norm(mean - command) > 0.5 * command[0] + 0.1)
-        yield passed(_WALKS, message, f"if it should be faster, {_POLICY_REMEDY}" * is_slow)
-        return ""
-    yield failed(_WALKS, message, _POLICY_REMEDY)
-    return f"correct '{_WALKS}' first: the policy does not walk"
 
 
 def _family(scenario: Scenario, num_episodes: int, seed: int, report: StageProgress) -> _Check:
