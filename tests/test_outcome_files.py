@@ -24,19 +24,26 @@ def outcomes(rng, share, names):
     return {name: float(rng.random() < share) for name in names}
 
 
-@pytest.mark.parametrize("candidate", [{"effort_share": 0.2}, {"damping": 0.0501}])
-@pytest.mark.parametrize("most", [2000, 20])
-def test_the_outcomes_of_simulated_pairs_give_the_same_verdict(tmp_path, candidate, most):
-    changed = load_scenario("pendulum", {f"parameters.{k}": v for k, v in candidate.items()})
-    options = {"worse_by": 0.1 + 0.1 * (most > 20), "num_workers": 1, "max_pairs": most}
+@pytest.mark.parametrize(
+    ("key", "value", "most", "expected"),
+    [
+        ("effort_share", 0.2, 2000, "worse"),
+        ("damping", 0.0501, 32, "not worse"),
+        ("effort_share", 0.2, 20, "undecided"),
+    ],
+)
+def test_the_outcomes_of_simulated_pairs_give_the_same_verdict(
+    tmp_path, key, value, most, expected
+):
+    changed = load_scenario("pendulum", {f"parameters.{key}": value})
+    options = {"worse_by": 0.2, "num_workers": 1, "max_pairs": most}
     simulated = compare_loops(load_scenario("pendulum"), changed, **options)
     files = [tmp_path / "a.csv", tmp_path / "b.csv"]
     for file, side in zip(files, zip(*simulated.outcomes, strict=True), strict=True):
         write_outcomes(file, side)
     found = compare_outcomes(*map(read_outcomes, files), worse_by=options["worse_by"])
-    assert (found.verdict, found.pairs, found.both) == (
-        *(simulated.verdict, simulated.pairs, simulated.both),
-    )
+    assert found.verdict == simulated.verdict == expected
+    assert (found.pairs, found.both) == (simulated.pairs, simulated.both)
     names = [int(one.episode) for one in found.newly_failing]
     assert sorted(names) == sorted(one.episode for one in simulated.newly_failing)
     assert found.difference[-1].value == simulated.difference[-1].value
@@ -60,11 +67,11 @@ def test_order_does_not_matter_and_other_episodes_are_drawn_into_pairs():
 
 def test_verdicts_on_equal_unpaired_sets_are_seldom_wrong():
     rng, wrong = np.random.default_rng(1), 0
-    for k in range(200):
+    for k in range(60):
         sides = [outcomes(rng, 0.3, [f"{s}{i}" for i in range(200)]) for s in "ab"]
         by_outcome = [dict(sorted(one.items(), key=lambda item: item[1])) for one in sides]
         wrong += compare_outcomes(*by_outcome, seed=k).verdict == "worse"
-    assert wrong <= 15  # 5 % and three standard deviations: 19.
+    assert wrong <= 8  # 5 % and three standard deviations.
 
 
 def test_columns_are_failures_shares_or_values_with_a_bound(tmp_path):
@@ -173,7 +180,7 @@ def test_the_simulated_gate_writes_outcomes_that_give_its_verdict(monkeypatch, c
     assert '"outcomes"' not in (tmp_path / "gate.json").read_text().replace('"outcomes": []', "")
     for k, code in ((1, 1), (2, 0)):
         files = [tmp_path / f"outcomes-{k}" / f"{side}.csv" for side in ("baseline", "candidate")]
-        again = ("--worse-by", 0.2, "--alpha", 0.025)
+        again = ("--worse-by", 0.25, "--alpha", 0.025)
         assert call(monkeypatch, "gate", "--outcomes", *files, *again) == code
         head, *rows = files[1].read_text().splitlines()
         assert head == "episode,failed,time_s,cause" and rows[0].startswith("0,")

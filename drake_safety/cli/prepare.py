@@ -97,7 +97,7 @@ def _names(text: str | None) -> list[str]:
 
 def check(
     scenario: console.ScenarioArgument,
-    quick: Annotated[bool, Option("--quick", help="Without the share of unsafe episodes.")] = False,
+    quick: Annotated[bool, Option("--quick", help="Without what takes a minute.")] = False,
     import_: Annotated[
         bool, Option("--import/--no-import", help="Import the task, which runs a stranger's code.")
     ] = True,
@@ -130,5 +130,5 @@ def check(
     if not import_:
         return console.say("its files are right; nothing else is checked: its code was not run")
     if quick:
-        console.say("not checked: the share of unsafe episodes")
+        console.say("not checked: the share of unsafe episodes, and the margins of a policy")
     console.say("ready: drake-safety train", scenario, "--out FOLDER")

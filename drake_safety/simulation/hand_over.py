@@ -84,10 +84,6 @@ class MotorLoads:
         self.peaks = np.zeros((3, len(self.names)))  # Of torque, speed and power.
         self.hit_s = self.total_s = 0.0
 
-    def begin(self) -> None:
-        """Begins another motion, at time zero."""
-        self._before_s = 0.0
-
     def targets(self, context: Context) -> np.ndarray:
         """The joint positions that the policy wants, (n_j,) [rad]."""
         port = self._controller.GetOutputPort("desired_joint_state")
@@ -102,8 +98,9 @@ class MotorLoads:
         torque, speed = np.clip(asked, -1.0, 1.0), v / self._speed
         loads = np.array([np.abs(asked), np.abs(speed), torque * (torque + speed)])
         np.maximum(self.peaks, loads, out=self.peaks)
-        step_s = context.get_time() - self._before_s
-        self._before_s = context.get_time()
+        now_s = context.get_time()
+        step_s = now_s - min(self._before_s, now_s)  # Another motion begins at time zero.
+        self._before_s = now_s
         self.total_s += step_s
         self.hit_s += step_s * bool((loads[:2] >= 1.0).any())
 
@@ -178,15 +175,11 @@ def _moved(
         ("output", "margins", "plant_state", "controller_status"),
         End(duration_s=duration_s),
         step_s=loop.scenario.control_period_s,
-        events=[(time_s, partial(_command, loop, one)) for time_s, one in commands],
+        events=[(time_s, partial(loop.set_command, command=one)) for time_s, one in commands],
         may_fail=True,
         who=ITEM,
         **options,
     )
-
-
-def _command(loop: Any, command: np.ndarray, context: Context) -> None:
-    loop.set_command(context, command)
 
 
 def _mean(motion: Motion, begin_s: float, end_s: float) -> np.ndarray:
@@ -201,29 +194,24 @@ def _taken_over(
 ) -> Finding:
     stop_s = _STAND_S + _WALK_S
     commands = [(_STAND_S, command), (stop_s, np.zeros(3))]
-    jump: list[np.ndarray] = []
-    joints, period_s = start.q[-len(loads.names) :], loop.policy.parameters.period_s
+    jump, period_s = np.zeros(len(loads.names)), loop.policy.parameters.period_s
 
     def watch(context: Context) -> None:
         if context.get_time() < 0.5 * period_s:  # Of its first action.
-            jump[:] = [np.abs(loads.targets(context) - joints)]
+            jump[:] = np.abs(loads.targets(context) - start.q[-len(jump) :])
         loads.read(context)
 
-    loads.begin()
     motion = _moved(loop, start, commands, stop_s + _STOP_S, monitor=watch)
     item, (where, unit) = f"{ITEM}, {name}", _AXES[axis]
-    message = ""
-    if jump:
-        k = int(jump[0].argmax())
-        message = f"the joint targets jump by {jump[0][k]:.2f} rad ({loads.names[k]}); "
+    message = f"the joint targets jump by {jump.max():.2f} rad ({loads.names[jump.argmax()]}); "
     if motion.failure:
         return failed(item, f"{message}the simulation fails: {motion.failure}", POLICY_REMEDY)
     if (motion["controller_status"] == HELD).any():
         what = "the network returns actions that are not finite, and the last one is held"
         return failed(item, message + what, POLICY_REMEDY)
     if motion.has_left:
-        what = "falls" if motion.has_fallen else "leaves the safe set"
-        what = f"it {what} at {motion.leave_time_s:.2f} s: {motion.cause}"
+        what = f"it leaves the safe set at {motion.leave_time_s:.2f} s: {motion.cause}"
+        what += f", and falls at {motion.fall_time_s:.2f} s" * motion.has_fallen
         return failed(item, message + what, POLICY_REMEDY)
     mean = _mean(motion, _STAND_S + _SETTLED_S, stop_s)
     asked, moves = command[axis], mean[axis]
@@ -238,7 +226,7 @@ def _taken_over(
         f"if it should be faster, {POLICY_REMEDY}"
         * bool(np.linalg.norm(mean - command) > 0.5 * asked + 0.1),
         "train the policy to stand at a command of zero" * (speed > _STOPPED_M_S),
-        _START_REMEDY * bool(jump and (jump[0] * loads.stiffness).max() >= _NEAR),
+        _START_REMEDY * bool((jump * loads.stiffness).max() >= _NEAR),
     ]
     return passed(item, message, "; ".join(filter(None, remedies)))
 
@@ -284,7 +272,8 @@ def _smallest_commands(
 def _margins(loop: Any, command: np.ndarray, progress: Callable[[int, int], Any]) -> Finding:
     """The first rung of each ladder on which the robot falls, by bisection."""
     scenario, num_tried, texts, is_small = loop.scenario, 0, [], False
-    for kind, rungs in _ladders(loop).items():
+    for kind, values in _CHANGES.items():
+        rungs = [_changed(loop, kind, x) for x in values]
         low, high = 0, len(rungs)  # Numbers of rungs without a fall.
         while low < high:
             progress(num_tried, 3 * len(_CHANGES))
@@ -296,28 +285,22 @@ def _margins(loop: Any, command: np.ndarray, progress: Callable[[int, int], Any]
             falls = motion.has_fallen or bool(motion.failure)
             low, high = (low, middle) if falls else (middle + 1, high)
             num_tried += 1
-        parts = [f"falls at {text}" for text, _ in rungs[low : low + 1]] or ["no fall"]
-        parts += [f"not at {text}" for text, _ in rungs[:low][-1:]]
+        parts = [f"falls at {text}" for text, _ in rungs[low : low + 1]]
+        parts += [f"no fall at {text}" for text, _ in rungs[:low][-1:]]
         texts.append(f"{kind}: {', '.join(parts)}")
         is_small |= low < _ENOUGH
     progress(num_tried, num_tried)
     return passed(f"{ITEM}, margins", "; ".join(texts), _RANDOM_REMEDY * is_small)
 
 
-def _ladders(loop: Any) -> dict[str, list[tuple[str, PlantVariation]]]:
-    """Plants that differ more and more from the nominal one, with words, by kind."""
-    nominal = loop.scenario.variation("nominal")
-    shift, friction = nominal.shift or Shift(), nominal.foot_friction or loop.robot.foot_friction
-    delay_s, mass = shift.command_delay_s, nominal.mass_scale
-    ladders: dict[str, list[tuple[str, PlantVariation]]] = {}
-    for kind, values in _CHANGES.items():
-        ladders[kind] = rungs = []
-        for x in values:
-            if kind == "latency":
-                late = replace(nominal, shift=replace(shift, command_delay_s=delay_s + x))
-                rungs.append((f"{1000 * x:g} ms", late))
-            elif kind == "friction":
-                rungs.append((f"{x * friction:.2g}", replace(nominal, foot_friction=x * friction)))
-            else:
-                rungs.append((f"×{x:g}", replace(nominal, mass_scale=x * mass)))
-    return ladders
+def _changed(loop: Any, kind: str, x: float) -> tuple[str, PlantVariation]:
+    """A plant that differs from the nominal one by a rung of a ladder, with words."""
+    nominal: PlantVariation = loop.scenario.variation("nominal")
+    if kind == "latency":
+        shift = nominal.shift or Shift()
+        late = replace(shift, command_delay_s=shift.command_delay_s + x)
+        return f"{1000 * x:g} ms", replace(nominal, shift=late)
+    if kind == "friction":
+        friction = x * (nominal.foot_friction or loop.robot.foot_friction)
+        return f"{friction:.2g}", replace(nominal, foot_friction=friction)
+    return f"×{x:g}", replace(nominal, mass_scale=x * nominal.mass_scale)
