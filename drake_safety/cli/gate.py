@@ -7,7 +7,7 @@ import html
 import math
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -145,14 +145,16 @@ def gate(
         if verdicts:
             title = f"{first.scenario.name}, {first.variation}"
             _report(title, verdicts, metric, alpha / len(others), worse_by, is_replayed=True)
-            candidates_ = {n: asdict(replace(one, outcomes=[])) for n, one in verdicts.items()}
+            candidates_ = {name: asdict(one) for name, one in verdicts.items()}
+            for one in candidates_.values():
+                del one["outcomes"]  # They are in files.
             entries = {"seed": seed, "metric": metric, "candidates": candidates_}
             write_results(folder / "gate.json", first, Results({}, entries))
             for picture in save(gate_figure(verdicts), folder / "gate"):
                 console.say("picture", picture)
-            for k, one in enumerate(verdicts.values(), start=1):
+            for k, verdict in enumerate(verdicts.values(), start=1):
                 files = [folder / f"outcomes-{k}" / f"{s}.csv" for s in ("baseline", "candidate")]
-                for file, of_side in zip(files, zip(*one.outcomes, strict=True), strict=True):
+                for file, of_side in zip(files, zip(*verdict.outcomes, strict=True), strict=True):
                     write_outcomes(file, of_side)
                 console.say("outcomes", *files)
     _end(verdicts)
@@ -228,7 +230,7 @@ def _report(
     show_rows(f"{title}: {metric}", columns, rows)
     for name, one in verdicts.items():
         if not one.is_paired:
-            console.say(f"{name}: it names other episodes than the baseline; pairs are drawn")
+            console.say(f"{name}: not the baseline's episodes; pairs are drawn, for one look")
             continue
         new, old = one.newly_failing, one.no_longer_failing
         show_episodes(f"{name}: episodes that newly fail", new, metric)

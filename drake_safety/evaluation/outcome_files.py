@@ -81,8 +81,8 @@ def _rows(text: str, metric: str) -> Iterator[tuple[str, str, float]]:
 
 def _lerobot(info: Any) -> Iterator[tuple[str, str, float]]:
     """The same of ``eval_info.json``: lists by task; of older versions a list of episodes."""
-    where = "per_task" if "per_task" in info else "per_episode"
     try:
+        where = "per_task" if "per_task" in info else "per_episode"
         if where == "per_task":
             tasks = [(f"{t['task_group']}/{t['task_id']}", t["metrics"]) for t in info[where]]
             found = [(f"{n}/{k}", x) for n, m in tasks for k, x in enumerate(m["successes"])]
