@@ -88,8 +88,9 @@ def gate(
     files, or LeRobot's eval_info.json: the baseline's, then the candidates'.
     """
     if outcomes:
-        if candidate or baseline or replay is not None or not candidates:
-            raise ValueError("gate: --outcomes takes files alone: the baseline's, the candidates'")
+        if not candidates or candidate or baseline or out or replay is not None:
+            without = "without --candidate, --baseline, --out and --replay"
+            raise ValueError(f"gate: --outcomes takes files, the baseline's first, {without}")
         metric, alpha = metric or FAILED, alpha / len(candidates)
         reference = read_outcomes(Path(scenario), metric)
         levels: dict[str, Any] = {"worse_by": worse_by, "alpha": alpha, "seed": seed}
