@@ -29,6 +29,7 @@ from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from studies.documents import CARDS, cards_of
+from studies.glance_figures import blocks, glance
 from studies.moving_pictures import recovery, walking
 from studies.path_figure import path_figure
 
@@ -93,8 +94,8 @@ def _shifts(name: str, folder: Path) -> Figure:
         for change in changes:
             one = results.get((f"shifts.{change}", *place))
             if one and (f"shifts.{change}", "monitor", "delay_s") in results:
-                ends = (scale * end for end in (one.value, one.low, one.high))
-                rows[set, change, metric] = Estimate(*ends, one.n)
+                value, low, high = (scale * end for end in (one.value, one.low, one.high))
+                rows[set, change, metric] = Estimate(value, low, high, one.n)
     return interval_figure(rows)
 
 
@@ -111,6 +112,8 @@ def _adaptation_study(folder: Path) -> Figure:
 
 
 PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
+    "glance": glance,
+    "blocks": blocks,
     "recovery": recovery,
     "walking": walking,
     "timeline": partial(_of_run, "timeline.png", "laikago_balancing", push=["ball"]),

@@ -85,7 +85,7 @@ def rare(
 def _rows(study: Study, name: str, system: System, samples: int) -> dict[str, Estimate]:
     scenario = load_scenario(system.scenario, system.changes)
     folder = study.folder / scenario.simulation_hash(system.variation)[:12]
-    options = {"variation": system.variation, "num_workers": study.workers}
+    options: dict[str, Any] = {"variation": system.variation, "num_workers": study.workers}
     found = [
         estimate_rare_failure(
             scenario,
