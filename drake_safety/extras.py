@@ -10,6 +10,7 @@ MODULES = {
     "live": ("aiohttp", "nicegui"),
     "logs": ("mcap", "pandas", "pyarrow", "rosbags"),
     "mujoco": ("mujoco",),
+    "c": ("emx_onnx_cgen", "jinja2", "onnx"),
     "onnx": ("onnx",),
     "report": ("jinja2",),
     "robots": ("trimesh", "collada"),

@@ -16,16 +16,29 @@ def export(
     scenario: console.ScenarioArgument,
     assessment: console.AssessmentOption = None,
     mode: console.ModeOption = MODES[0],
-    out: Annotated[Path, Option(help="The file.", dir_okay=False)] = Path("gamma.onnx"),
+    out: Annotated[
+        Path, Option(help="The file: ONNX, or C if its name ends in .c.", dir_okay=False)
+    ] = Path("gamma.onnx"),
+    part: Annotated[
+        str, Option(help="Of an ONNX file: 'gamma', 'assessor' or 'monitor'; C has all.")
+    ] = "gamma",
+    prefix: Annotated[
+        str | None, Option(help="Of all names in C; by default the file's name.")
+    ] = None,
 ) -> None:
-    """Write Γ as one ONNX file, which runs without this package and without Drake."""
+    """Write Γ as one ONNX or C file, which runs without this package and without Drake."""
     *_, gamma = folders.open_assessment(scenario, assessment, mode)
     folders.check_writable(out.parent)
-    gamma.to_onnx(out)
+    written = [out]
+    if out.suffix == ".c":
+        written = gamma.to_c(out, prefix)
+    else:
+        gamma.to_onnx(out, part)
     for one in gamma.calibrations_.values():
         verdicts = f"safe from {one.threshold:.4f}, unsafe below {one.unsafe_below:.4f}"
         console.say(f"{one.kind:<16}  {verdicts}: {one.promise}")
-    console.say(f"written           {out.stat().st_size / 1e6:.2f} MB,", out)
+    for file in written:
+        console.say(f"written           {file.stat().st_size / 1e6:.2f} MB,", file)
 
 
 def report(

@@ -408,12 +408,25 @@ class SafetyAssessment:
         learned = {name: value for name, value in vars(self).items() if name.endswith("_")}
         assessment_file.write(Path(path), self.parameters, learned)
 
-    def to_onnx(self, path: str | os.PathLike[str]) -> None:
-        """Writes `predict` as it is now as one ONNX graph, atomically; see docs/export.md."""
+    def to_onnx(self, path: str | os.PathLike[str], part: str = "gamma") -> None:
+        """Writes `predict` as it is now as one ONNX graph, atomically; see docs/export.md.
+
+        Other parts are the "assessor", which heeds margins and alarm, and the "monitor".
+        """
         from drake_safety.learning import onnx_graph
 
         self._check_fitted()
-        onnx_graph.write(Path(path), self)
+        onnx_graph.write(Path(path), self, part)
+
+    def to_c(self, path: str | os.PathLike[str], prefix: str | None = None) -> list[Path]:
+        """Writes assessor and monitor as C99: a source, its header and an example.
+
+        The prefix of all names is by default the name of the source. Returns the files.
+        """
+        from drake_safety.learning import c_source
+
+        self._check_fitted()
+        return c_source.write(Path(path), self, prefix)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SafetyAssessment:

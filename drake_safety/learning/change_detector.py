@@ -21,8 +21,9 @@ LEAST_MOTION_S = 360.0  # Below it limits are not learned, of the nominal plant 
 MOST_PREDICTOR_S = 3600.0  # Longest motion for the prediction; the rest is for the limits.
 LEAST_JUDGED = 0.5  # Share of inputs that can be judged, below which there is an alarm.
 RECOVERED_LEVEL, RECOVERY_S = 0.7, 5.0  # Levels are below it for this time before an alarm ends.
+SETTLING_S = 0.5  # Time for which the charts wait on after a disturbance that is known.
 NUM_PREVIEWED = 2  # Samples of the desired preview that the predictor sees.
-_CLIP = 6.0  # Of an innovation, in standard deviations, so that one impact is no lasting change.
+MOST_INNOVATION = 6.0  # In standard deviations, so that one impact is no lasting change.
 _BEFORE_LEAVING_S = 0.5  # Left out of a motion that leaves the safe set.
 _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
 _TAIL_SHARE = 0.1  # Of the blocks.
@@ -181,14 +182,14 @@ class ChangeDetector:
 
     def _charts(self, innovations: np.ndarray) -> np.ndarray:
         """The charts, signed, after each of consecutive innovations (K, n_w), (K, 6, n_w)."""
-        innovations = np.clip(innovations, -_CLIP, _CLIP)
+        innovations = np.clip(innovations, -MOST_INNOVATION, MOST_INNOVATION)
         both = innovations, np.square(innovations) - 1.0
         return np.stack([_smoothed(v, rate) for v in both for rate in self.rates], axis=1)
 
     def innovation(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
         """The innovation (n_w,) of a change of the state after two inputs (n_u,), clipped."""
         error = self.predictor.error(x, previous, change)
-        return np.minimum(np.maximum(error / self.deviation, -_CLIP), _CLIP)
+        return np.minimum(np.maximum(error / self.deviation, -MOST_INNOVATION), MOST_INNOVATION)
 
     def updated(self, charts: np.ndarray, innovation: np.ndarray) -> np.ndarray:
         """The charts (6, n_w), signed, after one more innovation (n_w,)."""

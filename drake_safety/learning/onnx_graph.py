@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +13,11 @@ import numpy as np
 
 from drake_safety.extras import require_extra
 from drake_safety.files.atomic import write_file
-from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, empty
+from drake_safety.learning.beliefs import EMPTY, SAFE, UNCERTAINTY, empty
+from drake_safety.learning.graph_nodes import Graph, Value
 from drake_safety.learning.grid import Grid
+from drake_safety.learning.monitor_graph import DESCRIPTIONS as _OF_MONITOR
+from drake_safety.learning.monitor_graph import add_monitor, cause_names, memory_sizes
 from drake_safety.learning.novelty import NUM_QUADRATIC, Novelty
 from drake_safety.learning.prediction import (
     LOGIT_LIMIT,
@@ -49,93 +52,73 @@ _DESCRIPTIONS = {
     "not learned.",
 }
 _OUTPUTS = list(_DESCRIPTIONS)[3:]
+_DESCRIPTIONS |= _OF_MONITOR | {
+    "margins": "Signed margins of the measured state; negative is outside the safe set.",
+    "belief_without_alarm": "The belief if there were no alarm.",
+    "probability_without_alarm": "The probability if there were no alarm.",
+}
+_CHECKED = ("belief", "safety_probability", "cause_probability")
+"""What margins and alarm change."""
+PARTS = {
+    "gamma": ([], _OUTPUTS),
+    "assessor": (
+        ["margins", "alarm"],
+        [*_OUTPUTS, "belief_without_alarm", "probability_without_alarm"],
+    ),
+    "monitor": (["hold", "memory"], list(_OF_MONITOR)[2:]),
+}
+"""Parts that are graphs, and their inputs beside those of Γ, and their outputs.
+
+Γ alone; what a `SafetyAssessor` makes of it by margins and alarm; one step of a `ChangeMonitor`.
+"""
 _UNITS = "those of the recorded ports: SI and radians (m, m/s, rad, rad/s, N, N·m) in the tasks of "
 _UNITS += "drake_safety"
 
 
-class _Graph:
-    """Nodes and constants of a graph."""
-
-    def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: list[onnx.TensorProto] = []
-
-    def node(
-        self, operator: str, *inputs: Any, output: str | None = None, **attributes: Any
-    ) -> _Value:
-        """Adds a node and returns its output; inputs that are no values become constants."""
-        from onnx import helper, numpy_helper
-
-        names = []
-        for given in inputs:
-            if isinstance(given, _Value):
-                names.append(given.name)
-                continue
-            value = np.ascontiguousarray(given).reshape(np.shape(given))
-            names.append(f"constant_{len(self.constants)}")
-            self.constants.append(numpy_helper.from_array(value, names[-1]))
-        name = output or f"{operator.lower()}_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(operator, names, [name], **attributes))
-        return _Value(self, name)
-
-
-class _Value:
-    """A value of a graph: its operators and methods add the node that has it as first input."""
-
-    def __init__(self, graph: _Graph, name: str):
-        self.graph, self.name = graph, name
-
-    def __getattr__(self, operator: str) -> Callable[..., _Value]:
-        return lambda *others, **options: self.graph.node(operator, self, *others, **options)
-
-    def __add__(self, other: Any) -> _Value:
-        return self.Add(other)
-
-    def __sub__(self, other: Any) -> _Value:
-        return self.Sub(other)
-
-    def __rsub__(self, other: float) -> _Value:
-        return self.graph.node("Sub", other, self)
-
-    def __mul__(self, other: Any) -> _Value:
-        return self.Mul(other)
-
-    def __truediv__(self, other: Any) -> _Value:
-        return self.Div(other)
-
-    def __matmul__(self, other: Any) -> _Value:
-        return self.MatMul(other)
-
-    def part(self, start: int, stop: int, *, axis: int, output: str | None = None) -> _Value:
-        """Entries along an axis."""
-        return self.Slice([start], [stop], [axis], output=output)
-
-    def double(self) -> _Value:
-        return self.Cast(to=11)  # onnx.TensorProto.DOUBLE
-
-    def single(self) -> _Value:
-        return self.Cast(to=1)  # onnx.TensorProto.FLOAT
-
-
-def write(path: Path, assessment: Any) -> None:
-    """Writes `SafetyAssessment.predict` as one ONNX file, atomically and with the same bytes."""
+def write(path: Path, assessment: Any, part: str = "gamma") -> None:
+    """Writes a part as one ONNX file, atomically and with the same bytes."""
     require_extra("onnx", f"export to '{path}'")
+    if part not in PARTS:
+        raise ValueError(f"export to '{path}': part must be one of {list(PARTS)}; got '{part}'")
+    write_file(path, make_model(assessment, part).SerializeToString(deterministic=True))
+
+
+def make_model(assessment: Any, part: str, rows: int | str = "N") -> onnx.ModelProto:
+    """Makes the graph of a part; by default it takes any number of rows."""
     import onnx
 
-    info, parameters = assessment.info_, assessment.parameters
-    ports = ["state", "desired_preview", *["features"] * assessment.columns_.has_features]
-    contract, graph = _contract(assessment, ports), _Graph()
-    _add_prediction(graph, assessment.model, ports, parameters.feature_unit)
-    widths = info.widths | dict.fromkeys(("safety_probability", "novelty", "fall_probability"))
+    info, detector, graph = assessment.info_, assessment.detector_, Graph()
+    ports = ["state", "desired_preview"]
+    # The monitor reads the place of the features among all columns.
+    if assessment.columns_.has_features or (part == "monitor" and info.feature_names):
+        ports.append("features")
+    further, outputs = PARTS[part]
+    contract = _contract(assessment, [*ports, *further])
+    if part == "monitor":
+        add_monitor(graph, detector, ports)
+        monitored = [info.state_names[i] for i in detector.watched]
+        contract |= {"step_s": detector.step_s, "monitored": monitored}
+        contract |= {"causes": cause_names(detector, info.state_names)}
+    else:
+        inner = "_of_gamma" if part == "assessor" else ""
+        feature_unit = assessment.parameters.feature_unit
+        _add_prediction(graph, assessment.model, ports, feature_unit, inner)
+        if inner:
+            _add_checks(graph, inner, len(info.constraint_names))
+    widths = info.widths | dict.fromkeys(outputs) | {"embedding": 2, "belief": 3}
     widths |= dict.fromkeys(("cause_probability", "predicted_margins"), info.widths["margins"])
-    widths |= {"belief": 3, "embedding": 2}
+    widths |= dict.fromkeys(("levels", "innovation"), len(detector.watched))
+    widths |= {"hold": 1, "belief_without_alarm": 3}
+    widths |= dict.fromkeys(("memory", "next_memory"), sum(memory_sizes(detector).values()))
+    if part == "assessor":
+        widths["alarm"] = 1
 
     def described(names: Iterable[str]) -> list[onnx.ValueInfoProto]:
         """Ports of double precision, (N, width) or (N,)."""
         return [
             onnx.helper.make_tensor_value_info(
                 *(name, onnx.TensorProto.DOUBLE),
-                ["N"] if widths[name] is None else ["N", widths[name]],
+                [rows] if widths[name] is None else [rows, widths[name]],
                 _DESCRIPTIONS[name],
             )
             for name in names
@@ -143,7 +126,8 @@ def write(path: Path, assessment: Any) -> None:
 
     model = onnx.helper.make_model(
         onnx.helper.make_graph(
-            graph.nodes, "gamma", described(ports), described(_OUTPUTS), graph.constants
+            *(graph.nodes, part, described([*ports, *further]), described(outputs)),
+            graph.constants,
         ),
         opset_imports=[onnx.helper.make_opsetid("", OPSET)],
         ir_version=_IR_VERSION,
@@ -152,7 +136,7 @@ def write(path: Path, assessment: Any) -> None:
     )
     onnx.helper.set_model_props(model, {name: json.dumps(v) for name, v in contract.items()})
     onnx.checker.check_model(model, full_check=True)
-    write_file(path, model.SerializeToString(deterministic=True))
+    return model
 
 
 def _contract(assessment: Any, ports: Iterable[str]) -> dict[str, Any]:
@@ -160,7 +144,10 @@ def _contract(assessment: Any, ports: Iterable[str]) -> dict[str, Any]:
     info, parameters = assessment.info_, assessment.parameters
     adaptation, calibrations = assessment.adaptation_, assessment.calibrations_.values()
     preview = [f"{name} [{k}]" for k in range(info.horizon) for name in info.output_names]
-    columns = info.columns | {"desired_preview": preview}
+    columns = info.columns | {"desired_preview": preview, "margins": info.constraint_names}
+    memory = memory_sizes(assessment.detector_).items()
+    columns |= {"alarm": ["alarm"], "hold": ["hold"]}
+    columns |= {"memory": [f"{name} [{i}]" for name, size in memory for i in range(size)]}
     return {
         "schema_version": SCHEMA_VERSION,
         "drake_safety": installed_versions()["drake_safety"],
@@ -180,11 +167,13 @@ def _contract(assessment: Any, ports: Iterable[str]) -> dict[str, Any]:
     }
 
 
-def _add_prediction(graph: _Graph, model: Model, ports: Iterable[str], feature_unit: float) -> None:
-    """Adds `Model.predict`; the outputs have the names of the ports."""
+def _add_prediction(
+    graph: Graph, model: Model, ports: Iterable[str], feature_unit: float, inner: str
+) -> None:
+    """Adds `Model.predict`; the outputs have the names of the ports, `_CHECKED` ones a suffix."""
     base_logit, correction, embedding = model.base_logit, model.correction, model.embedding
     num_causes = model.num_causes
-    parts = [_Value(graph, name) for name in ports]
+    parts = [Value(graph, name) for name in ports]
     if "features" in ports and feature_unit:
         # Runtimes have no asinh of double precision.
         u = parts[-1] / feature_unit
@@ -203,8 +192,8 @@ def _add_prediction(graph: _Graph, model: Model, ports: Iterable[str], feature_u
     # Relative to the empty belief, which a map contributes whose output lies outside its grid.
     masses = _read_grid(weights, (model.beliefs - nothing) / embedding.num_members) + nothing
     masses = is_known.Where(masses, nothing, output="masses")
-    masses.part(0, 3, axis=1, output="belief")
-    masses.part(3, 3 + num_causes, axis=1, output="cause_probability")
+    masses.part(0, 3, axis=1, output="belief" + inner)
+    masses.part(3, 3 + num_causes, axis=1, output="cause_probability" + inner)
     nan = np.full(num_causes, np.nan)
     margins = nan if head is None else head[1]
     is_usable.Where(margins, nan, output="predicted_margins")
@@ -232,17 +221,39 @@ def _add_prediction(graph: _Graph, model: Model, ports: Iterable[str], feature_u
             fall = fall_inputs @ np.array(model.fall_logit.weights)[:, None]
             fall = (fall + model.fall_logit.offset).Sigmoid()
     is_known = uncertainty.LessOrEqual(unknown_above(model.initial_uncertainty))
-    is_known.Where(probability, 0.0).Squeeze([1], output="safety_probability")
+    is_known.Where(probability, 0.0).Squeeze([1], output="safety_probability" + inner)
     # Without it, NaN of N rows.
     fall = safe * np.nan if fall is None else is_usable.Where(fall, 1.0)
     fall.Squeeze([1], output="fall_probability")
 
 
-def _maps(x: _Value, embedding: Embedding) -> tuple[_Value, tuple[_Value, _Value] | None, _Value]:
+def _add_checks(graph: Graph, inner: str, num_causes: int) -> None:
+    """Adds what a `SafetyAssessor` makes of Γ by the measured margins and an alarm."""
+    belief, probability, cause = (Value(graph, name + inner) for name in _CHECKED)
+    margins, alarm = Value(graph, "margins"), Value(graph, "alarm")
+    is_finite = margins.Abs().Less(np.inf)  # Not for NaN.
+    is_inside = is_finite.And(margins.GreaterOrEqual(0.0)).double()
+    is_inside = is_inside.ReduceMin(axes=[1], keepdims=1).Greater(0.5)
+    are_finite = is_finite.double().ReduceMin(axes=[1], keepdims=1).Greater(0.5)
+    violated = are_finite.Where(margins, is_finite.double()).ArgMin(axis=1, keepdims=1)
+    safe, unsafe, unknown = (belief.part(i, i + 1, axis=1) for i in range(3))
+    is_violated = violated.double().Equal(np.arange(num_causes, dtype=float)).double()
+    cause = is_inside.Where(cause, cause + is_violated * safe)
+    outside = graph.node("Concat", safe * 0.0, unsafe + safe, unknown, axis=1)
+    belief = is_inside.Where(belief, outside, output="belief_without_alarm")
+    probability = is_inside.Where(probability.Unsqueeze([1]), 0.0)
+    probability.Squeeze([1], output="probability_without_alarm")
+    is_calm = alarm.Greater(-np.inf).And(alarm.LessOrEqual(0.5))
+    is_calm.Where(belief, EMPTY, output="belief")
+    is_calm.Where(probability, 0.0).Squeeze([1], output="safety_probability")
+    is_calm.Where(cause, 0.0, output="cause_probability")
+
+
+def _maps(x: Value, embedding: Embedding) -> tuple[Value, tuple[Value, Value] | None, Value]:
     """y (K, N, 2), safety logits (K, N, 1) and mean margins (N, n_c), activations (K, N, n)."""
     weights = embedding.weights
 
-    def layer(name: str, z: _Value) -> _Value:
+    def layer(name: str, z: Value) -> Value:
         bias = embedding.centred_bias if name == "trunk.0" else weights[f"{name}.bias"]
         return z @ weights[f"{name}.weight"] + bias[:, None]
 
@@ -263,7 +274,7 @@ def _maps(x: _Value, embedding: Embedding) -> tuple[_Value, tuple[_Value, _Value
     return y.double(), heads, z
 
 
-def _novelty(x: _Value, novelty: Novelty) -> _Value:
+def _novelty(x: Value, novelty: Novelty) -> Value:
     """The largest distance in units of its limit, (N, 1), in double precision."""
     quadratic, inverse = novelty.quadratic, novelty.inverse_limits
     offset = x - quadratic.mean
@@ -277,7 +288,7 @@ def _novelty(x: _Value, novelty: Novelty) -> _Value:
     return largest.Less(np.inf).Where(largest.Max(0.0), np.inf).Sqrt()
 
 
-def _cell_weights(y: _Value, grid: Grid) -> tuple[_Value, _Value]:
+def _cell_weights(y: Value, grid: Grid) -> tuple[Value, Value]:
     """Weights of the R cells along each axis at y, (K, N, 2, R); 1 inside the grid, (K, N, 1)."""
     resolution = float(grid.resolution)
     position = (y + grid.half_width) / grid.cell_length
@@ -293,7 +304,7 @@ def _cell_weights(y: _Value, grid: Grid) -> tuple[_Value, _Value]:
     return weights * inside.Unsqueeze([3]), inside
 
 
-def _read_grid(weights: _Value, values: np.ndarray) -> _Value:
+def _read_grid(weights: Value, values: np.ndarray) -> Value:
     """The weighted sum of the cells' values (K, R*R, C) over cells and maps, (N, C)."""
     num_members, num_cells, num_columns = values.shape
     resolution = math.isqrt(num_cells)
@@ -303,7 +314,7 @@ def _read_grid(weights: _Value, values: np.ndarray) -> _Value:
     return (second @ along).ReduceSum([0, 2], keepdims=0)
 
 
-def _trees(x: _Value, trees: Trees) -> _Value:
+def _trees(x: Value, trees: Trees) -> Value:
     """The clipped logit of the trees, (N, 1), from counts of the nodes that exclude a leaf."""
     arrays = trees.arrays
     num_trees, num_leaves = arrays["value"].shape
@@ -311,15 +322,14 @@ def _trees(x: _Value, trees: Trees) -> _Value:
     feature, threshold = arrays["feature"].T.astype(np.int64), arrays["threshold"].T
     bits = arrays["left"].T[..., None] >> np.arange(num_leaves, dtype=np.uint32) & 1
     is_right = x.single().Gather(feature, axis=1).Greater(threshold)
-    is_right = is_right.single().Unsqueeze([2])
-    excludes = x.graph.node("Cast", bits.astype(np.uint8), to=1)
-    leaf = (is_right @ excludes).ArgMin(axis=3, keepdims=0)
+    is_right = is_right.Cast(to=2).Unsqueeze([2])  # onnx.TensorProto.UINT8
+    leaf = is_right.MatMulInteger(bits.astype(np.uint8)).ArgMin(axis=3, keepdims=0)
     leaf = leaf.Squeeze([2]) + num_leaves * np.arange(num_trees)
     logits = x.graph.node("Gather", arrays["value"].ravel(), leaf).double()
     return logits.ReduceSum([1], keepdims=1).Clip(-LOGIT_LIMIT, LOGIT_LIMIT)
 
 
-def _shift(heads: _Value, activations: _Value, guard: _Value, correction: Correction) -> _Value:
+def _shift(heads: Value, activations: Value, guard: Value, correction: Correction) -> Value:
     """The shift of the base logit by feedback, (N, 1), see `Correction.shift`."""
     hidden = correction.hidden
     shift = heads @ correction.change[1:, None] + correction.change[0]

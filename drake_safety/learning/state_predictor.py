@@ -13,7 +13,7 @@ from drake_safety.learning.maps import one_torch_thread
 
 HIDDEN_SIZES = (256, 256)
 _SMALLEST_SPREAD = 1e-4  # Of a column [unit of the column]; constant ones would be divided by zero.
-_LARGEST_INPUT = 10.0  # In standard deviations.
+LARGEST_INPUT = 10.0  # In standard deviations.
 _OUTSIDE = 0.005  # Share of training below and above the usual range of an input.
 _VECTORS = ("mean", "scale", "low", "high", "unit")
 _EPOCHS, _MOST_STEPS, _BATCH, _RATE, _DECAY = 25, 6000, 512, 2e-3, 1e-3
@@ -80,7 +80,7 @@ class StatePredictor:
         return replace(start, weights=weights)
 
     def _standardised(self, inputs: np.ndarray) -> np.ndarray:
-        return np.clip((inputs - self.mean) / self.scale, -_LARGEST_INPUT, _LARGEST_INPUT)
+        return np.clip((inputs - self.mean) / self.scale, -LARGEST_INPUT, LARGEST_INPUT)
 
     def _pairs(self, inputs: np.ndarray) -> np.ndarray:
         """Standardised inputs (K, n_u) beside the ones before them, (K - 2, 2 n_u)."""
@@ -114,8 +114,8 @@ class StatePredictor:
         z = np.array((x, previous))
         z -= self.mean
         z /= self.scale
-        np.maximum(z, -_LARGEST_INPUT, out=z)  # Twice as fast as `np.clip`.
-        np.minimum(z, _LARGEST_INPUT, out=z)
+        np.maximum(z, -LARGEST_INPUT, out=z)  # Twice as fast as `np.clip`.
+        np.minimum(z, LARGEST_INPUT, out=z)
         error = change - self.unit * self._evaluated(z.ravel().astype(np.float32))
         return error / self._divisor(z[0])
 

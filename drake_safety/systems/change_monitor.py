@@ -10,10 +10,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.blas_threads import one_blas_thread
-from drake_safety.learning.change_detector import TIME_CONSTANTS_S, ChangeDetector
-
-SETTLING_S = 0.5
-"""Time for which the charts wait on after a disturbance that is known [s]."""
+from drake_safety.learning.change_detector import SETTLING_S, TIME_CONSTANTS_S, ChangeDetector
 
 
 class ChangeMonitor(LeafSystem):
