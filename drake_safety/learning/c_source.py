@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from drake_safety.extras import require_extra
 from drake_safety.files.atomic import write_file
@@ -17,14 +17,6 @@ if TYPE_CHECKING:
 PARTS = ("assessor", "monitor")
 
 
-class Port(NamedTuple):
-    """A port of one row; a number has no width."""
-
-    name: str
-    width: int | None
-    description: str
-
-
 def write(path: Path, assessment: Any, prefix: str | None = None) -> list[Path]:
     """Writes source, header and example, atomically and with the same bytes; returns the files."""
     require_extra("c", f"export to '{path}'")
@@ -32,57 +24,48 @@ def write(path: Path, assessment: Any, prefix: str | None = None) -> list[Path]:
 
     prefix = path.stem if prefix is None else prefix
     if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):
-        raise ValueError(
-            f"export to '{path}': prefix must be a name in C, of letters, digits and '_'; "
-            f"got '{prefix}'"
-        )
+        what = f"prefix must be a name in C, of letters, digits and '_'; got '{prefix}'"
+        raise ValueError(f"export to '{path}': {what}")
     models = {part: make_model(assessment, part, rows=1) for part in PARTS}
-    contracts = {
-        part: {entry.key: json.loads(entry.value) for entry in model.metadata_props}
-        for part, model in models.items()
-    }
-    ports = {
-        part: (_ports(model.graph.input), _ports(model.graph.output))
-        for part, model in models.items()
-    }
-    inputs = {port.name: port for part in PARTS for port in ports[part][0]}
-    columns = {name: names for part in PARTS for name, names in contracts[part]["inputs"].items()}
+    contracts = [{e.key: json.loads(e.value) for e in m.metadata_props} for m in models.values()]
+    inputs = {port.name: port for model in models.values() for port in model.graph.input}
+    inputs = {name: port for name, port in inputs.items() if name not in ("alarm", "memory")}
+    columns = contracts[1]["inputs"] | contracts[0]["inputs"]
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        keep_trailing_newline=True,
     )
     environment.filters |= {"c_name": _c_name, "comment": lambda text: text.replace("*/", "* /")}
-    environment.filters["quoted"] = lambda text: json.dumps(text, ensure_ascii=False)
-    header = path.with_suffix(".h")
-    calibrations = assessment.calibrations_
+    environment.filters |= {"quoted": lambda text: json.dumps(text, ensure_ascii=False)}
+    environment.filters |= {"width": _width}
+    header, calibrations = path.with_suffix(".h"), assessment.calibrations_
     known: dict[str, Any] = {
         "p": prefix,
+        "P": prefix.upper(),
         "header": header.name,
-        "ports": ports,
-        "inputs": [one for name, one in inputs.items() if name not in ("alarm", "memory")],
-        "columns": {name: _distinct(names) for name, names in columns.items()},
-        "contract": contracts["assessor"],
-        "monitor": contracts["monitor"],
+        "inputs": inputs.values(),
+        "ports": {part: (m.graph.input, m.graph.output) for part, m in models.items()},
+        "columns": {name: _distinct(columns[name]) for name in inputs},
+        "num_inputs": sum(map(_width, inputs.values())),
+        "contract": contracts[0],
+        "monitor": contracts[1],
         "calibrations": calibrations,
         "threshold": next((key for key in ("motion", "plan") if key in calibrations), None),
-        "sources": {part: _source(model, prefix, part) for part, model in models.items()},
+        "sources": [_source(model, prefix, part) for part, model in models.items()],
     }
-    templates = {path: "source.c.j2", header: "header.h.j2"}
-    templates[path.with_name("example.c")] = "example.c.j2"
-    for file, template in templates.items():
-        write_file(file, environment.get_template(template).render(known))
-    return list(templates)
+    files = {path: "source.c", header: "header.h", path.with_name("example.c"): "example.c"}
+    for file, template in files.items():
+        text = environment.get_template(f"{template}.j2").render(known)
+        write_file(file, f"{text}\n")
+    return list(files)
 
 
-def _ports(values: Any) -> list[Port]:
-    shapes = [[d.dim_value for d in one.type.tensor_type.shape.dim] for one in values]
-    return [
-        Port(one.name, shape[1] if len(shape) > 1 else None, one.doc_string)
-        for one, shape in zip(values, shapes, strict=True)
-    ]
+def _width(port: onnx.ValueInfoProto) -> int:
+    """Width of a port of one row; 0 for a number."""
+    shape = port.type.tensor_type.shape.dim
+    return int(shape[1].dim_value) if len(shape) > 1 else 0
 
 
 def _source(model: onnx.ModelProto, prefix: str, part: str) -> str:
@@ -108,7 +91,7 @@ def _c_name(text: str) -> str:
 
 
 def _distinct(names: list[str]) -> dict[str, str]:
-    """Constants of the columns' names, which two names may not share."""
+    """Names of columns by their constants, which two names may not share."""
     constants: dict[str, str] = {}
     for i, name in enumerate(names):
         constant = _c_name(name)

@@ -27,7 +27,7 @@ DESCRIPTIONS = {
     "NaN where the step is not judged.",
     "judged_share": "Share of inputs that could be judged over two seconds.",
     "cause": "Index of the alarm's cause among the `causes`; -1 without an alarm.",
-    "next_memory": "Memory for the next step.",
+    "next_memory": "Memory for the next step; all zeros at the start.",
 }
 _NUM_CHARTS = 2 * len(TIME_CONSTANTS_S)
 
