@@ -97,6 +97,6 @@ $(LIGHT)/.installed: pyproject.toml constraints.txt policies.txt
 $(LOWEST)/.installed: pyproject.toml lowest.txt
 	python3.11 -m venv $(LOWEST)
 	$(LOWEST)/bin/python -m pip install --constraint lowest.txt --editable \
-		".[cluster,live,logs,mujoco,onnx,report,robots,test,train,tutorials,walking]"
+		".[c,cluster,live,logs,mujoco,onnx,report,robots,test,train,tutorials,walking]"
 	$(LOWEST)/bin/python -m pip install --no-deps --require-hashes --requirement policies.txt
 	touch $@
