@@ -44,9 +44,9 @@ def unlike_training(assessment: SafetyAssessment, num: int) -> np.ndarray:
     rng, known = np.random.default_rng(SEED), assessment.novelty_.training
     x = rng.multivariate_normal(known.mean, known.covariance, size=num, method="eigh")
     x = known.mean + rng.choice([0.5, 1.0, 2.0, 100.0], size=(num, 1)) * (x - known.mean)
-    odd = rng.choice(num, num // 10, replace=False)
-    x[odd, rng.integers(x.shape[1], size=len(odd))] = rng.choice([np.nan, np.inf], size=len(odd))
-    return x
+    odd, num_states = rng.choice(num, num // 10, replace=False), len(assessment.info_.state_names)
+    x[odd, rng.integers(num_states, size=len(odd))] = rng.choice([np.nan, np.inf], size=len(odd))
+    return x[:, : sum(assessment.info_.widths[port] for port in PORTS)]
 
 
 def built(assessment: SafetyAssessment, folder: Path) -> tuple[float, float]:

@@ -227,37 +227,31 @@ def test_example_prints_the_verdict_of_every_row(
 
 @pytest.mark.slow
 @COMPILERS
-def test_sources_of_two_prefixes_link_into_one_program(generated, assessment, tmp_path):
-    assessment.to_c(tmp_path / "gamma.c", prefix="robot_2")
-    shutil.copy(tmp_path / "gamma.h", tmp_path / "second.h")
-    main = '#include "second.h"\n#include "gamma.h"\nint main(void) {\n'
-    main += "    static robot_2_monitor a;\n    static robot_2_inputs in;\n"
-    main += "    robot_2_watch(&in, &a);\n    return (int)a.alarm;\n}\n"
-    (tmp_path / "main.c").write_text(main)
-    options = ["-std=c99", "-O0", "main.c", "gamma.c", str(generated / "gamma.c"), "-lm"]
-    build("gcc", *options, "-o", "main", folder=tmp_path)
-    assert subprocess.run([tmp_path / "main"]).returncode == 0
-
-
-def test_command_writes_three_files_and_the_promise(monkeypatch, capsys, tmp_path):
-    pytest.importorskip("emx_onnx_cgen", reason="the extra 'c' is not installed")
+def test_command_writes_the_promise_and_sources_that_link_with_others(
+    generated, monkeypatch, capsys, tmp_path
+):
     file = tmp_path / "robot" / "safety.c"
-    assert call(monkeypatch, "export", SCENARIO, "--out", file) == 0
+    assert call(monkeypatch, "export", SCENARIO, "--out", file, "--prefix", "robot_2") == 0
     printed = capsys.readouterr().out
     calibration = load_assessment(SCENARIO).calibrations_["motion"]
     header = file.with_suffix(".h").read_text()
     assert calibration.promise in printed and calibration.promise in header
-    assert f"SAFETY_MOTION_THRESHOLD {calibration.threshold}" in header
-    assert "SAFETY_STATE_BASE_Z = 2," in header and "#define SAFETY_STEP_S 0.04 " in header
+    assert f"ROBOT_2_MOTION_THRESHOLD {calibration.threshold}" in header
+    assert "ROBOT_2_STATE_BASE_Z = 2," in header and "#define ROBOT_2_STEP_S 0.04 " in header
     assert {one.name for one in file.parent.iterdir()} == {"safety.c", "safety.h", "example.c"}
     # No memory is allocated, and nothing but C's own headers is included.
     source = file.read_text()
     assert "alloc(" not in source and "free(" not in source
     included = {line for line in source.splitlines() if line.startswith("#include")}
-    standard = {
-        f"#include <{one}.h>" for one in ("stdint", "stdbool", "math", "float", "limits", "string")
-    }
-    assert included == standard | {'#include "safety.h"'}
+    standard = ("stdint", "stdbool", "math", "float", "limits", "string")
+    assert included == {*(f"#include <{one}.h>" for one in standard), '#include "safety.h"'}
+    main = f'#include "safety.h"\n#include "{generated}/gamma.h"\nint main(void) {{\n'
+    main += "    static robot_2_monitor a;\n    static robot_2_inputs in;\n"
+    main += "    robot_2_watch(&in, &a);\n    return (int)a.alarm;\n}\n"
+    (file.parent / "main.c").write_text(main)
+    options = ["-std=c99", "-O0", "main.c", "safety.c", str(generated / "gamma.c"), "-lm"]
+    build("gcc", *options, "-o", "main", folder=file.parent)
+    assert subprocess.run([file.parent / "main"]).returncode == 0
 
 
 def test_errors_name_what_was_given(monkeypatch, assessment, tmp_path):
