@@ -85,6 +85,7 @@ class Balancing(LeggedLoop):
             builder.Connect(stance_pose, planner.GetInputPort("stance_pose"))
             for name in ("desired_foot_positions", "desired_yaw"):
                 builder.Connect(switch.GetOutputPort(name), controller.GetInputPort(name))
+            desired["desired_foot_positions"] = switch.GetOutputPort("desired_foot_positions")
         builder.Connect(measured, controller.GetInputPort("plant_state"))
         builder.Connect(desired["desired_output"], controller.GetInputPort("desired_output"))
         joint_state = controller.GetOutputPort("desired_joint_state")

@@ -40,7 +40,7 @@ def adapt(
     log: Annotated[
         list[Path] | None, Option(help="Logs of a robot, in place of a variation.", exists=True)
     ] = None,
-    log_map: Annotated[Path | None, Option("--map", help="Map of their columns (YAML).")] = None,
+    log_map: console.MapOption = None,
     out: Annotated[
         Path | None, Option(help="Folder to write; ASSESSMENT/adapted-VARIATION by default.")
     ] = None,
@@ -60,15 +60,15 @@ def adapt(
         folders.check_fresh(prior, loaded)
         prior.check_unused(seed, purpose="adaptation")
     logs = log or []
-    if bool(logs) != (log_map is not None):
-        raise ValueError("adapt: --log needs --map, and --map needs --log")
+    if log_map is not None and not logs:
+        raise ValueError("adapt: --map needs --log")
     if len({path.resolve() for path in logs}) < len(logs):
         raise ValueError("adapt: logs must differ, as each is judged by the others")
     name = logs[0].stem if logs else variation
     folder = out or learned.out / f"adapted-{name}"
     folders.check_writable(folder)
     with console.open_stages() as stages:
-        if log_map is not None:
+        if logs:
             loop = loaded.make_loop("actual")
             pieces, cut = [], []
             for path in logs:

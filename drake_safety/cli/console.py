@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +21,9 @@ from drake_safety.learning.segments import installed_versions
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
+    from pydrake.systems.framework import Context, Diagram
+
+    Monitor = Callable[[Context], object]
 
 
 ScenarioArgument = Annotated[
@@ -43,6 +47,12 @@ TargetOption = Annotated[
 HandOption = Annotated[str | None, Option(help="Reaching hand; the trained one by default.")]
 RecoveryOption = Annotated[
     bool | None, Option(help="Whether Γ triggers recovery; by default in balancing only.")
+]
+MapOption = Annotated[
+    Path | None, Option("--map", help="Map of their columns (YAML); or that of an MCAP file.")
+]
+McapOption = Annotated[
+    Path | None, Option("--mcap", help="MCAP file to write of it.", dir_okay=False)
 ]
 WorkersOption = Annotated[int | None, Option(help="Worker processes; one a core by default.")]
 ClusterOption = Annotated[
@@ -95,6 +105,18 @@ def open_viewer(host: str = LOOPBACK) -> Meshcat:
     from pydrake.geometry import Meshcat, MeshcatParams
 
     return Meshcat(MeshcatParams(host=host, port=0, show_stats_plot=False))
+
+
+def recorded(
+    diagram: Diagram, path: Path | None, monitor: Monitor | None = None
+) -> AbstractContextManager[Monitor | None]:
+    """Context manager with a monitor that also records into an MCAP file, if there is a path."""
+    if path is None:
+        return nullcontext(monitor)
+    from drake_safety.logs.mcap_recorder import McapRecorder
+
+    say("MCAP     ", path)
+    return McapRecorder(diagram, path, monitor)
 
 
 def given(**options: Any) -> dict[str, Any]:

@@ -76,6 +76,7 @@ def gate(
     episodes: Annotated[int, Option(help="Most pairs of episodes a candidate.", min=1)] = 2000,
     out: OutOption = None,
     replay: Annotated[int | None, Option(help="Only record this episode.", min=0)] = None,
+    mcap: Annotated[bool, Option("--mcap", help="With --replay: MCAP files beside it.")] = False,
     seed: Annotated[int, Option(help="Seed of the episodes.")] = GATE.first,
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
@@ -114,10 +115,10 @@ def gate(
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
     if replay is not None:
-        motions = {
-            name: partial(_record_episode, (first, plant), replay, seed)
-            for name, plant in {"baseline": first, **others}.items()
-        }
+        motions = {}
+        for i, (name, plant) in enumerate({"baseline": first, **others}.items()):
+            file = folder / f"episode-{replay}-{i}.mcap" if mcap else None
+            motions[name] = partial(_record_episode, (first, plant), replay, seed, file)
         return record_motions(motions, folder / f"episode-{replay}.html")
     gamma = None
     with contextlib.suppress(ValueError):  # That of this very scenario, if one is shipped.
@@ -200,13 +201,17 @@ def record_motions(motions: Mapping[str, Callable[[Meshcat], str]], file: Path) 
 
 
 def _record_episode(
-    pair: tuple[ComparedPlant, ComparedPlant], index: int, seed: int, viewer: Meshcat
+    pair: tuple[ComparedPlant, ComparedPlant],
+    index: int,
+    seed: int,
+    file: Path | None,
+    viewer: Meshcat,
 ) -> str:
-    """Records one episode of a pair's second loop; returns how it ends."""
+    """Records one episode of a pair's second loop, also as MCAP; returns how it ends."""
     loop = make_paired(pair, int(pair[0] is not pair[1]), meshcat=viewer)
     viewer.StartRecording()
-    camera = follow(loop, viewer)
-    episode = run_episode(loop, index, seed=seed, after_leaving_s=math.inf, monitor=camera)
+    with console.recorded(loop, file, follow(loop, viewer)) as monitor:
+        episode = run_episode(loop, index, seed=seed, after_leaving_s=math.inf, monitor=monitor)
     end = f"leaves the safe set: {spoken(episode.cause)}"
     return "stays in the safe set" if episode.is_safe else end
 

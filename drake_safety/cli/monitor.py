@@ -32,7 +32,7 @@ def monitor(
     log: Annotated[
         list[Path], Option(help="Log, .npz file of sequences, or folder of either; repeatable.")
     ],
-    log_map: Annotated[Path, Option("--map", help="Map of their columns, a YAML file.")],
+    log_map: console.MapOption = None,
     assessment: console.AssessmentOption = None,
     out: Annotated[Path | None, Option(help="Folder; by default ASSESSMENT/monitor.")] = None,
 ) -> None:
@@ -73,11 +73,13 @@ def _files(path: Path) -> list[Path]:
 
 
 def _motions(
-    file: Path, log_map: Path, scenario: Scenario, gamma: SafetyAssessment
+    file: Path, log_map: Path | None, scenario: Scenario, gamma: SafetyAssessment
 ) -> Iterator[tuple[dict[str, Any], list[Motion]]]:
     """What identifies a log, or each sequence of a file, and its motions."""
     entry = {"log": str(file), "sequence": None, "left_safe_set": ""}
     if file.suffix.lower() == _SEQUENCES:
+        if log_map is None:
+            raise ValueError(f"sequences '{file}' need --map")
         sequence_map = load_typed_file(SequenceMap, log_map, f"map '{log_map}'")
         sequences = read_sequences(file, sequence_map, gamma.detector_, gamma.info_)
         yield from ((entry | {"sequence": i}, motions) for i, motions in enumerate(sequences))

@@ -30,6 +30,7 @@ def play(
     recovery: console.RecoveryOption = None,
     seed: Annotated[int, Option(help="Seed of start and noise.")] = DEMONSTRATION.first,
     mode: console.ModeOption = MODES[0],
+    mcap: console.McapOption = None,
     port: Annotated[int | None, Option(help="Of the page; by default a free one.")] = None,
     host: Annotated[
         str, Option(help="Address that serves the page; whoever reaches it can use the controls.")
@@ -55,8 +56,11 @@ def play(
     meshcat = console.open_viewer(hidden if sys.platform == "linux" else console.LOOPBACK)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=meshcat, **options)
     limits = {"threshold": threshold, "unsafe_below": rule.unsafe_below}
-    session = LiveSession(loop, meshcat, **limits, seed=seed)
-    with serve_page(session.panel, host=host, port=page_port, scene_url=meshcat.web_url()):
+    with contextlib.ExitStack() as stack:
+        monitor = stack.enter_context(console.recorded(loop, mcap))
+        session = LiveSession(loop, meshcat, **limits, seed=seed, monitor=monitor)
+        scene = meshcat.web_url()
+        stack.enter_context(serve_page(session.panel, host=host, port=page_port, scene_url=scene))
         # An exception of a handler could be raised, and lost, inside Drake.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, session.end)

@@ -69,6 +69,7 @@ def run(
     ] = None,
     seed: Annotated[int, Option(help="Seed of start, plan and noise.")] = DEMONSTRATION.first,
     mode: console.ModeOption = MODES[0],
+    mcap: console.McapOption = None,
     out: Annotated[Path | None, Option(help="Folder of run/; by default ASSESSMENT.")] = None,
 ) -> None:
     """Simulate once with Γ in the loop; write a recording, a timeline and the events.
@@ -105,8 +106,8 @@ def run(
     options |= console.given(guard=guard or None)
     loop = loaded.make_loop(variation, assessment=gamma, meshcat=viewer, **options)
     viewer.StartRecording()
-    camera = follow(loop, viewer)
-    shown = simulated(loop, duration_s=duration or duration_s, seed=seed, monitor=camera)
+    with console.recorded(loop, mcap, follow(loop, viewer)) as monitor:
+        shown = simulated(loop, duration_s=duration or duration_s, seed=seed, monitor=monitor)
     _save(folder, viewer, loop, shown)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from pydrake.geometry import Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
 
 from drake_safety.diagrams.balancing.throws import HasBall
 from drake_safety.learning.causes import cause_words, is_on, is_outside, likely_cause, violated
@@ -69,7 +70,8 @@ class LiveSession:
     The capabilities of the loop, which is built with this Meshcat and an assessment, decide what
     the controls do: change commands, choose a goal, or throw balls. Any other task runs episode
     after episode from random starts. From the threshold on a probability is "safe", and a goal
-    below ``unsafe_below`` is unsafe; in between is "don't know".
+    below ``unsafe_below`` is unsafe; in between is "don't know". ``monitor`` is called with the
+    Context after each step of the simulator.
     """
 
     def __init__(
@@ -80,6 +82,7 @@ class LiveSession:
         threshold: float,
         unsafe_below: float | None = None,
         seed: int = 0,
+        monitor: Callable[[Context], object] | None = None,
     ):
         require_ports(loop, _PORTS)
         self.loop: Any = loop  # What it can do is asked below.
@@ -87,6 +90,8 @@ class LiveSession:
         self.meshcat = meshcat
         self.threshold, self.unsafe_below = threshold, unsafe_below
         self._simulator = Simulator(loop)
+        if monitor is not None:
+            self._simulator.set_monitor(monitor)
         self.cause = ""  # The constraint that was violated first since the start.
         self.command, self.is_guarded = np.zeros(3), True
         # On the present goal, and the nearest accepted one.

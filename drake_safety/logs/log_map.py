@@ -24,6 +24,8 @@ VELOCITIES = {
 }
 """Velocities that a log may have, and the positions whose derivatives they are."""
 COMMANDS = ("desired_output", "foot_positions")  # Valid until the next value.
+ATTACHED_MAP = "columns.yaml"
+"""Name of the attachment by which an MCAP file has its own map."""
 QUANTITIES = (*VELOCITIES.values(), *VELOCITIES, *COMMANDS)  # Fields of a LogMap with columns.
 
 

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from drake_safety.extras import require_extra
-from drake_safety.files.reading import reading
+from drake_safety.files.reading import parse_yaml, reading
+from drake_safety.files.schema import load_typed
 from drake_safety.logs.channel import Channel, Wanted, listed
-from drake_safety.logs.log_map import LogTime
+from drake_safety.logs.log_map import ATTACHED_MAP, LogMap, LogTime
 
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]|\.")
 _REMEDIES = {
@@ -88,6 +89,23 @@ def _channels(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel]:
             row_name="message",
         )
     return channels
+
+
+def attached_map(path: Path) -> LogMap:
+    """The map that an MCAP file has as an attachment, as those of `McapRecorder` do."""
+    if path.suffix.lower() == ".mcap":
+        require_extra("logs", f"log '{path}'", "mcap")
+        from mcap.reader import make_reader
+
+        what = f"damaged{_REMEDIES['.mcap']}: log"
+        with reading(path, what, Exception), path.open("rb") as file:
+            for attachment in make_reader(file).iter_attachments():
+                if attachment.name == ATTACHED_MAP:
+                    who = f"map '{ATTACHED_MAP}' in '{path}'"
+                    return load_typed(LogMap, parse_yaml(attachment.data.decode(), who), who)
+    raise ValueError(
+        f"log '{path}' has no map of its own, an MCAP attachment '{ATTACHED_MAP}': --map"
+    )
 
 
 def field_of(path: str) -> Callable[[Any], Any]:

@@ -14,7 +14,7 @@ from drake_safety.logs.channel import Wanted
 from drake_safety.logs.checks import check
 from drake_safety.logs.conversion import Source, common_span, rotations_at, values_at
 from drake_safety.logs.log_map import COMMANDS, QUANTITIES, TIME_UNITS, Joints, LogMap, load_log_map
-from drake_safety.logs.messages import read_messages
+from drake_safety.logs.messages import attached_map, read_messages
 from drake_safety.logs.quantities import MIN_ROWS, continued, cut, in_order, quantities
 from drake_safety.logs.tables import read_csv, read_parquet
 from drake_safety.robots.robot_model import RobotModel
@@ -82,15 +82,16 @@ class LogPieces:
         return "\n".join([head, *self.cuts[:_MOST_CUTS], *more])
 
 
-def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> LogPieces:
+def read_pieces(path: str | Path, map_file: str | Path | None, robot: RobotModel) -> LogPieces:
     """Reads, checks and converts a log, cut where values are missing and at gaps.
 
     Args:
         path: A ``.csv``, ``.tsv``, ``.parquet``, ``.mcap`` or ``.bag`` file, or the folder of a
             ROS 2 bag.
-        map_file: The ``columns.yaml`` that names its columns.
+        map_file: The ``columns.yaml`` that names its columns; None for that in an MCAP file, by
+            which nothing is checked.
     """
-    path, log_map = Path(path), load_log_map(map_file)
+    path = Path(path)
     kinematics = RobotKinematics(robot)
     joints = kinematics.joint_names
     require_extra("logs", f"log '{path}'", "pandas")
@@ -100,6 +101,7 @@ def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> Lo
     if suffix not in _READERS:
         known = f"{list(FORMATS)} and the folder of a ROS 2 bag"
         raise ValueError(f"log '{path}' has the suffix '{suffix}'; known are {known}")
+    log_map = attached_map(path) if map_file is None else load_log_map(map_file)
     topics = _READERS[suffix](path, _wanted(log_map, kinematics), log_map.time)
     lost, restarts = list[str](), dict[str, float]()
     for topic, channel in topics.items():
@@ -124,7 +126,8 @@ def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> Lo
             why = f"its topics do not overlap: {spans}"
         what = f"has no {MIN_ROWS} rows without a missing value or a gap between them"
         raise ValueError(f"log '{path}' {what}: {why}")
-    notes += check(sources, kinematics)
+    if map_file is not None:  # A file's own map was written with it.
+        notes += check(sources, kinematics)
     unit = TIME_UNITS[next(iter(topics.values())).time_unit]
     begins = (np.array([*restarts.values()]) - origin) / unit
     logs = np.searchsorted(begins, [source.at_s[0] for source in sources], "right")
@@ -145,7 +148,7 @@ def read_pieces(path: str | Path, map_file: str | Path, robot: RobotModel) -> Lo
     return LogPieces(pieces=pieces, duration_s=duration_s, lost=lost, notes=notes)
 
 
-def read_log(path: str | Path, map_file: str | Path, robot: RobotModel) -> RobotLog:
+def read_log(path: str | Path, map_file: str | Path | None, robot: RobotModel) -> RobotLog:
     """Reads a log as :func:`read_pieces` does, but refuses one of which something is lost."""
     pieces = read_pieces(path, map_file, robot)
     if pieces.lost:
