@@ -104,10 +104,10 @@ def test_a_task_without_goals_or_balls_runs_an_episode_and_takes_no_push(
     learned(quick(load_scenario("pendulum"))).save(tmp_path / "sharpened.safetensors")
     command = ("run", "pendulum", "--assessment", tmp_path)
     assert call(monkeypatch, *command, "--push", "ball") == 2
-    assert call(monkeypatch, *command) == 0
+    assert call(monkeypatch, *command, "--mcap", tmp_path / "run" / "run.mcap") == 0
     assert "the episode starts" in capsys.readouterr().out
     written = {path.name for path in (tmp_path / "run").iterdir()}
-    assert written == {"recording.html", "run.json", "timeline.png", "timeline.svg"}
+    assert written == {"recording.html", "run.json", "run.mcap", "timeline.png", "timeline.svg"}
 
 
 @pytest.fixture

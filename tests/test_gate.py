@@ -245,12 +245,17 @@ def test_the_command_says_which_candidate_is_worse_and_replays_an_episode(
     first = candidates["parameters.effort_share=0.2 variation=actual"]
     assert first["pairs"] == first["difference"][-1]["n"]
     assert (tmp_path / "gate.png").stat().st_size > 10_000
+    from mcap.reader import make_reader
+
     index = first["newly_failing"][0]["episode"]
     assert f"--replay={index}" in printed
-    assert call(monkeypatch, *command, "--replay", index) == 0
+    assert call(monkeypatch, *command, "--replay", index, "--mcap") == 0
     printed = capsys.readouterr().out
     recording = (tmp_path / f"episode-{index}.html").read_text()
     assert recording.count("<iframe srcdoc=") == 3
+    for number in range(3):
+        with (tmp_path / f"episode-{index}-{number}.mcap").open("rb") as file:
+            assert make_reader(file).get_summary().statistics.message_count > 100
     assert "baseline: stays in the safe set" in printed
     assert "variation=actual: leaves the safe set: " in printed
 

@@ -132,11 +132,12 @@ def answer_to(address, **headers):
 
 
 @pytest.fixture
-def playing():
-    """A command that plays, and the address of its page."""
+def playing(tmp_path):
+    """A command that plays, the address of its page, and the file that it records."""
     pytest.importorskip("nicegui")
     code = "from drake_safety.cli import main; main()"
     command = [sys.executable, "-u", "-c", code, "play", "laikago_balancing"]
+    command += ["--mcap", str(tmp_path / "play.mcap")]
     # NiceGUI serves otherwise in a test.
     environment = {key: text for key, text in os.environ.items() if "PYTEST" not in key}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
@@ -145,7 +146,8 @@ def playing():
         line = process.stdout.readline()
         assert line, printed
         printed += line
-    yield process, re.search(r"http://\S+", printed[printed.index("live at") :])[0]
+    address = re.search(r"http://\S+", printed[printed.index("live at") :])[0]
+    yield process, address, tmp_path / "play.mcap"
     process.kill()
     process.wait()
     process.stdout.close()
@@ -172,7 +174,9 @@ def check_scene(address):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_page_is_served_without_other_hosts_until_a_signal(playing, number):
-    process, address = playing
+    from mcap.reader import make_reader
+
+    process, address, recorded = playing
     status, page = answer_to(address)
     assert status == 200 and "laikago_balancing" in page
     hosts = set(re.findall(r"(?:src|href|url)[=(]\W{0,2}(https?://[^/\"'\\]+)", page))
@@ -182,3 +186,5 @@ def test_a_page_is_served_without_other_hosts_until_a_signal(playing, number):
     process.send_signal(number)
     process.communicate(timeout=WITHIN_S)
     assert process.returncode == 0
+    with recorded.open("rb") as file:
+        assert make_reader(file).get_summary().statistics.message_end_time > 100_000_000

@@ -9,6 +9,7 @@ from drake_safety.cli.training_folder import MODES, assessment_file
 from drake_safety.learning.assessment_parameters import PaperReading
 from drake_safety.learning.segments import Episodes
 from drake_safety.logs.episodes import cut_log, motions_from_log
+from drake_safety.logs.mcap_recorder import McapRecorder
 from drake_safety.simulation.feedback import EpisodePairs, pair_starts
 from drake_safety.simulation.rollouts import episodes_info
 from log_files import balancing_scenario, frame_of, map_beside, recorded, save
@@ -94,6 +95,16 @@ def test_logs_adapt_as_the_runs_that_they_are_of(folder, tmp_path, monkeypatch, 
         atol = min(0.1 * changed, 0.02)
         np.testing.assert_allclose(adapted.beliefs_, near.beliefs_, atol=atol)
         np.testing.assert_allclose(change, near.correction_.change, atol=0.05)
+
+
+def test_a_recorded_simulation_adapts_without_a_map(folder, capsys, monkeypatch, tmp_path):
+    loop, path = load_scenario(folder / "short.yaml").make_loop("actual"), tmp_path / "run.mcap"
+    with McapRecorder(loop, path) as recorder:
+        run_episode(loop, INDICES[1], monitor=recorder)
+    options = ("--assessment", folder, "--log", path, "--out", tmp_path / "out")
+    assert not call(monkeypatch, "adapt", folder / "short.yaml", *options)
+    assert "adapted to 'run': 0 of 1 pairs end differently" in capsys.readouterr().out
+    assert load(tmp_path / "out", "paper").adaptation_.num_sets == 1
 
 
 def test_a_log_is_cut_where_a_value_is_missing(folder, capsys, monkeypatch, tmp_path):
