@@ -13,7 +13,7 @@ MODULES = {
     "c": ("emx_onnx_cgen", "jinja2", "onnx"),
     "onnx": ("onnx",),
     "report": ("jinja2",),
-    "robots": ("trimesh", "collada"),
+    "robots": ("collada", "robot_descriptions", "trimesh", "xacrodoc"),
     "train": ("dtaidistance", "openTSNE", "pyarrow", "sklearn", "torch", "tslearn"),
     "walking": ("onnx", "onnxruntime"),
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from rich.text import Text
 from typer import Argument, Exit, Option
@@ -11,6 +11,7 @@ from typer import Argument, Exit, Option
 from drake_safety.assessments import assessed_scenarios
 from drake_safety.cli import console
 from drake_safety.extras import MissingExtraError
+from drake_safety.importing.model_source import described_model
 from drake_safety.importing.policy_template import survey_policy
 from drake_safety.importing.robot_check import check_urdf
 from drake_safety.importing.robot_template import write_robot
@@ -43,7 +44,16 @@ def scenarios() -> None:
 
 def new(
     name: Annotated[str, Argument(help="Name of the robot, and of its folder.")],
-    model: Annotated[Path, Option("--urdf", "--mjcf", help="Its model file.", dir_okay=False)],
+    model: Annotated[
+        Path | None,
+        Option("--urdf", "--mjcf", help="Its model file; a URDF may be xacro.", dir_okay=False),
+    ] = None,
+    robot_description: Annotated[
+        str | None, Option(help="Its module of robot_descriptions, such as go2_description.")
+    ] = None,
+    xacro_arg: Annotated[
+        list[str] | None, Option(metavar="KEY=VALUE", help="An argument of xacro; repeatable.")
+    ] = None,
     task: Annotated[str, Option(help="'balancing', 'reaching' or 'walking'.")] = "balancing",
     policy: Annotated[
         Path | None, Option(help="Of walking: network, deploy.yaml or config.yaml.", dir_okay=False)
@@ -55,17 +65,24 @@ def new(
     hands: Annotated[str | None, Option(help="Links that arms end in, with commas.")] = None,
     out: Annotated[Path | None, Option(help="Folder to write; NAME by default.")] = None,
 ) -> None:
-    """Write the folder of a robot and a first scenario from a URDF or an MJCF, for review.
+    """Write the folder of a robot and a first scenario from a model file, for review.
 
     Values that the file does not have are marked ASK in the files, with their units.
     """
     if (task == "walking") != (policy is not None):
         raise ValueError(f"new: --policy is that of --task walking; got '{task}' and {policy}")
+    if (model is None) == (robot_description is None):
+        raise ValueError("new: pass one of --urdf, --mjcf and --robot-description")
+    arguments = dict(text.partition("=")[::2] for text in xacro_arg or [])
+    if not all(arguments.values()):
+        raise ValueError(f"new: --xacro-arg is KEY=VALUE; got {xacro_arg}")
     # Before anything is written.
     template = None if policy is None else survey_policy(policy, _names(motors), console.say)
     moved = () if template is None else template.joints or None
-    limbs = {"feet": _names(feet) or None, "hands": _names(hands) or None}
-    written = write_robot(name, model, task, out or Path(name), **limbs, moved=moved)
+    options: dict[str, Any] = {"feet": _names(feet) or None, "hands": _names(hands) or None}
+    options |= {"moved": moved, "xacro_arguments": arguments}
+    model = model or described_model(robot_description or "")
+    written = write_robot(name, model, task, out or Path(name), **options)
     files, asked, sizes = written.files, written.asked, written.sizes
     if template is not None:
         more, unknown = template.write(written.folder, written.joints, written.posture)

@@ -1,4 +1,4 @@
-"""Writes a robot's folder and its first scenario from a URDF or an MJCF."""
+"""Writes a robot's folder and its first scenario from a URDF, xacro or an MJCF."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import re
 import shutil
 import tempfile
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +16,7 @@ import numpy as np
 from drake_safety.files.reading import yaml_text
 from drake_safety.importing import urdf_survey
 from drake_safety.importing.mjcf import ModelFacts, is_mjcf, mjcf_to_urdf
+from drake_safety.importing.model_source import expanded, is_xacro
 from drake_safety.importing.scenario_template import TASKS, Sizes, scenario_yaml
 from drake_safety.importing.simulatable_urdf import simulatable_copy
 from drake_safety.importing.standing_posture import standing_posture
@@ -123,6 +124,7 @@ def write_robot(
     feet: list[str] | None = None,
     hands: list[str] | None = None,
     moved: Collection[str] | None = (),
+    xacro_arguments: Mapping[str, str] | None = None,
 ) -> NewRobot:
     """Writes a robot's folder: a URDF that Drake can simulate, robot.yaml, README and a scenario.
 
@@ -130,6 +132,7 @@ def write_robot(
         feet: Links that touch the ground; found by their height by default.
         hands: Links that arms end in; those of limbs of four joints or more by default.
         moved: Joints that a policy moves, which are not fixed; None for all.
+        xacro_arguments: Of a model in xacro, which have no default in it.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise ValueError(f"new: a robot's name is letters, digits and _; got '{name}'")
@@ -138,12 +141,15 @@ def write_robot(
     if folder.exists():
         raise ValueError(f"new: '{folder}' exists already; choose another name, or another --out")
     with tempfile.TemporaryDirectory() as scratch:
-        urdf, facts = model, ModelFacts()
-        if is_mjcf(model):
+        urdf, facts, source = model, ModelFacts(), None
+        if is_xacro(model):
+            urdf, source = Path(scratch) / f"{name}-expanded.urdf", model
+            urdf.write_text(expanded(model, xacro_arguments or {}), encoding="utf-8")
+        elif is_mjcf(model):
             urdf = Path(scratch) / "mjcf" / f"{name}.urdf"
             urdf.parent.mkdir()
             facts = mjcf_to_urdf(model, urdf)
-        copy = simulatable_copy(urdf)
+        copy = simulatable_copy(urdf, source)
         copy.source = model
         copy.left_out = facts.left_out + copy.left_out
         copy.notes += [f"it is converted from '{model.name}'", *facts.left_out][urdf == model :]

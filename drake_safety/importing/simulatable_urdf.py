@@ -32,9 +32,12 @@ _ROUNDING = 1e-6  # Of the digits of moments of inertia.
 _NOISE = 1e-12  # Of moments of inertia that should be zero [kg·m²].
 
 
-def simulatable_copy(path: Path) -> UrdfCopy:
-    """Reads a URDF, replaces what Drake rejects, and collects and converts its meshes."""
-    copy = UrdfCopy(source=path, root=urdf.read_urdf(path))
+def simulatable_copy(path: Path, source: Path | None = None) -> UrdfCopy:
+    """Reads a URDF, replaces what Drake rejects, and collects and converts its meshes.
+
+    They are searched around ``source``, by default the URDF.
+    """
+    copy = UrdfCopy(source=source or path, root=urdf.read_urdf(path))
     urdf.remove_fixed_mimics(copy.root)
     for place, tags in _IGNORED.items():
         for element, tag in product(copy.root.findall(place), tags):

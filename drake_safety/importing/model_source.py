@@ -1,0 +1,54 @@
+"""Model files to be made first: xacro is expanded, a named description downloaded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from difflib import get_close_matches
+from importlib import import_module
+from pathlib import Path
+
+from drake_safety.extras import require_extra
+from drake_safety.files.reading import shortened
+
+_PATHS = ("URDF_PATH", "MJCF_PATH", "XACRO_PATH")
+
+
+def is_xacro(path: Path) -> bool:
+    """Whether a file is to be expanded by xacro."""
+    return path.suffix == ".xacro" or (path.is_file() and b"<xacro:" in path.read_bytes())
+
+
+def expanded(path: Path, arguments: Mapping[str, str]) -> str:
+    """The URDF of a xacro file; its packages are those above it and in ROS_PACKAGE_PATH."""
+    require_extra("robots", f"new: '{path}' is xacro", "xacrodoc")
+    from xacrodoc import XacroDoc, packages
+
+    if not path.is_file():
+        raise ValueError(f"new: '{path}' does not exist")
+    packages.walk_up_from(path)
+    included, options = [str(path.resolve())], {"subargs": dict(arguments), "rootdir": path.parent}
+    try:
+        # An include, so that those in it are relative to it.
+        document = XacroDoc.from_includes(included, resolve_packages=False, **options)
+    except Exception as error:  # Of a kind of xacro's own, of XML, or of its expressions.
+        missing = str(error).partition("Undefined substitution argument ")[2]
+        remedy = f"; pass --xacro-arg {missing}=VALUE" if missing else ""
+        raise ValueError(f"new: xacro of '{path}': {shortened(str(error))}{remedy}") from error
+    text: str = document.to_urdf_string()
+    return text
+
+
+def described_model(name: str) -> Path:
+    """The model file of a robot of robot_descriptions, which git downloads on first use."""
+    who = f"new: --robot-description {name}"
+    require_extra("robots", who, "robot_descriptions")
+    known = import_module("robot_descriptions").DESCRIPTIONS
+    if name not in known:
+        near = [one for one in known if name in one] or get_close_matches(name, known, cutoff=0.5)
+        raise ValueError(f"{who}: robot_descriptions has {len(known)} others; near are {near}")
+    try:
+        module = import_module(f"robot_descriptions.{name}")
+    except Exception as error:  # Of git, or of a network.
+        what = f"git cannot download it: {shortened(' '.join(str(error).split()))}"
+        raise ValueError(f"{who}: {what}; pass a file by --urdf or --mjcf") from error
+    return Path(next(getattr(module, key) for key in _PATHS if hasattr(module, key)))
