@@ -11,7 +11,7 @@ from typer import Argument, Exit, Option
 from drake_safety.assessments import assessed_scenarios
 from drake_safety.cli import console
 from drake_safety.extras import MissingExtraError
-from drake_safety.importing.model_source import described_model
+from drake_safety.importing.model_source import model_file
 from drake_safety.importing.policy_template import survey_policy
 from drake_safety.importing.robot_check import check_urdf
 from drake_safety.importing.robot_template import write_robot
@@ -45,12 +45,13 @@ def scenarios() -> None:
 def new(
     name: Annotated[str, Argument(help="Name of the robot, and of its folder.")],
     model: Annotated[
-        Path | None,
-        Option("--urdf", "--mjcf", help="Its model file; a URDF may be xacro.", dir_okay=False),
-    ] = None,
-    robot_description: Annotated[
-        str | None, Option(help="Its module of robot_descriptions, such as go2_description.")
-    ] = None,
+        str,
+        Option(
+            *("--urdf", "--mjcf", "--robot-description"),
+            metavar="FILE | NAME",
+            help="Its model file, which may be xacro; or its name in robot_descriptions.",
+        ),
+    ],
     xacro_arg: Annotated[
         list[str] | None, Option(metavar="KEY=VALUE", help="An argument of xacro; repeatable.")
     ] = None,
@@ -71,8 +72,6 @@ def new(
     """
     if (task == "walking") != (policy is not None):
         raise ValueError(f"new: --policy is that of --task walking; got '{task}' and {policy}")
-    if (model is None) == (robot_description is None):
-        raise ValueError("new: pass one of --urdf, --mjcf and --robot-description")
     arguments = dict(text.partition("=")[::2] for text in xacro_arg or [])
     if not all(arguments.values()):
         raise ValueError(f"new: --xacro-arg is KEY=VALUE; got {xacro_arg}")
@@ -81,8 +80,7 @@ def new(
     moved = () if template is None else template.joints or None
     options: dict[str, Any] = {"feet": _names(feet) or None, "hands": _names(hands) or None}
     options |= {"moved": moved, "xacro_arguments": arguments}
-    model = model or described_model(robot_description or "")
-    written = write_robot(name, model, task, out or Path(name), **options)
+    written = write_robot(name, model_file(model), task, out or Path(name), **options)
     files, asked, sizes = written.files, written.asked, written.sizes
     if template is not None:
         more, unknown = template.write(written.folder, written.joints, written.posture)

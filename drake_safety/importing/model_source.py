@@ -38,17 +38,19 @@ def expanded(path: Path, arguments: Mapping[str, str]) -> str:
     return text
 
 
-def described_model(name: str) -> Path:
-    """The model file of a robot of robot_descriptions, which git downloads on first use."""
-    who = f"new: --robot-description {name}"
+def model_file(name: str) -> Path:
+    """A file, or that of a robot of robot_descriptions, which git downloads on first use."""
+    if (path := Path(name)).suffix or path.exists():
+        return path
+    who = f"new: '{name}' is no file"
     require_extra("robots", who, "robot_descriptions")
     known = import_module("robot_descriptions").DESCRIPTIONS
     if name not in known:
         near = [one for one in known if name in one] or get_close_matches(name, known, cutoff=0.5)
-        raise ValueError(f"{who}: robot_descriptions has {len(known)} others; near are {near}")
+        raise ValueError(f"{who}, and none of {len(known)} robot_descriptions; near are {near}")
     try:
         module = import_module(f"robot_descriptions.{name}")
     except Exception as error:  # Of git, or of a network.
-        what = f"git cannot download it: {shortened(' '.join(str(error).split()))}"
-        raise ValueError(f"{who}: {what}; pass a file by --urdf or --mjcf") from error
+        what = shortened(" ".join(str(error).split()))
+        raise ValueError(f"new: git cannot download '{name}': {what}") from error
     return Path(next(getattr(module, key) for key in _PATHS if hasattr(module, key)))

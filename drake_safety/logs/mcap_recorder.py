@@ -25,6 +25,7 @@ _BREAK_NS = 1_000_000_000  # Before a motion that begins anew.
 _STATE, _GOAL, _FEET = "measured_plant_state", "desired_output", "desired_foot_positions"
 _POSE = [f"base_{entry}" for entry in ("qw", "qx", "qy", "qz", "x", "y", "z")]
 _RATES = [f"base_{entry}" for entry in ("wx", "wy", "wz", "vx", "vy", "vz")]
+_Monitor = Callable[[Context], object]
 _BELIEF = ["safe", "unsafe", "unknown"]
 
 
@@ -42,12 +43,7 @@ class McapRecorder:
         monitor: Called with each Context as well.
     """
 
-    def __init__(
-        self,
-        diagram: Diagram,
-        path: str | Path,
-        monitor: Callable[[Context], object] | None = None,
-    ):
+    def __init__(self, diagram: Diagram, path: str | Path, monitor: _Monitor | None = None):
         require_extra("logs", f"MCAP file '{path}'", "mcap", "rosbags")
         from mcap.writer import Writer
         from rosbags.typesys import Stores, get_typestore
@@ -164,9 +160,8 @@ class McapRecorder:
         # The plant reports a joint's net actuation for each of its actuators.
         entry = {motor.joint().name(): i for i, motor in enumerate(motors)}
         net = plant.get_net_actuation_output_port(instance)
-        self._add_numbers(
-            "actuation", entry, lambda c: net.Eval(plant_context(c))[[*entry.values()]]
-        )
+        places = [*entry.values()]
+        self._add_numbers("actuation", entry, lambda c: net.Eval(plant_context(c))[places])
         feet = [plant.GetBodyByName(foot.body, instance) for foot in loop.robot.feet.values()]
 
         def forces(context: Context) -> np.ndarray:

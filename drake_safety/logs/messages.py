@@ -97,15 +97,12 @@ def attached_map(path: Path) -> LogMap:
         require_extra("logs", f"log '{path}'", "mcap")
         from mcap.reader import make_reader
 
-        what = f"damaged{_REMEDIES['.mcap']}: log"
+        what, who = f"damaged{_REMEDIES['.mcap']}: log", f"map '{ATTACHED_MAP}' in '{path}'"
         with reading(path, what, Exception), path.open("rb") as file:
             for attachment in make_reader(file).iter_attachments():
                 if attachment.name == ATTACHED_MAP:
-                    who = f"map '{ATTACHED_MAP}' in '{path}'"
                     return load_typed(LogMap, parse_yaml(attachment.data.decode(), who), who)
-    raise ValueError(
-        f"log '{path}' has no map of its own, an MCAP attachment '{ATTACHED_MAP}': --map"
-    )
+    raise ValueError(f"log '{path}' has no map of its own: pass --map")
 
 
 def field_of(path: str) -> Callable[[Any], Any]:
