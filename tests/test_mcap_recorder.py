@@ -6,7 +6,7 @@ import signal
 import numpy as np
 import pytest
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from command_line import call
@@ -180,11 +180,11 @@ def test_any_diagram_is_recorded_and_motions_follow_one_another(tmp_path):
     source = builder.AddSystem(ConstantVectorSource([3.0, 4.0]))
     builder.ExportOutput(source.get_output_port(), "value")
     diagram = builder.Build()
-    with McapRecorder(diagram, tmp_path / "run.mcap") as recorder:
+    with McapRecorder(diagram, tmp_path / "run.mcap", Context.get_time) as recorder:
         context = diagram.CreateDefaultContext()
         for time_s in (0.0, 0.004, 0.02 - 1e-17, 0.02, 0.1, 0.0, 0.02):
             context.SetTime(time_s)
-            recorder(context)
+            assert recorder(context) == time_s
     found, _ = messages(tmp_path / "run.mcap")
     times, values = found["/value"]
     np.testing.assert_allclose(times, [0.0, 0.02, 0.1, 1.1, 1.12])

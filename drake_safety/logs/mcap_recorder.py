@@ -40,7 +40,7 @@ class McapRecorder:
     [N]. Stamps are times of the Context; a motion that begins anew follows after a second.
 
     Args:
-        monitor: Called with each Context as well.
+        monitor: Called with each Context as well; it may end the simulation.
     """
 
     def __init__(self, diagram: Diagram, path: str | Path, monitor: _Monitor | None = None):
@@ -76,10 +76,12 @@ class McapRecorder:
     def __exit__(self, *error: object) -> None:
         self._writer.finish()
 
-    def __call__(self, context: Context) -> None:
-        """Writes a row of a root Context if one is due."""
-        if self._monitor is not None:
-            self._monitor(context)
+    def __call__(self, context: Context) -> object:
+        """Writes a row of a root Context if one is due; returns what the monitor returns."""
+        self._write_due(context)
+        return None if self._monitor is None else self._monitor(context)
+
+    def _write_due(self, context: Context) -> None:
         now_s, before_s = context.get_time(), self._now_s
         if now_s < before_s:
             self._shift_ns += round(1e9 * (before_s - now_s)) + _BREAK_NS
