@@ -23,7 +23,7 @@ from drake_safety.plants.balls import Throw
 from drake_safety.simulation.rollouts import inputs_at, run_episodes
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
-_EPISODES, _LINES = 160, 40
+_EPISODES, _LINES = 120, 40
 _BALL = Throw(time_s=0.8, mass_kg=3.0, speed_m_s=9.0, direction_rad=-1.2)
 _MASSES = "safe", "unsafe", "don't know"
 _COLOURS = style.SAFE_COLOUR, style.UNSAFE_COLOUR, style.UNKNOWN_COLOUR
@@ -34,7 +34,7 @@ def glance(folder: Path) -> Figure:
     scenario, gamma = load_scenario("laikago_balancing"), load_assessment("laikago_balancing")
     episodes = run_episodes(scenario, _EPISODES, seed=DEMONSTRATION.first)
     with style.drawing_style():
-        fig = style.new_figure(14.5, 3.9)
+        fig = style.new_figure(14.5, 3.4)
         rollouts, plane, grid, verdicts = fig.subplots(1, 4, width_ratios=(1.1, 1.0, 1.15, 1.3))
         for episode in episodes[:_LINES]:
             margin = episode.margins.min(axis=1)
@@ -42,6 +42,7 @@ def glance(folder: Path) -> Figure:
             rollouts.plot(episode.time_s, margin, color=colour, linewidth=0.9, alpha=0.7)
         rollouts.axhline(0.0, color=style.INK, linewidth=0.8)
         rollouts.set(title="1  Simulated episodes", xlabel="time [s]", ylabel="smallest margin")
+        rollouts.set_ylim(-0.02, 0.105)
         segments = split(episodes, stride=5, discount=gamma.parameters.discount)
         inputs = segments.state, segments.desired_preview, segments.features
         x, y = gamma.predict(*inputs).embedding.T
@@ -57,6 +58,7 @@ def glance(folder: Path) -> Figure:
         grid.set(title="3  Beliefs on a grid", xlabel="hatched: don't know")
         for axes in (plane, grid):
             axes.set_ylim(-0.6 * half, 0.6 * half)
+            axes.set_anchor("N")
         _draw_verdicts(verdicts, scenario, gamma)
     return fig
 
