@@ -45,6 +45,7 @@ SAFE_RECALL, UNSAFE_RECALL = 0.952, 0.987
 _MODES = re.compile(r"^(sharpened|paper)\b")
 _FORMATS = {
     "share": {},
+    "point": {"unit": "="},
     "plain": {"digits": 2},
     "value": {"unit": "=", "digits": 2},
     "fine": {"digits": 4},
