@@ -66,7 +66,7 @@ def test_the_text_between_the_markers_is_rewritten_and_no_other(tmp_path):
     assert text.startswith("# Title\n\n<!-- results: lip -->\n```sh\npython -m studies evaluate")
     assert text.endswith("<!-- end -->\n\nThe end.\n")
     assert "stale words" not in text
-    assert "Γ learned from 64 episodes of seed 7. Its judges are 60 fresh episodes of" in text
+    assert "Γ learned from 64 episodes of seed 7. The evaluation has 60 fresh episodes" in text
     assert "| `sharpened` | 0.900 (0.795–0.962) |" in text
     assert "| `sharpened` | 0.40 | 10.0 % (3.8–20.5) | 6.7 % (0.8–22.1) | 0 of 20 |" in text
     # Whatever is changed by hand is written again.
