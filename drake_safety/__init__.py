@@ -42,8 +42,7 @@ _BESIDE = ("assessments", "diagrams", "models")
 class _CheckoutFinder:
     """Finds in a checkout what stands beside this package, by the name that it is installed as.
 
-    An editable install's finder does so too, but for the checkout that was installed, which need
-    not be the one that this package was imported from.
+    An editable install's finder does so too, but for its own checkout alone.
     """
 
     @staticmethod

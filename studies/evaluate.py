@@ -27,7 +27,11 @@ from drake_safety.cli.evaluate import (
     add_verdicts,
     evaluating,
 )
-from drake_safety.cli.training_folder import check_writable, training_episodes
+from drake_safety.cli.training_folder import (
+    AssessmentFolder,
+    check_writable,
+    training_episodes,
+)
 from drake_safety.diagrams.balancing.throws import HasBall, run_throws
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Key, Results
@@ -75,12 +79,13 @@ def evaluate(
     """Evaluate Γ beside baselines, trained on the same episodes, for README and docs."""
     loaded, folder = load_scenario(scenario), out or assessment
     check_writable(assessment, folder)
+    learned = AssessmentFolder(assessment, assessment)
     first = (EVALUATION.first if seed is None else seed) + RELEASE * release
     loop = loaded.make_loop()
     if throws:
         require(loop, HasBall)
     with evaluating(
-        loaded, assessment, folder, EVALUATION, first, workers, _tables, _PROGRAM
+        loaded, learned, folder, EVALUATION, first, workers, _tables, _PROGRAM
     ) as evaluation:
         evaluation.entries["calibration_episodes"] = calibration_episodes
         test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")

@@ -71,6 +71,11 @@ def test_an_accepted_target_is_printed_with_its_belief_and_ends_with_zero(ask, f
     assert re.search(r"verdict +safe: probability \d\.\d+ ≥ threshold 0\.400", printed)
     assert "belief" in printed
     assert "at most 1 % of unsafe episodes called safe" in printed
+    # The answer first, the origin of Γ last.
+    assert [line.split()[0] for line in printed.splitlines()] == [
+        *("verdict", "target", "belief", "threshold"),
+        "monitor:",
+    ]
 
 
 def test_a_refused_target_is_printed_with_its_cause_and_the_nearest_accepted_one(ask, folder):
@@ -79,8 +84,9 @@ def test_a_refused_target_is_printed_with_its_cause_and_the_nearest_accepted_one
     Results({("plans", "sharpened", "threshold"): forged}).write(folder / "evaluation.json")
     code, printed = ask("--target", *FAR)
     assert code == 1
-    assert re.search(r"verdict +unsafe: probability \d\.\d+ < threshold 0\.500", printed)
-    assert re.search(rf"likely cause +{CAUSE}", printed)
+    because = rf"the constraint '{CAUSE}' would be violated by \d+\.\d cm"
+    assert re.match(rf"verdict +unsafe: {because}\nnearest accepted ", printed)
+    assert re.search(r"probability +\d\.\d+ < threshold 0\.500", printed)
     assert re.search(r"threshold +0\.500, the default, which promises nothing", printed)
     nearest = re.search(r"nearest accepted +(\S+ \S+ \S+) m, \S+ cm away", printed)[1]
     # The printed target can be typed, and is accepted then.

@@ -2,15 +2,17 @@
 
 import math
 import re
+import shlex
 import sys
 from types import SimpleNamespace
 
 import pytest
+import typer
 
 import drake_safety
 from command_line import call
 from drake_safety.assessments import assessed_scenarios
-from drake_safety.cli import main
+from drake_safety.cli import COMMANDS, main, make_app
 from drake_safety.cli.run import parse_pushes
 from drake_safety.learning.segments import EpisodeError
 from drake_safety.plants.balls import Throw
@@ -38,25 +40,65 @@ def test_a_table_of_scenarios_and_the_version_are_printed(monkeypatch, capsys):
     assert call(monkeypatch, "scenarios") in (0, None)
     printed = capsys.readouterr().out
     assert "nominal, actual" in printed
-    rows = dict(re.findall(r"│ (\w+) +│ (yes|no) ", printed))
-    assert {name for name, trained in rows.items() if trained == "yes"} == {*assessed_scenarios()}
-    assert rows["pendulum"] == "no"
+    assert max(map(len, printed.splitlines())) <= 80
+    rows = {name: cells for name, *cells in re.findall(r"│ (\w+) +│ (yes|no) +│ (.*?) +│", printed)}
+    trained = {name for name, cells in rows.items() if cells[0] == "yes"}
+    assert trained == {*assessed_scenarios()}
+    assert rows["pendulum"] == ["no", ""] and rows["atlas_reaching"] == ["yes", ""]
+    assert rows["g1_walking"][1] in ("robots, walking", "drake_safety[robots]")
     assert call(monkeypatch, "--version") in (0, None)
     printed = capsys.readouterr().out
     assert printed.startswith(f"drake-safety {drake_safety.__version__}, drake ")
 
 
+def test_the_help_has_every_command_in_a_group_with_an_example_that_parses(monkeypatch, capsys):
+    assert call(monkeypatch) == 0
+    listing = capsys.readouterr().out
+    assert (
+        listing.split("\n\n")[1].strip().startswith("Γ, learned from simulated episodes, predicts")
+    )
+    listed = re.findall(r"^  ([a-z]+)  ", listing, flags=re.MULTILINE)
+    assert sorted(listed) == sorted(COMMANDS)
+    assert re.findall(r"^(\w+):$", listing, flags=re.MULTILINE) == [
+        "Options",
+        "Use",
+        "Train",
+        "Judge",
+    ]
+    commands = typer.main.get_command(make_app()).commands
+    for name in COMMANDS:
+        assert call(monkeypatch, name, "--help") == 0
+        shown = capsys.readouterr().out
+        assert not re.search(r"[<{}]|list\[", shown), shown
+        (example,) = re.findall(r"^  Example:\n\n  drake-safety (.*)$", shown, flags=re.MULTILINE)
+        command, *arguments = shlex.split(example)
+        assert command == name
+        commands[name].make_context(name, arguments)
+        if name != "scenarios":
+            assert "Arguments:" in shown and re.search(r"^Usage: .* [A-Z]+", shown)
+
+
 SCENE = "laikago_balancing"
-MISSING = "error folder 'x' holds no 'sharpened' assessment; it holds []: run `drake-safety train`"
+MISSING = "error: folder 'x' holds no 'sharpened' assessment; it holds []: run `drake-safety train`"
+
+
+@pytest.mark.parametrize("arguments", [["run", SCENE, "--foo"], ["fly"]])
+def test_an_option_or_a_command_that_is_not_there_is_one_line_too(monkeypatch, capsys, arguments):
+    assert call(monkeypatch, *arguments) == 2
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("error: No such ")
 
 
 @pytest.mark.train
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["train", "nothing", "--out", "x"], "error scenario 'nothing' does not exist"),
-        (["train", SCENE, "--out", "x", "--mode", "both ways"], "error train: mode must be one of"),
-        (["calibrate", SCENE, "--miss-rate", "2"], "error calibration: --miss-rate is 2.0"),
+        (["train", "nothing", "--out", "x"], "error: scenario 'nothing' does not exist"),
+        (
+            ["train", SCENE, "--out", "x", "--mode", "both ways"],
+            "error: train: mode must be one of",
+        ),
+        (["calibrate", SCENE, "--miss-rate", "2"], "error: calibration: --miss-rate is 2.0"),
         (["run", SCENE, "--assessment", "x"], MISSING),
     ],
 )
@@ -85,7 +127,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_simulated(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     assert call(monkeypatch, *arguments, what) == 2
-    assert f"error folder '{what}" in (printed := capsys.readouterr().out)
+    assert f"error: folder '{what}" in (printed := capsys.readouterr().out)
     assert "cannot be written" in printed
 
 

@@ -1,8 +1,12 @@
 import shutil
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from command_line import call
+from drake_safety.assessments import shipped_folder
 from drake_safety.cli.training_folder import MODES, fresh_episodes_folder, load_assessment
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.seeds import SHIFTS
@@ -16,6 +20,27 @@ from toy_tasks import train_shuttle
 def shuttle_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("shuttle")
     return train_shuttle(folder), folder
+
+
+def test_without_an_assessment_that_of_the_package_is_evaluated_and_not_written(
+    monkeypatch, capsys, tmp_path
+):
+    given = []
+
+    @contextmanager
+    def evaluating(scenario, learned, folder, *others):
+        given.append((scenario.name, learned, folder))
+        yield SimpleNamespace(entries={}, fresh=lambda *_: None, scorers=[])
+
+    monkeypatch.chdir(tmp_path)
+    for name, stands_for in (("evaluating", evaluating), ("add_verdicts", None)):
+        monkeypatch.setattr(f"drake_safety.cli.evaluate.{name}", stands_for or (lambda *_: None))
+    monkeypatch.setattr("drake_safety.cli.evaluate.add_reliability", lambda *_: None)
+    assert call(monkeypatch, "evaluate", "laikago_balancing", "--throws", 0) == 0
+    out = Path("runs/laikago_balancing-shipped")
+    learned = (shipped_folder("laikago_balancing"), out)
+    assert given == [("laikago_balancing", learned, out)]
+    assert "assessment        comes with the package" in capsys.readouterr().out
 
 
 OPTIONS = ("--episodes", 30, "--calibration-episodes", 20, "--workers", 1, "--seed", 100)

@@ -176,6 +176,6 @@ def test_a_log_with_too_few_values_is_not_judged(folder, kept, monkeypatch, caps
     printed = " ".join(capsys.readouterr().out.split())
     assert printed.count("no alarm") == 1
     assert "not judged: 0." in printed
-    assert "error 1 of 2 logs have less than 1 s" in printed
+    assert "error: 1 of 2 logs have less than 1 s" in printed
     assert logs[0]["judged_s"] < 1.0 < logs[1]["judged_s"]
     assert logs[1]["judged_s"] == pytest.approx(logs[1]["duration_s"])

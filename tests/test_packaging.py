@@ -174,7 +174,7 @@ def test_a_command_names_its_extra_before_it_does_anything(
     done = subprocess.run([str(word) for word in words], cwd="/", capture_output=True, text=True)
     assert done.returncode == 2
     (line,) = done.stdout.splitlines()
-    assert line.startswith(f"error {command.split()[0]}: the package '")
+    assert line.startswith(f"error: {command.split()[0]}: the package '")
     assert line.endswith(f"is not installed: pip install 'drake_safety[{extra}]'")
     assert not folder.exists()
 

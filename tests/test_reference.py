@@ -1,6 +1,8 @@
 """The reference documentation: ports as the docstrings say them, and as the systems have them."""
 
 import ast
+import dataclasses
+import inspect
 import json
 import re
 import shlex
@@ -13,12 +15,18 @@ import pytest
 import yaml
 from packaging.specifiers import SpecifierSet
 
+import drake_safety
 import notebook_pages
+import public_page
 import system_block
 
 ROOT = Path(__file__).resolve().parents[1]
 SYSTEMS = sorted((ROOT / "drake_safety" / "systems").glob("*.py"))
-COMMAND_GUARD = ROOT / "diagrams" / "walking" / "command_guard.py"
+OTHERS = (
+    "diagrams/walking/command_guard.py",
+    "drake_safety/plants/mujoco_plant.py",
+    "drake_safety/simulation/closed_loop.py",
+)
 
 DOCSTRING = """Adds two numbers.
 
@@ -32,6 +40,8 @@ DOCSTRING = """Adds two numbers.
     - margins: 3
 
 Not :meth:`subtract`, see ``margins``.
+
+Example: ``Adder()``
 """
 
 
@@ -54,7 +64,8 @@ def test_a_block_says_its_ports_and_their_remarks():
 
 def test_a_docstring_becomes_markdown_without_its_block():
     text = system_block.to_markdown(DOCSTRING)
-    assert text == "Adds two numbers.\n\nNot `subtract`, see `margins`."
+    example = "Examples:\n    >>> Adder()\n"
+    assert text == f"Adds two numbers.\n\nNot `subtract`, see `margins`.\n\n{example}"
     # A unit behind an index is no link.
     assert system_block.to_markdown("The entry q[3] [rad].") == "The entry q[3] \\[rad]."
 
@@ -70,7 +81,7 @@ def test_a_block_of_something_else_is_refused():
 def test_every_port_has_a_meaning_and_every_meaning_a_port():
     nodes = [
         node
-        for path in (*SYSTEMS, COMMAND_GUARD)
+        for path in (*SYSTEMS, *map(ROOT.joinpath, OTHERS))
         for node in ast.parse(path.read_text("utf-8")).body
     ]
     docs = [ast.get_docstring(node) or "" for node in nodes if isinstance(node, ast.ClassDef)]
@@ -81,6 +92,32 @@ def test_every_port_has_a_meaning_and_every_meaning_a_port():
             own = f"{block.name}.{port.name}"
             used.add(own if own in system_block.PORTS else port.name)
     assert used == set(system_block.PORTS)
+
+
+def test_every_public_name_is_on_the_page_with_an_example_that_runs():
+    homes, page = public_page.public_homes(), public_page.public_page()
+    assert [*homes, "__version__"] == drake_safety.__all__
+    shared = {}
+    exec(public_page.PREAMBLE, shared)
+    for name in homes:
+        assert f"heading: drake_safety.{name}\n" in page
+        public = getattr(drake_safety, name)
+        (example,) = system_block.EXAMPLE.findall(inspect.getdoc(public))
+        assert name in example or not callable(public) or name in NOT_CALLED
+        exec(example, dict(shared))
+
+
+# Their objects come from others, such as `run_episodes`.
+NOT_CALLED = ("ChangeDetector", "ClosedLoop", "Episode", "Episodes", "SafetyAssessment", "Scenario")
+
+
+def test_every_public_function_of_three_arguments_says_what_they_are():
+    for name in public_page.public_homes():
+        public = getattr(drake_safety, name)
+        arguments = [one for one in inspect.signature(public).parameters if one != "self"]
+        of_fields = dataclasses.is_dataclass(public) or name == "ClosedLoop"  # Have comments.
+        if len(arguments) >= 3 and not of_fields:
+            assert "\nArgs:\n" in inspect.getdoc(public), name
 
 
 def test_hosted_pages_are_built_with_what_the_extra_docs_installs_alone():
@@ -105,6 +142,17 @@ def test_the_reference_builds_without_a_warning(tmp_path):
     page = (tmp_path / "reference" / "systems" / "safety_assessor" / "index.html").read_text()
     assert "predicted_margins" in page
     assert "<svg" in page
+    assert "drake_safety.systems.safety_assessor.SafetyAssessor" in page
+    page = (tmp_path / "reference" / "public" / "index.html").read_text()
+    shown = re.sub(r"<[^>]+>", "", page)
+    for name in public_page.public_homes():
+        assert f"drake_safety.{name}" in shown
+    assert shown.count("Examples:") == len(public_page.public_homes())
+    assert "initial_uncertainty: Share = 0.3" in shown and "dropout: ShareBelowOne" in shown
+    assert "hidden_sizes: Widths = [128, 128]" in shown
+    for page in tmp_path.rglob("*.html"):
+        shown = re.sub(r"<[^>]+>", "", page.read_text(encoding="utf-8"))
+        assert not re.search(r":(class|meth|func|attr|mod):|={6}|\.\. \w+::", shown), page
 
 
 def test_every_tutorial_is_a_page_and_shows_the_outputs_of_one_that_was_run(tmp_path):
@@ -112,7 +160,7 @@ def test_every_tutorial_is_a_page_and_shows_the_outputs_of_one_that_was_run(tmp_
     pages = notebook_pages.tutorial_pages(tmp_path)
     assert [*pages] == [f"tutorials/{path.stem}.md" for path in paths]
     first = next(iter(pages.values()))
-    assert "](../promises.md)" in first and "](2_throw_and_recover.md)" in first
+    assert "](../concepts.md)" in first and "](6_compose.md)" in first
     assert "`make tutorials` adds its outputs" in first
     content = json.loads(paths[0].read_text(encoding="utf-8"))
     code = next(cell for cell in content["cells"] if cell["cell_type"] == "code")

@@ -12,6 +12,10 @@ import griffe
 sys.path.insert(0, str(Path(__file__).parent))
 from system_block import to_markdown
 
+_SCHEMA = "drake_safety.files.schema.schema"  # A dataclass that checks itself.
+_DATACLASSES = griffe.Module("dataclasses")
+_DATACLASSES["dataclass"] = griffe.Function("dataclass")
+
 
 def comment_of(obj: griffe.Object) -> str:
     """The comment behind an attribute, or that on the lines above it; "" if there is none."""
@@ -29,8 +33,27 @@ def comment_of(obj: griffe.Object) -> str:
 class PlainMarkdown(griffe.Extension):
     """Takes port blocks, which have a table of their own, and roles out of every docstring.
 
-    A comment beside a field of a class is its docstring.
+    A comment beside a field of a class is its docstring. A class of the package's own decorator
+    is a dataclass, so that its page shows the constructor with the defaults.
     """
+
+    def on_class_instance(self, *, cls: griffe.Class, **kwargs: Any) -> None:
+        """Says that a class is a dataclass."""
+        del kwargs
+        for decorator in cls.decorators:
+            if decorator.callable_path == _SCHEMA:
+                call = decorator.value
+                assert isinstance(call, griffe.ExprCall) and cls.parent is not None
+                call.function = griffe.ExprName("dataclass", parent=_DATACLASSES)
+
+    def on_attribute_instance(self, *, attr: griffe.Attribute, **kwargs: Any) -> None:
+        """Shows the list that a ``default_factory`` returns as the default."""
+        del kwargs
+        if isinstance(attr.value, griffe.ExprCall) and len(attr.value.arguments) == 1:
+            (argument,) = attr.value.arguments
+            factory = argument.value if isinstance(argument, griffe.ExprKeyword) else None
+            if isinstance(factory, griffe.ExprLambda) and str(attr.value.function) == "field":
+                attr.value = factory.body
 
     def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
         """Rewrites an object's docstring."""

@@ -16,7 +16,8 @@ from mkdocs.structure.files import File, Files
 
 sys.path.insert(0, str(Path(__file__).parent))
 from notebook_pages import tutorial_pages
-from system_block import parse_block
+from public_page import public_page
+from system_block import parse_block, to_markdown
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = (
@@ -72,17 +73,28 @@ def reference_pages() -> dict[str, str]:
             pages[f"reference/systems/{path.stem}.md"] = "\n\n".join(
                 [f"# {block.name}", block.svg, block.table, f"::: {module}"]
             )
-            summary = (ast.get_docstring(node) or "").splitlines()[0].replace("``", "`")
+            summary = to_markdown((ast.get_docstring(node) or "").splitlines()[0])
             systems.append(f"| [{block.name}](systems/{path.stem}.md) | {summary} |")
-    lines = ["# Reference", "", "## Systems", "", "| system | |", "|---|---|", *sorted(systems)]
+    pages["reference/public.md"] = public_page()
+    lines = [
+        "# Reference",
+        "",
+        "[Public names](public.md) has what most users need, with examples.",
+    ]
+    lines += ["", "## Systems", "", "| system | |", "|---|---|", *sorted(systems)]
     for room in ROOMS:
         lines += ["", f"## {room}", "", "| module | |", "|---|---|"]
         for path in _modules(room):
             module = f"drake_safety.{room}.{path.stem}"
             page = f"reference/{room}/{path.stem}.md"
-            pages[page] = f"# {path.stem}\n\n::: {module}\n"
+            docstrings = (
+                inspect.cleandoc(ast.get_docstring(node) or "") for node in _classes(path)
+            )
+            blocks = [block for block in map(parse_block, docstrings) if block]
+            ports = [f"Ports of {block.name}:\n\n{block.table}" for block in blocks]
+            pages[page] = "\n\n".join([f"# {path.stem}", *ports, f"::: {module}\n"])
             summary = (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or "").splitlines()[0]
-            lines.append(f"| [{path.stem}]({room}/{path.stem}.md) | {summary.replace('``', '`')} |")
+            lines.append(f"| [{path.stem}]({room}/{path.stem}.md) | {to_markdown(summary)} |")
     pages["reference/index.md"] = "\n".join(lines) + "\n"
     return pages
 

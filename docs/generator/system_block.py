@@ -10,6 +10,7 @@ from pathlib import Path
 import yaml
 
 DIRECTIVE = re.compile(r"^\.\. pydrake_system::\n((?:[ \t]+.*\n|\n)*)", re.MULTILINE)
+EXAMPLE = re.compile(r"^Example: ``(.+)``$", re.MULTILINE)
 _ROW, _MARGIN, _HEAD, _LETTER = 24, 14, 34, 7.4  # Of the picture [pixels].
 _SIZE = re.compile(r"^([^(]+?)\s*(?:\((.*)\))?$")
 _KNOWN = yaml.safe_load((Path(__file__).parent / "ports.yaml").read_text("utf-8"))
@@ -126,12 +127,15 @@ def parse_block(docstring: str) -> SystemBlock | None:
 
 
 def to_markdown(docstring: str) -> str:
-    """A docstring without the block, for its page shows it, and with roles as plain code.
+    """A docstring without the block, for its page shows it, with roles as plain code.
+
+    An ``Example:`` is a section.
 
     Args:
         docstring: Without its indentation.
     """
     text = DIRECTIVE.sub("", docstring + "\n").rstrip("\n")
+    text = EXAMPLE.sub(r"Examples:\n    >>> \1\n", text)
     text = re.sub(r":(?:attr|class|func|meth|mod):`~?([^`]+)`", r"`\1`", text)
     # What follows a bracket in brackets is a unit, not the target of a link.
     text = re.sub(r"\]( ?)\[([^\]\n]*)\]", r"]\1\\[\2]", text)

@@ -1,13 +1,14 @@
 """The command ``drake-safety``: train, run and evaluate safety assessments.
 
 Another command is a function of the command's name (its arguments are the command line, its
-docstring the help) and an entry of `COMMANDS`. Only the module of the command that is called is
-imported.
+docstring the help), an entry of `COMMANDS` and an example in `EXAMPLES`. Only the module of the
+command that is called is imported.
 """
 
 from __future__ import annotations
 
 import logging
+import re
 import signal
 import sys
 import traceback
@@ -18,7 +19,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from drake_safety.cli import console
 from drake_safety.extras import require_extra
@@ -40,13 +41,45 @@ COMMANDS = {
     "pushes": ("pushes", "", "Find the smallest pushes that make a robot fall, all around it."),
     "adapt": ("adapt", "train", "Adapt Γ to an actual robot, and say whether it is better."),
     "monitor": ("monitor", "", "Run the change monitor over logs of a robot."),
-    "export": ("export", "", "Write Γ as one ONNX file."),
+    "export": ("export", "", "Write Γ as one ONNX or C file."),
     "report": ("export", "report", "Write RUN/report.html, a self-contained page of a run."),
 }
-"""In the order of the help: module, the extra that it needs, and a line of help."""
+"""Module, the extra that it needs, and a line of help."""
+EXAMPLES = """
+Use    scenarios
+Use    ask atlas_reaching --target 0.7 0.3 1.0
+Use    run laikago_balancing --push ball
+Use    play laikago_balancing
+Train  new my_robot --urdf robot.urdf --task balancing
+Train  check my_robot/balancing.yaml
+Train  train my_robot/balancing.yaml --out runs/my_robot
+Train  calibrate my_robot/balancing.yaml --assessment runs/my_robot --miss-rate 0.05
+Train  adapt laikago_balancing --variation payload
+Train  export laikago_balancing --out gamma.onnx
+Judge  evaluate laikago_balancing --episodes 1000 --throws 600
+Judge  gate go2_walking --candidate policy=new.onnx
+Judge  rate atlas_reaching --variation actual
+Judge  pushes go2_walking --command 0.6 0 0
+Judge  monitor laikago_balancing --log stand.mcap --map columns.yaml
+Judge  report runs/my_robot
+"""  # Of each command, after its group, in the order of the help.
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.
 _ERRORS = {"gate": 3}  # Exit codes of errors where 1 and 2 are results.
+# An argument with its type in the help, or the type behind an option.
+_TYPED = re.compile(r"^(\w[\w.]*) <.*|<(?:list\[)?(\w+)[^>]*>")
+
+
+class _Group(TyperGroup):
+    """The commands, in groups."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Writes the commands' lines of help."""
+        listed = re.findall(r"(?m)^(\w+) +(\w+)", EXAMPLES)
+        for group in dict(listed):
+            with formatter.section(group):
+                names = [name for its_group, name in listed if its_group == group]
+                formatter.write_dl([(f"{name:<9}", COMMANDS[name][2]) for name in names])
 
 
 class _Command(TyperCommand):
@@ -55,6 +88,16 @@ class _Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parses the arguments, of which the three numbers of a target are one value."""
         return super().parse_args(ctx, join_targets(args))
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """The arguments, by words in capitals."""
+        return [piece.strip("{}").upper() for piece in super().collect_usage_pieces(ctx)]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Writes arguments and options, with words in capitals for their values."""
+        write, word = formatter.write_dl, lambda found: (found[1] or found[2]).upper()
+        formatter.write_dl = lambda rows: write([(_TYPED.sub(word, n), text) for n, text in rows])
+        super().format_options(ctx, formatter)
 
     def invoke(self, ctx: Any) -> Any:
         """Runs the command."""
@@ -83,9 +126,10 @@ def join_targets(args: Sequence[str]) -> list[str]:
 def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
     """The commands; those that are not called have a name and a line of help."""
     app = typer.Typer(
-        help="Learn safety assessments of robot motions from simulations, and use them before and "
-        f"during motions. With {_DEBUG}, anywhere in the line, errors show their traceback.",
-        no_args_is_help=True,
+        cls=_Group,
+        help="Γ, learned from simulated episodes, predicts from a robot's state and plan whether "
+        "its motion stays safe. COMMAND --help shows a command's options and an example. With "
+        f"{_DEBUG}, anywhere in the line, errors show their traceback.",
         rich_markup_mode=None,
         pretty_exceptions_enable=False,
     )
@@ -94,7 +138,9 @@ def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
         function: Any = _not_called
         if name in called:
             function = getattr(import_module(f"drake_safety.cli.{module}"), name)
-        app.command(name, cls=_Command, short_help=line)(function)
+        (example,) = re.findall(rf"(?m)^\w+ +({name}\b.*)", EXAMPLES)
+        epilog = f"Example:\n\n\b\ndrake-safety {example}"
+        app.command(name, cls=_Command, short_help=line, epilog=epilog)(function)
     return app
 
 
@@ -137,8 +183,8 @@ def run_app(commands: Callable[..., Any], program: str) -> None:
     # Commands that keep a page open print its address themselves.
     logging.getLogger("drake").setLevel(logging.WARNING)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    arguments = [argument for argument in sys.argv[1:] if argument != _DEBUG]
-    name = next(iter(arguments), "")
+    arguments = [argument for argument in sys.argv[1:] if argument != _DEBUG] or ["--help"]
+    name = arguments[0]
     try:
         code = commands(arguments, prog_name=program, standalone_mode=False)
         if code == _STOPPED:  # Typer's own answer to Ctrl-C.
@@ -150,9 +196,9 @@ def run_app(commands: Callable[..., Any], program: str) -> None:
         sys.exit(_STOPPED)
     except (Exception, SystemExit) as error:
         if isinstance(error, (ValueError, OSError, EpisodeError)) and _DEBUG not in sys.argv:
-            console.say("error", error, style="red")
-        elif hasattr(error, "show"):  # Typer's own errors: unknown options, wrong types.
-            error.show()
+            console.say("error:", error, style="red")
+        elif hasattr(error, "format_message"):  # Typer's own: unknown options, wrong types.
+            console.say("error:", error.format_message(), style="red")
         elif name in _ERRORS:
             traceback.print_exception(error)
         else:

@@ -11,6 +11,8 @@ from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.training_folder import MODES
 from drake_safety.files.reading import is_number
+from drake_safety.learning.calibration import UNSAFE
+from drake_safety.learning.causes import describe_margin
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.simulation.capabilities import HasGoals, goal_words, require
@@ -32,7 +34,8 @@ def ask(
 
     Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
     """
-    loaded, _, gamma = folders.open_assessment(scenario, assessment, mode)
+    with console.console.capture() as origin:  # Of Γ, printed last.
+        loaded, _, gamma = folders.open_assessment(scenario, assessment, mode)
     loop = loaded.make_loop(assessment=gamma, **console.given(hand=hand, command_s=duration))
     if not isinstance(loop, HasGoals):
         raise ValueError(
@@ -44,6 +47,7 @@ def ask(
     goal, rule = parse_target(loop, target), folders.goal_threshold(gamma)
     verdict, nearest = judge_target(loop, goal, rule)
     print_verdict(loop, verdict, nearest, rule.origin)
+    console.say(origin.get().rstrip())
     if not verdict.is_accepted:
         raise Exit(1)
 
@@ -78,29 +82,32 @@ def judge_target(
 def print_verdict(
     loop: ClosedLoop, verdict: GoalVerdict, nearest: GoalVerdict | None, origin: str
 ) -> None:
-    """Prints a verdict, and for a refusal what would be accepted."""
+    """Prints a verdict and its reason, for a refusal what would be accepted, then numbers."""
     words = goal_words(require(loop, HasGoals))
     probability, threshold = verdict.probability, verdict.threshold
     subject = f" of {words.subject}" if words.is_point else ""
     sign = "<" if probability < threshold else "≥"
     numbers = f"probability {probability:.3f} {sign} threshold {threshold:.3f}"
-    lines = {words.goal: f"{words.value(verdict.goal)}{subject}"}
-    lines["verdict"] = f"{verdict.verdict}: {verdict.reason or numbers}"
-    if np.isfinite(probability):
-        safe, unsafe, unknown = verdict.belief.tolist()
-        lines["belief"] = f"safe {safe:.2f}, unsafe {unsafe:.2f}, don't know {unknown:.2f}"
-    if not verdict.is_accepted and verdict.cause:
-        masses = verdict.cause_probability
-        label, cause = verdict.cause_words(loop.angular_constraints)
-        if not np.isfinite(verdict.cause_margin):
-            cause += f" ({100 * masses.max() / masses.sum():.0f} %)"
-        lines[label] = cause
+    because, name, margin = verdict.reason or numbers, verdict.cause, verdict.cause_margin
+    if verdict.verdict == UNSAFE and np.isfinite(margin):
+        size = describe_margin(name, abs(margin), loop.angular_constraints)
+        happens = "within {} of its limit" if margin > 0.0 else "violated by {}"
+        because = f"the constraint '{name}' would be {happens.format(size.partition('+')[2])}"
+    lines = {"verdict": f"{verdict.verdict}: {because}"}
     if nearest is not None:
         away = f"{words.distance(nearest.goal - verdict.goal)} away"
         value, probability_there = words.value(nearest.goal), nearest.probability
         lines["nearest accepted"] = f"{value}, {away}, probability {probability_there:.3f}"
     elif not verdict.is_accepted and np.isfinite(verdict.goal).all():
         lines["nearest accepted"] = "none found that is accepted with reserve"
+    lines[words.goal] = f"{words.value(verdict.goal)}{subject}"
+    if name and not verdict.is_accepted and because in (verdict.reason, numbers):
+        lines.update([verdict.cause_words(loop.angular_constraints)])
+    if np.isfinite(probability):
+        if because != numbers:
+            lines["probability"] = numbers.partition(" ")[2]
+        safe, unsafe, unknown = verdict.belief.tolist()
+        lines["belief"] = f"safe {safe:.2f}, unsafe {unsafe:.2f}, don't know {unknown:.2f}"
     if nearest is not None or np.isfinite(probability):
         lines["threshold"] = f"{threshold:.3f}, {origin}"
     width = max(map(len, lines))

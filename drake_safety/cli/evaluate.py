@@ -85,7 +85,7 @@ class Evaluation:
 
 def evaluate(
     scenario: console.ScenarioArgument,
-    assessment: console.TrainingOption,
+    assessment: console.AssessmentOption = None,
     episodes: Annotated[int, Option(help="Fresh nominal episodes.", min=1)] = 1000,
     calibration_episodes: Annotated[int, Option(help="Others, for thresholds.", min=20)] = 300,
     throws: Annotated[
@@ -106,15 +106,17 @@ def evaluate(
 
     Episodes are kept in ASSESSMENT: a stopped evaluation continues.
     """
-    loaded, folder = load_scenario(scenario), out or assessment
-    folders.check_writable(assessment, folder)
+    loaded = load_scenario(scenario)
+    learned = folders.assessment_folder(loaded, assessment)
+    folder = out or learned.out
+    folders.check_writable(learned.out, folder)
     loop, block = loaded.make_loop(), SHIFTS if shifts else EVALUATION
     if throws is None:
         is_thrown_at = isinstance(loop, HasBall) and not isinstance(loop, HasGoals)
         throws = 600 if is_thrown_at else 0
     elif throws:
         require(loop, HasBall, "evaluate: pass --throws 0")
-    with evaluating(loaded, assessment, folder, block, seed, workers) as evaluation:
+    with evaluating(loaded, learned, folder, block, seed, workers) as evaluation:
         if shifts:
             _add_shifts(evaluation, shifts, episodes, hours)
             return
@@ -130,7 +132,7 @@ def evaluate(
 @contextmanager
 def evaluating(
     scenario: Scenario,
-    run_folder: Path,
+    learned: folders.AssessmentFolder,
     folder: Path,
     block: SeedBlock,
     seed: int | None,
@@ -139,14 +141,14 @@ def evaluating(
     program: str = "drake-safety",
 ) -> Iterator[Evaluation]:
     """Yields an evaluation of a run; after the `with` statement its results are written."""
-    assessments = folders.load_assessments(run_folder)
-    files = {mode: folders.assessment_file(run_folder, mode) for mode in assessments}
+    assessments = folders.load_assessments(learned.path)
+    files = {mode: folders.assessment_file(learned.path, mode) for mode in assessments}
     hashes = {mode: file_hash(file) for mode, file in files.items()}
     seeds = block.seeds(seed)
     for gamma in assessments.values():
         folders.check_fresh(gamma, scenario, seeds.values())
     with console.open_stages() as stages:
-        evaluation = Evaluation(scenario, assessments, run_folder, folder, seeds, workers, stages)
+        evaluation = Evaluation(scenario, assessments, learned.out, folder, seeds, workers, stages)
         yield evaluation
     sharpened = assessments[MODES[0]]
     trained = [one for one in sharpened.used_ if one.purpose.startswith("training")]

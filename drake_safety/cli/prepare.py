@@ -20,6 +20,7 @@ from drake_safety.simulation.scenario import load_scenario, scenario_names
 from drake_safety.simulation.scenario_check import check_scenario
 
 _NUM_EPISODES = 16  # For the share of unsafe episodes.
+_NEEDS = {"example-robot-data": "robots", ".onnx": "walking"}  # Extras by folder or suffix.
 
 
 def scenarios() -> None:
@@ -27,19 +28,18 @@ def scenarios() -> None:
     rows: list[tuple[str, ...]] = []
     trained = assessed_scenarios()
     for name in scenario_names():
-        is_trained = "yes" if name in trained else "no"
         try:
             scenario = load_scenario(name)
-            scenario.task_class().model_files(scenario)
+            files = scenario.task_class().model_files(scenario)
+            marks = {mark for file in files for mark in (*file.parts, file.suffix)}
+            needs = ", ".join(extra for mark, extra in _NEEDS.items() if mark in marks)
+            plants = ", ".join(scenario.variations)
         except MissingExtraError as error:
-            rows.append((name, is_trained, *3 * ["–"], f"needs {error.needs}"))
-            continue
-        horizon = f"{scenario.assessment.horizon * scenario.preview_step_s:g} s"
-        task, plants = scenario.task.rpartition(":")[2], ", ".join(scenario.variations)
-        rows.append((name, is_trained, task, scenario.robot, horizon, plants))
-    columns = ("scenario", "trained", "task", "robot", "horizon", "plants")
-    console.show(console.new_table(*columns, rows=rows))
+            needs, plants = error.needs, "–"
+        rows.append((name, "yes" if name in trained else "no", needs, plants))
+    console.show(console.new_table("scenario", "trained", "needs", "plants", rows=rows), width=80)
     console.say("trained: an assessment comes with the package; `train` learns that of any other")
+    console.say("needs: extras; `make walking` installs both, and the policies that walk")
 
 
 def new(

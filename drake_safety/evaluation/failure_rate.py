@@ -54,8 +54,13 @@ def estimate_failure_rate(
     """Estimates how often a closed loop fails, from few simulations of many starts.
 
     Γ of each start, in its first undisturbed row, divides them into strata, and equally many starts
-    of each are simulated, ``num_rollouts`` in all. The share of failures, weighted by that of the
-    starts, is unbiased however wrong Γ is. Starts and episodes are kept in the folder ``path``.
+    of each are simulated. The share of failures, weighted by that of the starts, is unbiased
+    however wrong Γ is.
+
+    Args:
+        metric: As of `compare_loops`.
+        num_starts, num_rollouts: Starts of which Γ is asked; and that are simulated.
+        path: Folder in which starts and episodes are kept.
     """
     if not _NUM_STRATA <= num_rollouts <= num_starts:
         raise ValueError(f"num_rollouts must be in {_NUM_STRATA}..{num_starts}; got {num_rollouts}")

@@ -76,9 +76,16 @@ def compare_loops(
     """Simulates two closed loops in the same episodes until it is known which one fails more.
 
     Every 16 pairs it looks at a confidence sequence of the difference of their failure rates:
-    *worse* means that it is above 0, *better* below 0, *not worse* below `worse_by`. A verdict of
-    each kind is wrong with probability alpha: with k candidates pass alpha / k. Episodes are kept
-    in the folder ``path``. Γ of the baseline's scenario says whether a change was foreseen.
+    *worse* means that it is above 0, *better* below 0, *not worse* below `worse_by`.
+
+    Args:
+        metric: A `Metric`: unsafe, fall, a constraint, tracking=BOUND [m], or a function.
+        alpha: Probability that a verdict of each kind is wrong; with k candidates pass alpha / k.
+        path: Folder in which episodes are kept.
+        assessment: Γ of the baseline's scenario, which says whether a change was foreseen.
+        each_look: Called with the verdict so far.
+
+    Example: ``verdict = compare_loops(scenario, heavier_scenario, max_pairs=4, num_workers=1)``
     """
     check_levels(worse_by, alpha)
     first, second = (

@@ -71,6 +71,8 @@ class SafetyAssessment:
     the maps learn safety and future margins beside t-SNE's points from every start row, Γ is
     interpolated bilinearly between cell centres, and it is the mean of an ensemble of maps, each
     with its own grid. The "paper" mode is the literal reading, for comparison.
+
+    Example: ``belief = assessment.predict_one(*inputs_at(legged_loop, start)).belief``
     """
 
     info_: EpisodesInfo  # Of the training episodes.
@@ -131,9 +133,11 @@ class SafetyAssessment:
     ) -> SafetyAssessment:
         """Learns embedding and beliefs from nominal episodes, and from episodes of a plant family.
 
-        Without a detector it learns one from long undisturbed motions of the same diagram; without
-        them from the episodes, whose motion rarely suffices for its limits. `progress` is called
-        with a stage, the percentage done and 100; True shows it.
+        Args:
+            progress: Called with a stage, the percentage done and 100; True shows it.
+            detector: The monitor; by default it is learned.
+            motions: Long undisturbed motions of the same diagram, of which it is learned; by
+                default the episodes, whose motion rarely suffices for its limits.
         """
         require_extra("train", "SafetyAssessment.fit")
         self.parameters.check()

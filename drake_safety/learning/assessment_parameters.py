@@ -56,6 +56,8 @@ class AssessmentParameters:
 
     The paper's mode has one plain map, described by `paper`; parameters from `epochs` to
     `feature_unit` are the sharpened mode's.
+
+    Example: ``parameters = AssessmentParameters(horizon=20, ensemble_size=1)``
     """
 
     mode: Literal["sharpened", "paper"] = "sharpened"

@@ -51,10 +51,11 @@ class ChangeDetector:
 
     Each state's innovation, in its standard deviations and clipped, has exponentially weighted
     means of itself and of its square, with three memories. The largest of the six, each in units of
-    its limit, is the state's level; an alarm is a level above 1. The limits are from motion that
-    the predictor has not learned, extrapolated to a rate of false alarms by the exponential tail of
-    the maxima of blocks (peaks over threshold; Coles 2001, section 4), first of each chart and then
-    of the levels. Nothing is learned from failures.
+    its limit, is the state's level; an alarm is a level above 1. Limits are of motion that the
+    predictor has not learned, extrapolated to a rate of false alarms by exponential tails of block
+    maxima (peaks over threshold; Coles 2001, section 4), of each chart and then of the levels.
+
+    Example: ``text = assessment.detector_.describe()``
     """
 
     predictor: StatePredictor
@@ -101,7 +102,9 @@ class ChangeDetector:
     ) -> ChangeDetector:
         """Learns a prediction from half of the motions, at most an hour; limits from the rest.
 
-        Of `episodes`, which may be less calm than the undisturbed motions, the safe ones are added.
+        Args:
+            progress: Called with the share done.
+            episodes: Further motion, less calm than the undisturbed motions; safe ones are used.
         """
         require_extra("train", "ChangeDetector.fit", "torch")
         info = motions.info

@@ -112,6 +112,8 @@ class Episode:
     """One closed-loop rollout, sampled at rows 0..K; row r is at time r * step_s.
 
     The last row is the sample at t = T or at the instant when the safe set was left.
+
+    Example: ``last_margins = episodes[0].margins[-1]``
     """
 
     index: int
@@ -147,7 +149,10 @@ class Episode:
 
 
 class Episodes(Sequence[Episode]):
-    """A set of episodes that share one `EpisodesInfo` and fit it; a slice is a set."""
+    """A set of episodes that share one `EpisodesInfo` and fit it; a slice is a set.
+
+    Example: ``unsafe = [episode.cause for episode in episodes[:8] if not episode.is_safe]``
+    """
 
     def __init__(self, info: EpisodesInfo, episodes: Iterable[Episode]):
         self.info = info

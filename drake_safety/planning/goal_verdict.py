@@ -72,10 +72,13 @@ def assess_goal(
     threshold: float,
     unsafe_below: float | None = None,
 ) -> GoalVerdict:
-    """Assesses the motion from standing to a goal, (3,) [m], by state and plan at its start.
+    """Assesses the motion from standing to a goal, by state and plan at its start.
 
-    A goal outside the region sampled in training is "don't know". So is a probability from
-    ``unsafe_below``, the threshold by default, to the threshold.
+    Args:
+        goal: (3,) [m], or a command; outside the region sampled in training it is "don't know".
+        threshold: Probability from which the goal is safe.
+        unsafe_below: Probability below which it is unsafe, the threshold by default; in between
+            it is "don't know".
     """
     goal, with_goals = checked_goal(goal), require(loop, HasGoals)
     box, words = with_goals.target_box, goal_words(with_goals)

@@ -40,11 +40,13 @@ def nearest_accepted_goal(
 ) -> GoalVerdict | None:
     """Finds an accepted goal near a given one, (3,) [m], with a reserve; None if there is none.
 
-    With reserve: probability ≥ threshold + reserve (p - threshold), where p is the largest
-    probability: 1, or 1 - mu_ini without heads, as in the paper's mode.
-
     Descent along the gradient of the safety head's logit, if any, bounds a search in all
-    directions, on a grid of ``resolution_m``, so that rounding does not change a verdict.
+    directions.
+
+    Args:
+        reserve: Share r of p - threshold in the least probability, threshold + r (p - threshold);
+            p is 1, or 1 - mu_ini without heads, as in the paper's mode.
+        resolution_m: Of the grid of goals, so that rounding does not change a verdict.
     """
     unknown = assessment.parameters.initial_uncertainty if assessment.base_logit_ is None else 0.0
     stricter = threshold + reserve * max(1.0 - unknown - threshold, 0.0)

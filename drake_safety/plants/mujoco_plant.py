@@ -26,8 +26,8 @@ class MujocoPlant(LeafSystem):
     .. pydrake_system::
 
         name: MujocoPlant
-        input_ports: [command, applied_spatial_force (optional)]
-        output_ports: [state, positions]
+        input_ports: [command: n_j (or 2 n_j), applied_spatial_force: abstract (optional)]
+        output_ports: [state: n_q + n_v, positions: n_q]
 
     ``command`` has joint torques, or with ``servos`` the desired joint state ``[q; v]``, in the
     order of ``joint_names``. The discrete state is MuJoCo's ``[qpos, qvel, qacc_warmstart]``, with

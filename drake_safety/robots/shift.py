@@ -24,7 +24,10 @@ class JointShift:
 
 @schema(kw_only=True)
 class Fault:
-    """A fault of some entries of a vector signal; ``docs/shifts.md`` lists the kinds."""
+    """A fault of some entries of a vector signal; ``docs/shifts.md`` lists the kinds.
+
+    Example: ``fault = Fault(kind="bias", entries=["angle"], value=0.05, start_s=1.0)``
+    """
 
     kind: Literal[*FAULTS] = "zero"  # type: ignore[valid-type]
     # By name or pattern; by default all.

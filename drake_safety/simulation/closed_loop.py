@@ -26,29 +26,20 @@ class ClosedLoop(Diagram):
     A subclass sets the names of the ports' entries and connects its systems in ``__init__``, calls
     :meth:`export`, and finally ``builder.BuildInto(self)``. Optional features are protocols.
 
-    ====================== ======= ============================================================
-    output port            size    meaning
-    ====================== ======= ============================================================
-    ``state``              n_s     s_k, the assessor's input, in the stance frame
-    ``true_state``         n_s     s_k without observation noise
-    ``output``             n_z     z_k, measured, in the world [m]
-    ``desired_output``     n_z     z*_k, in the world [m]
-    ``desired_preview``    H n_z   z*_{k:k+H}, row-major in time, in the stance frame [m]
-    ``features``           n_f     the safe set's features of state and preview
-    ``margins``            n_c     signed margins of the safe set, negative = violated
-    ``safe``               1       1 while the state is inside the safe set
-    ``safety_probability`` 1       probability of staying safe, with an assessment
-    ``belief``             3       (safe, unsafe, unknown), with an assessment
-    ``alarm``              1       1 since the monitor's alarm (also ``alarm_cause``, ``levels``)
-    ``recovery_active``    1       1 during recovery, with recovery
-    ====================== ======= ============================================================
+    .. pydrake_system::
 
-    Optional are ``num_controller_failures``, the control periods since the start for which the
-    controller found no command, and ``controller_memory``, ``EpisodeStart.controller_state``.
+        name: ClosedLoop
+        output_ports: [state: n_s, true_state: n_s, output: n_z, desired_output: n_z,
+          desired_preview: H n_z, features: n_f, margins: n_c, safe: 1,
+          safety_probability: 1 (with an assessment), belief: 3 (with an assessment),
+          alarm: 1 (with an assessment), recovery_active: 1 (with recovery),
+          num_controller_failures: 1 (optional), controller_memory: n_m (optional)]
 
     ``Parameters`` is the dataclass of the task's part of the scenario file. It may also have
     ``online``, names of parameters on which no episode depends, and a class method
     ``completed(stated, robot)``, which adds defaults that depend on the robot.
+
+    Example: ``margins = loop.GetOutputPort("margins")``
     """
 
     Parameters: type
@@ -114,7 +105,8 @@ class ClosedLoop(Diagram):
     ) -> MonitoredSafetyAssessor | None:
         """Exports output ports by name; adds an assessor and its ports, if there is an assessment.
 
-        It reads ``margins``, by default those exported; ``hold`` is as for `AddSafetyAssessor`.
+        Args:
+            period_s, margins, hold: As of `AddSafetyAssessor`; the exported margins by default.
         """
         for name, port in ports.items():
             builder.ExportOutput(port, name)

@@ -38,7 +38,10 @@ def failed(item: str, message: str, remedy: str) -> Finding:
 
 
 def check_contract(diagram: ClosedLoop, *, seed: int = 0) -> list[Finding]:
-    """Checks a task's ports and names, its `reset`, and the ports' values over one step."""
+    """Checks a task's ports and names, its `reset`, and the ports' values over one step.
+
+    Example: ``problems = [one for one in check_contract(loop) if not one.is_ok]``
+    """
     findings = []
     item, remedy = "ports", "set the names and export the ports in __init__; one name per entry"
     try:

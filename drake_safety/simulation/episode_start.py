@@ -20,6 +20,8 @@ class EpisodeStart:
     the stance frame, (n_z, 1) [m]. ``foot_positions`` (n_c, 3) [m] are the centres of the contact
     spheres as the controller assumes them, by default those of ``q``, put on the ground.
     ``controller_state`` is the controller's memory, such as the phase of a gait.
+
+    Example: ``moving = EpisodeStart(q=start.q, v=start.v + 0.1, plan=start.plan)``
     """
 
     q: np.ndarray

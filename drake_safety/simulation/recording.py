@@ -86,6 +86,8 @@ def record_episodes(
         state_names: Names of the n_s entries of ``state``; numbered by default.
         monitor_period_s: Sampling period of ``safe`` [s]; a tenth of ``step_s`` by default.
         num_workers, path, progress: As of `run_episodes`.
+
+    Example: ``recorded = record_episodes(scenario.make_loop, 8, reset=type(loop).reset, **times)``
     """
     options: dict[str, Any] = {"num_workers": num_workers, "path": path, "progress": progress}
     info, make, run = prepare_recording(

@@ -196,6 +196,8 @@ def run_episode(
         monitor: Called with the Context after each step of the simulator.
         draws: Generator of all random numbers, in place of those of seed and index.
         **end: Fields of :class:`~drake_safety.simulation.motion.End`.
+
+    Example: ``cause = run_episode(loop, seed=1).cause``
     """
     if start is not None and goal is not None:
         raise ValueError("run_episode: a start has a plan of its own; leave out the goal")
@@ -263,7 +265,10 @@ def run_to_goal(
 
 
 def inputs_at(loop: ClosedLoop, start: EpisodeStart) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Computes Γ's inputs (n_s,), (H n_z,) and (n_f,) for a hypothetical state and plan."""
+    """Computes Γ's inputs (n_s,), (H n_z,) and (n_f,) for a hypothetical state and plan.
+
+    Example: ``state, preview, features = inputs_at(legged_loop, start)``
+    """
     context = loop.CreateDefaultContext()
     require(loop, CanStartAnywhere).reset_to(context, None, start)
     names = ("state", "desired_preview", "features")
@@ -285,10 +290,14 @@ def run_motions(
     extra: dict[str, Any] | None = None,
     **loop_options: Any,
 ) -> Episodes:
-    """Simulates undisturbed motion for a `ChangeDetector`; arguments are as for `run_episodes`.
+    """Simulates undisturbed motion for a `ChangeDetector`; rows are `monitor_step_s` apart.
 
-    A task that `MovesUndisturbed` moves for a minute at a time, unless ``are_episodes``; of others
-    these are episodes. ``duration_s`` is of all motions; rows are `scenario.monitor_step_s` apart.
+    Args:
+        duration_s: Of all motions [s]; a task that `MovesUndisturbed` moves a minute at a time.
+        are_episodes: Whether the motions are episodes, as of other tasks.
+        variation, plants, seed, num_workers, path, progress, extra: As of `run_episodes`.
+
+    Example: ``motions = run_motions(scenario, 10.0, num_workers=1)``
     """
     check_times("run_motions", duration_s=duration_s)
     make, loop = _loops(scenario, variation, seed, loop_options)
@@ -381,6 +390,8 @@ def run_episodes(
         extra: Further content of the folder's ``info.json``.
         until_fall: As of `run_episode`.
         **loop_options: Options of the task; part of the set's hash.
+
+    Example: ``more = run_episodes(scenario, 8, variation="actual", seed=1, num_workers=1)``
     """
     make, loop = _loops(scenario, variation, seed, loop_options)
     info = episodes_info(loop, seed, loop_options | ({"until_fall": True} if until_fall else {}))

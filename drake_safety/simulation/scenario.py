@@ -43,7 +43,10 @@ _TEXT_FORMATS = (".yaml", ".yml", ".urdf", ".sdf", ".xml")
 
 @schema(kw_only=True)
 class Scenario:
-    """Schema of a scenario file; the fields under ``parameters`` are those of the task."""
+    """Schema of a scenario file; the fields under ``parameters`` are those of the task.
+
+    Example: ``actual = scenario.make_loop("actual")``
+    """
 
     name: str = ""  # File name without suffix.
     task: str = ""  # Import path ``package.module:Class`` of a ClosedLoop.
@@ -145,7 +148,13 @@ class Scenario:
         meshcat: "Meshcat | None" = None,
         **options: Any,
     ) -> ClosedLoop:
-        """Builds the task's diagram, with options of the task, such as ``recovery=False``."""
+        """Builds the task's diagram.
+
+        Args:
+            variation: The plant, a key of ``variations``, or ``family``.
+            assessment: Γ that is added; without it the diagram has no ports of Γ.
+            **options: Of the task, such as ``recovery=False``.
+        """
         task: Any = self.task_class()  # Its constructor has options of its own.
         known = inspect.signature(task).parameters
         takes_all = any(p.kind is p.VAR_KEYWORD for p in known.values())
@@ -294,6 +303,8 @@ def load_scenario(name: str | Path, changes: Mapping[str, Any] | None = None) ->
     Importing runs the task's code; :func:`read_scenario` does not. The task's module may stand in
     the scenario file's folder; a relative ``robot`` path begins there. ``changes`` replace values
     by key, such as ``parameters.policy``.
+
+    Example: ``short = load_scenario("pendulum", {"episode_duration_s": 1.0})``
     """
     path = _scenario_file(name)
     with reading(path, errors=ValueError):

@@ -30,6 +30,8 @@ class ChangeMonitor(LeafSystem):
     ``judged_share`` is the share of the others over two seconds; below a half every level is above
     1. The charts wait while a known disturbance acts, by ``hold`` or :meth:`expect_disturbance`,
     and `SETTLING_S` longer. The detector is a parameter of the Context.
+
+    Example: ``monitor = builder.AddSystem(ChangeMonitor(assessment))``
     """
 
     def __init__(self, assessment: SafetyAssessment):

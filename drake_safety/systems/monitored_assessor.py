@@ -36,6 +36,8 @@ class MonitoredSafetyAssessor(Diagram):
         period_s: Time between two evaluations [s]; the step of the training episodes by default.
         checks_margins: Whether a state outside the safe set is always unsafe.
         on_alarm: Effect of the monitor's alarm, an `OnAlarm`; None for no monitor.
+
+    Example: ``assessor = builder.AddSystem(MonitoredSafetyAssessor(assessment))``
     """
 
     def __init__(
@@ -102,9 +104,15 @@ def AddSafetyAssessor(
 ) -> MonitoredSafetyAssessor:
     """Adds a :class:`MonitoredSafetyAssessor` named ``safety_assessor``, and connects it.
 
-    Without ``margins``, those of the measured state, nothing checks them. The monitor waits while
-    ``hold`` is 1, as a known disturbance acts. Plants with sampled output ports, and a monitor that
-    never alarms, are warned of.
+    Plants with sampled output ports, and a monitor that never alarms, are warned of.
+
+    Args:
+        state, desired_preview, features: Γ's inputs, (n_s,), (H n_z,) and (n_f,).
+        margins: Of the measured state, (n_c,) [m, rad]; None: a state outside is not detected.
+        hold: 1 while a known disturbance acts, for which the monitor waits.
+        period_s, on_alarm: As of `MonitoredSafetyAssessor`.
+
+    Example: ``assessor = AddSafetyAssessor(builder, assessment, margins=None, **ports)``
     """
     assessor = MonitoredSafetyAssessor(
         assessment, period_s=period_s, checks_margins=margins is not None, on_alarm=on_alarm

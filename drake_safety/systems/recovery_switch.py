@@ -24,8 +24,16 @@ class RecoverySwitch(Diagram):
           desired_foot_positions: 3 n_p, desired_yaw: 1, stance_pose: 3, recovery_active: 1]
 
     Connect ``stance_pose`` to the TrajectoryPlanner, so that the plan continues over the new
-    footholds. The trigger updates ``offset_s`` after the assessor, and the step planner as much
-    after the trigger: updates of one time would see the state before all of them.
+    footholds.
+
+    Args:
+        threshold: Probability below which, for ``persistence_s`` [s], recovery starts.
+        initial_uncertainty: Of the assessment, to recognise "don't know".
+        period_s, offset_s: Of the trigger [s]; after the assessor, and the planner after it, as
+            updates of one time would see the state before all of them.
+        horizon, num_outlook: H and M, samples of preview and outlook.
+
+    Example: ``switch = RecoverySwitch(legged_loop.kinematics, steps, threshold=0.2, **timing)``
     """
 
     def __init__(

@@ -29,20 +29,22 @@ class SafetyAssessor(LeafSystem):
           predicted_margins: n_c, novelty: 1, probability_without_alarm: 1, belief_without_alarm: 3,
           fall_probability: 1, learned: abstract]
 
-    Γ is evaluated every ``period_s`` [s] and held, so only ``learned`` has direct feedthrough.
-
-    - ``belief`` is (safe, unsafe, don't know); its first entry is the paper's Γ. It is (0, 0, 1)
-      for inputs that are novel or not finite, before the first evaluation, and during an alarm.
-    - ``safety_probability`` is the probability of staying safe, by the maps' heads with the
-      correction from feedback, or the belief's first entry in the paper's mode. It is 0 where the
-      belief is "don't know".
+    - ``belief``, whose first entry is the paper's Γ, is (0, 0, 1) for inputs that are novel or not
+      finite, before the first evaluation, and during an alarm.
+    - ``safety_probability`` is that of the maps' heads with the correction from feedback, or the
+      belief's first entry in the paper's mode.
     - ``fall_probability`` is 1 for inputs that are not finite, and NaN if no falls were learned.
-    - ``learned`` has beliefs, correction and novelty, with empty beliefs during an alarm, for a
-      :class:`~drake_safety.diagrams.walking.command_guard.CommandGuard`.
+    - ``learned``, the only output with direct feedthrough, is for a `CommandGuard`.
 
-    While one of the measured state's ``margins`` is negative or not finite, the belief's mass for
-    "safe" counts as unsafe by a constraint that is not finite, else by the most violated one.
     Beliefs, correction and novelty are parameters of the Context, see :meth:`adopt`.
+
+    Args:
+        period_s: Time between two evaluations [s], between which the outputs are held.
+        checks_margins: Whether the belief's mass for "safe" counts as unsafe while one of the
+            measured state's ``margins`` is negative or not finite.
+        heeds_alarm: Whether beliefs are empty during an alarm.
+
+    Example: ``assessor = builder.AddSystem(SafetyAssessor(assessment, period_s=0.04))``
     """
 
     def __init__(

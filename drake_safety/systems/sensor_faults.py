@@ -23,9 +23,15 @@ class SensorFaults(LeafSystem):
         input_ports: [input: n]
         output_ports: [output: n]
 
-    Delays and ``freeze`` hold samples, taken every ``period_s`` [s]: a delay's output is the input
-    of ``value / period_s`` samples ago, or the first sample until that is so old. ``fade`` moves
-    the entries in ``value`` seconds to the same entries of a port ``rest``, by default to zero.
+    A delay's output is the input of ``value / period_s`` samples ago, or the first sample until
+    that is so old. ``fade`` moves the entries in ``value`` seconds to the same entries of a port
+    ``rest``, by default to zero.
+
+    Args:
+        names: Of the n entries, which `Fault.entries` match.
+        period_s, offset_s: Between the samples of delays and ``freeze``, and before the first [s].
+
+    Example: ``sensor = SensorFaults(loop.state_names, [Fault(kind="freeze")], period_s=0.01)``
     """
 
     def __init__(
