@@ -50,9 +50,11 @@ def shell_commands(program, text=README):
 @pytest.mark.slow
 def test_the_python_of_the_readme_runs_as_one_script_and_prints_a_belief(tmp_path):
     (first,) = blocks("python")
-    # The README's number of episodes takes minutes; it is the only thing that is changed.
-    assert first.count("num_episodes=2048") == 1
+    # The README's numbers of episodes, maps and epochs take minutes; nothing else is changed.
+    assert first.count("num_episodes=2048") == first.count("\nassessment = ") == 1
     first = first.replace("num_episodes=2048", "num_episodes=56")
+    few = "scenario.assessment.epochs, scenario.assessment.ensemble_size = 5, 1"
+    first = first.replace("\nassessment = ", f"\n{few}\nassessment = ")
     script = tmp_path / "readme.py"
     script.write_text(first, encoding="utf-8")
     paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
