@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -10,12 +10,18 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from scipy.stats import t
+from scipy.stats import norm, t
 
 from drake_safety.cli.console import WorkersOption
 from drake_safety.evaluation.metrics import Estimate, proportion
-from drake_safety.evaluation.rare_failures import RareFailures, estimate_rare_failure
+from drake_safety.evaluation.rare_failures import (
+    RareFailures,
+    Sample,
+    estimate_rare_failure,
+    search_and_sample,
+)
 from drake_safety.learning.seeds import RATE
+from drake_safety.simulation.normal_space import NormalGenerator, NormalPoint
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
 from studies.gate import failures
@@ -63,9 +69,69 @@ SYSTEMS = {
 }
 
 
+class KnownRate:
+    """Samples of a margin that is a function of draws."""
+
+    def __init__(self, margin: Callable[[np.random.Generator], float]):
+        self.margin, self.number = margin, 0
+
+    def __call__(
+        self, points: Sequence[np.ndarray | None], rng: np.random.Generator
+    ) -> list[Sample]:
+        """The samples of the points."""
+        self.number += len(points)
+        seeds = rng.integers(2**62, size=len(points)).tolist()
+        return [self._sample(z, seed) for z, seed in zip(points, seeds, strict=True)]
+
+    def _sample(self, z: np.ndarray | None, seed: int) -> Sample:
+        point = NormalPoint(np.random.default_rng(seed), z)
+        margin = float(self.margin(NormalGenerator(point)))
+        return Sample(
+            seed=seed,
+            z=point.z.tolist(),
+            is_discrete=point.is_discrete.tolist(),
+            margins=[margin],
+            has_failed=margin < 0.0,
+            time_s=1.0,
+            cause="toy" if margin < 0.0 else "",
+        )
+
+
+def one_side(rate: float, rng: np.random.Generator) -> float:
+    """A margin that is negative where the sum of ten draws is large."""
+    return float(norm.isf(rate) - rng.normal(size=10).sum() / 10**0.5)
+
+
+def two_sides(rate: float, rng: np.random.Generator) -> float:
+    """A margin that is negative where one of sixty draws is large or small."""
+    return float(norm.isf(rate / 2) - abs(rng.normal(size=60)[7]))
+
+
+def four_sides(limit: float, rng: np.random.Generator) -> float:
+    """A margin with four kinds of failures, two of them less likely."""
+    x, y = rng.normal(size=20)[:2]
+    return float(min(limit - abs(x + y) / 2**0.5, limit + 0.2 - abs(x - y) / 2**0.5))
+
+
+KNOWN: dict[str, tuple[float, Callable[[np.random.Generator], float]]] = {
+    "sum of ten draws": (1e-3, partial(one_side, 1e-3)),
+    "sum of ten draws, rarer": (1e-4, partial(one_side, 1e-4)),
+    "one of sixty draws": (1e-3, partial(two_sides, 1e-3)),
+    "one of sixty draws, rarer": (1e-4, partial(two_sides, 1e-4)),
+    "one of sixty draws, rarest": (1e-6, partial(two_sides, 1e-6)),
+    "four kinds of failures": (
+        1.0 - (1.0 - 2.0 * norm.sf(3.6)) * (1.0 - 2.0 * norm.sf(3.8)),
+        partial(four_sides, 3.6),
+    ),
+}
+"""Margins of draws, with the rates at which they are negative."""
+_REPETITIONS = 20  # Of these.
+
+
 def rare(
     systems: Annotated[
-        list[str] | None, typer.Argument(help=f"Of {list(SYSTEMS)}; all by default.")
+        list[str] | None,
+        typer.Argument(help=f"Of {[*KNOWN, *SYSTEMS]}; by default all whose rate is known."),
     ] = None,
     samples: Annotated[int, typer.Option(help="Episodes of a level.", min=40)] = 256,
     out: Annotated[Path, typer.Option(help="Folder of episodes and results.")] = Path("runs/rare"),
@@ -76,10 +142,19 @@ def rare(
     The rows: the share of random episodes that fail, the mean of the estimates by it, intervals
     that hold it, episodes of an estimate, and random episodes with its variance by episode used.
     Where fewer than 20 random episodes fail, the mean of the estimates takes the share's place.
+    Systems whose rate is known are functions of random draws, without a simulation.
     """
     with open_study("rare", "pendulum", out, seed=RATE.first, workers=workers, out=out) as study:
-        for name in systems or SYSTEMS:
-            study.add(name, "rare", _rows(study, name, SYSTEMS[name], samples))
+        if unknown := {*(systems or ())} - {*KNOWN, *SYSTEMS}:
+            raise ValueError(f"rare: no system {sorted(unknown)}; there are {[*KNOWN, *SYSTEMS]}")
+        for name in systems or KNOWN:
+            if name in SYSTEMS:
+                study.add(name, "rare", _rows(study, name, SYSTEMS[name], samples))
+                continue
+            rate, margin = KNOWN[name]
+            rngs = map(np.random.default_rng, range(_REPETITIONS))
+            found = [search_and_sample(KnownRate(margin), samples, rng) for rng in rngs]
+            study.add(name, "rare", judged(found, rate))
 
 
 def _rows(study: Study, name: str, system: System, samples: int) -> dict[str, Estimate]:
@@ -113,20 +188,19 @@ def _rows(study: Study, name: str, system: System, samples: int) -> dict[str, Es
     return judged(found, failed)
 
 
-def judged(found: list[RareFailures], failed: np.ndarray) -> dict[str, Estimate]:
-    """The rows of estimates, and of random episodes by whether they failed, (N,)."""
-    rates, used = (
-        np.array([(one.rate.value, one.simulations) for one in found]).T
-        if found
-        else np.zeros((2, 0))
-    )
-    mean, number = float(rates.mean()), len(found)
-    truth = float(failed.mean()) if failed.sum() >= _ENOUGH else mean
-    held = sum(one.rate.low <= truth <= one.rate.high for one in found)
+def judged(found: list[RareFailures], random: np.ndarray | float) -> dict[str, Estimate]:
+    """The rows of estimates, and of random episodes by whether they failed, (N,), or a rate."""
+    rates, used = np.array([(one.rate.value, one.simulations) for one in found]).T
+    number, truth = len(found), float(np.mean(random)) if np.size(random) else 0.0
     rows = {"mean_rate": _mean(rates), "episodes": Estimate.exact(float(used.mean()), number)}
-    if failed.size:
-        rows["random_rate"] = proportion(int(failed.sum()), len(failed))
+    if isinstance(random, float):
+        rows["random_rate"] = Estimate.exact(random, 0)
+    elif random.size:
+        rows["random_rate"] = proportion(int(random.sum()), len(random))
+    if not isinstance(random, float) and random.sum() < _ENOUGH:
+        truth = float(rates.mean())
     if number > 2:
+        held = sum(one.rate.low <= truth <= one.rate.high for one in found)
         saved = truth * (1.0 - truth) / float(((rates - truth) ** 2).mean()) / used.mean()
         rows |= {"held": proportion(held, number), "saved": Estimate.exact(saved, number)}
     return rows

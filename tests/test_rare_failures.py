@@ -1,51 +1,20 @@
 """Rates of rare failures: against known ones, and the command."""
 
-import math
+from functools import partial
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from command_line import call
 from drake_safety.evaluation import rare_failures
-from drake_safety.evaluation.rare_failures import Sample, _estimated, estimate_rare_failure
+from drake_safety.evaluation.rare_failures import estimate_rare_failure, search_and_sample
 from drake_safety.evaluation.rare_figure import telling_facts
 from drake_safety.evaluation.results import Results
 from drake_safety.simulation.normal_space import NormalGenerator, NormalPoint
+from studies.rare import KnownRate, one_side, two_sides
 from toy_tasks import SCENARIO, Gliding, gliding
 
-# Failures where the sum of ten draws is large, or one of sixty to either side, by their rate.
-SYSTEMS = {
-    "one side": lambda rate, rng: norm.isf(rate) - rng.normal(size=10).sum() / math.sqrt(10),
-    "two sides": lambda rate, rng: norm.isf(rate / 2) - abs(rng.normal(size=60)[7]),
-}
-
-
-class Toy:
-    """Samples of a margin that is a function of draws."""
-
-    def __init__(self, margin):
-        self.margin, self.number = margin, 0
-
-    def __call__(self, points, rng):
-        self.number += len(points)
-        return [
-            self.sample(z, int(seed))
-            for z, seed in zip(points, rng.integers(99, size=len(points)), strict=True)
-        ]
-
-    def sample(self, z, seed):
-        point = NormalPoint(np.random.default_rng([seed, self.number]), z)
-        margin = float(self.margin(NormalGenerator(point)))
-        return Sample(
-            seed=seed,
-            z=point.z.tolist(),
-            is_discrete=point.is_discrete.tolist(),
-            margins=[margin],
-            has_failed=margin < 0.0,
-            time_s=1.0,
-            cause="" if margin >= 0.0 else "toy",
-        )
+SYSTEMS = {"one side": one_side, "two sides": two_sides}
 
 
 @pytest.mark.train
@@ -54,8 +23,8 @@ class Toy:
 def test_rates_are_found_without_bias_from_few_samples_and_intervals_hold(name, rate):
     found = []
     for seed in range(12):
-        toy = Toy(lambda rng: SYSTEMS[name](rate, rng))
-        found.append(_estimated(toy, 256, np.random.default_rng(seed)))
+        toy = KnownRate(partial(SYSTEMS[name], rate))
+        found.append(search_and_sample(toy, 256, np.random.default_rng(seed)))
         assert found[-1].simulations == toy.number < 2500
     values = np.array([one.rate.value for one in found])
     assert np.mean(values) / rate == pytest.approx(1.0, abs=4.0 * np.std(values) / rate / 12**0.5)
@@ -68,8 +37,8 @@ def test_rates_are_found_without_bias_from_few_samples_and_intervals_hold(name, 
 
 @pytest.mark.train
 def test_kinds_of_failures_are_apart_and_their_shares_are_of_the_rate():
-    toy = Toy(lambda rng: SYSTEMS["two sides"](1e-3, rng))
-    found = _estimated(toy, 256, np.random.default_rng(1))
+    toy = KnownRate(partial(two_sides, 1e-3))
+    found = search_and_sample(toy, 256, np.random.default_rng(1))
     assert sum(one.weight for one in found.failures) == pytest.approx(1.0)
     shares = [one.weight for one in found.failures]
     assert shares == sorted(shares, reverse=True)
@@ -80,10 +49,10 @@ def test_kinds_of_failures_are_apart_and_their_shares_are_of_the_rate():
 
 
 def test_frequent_failures_need_no_search_and_none_are_no_rate_of_zero():
-    half = _estimated(Toy(lambda rng: rng.normal()), 100, np.random.default_rng(0))
+    half = search_and_sample(KnownRate(lambda rng: rng.normal()), 100, np.random.default_rng(0))
     assert half.rate.low < 0.5 < half.rate.high
     assert half.simulations == half.plain_rollouts == 100
-    never = _estimated(Toy(lambda rng: 1.0), 100, np.random.default_rng(0))
+    never = search_and_sample(KnownRate(lambda rng: 1.0), 100, np.random.default_rng(0))
     assert (never.rate.value, never.failures, never.simulations) == (0.0, [], 100)
     assert never.rate.high == pytest.approx(0.036, abs=0.001)
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from pydrake.systems.framework import Diagram
@@ -69,6 +69,17 @@ class RareFailures:
     plain_rollouts: float  # Random episodes whose share of failures has the same variance.
     failures: list[Sample]
     random: list[Sample]  # Random episodes, for comparison.
+
+
+class Simulate(Protocol):
+    """Simulates points of the normal space, None for random ones, and counts them."""
+
+    number: int
+
+    def __call__(
+        self, points: Sequence[np.ndarray | None], rng: np.random.Generator
+    ) -> list[Sample]:
+        """The samples of the points."""
 
 
 class _Simulator:
@@ -166,11 +177,11 @@ def estimate_rare_failure(
     key = hashlib.sha256(repr((who, metric, samples, seed)).encode()).hexdigest()[:12]
     file = None if path is None else Path(path) / f"samples-{key}.json"
     simulate = _Simulator(call, make, file, num_workers=num_workers, progress=progress)
-    return _estimated(simulate, samples, np.random.default_rng(seed))
+    return search_and_sample(simulate, samples, np.random.default_rng(seed))
 
 
-def _estimated(simulate: _Simulator, samples: int, rng: np.random.Generator) -> RareFailures:
-    """Searches and samples, by any simulator."""
+def search_and_sample(simulate: Simulate, samples: int, rng: np.random.Generator) -> RareFailures:
+    """Searches failures and samples around them, by any function that simulates points."""
     search = _search(simulate, samples, rng)
     num_failed = sum(one.has_failed for one in search.random)
     rate, failures = proportion(num_failed, samples), search.failures
@@ -257,7 +268,7 @@ class _Search(NamedTuple):
     rate: float
 
 
-def _search(simulate: _Simulator, number: int, rng: np.random.Generator) -> _Search:
+def _search(simulate: Simulate, number: int, rng: np.random.Generator) -> _Search:
     """Searches failures, level by level."""
     samples = random = simulate([None] * number, rng)
     spread = np.maximum(np.array([one.margins for one in random]).std(axis=0), 1e-12)
