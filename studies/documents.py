@@ -51,7 +51,7 @@ _FORMATS = {
     "fine": {"digits": 4},
     "percent": {"unit": "%", "digits": 1},
     "points": {"unit": "points", "digits": 1},
-    "fine_percent": {"unit": "%", "digits": 3},
+    "single": {"digits": 1},
     "share_of": {"unit": "of"},
     "whole": {"unit": "=", "digits": 0},
     "tenths": {"unit": "=", "digits": 1},

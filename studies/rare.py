@@ -139,8 +139,8 @@ def rare(
 ) -> None:
     """Estimate rates of rare failures by other seeds, and compare them with random episodes.
 
-    The rows: the share of random episodes that fail, the mean of the estimates by it, intervals
-    that hold it, episodes of an estimate, and random episodes with its variance by episode used.
+    The rows: failures of a million, known or of random episodes; the mean of the estimates;
+    intervals that hold the rate; episodes of an estimate, and random ones with its variance by it.
     Where fewer than 20 random episodes fail, the mean of the estimates takes the share's place.
     Systems whose rate is known are functions of random draws, without a simulation.
     """
@@ -192,11 +192,14 @@ def judged(found: list[RareFailures], random: np.ndarray | float) -> dict[str, E
     """The rows of estimates, and of random episodes by whether they failed, (N,), or a rate."""
     rates, used = np.array([(one.rate.value, one.simulations) for one in found]).T
     number, truth = len(found), float(np.mean(random)) if np.size(random) else 0.0
-    rows = {"mean_rate": _mean(rates), "episodes": Estimate.exact(float(used.mean()), number)}
+    rows = {
+        "mean": _millionth(_mean(rates)),
+        "episodes": Estimate.exact(float(used.mean()), number),
+    }
     if isinstance(random, float):
-        rows["random_rate"] = Estimate.exact(random, 0)
+        rows["rate"] = _millionth(Estimate.exact(random, 0))
     elif random.size:
-        rows["random_rate"] = proportion(int(random.sum()), len(random))
+        rows["rate"] = _millionth(proportion(int(random.sum()), len(random)))
     if not isinstance(random, float) and random.sum() < _ENOUGH:
         truth = float(rates.mean())
     if number > 2:
@@ -204,6 +207,11 @@ def judged(found: list[RareFailures], random: np.ndarray | float) -> dict[str, E
         saved = truth * (1.0 - truth) / float(((rates - truth) ** 2).mean()) / used.mean()
         rows |= {"held": proportion(held, number), "saved": Estimate.exact(saved, number)}
     return rows
+
+
+def _millionth(rate: Estimate) -> Estimate:
+    """A rate as failures of a million."""
+    return Estimate(1e6 * rate.value, 1e6 * rate.low, 1e6 * rate.high, rate.n)
 
 
 def _mean(values: np.ndarray) -> Estimate:

@@ -108,8 +108,8 @@ def test_rates_of_rare_failures_stand_beside_random_episodes(monkeypatch, tmp_pa
     assert study(monkeypatch, "rare", "--samples", 40, "--workers", 1, "--out", tmp_path) == 0
     found = Results.read(tmp_path / "rare.json")
     assert {key[2]: row.n for key, row in found.items()} == {
-        "random_rate": 60,
-        "mean_rate": 3,
+        "rate": 60,
+        "mean": 3,
         "held": 3,
         "episodes": 3,
         "saved": 3,
@@ -131,9 +131,9 @@ def test_saved_episodes_are_of_the_error_about_the_share_of_random_episodes():
     ]
     failed = np.repeat([1, 0], [20, 1980])
     rows = rare.judged(found, failed)
-    assert rows["random_rate"].value == 0.01
-    assert rows["mean_rate"].value == pytest.approx(0.012)
-    assert rows["mean_rate"].low < 0.01 < rows["mean_rate"].high
+    assert rows["rate"].value == pytest.approx(1e4)
+    assert rows["mean"].value == pytest.approx(1.2e4)
+    assert rows["mean"].low < 1e4 < rows["mean"].high
     assert rows["held"].value == pytest.approx(2 / 3)
     error = (0.002**2 + 0.002**2 + 0.006**2) / 3
     assert rows["saved"].value == pytest.approx(0.01 * 0.99 / error / 100)
