@@ -181,6 +181,18 @@ def test_the_figure_has_a_curve_for_each_loop_and_for_gamma():
     assert one.summary == ("0°, phase 1 of 2", "10 (0.50)", "12", "14", "0 % (0–21)", "0.50")
 
 
+def test_a_wrong_candidate_is_refused_before_anything_is_pushed(monkeypatch, tmp_path, capsys):
+    def make_rig(scenario, variation, plan, **options):
+        if variation == "actual":
+            raise ValueError("it has no motors")
+
+    monkeypatch.setattr("drake_safety.cli.pushes.PushRig", make_rig)
+    monkeypatch.setattr("drake_safety.cli.pushes.make_push_card", None)
+    options = ["--candidate", "variation=actual", "--out", tmp_path]
+    assert call(monkeypatch, "pushes", "laikago_balancing", *options) == 2
+    assert "it has no motors" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_the_command_compares_two_loops_and_names_the_weakest(monkeypatch, tmp_path, capsys):
     options = ["--directions", 2, "--workers", 1, "--out", tmp_path]

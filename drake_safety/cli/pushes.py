@@ -93,6 +93,8 @@ def pushes(
     )
     out = out or Path("runs") / f"{first.scenario.name}-pushes"
     folders.check_writable(out)
+    for plant, options in loops.values():
+        PushRig(plant.scenario, plant.variation, plan, **options)  # Raises before a long job.
     cards: dict[str, PushCard] = {}
     with console.open_stages() as stages:
         for name, (plant, options) in loops.items():

@@ -44,7 +44,7 @@ _OF_LOW = 0.3, 0.95  # Their range, by the largest survived one.
 _ASKED = np.geomspace(0.2, 2.0, 8)  # Impulses after which Γ is asked, by the critical one.
 COLUMNS = ("weakest", "worst [N·s]", "median", "best", "islands", "joint speed")
 """Titles of `PushCard.summary`."""
-_SHARE = Column("", "", "%", digits=0)
+_SHARE, _SPEED = Column("", "", "%", digits=0), Column("", "", "=", digits=2)
 _PORTS = ("state", "output", "desired_preview", "margins", "safe", "plant_state")
 
 
@@ -141,7 +141,7 @@ class PushCard:
             f"{middle:.0f}",
             f"{best:.0f}",
             _SHARE.text(self.islands),
-            f"{self.speed:.2f}",
+            _SPEED.text(Estimate.exact(self.speed, self.num_pushes)),
         )
 
     @property
