@@ -1,7 +1,7 @@
 """The command ``drake-safety``: train, run and evaluate safety assessments.
 
 Another command is a function of the command's name (its arguments are the command line, its
-docstring the help), an entry of `COMMANDS` and an example in `EXAMPLES`. Only the module of the
+docstring the help), an entry of `COMMANDS` and an example in `commands.txt`. Only the module of the
 command that is called is imported.
 """
 
@@ -14,6 +14,7 @@ import sys
 import traceback
 from collections.abc import Callable, Container, Sequence
 from importlib import import_module
+from importlib.resources import files
 from typing import Annotated, Any
 
 import typer
@@ -45,24 +46,8 @@ COMMANDS = {
     "report": ("export", "report", "Write RUN/report.html, a self-contained page of a run."),
 }
 """Module, the extra that it needs, and a line of help."""
-EXAMPLES = """
-Use    scenarios
-Use    ask atlas_reaching --target 0.7 0.3 1.0
-Use    run laikago_balancing --push ball
-Use    play laikago_balancing
-Train  new my_robot --urdf robot.urdf --task balancing
-Train  check my_robot/balancing.yaml
-Train  train my_robot/balancing.yaml --out runs/my_robot
-Train  calibrate my_robot/balancing.yaml --assessment runs/my_robot --miss-rate 0.05
-Train  adapt laikago_balancing --variation payload
-Train  export laikago_balancing --out gamma.onnx
-Judge  evaluate laikago_balancing --episodes 1000 --throws 600
-Judge  gate go2_walking --candidate policy=new.onnx
-Judge  rate atlas_reaching --variation actual
-Judge  pushes go2_walking --command 0.6 0 0
-Judge  monitor laikago_balancing --log stand.mcap --map columns.yaml
-Judge  report runs/my_robot
-"""  # Of each command, after its group, in the order of the help.
+EXAMPLES = files("drake_safety.diagrams").joinpath("commands.txt").read_text(encoding="utf-8")
+"""Of each command, after its group, in the order of the help."""
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.
 _ERRORS = {"gate": 3}  # Exit codes of errors where 1 and 2 are results.
