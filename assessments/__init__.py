@@ -39,7 +39,7 @@ def load_assessment(scenario: str | os.PathLike[str], mode: str = "sharpened") -
     Args:
         scenario: Name of a scenario with shipped assessments, or a folder that ``train`` wrote.
 
-    Example: ``plain = load_assessment("laikago_balancing", mode="paper")``
+    Example: ``plain = load_assessment(legged_scenario.name, mode="paper")``
     """
     from drake_safety.learning.assessment import SafetyAssessment
 
