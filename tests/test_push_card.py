@@ -195,7 +195,7 @@ def test_a_wrong_candidate_is_refused_before_anything_is_pushed(monkeypatch, tmp
 
 @pytest.mark.slow
 def test_the_command_compares_two_loops_and_names_the_weakest(monkeypatch, tmp_path, capsys):
-    options = ["--directions", 2, "--workers", 1, "--out", tmp_path]
+    options = ["--directions", 1, "--workers", 1, "--out", tmp_path]
     options += ["--candidate", "variations.nominal.motors=dc"]
     assert call(monkeypatch, "pushes", "laikago_balancing", *options) == 0
     printed = capsys.readouterr().out
