@@ -19,13 +19,13 @@ PARTS = ("assessor", "monitor")
 
 def write(path: Path, assessment: Any, prefix: str | None = None) -> list[Path]:
     """Writes source, header and example, atomically and with the same bytes; returns the files."""
-    require_extra("c", f"export to '{path}'")
-    import jinja2
-
     prefix = path.stem if prefix is None else prefix
     if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):
         what = f"prefix must be a name in C, of letters, digits and '_'; got '{prefix}'"
         raise ValueError(f"export to '{path}': {what}")
+    require_extra("c", f"export to '{path}'")
+    import jinja2
+
     models = {part: make_model(assessment, part, rows=1) for part in PARTS}
     contracts = [{e.key: json.loads(e.value) for e in m.metadata_props} for m in models.values()]
     inputs = {port.name: port for model in models.values() for port in model.graph.input}
