@@ -22,6 +22,7 @@ def shuttle_run(tmp_path_factory):
     return train_shuttle(folder), folder
 
 
+@pytest.mark.train
 def test_without_an_assessment_that_of_the_package_is_evaluated_and_not_written(
     monkeypatch, capsys, tmp_path
 ):
