@@ -15,7 +15,6 @@ import typer
 import yaml
 
 import command_line
-import quadrotor
 from drake_safety.cli import make_app
 from drake_safety.learning.assessment import AssessmentParameters
 from drake_safety.robots.robot_model import load_robot_file
@@ -73,16 +72,13 @@ def test_the_python_of_the_readme_runs_as_one_script_and_prints_a_belief(tmp_pat
 
 
 def test_every_name_in_the_python_of_the_readme_is_defined_in_it():
-    for block in [*blocks("python"), *blocks("py")]:
+    for block in blocks("python"):
         tree = ast.parse(block)
         names = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
         imported = [one.name for node in ast.walk(tree) for one in getattr(node, "names", [])]
         known = {one.id for one in names if isinstance(one.ctx, ast.Store)}
         known |= {"np", *imported, *dir(builtins)}
         assert {one.id for one in names} - known == set()
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and node.module == "quadrotor":
-                assert {one.name for one in node.names} <= set(dir(quadrotor))
 
 
 def test_the_refusal_of_the_readme_is_what_the_command_prints(monkeypatch, capsys):

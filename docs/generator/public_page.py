@@ -28,7 +28,7 @@ for name in ("state", "desired_preview", "features"):
     source = ConstantVectorSource(np.zeros(assessment.info_.widths[name]))
     ports[name] = builder.AddSystem(source).get_output_port()
 """
-"""What the examples begin with."""
+"""The first lines of all examples."""
 _INTRODUCTION = """\
 # Public names
 

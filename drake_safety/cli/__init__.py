@@ -47,7 +47,7 @@ COMMANDS = {
 }
 """Module, the extra that it needs, and a line of help."""
 EXAMPLES = files("drake_safety.diagrams").joinpath("commands.txt").read_text(encoding="utf-8")
-"""Of each command, after its group, in the order of the help."""
+"""A line for each command, in the order of the help: its group, then an example."""
 _DEBUG = "--debug"
 _STOPPED = 130  # Exit code after Ctrl-C.
 _ERRORS = {"gate": 3}  # Exit codes of errors where 1 and 2 are results.
