@@ -151,7 +151,7 @@ def test_mujoco_has_the_frames_too(tmp_path):
     place = base[0].transform.translation
     np.testing.assert_allclose([place.x, place.y, place.z], motion["plant_state"][-1, 4:7])
     assert "/contact_forces" not in found
-    assert len(read_pieces(path, None, loop.robot).pieces[0].time_s) == 5
+    assert len(read_pieces(path, None, loop.robot).pieces[0].time_s) == 6
 
 
 def test_a_file_is_complete_after_ctrl_c_in_a_simulation(tmp_path):

@@ -49,6 +49,7 @@ class McapRecorder:
         from rosbags.typesys import Stores, get_typestore
 
         is_loop = isinstance(diagram, ClosedLoop)
+        self._is_delayed = is_loop and diagram.assessment is not None
         self._period_s = diagram.scenario.monitor_step_s if is_loop else _PERIOD_S
         self._monitor, self._store = monitor, get_typestore(Stores.ROS2_HUMBLE)
         self._now_s = self._due_s = -math.inf
@@ -95,8 +96,9 @@ class McapRecorder:
         self._stamp_ns = round(1e9 * now_s) + self._shift_ns
         row = []
         for topic, (channel, make) in self._topics.items():
-            # A sample of the last row's time; at the start there is none.
-            delay_ns = round(1e9 * self._period_s) if topic == _STATE else 0
+            # With a monitor a sample of the last row's time; at the start there is none.
+            is_delayed = self._is_delayed and topic == _STATE
+            delay_ns = round(1e9 * self._period_s) if is_delayed else 0
             if not (delay_ns and is_first):
                 row.append((channel, self._stamp_ns - delay_ns, make(context)))
         for channel, stamp_ns, data in row:  # Of complete rows, wherever Ctrl-C stops it.

@@ -208,11 +208,13 @@ class LeggedLoop(PlannedLoop):
         self.state_names, self.feature_names = inputs.state_names, inputs.feature_names
         read = {name: inputs.GetOutputPort(name) for name in ("state", "features")}
         of_robot = {"plant_state": self._physics.state, **self._observed, **read}
-        # Drake draws noise before discrete updates: the monitor sees other noise than a row does.
-        sample = ZeroOrderHold(self.scenario.monitor_step_s, self._assessed_state.size())
-        builder.AddNamedSystem("measurement_sample", sample)
-        builder.Connect(self._assessed_state, sample.get_input_port())
-        of_robot["measured_plant_state"] = sample.get_output_port()
+        of_robot["measured_plant_state"] = self._assessed_state
+        if self.assessment is not None:
+            # Drake draws noise before discrete updates: the monitor sees other noise than a row.
+            sample = ZeroOrderHold(self.scenario.monitor_step_s, self._assessed_state.size())
+            builder.AddNamedSystem("measurement_sample", sample)
+            builder.Connect(self._assessed_state, sample.get_input_port())
+            of_robot["measured_plant_state"] = sample.get_output_port()
         if self._physics.ball_state is not None:
             of_robot["ball_state"] = self._physics.ball_state
         assessor = self._finish(
