@@ -22,6 +22,7 @@ from drake_safety.cli.console import (
 )
 from drake_safety.cli.evaluate import (
     Evaluation,
+    add_family,
     add_reliability,
     add_throws,
     add_verdicts,
@@ -101,6 +102,7 @@ def evaluate(
         add_verdicts(evaluation, [*evaluation.scorers, *classifiers], other, test)
         evaluation.add(classifier_differences(evaluation.scorers[0], trained, test))
         add_reliability(evaluation, test)
+        add_family(evaluation, calibration_episodes)
         if throws:
             _add_throws(evaluation, loop, classifiers, throws, calibration_throws)
 

@@ -13,6 +13,8 @@ from drake_safety import (
     run_motions,
 )
 from drake_safety.cli import training_folder
+from drake_safety.cli.evaluate import Evaluation, add_family
+from drake_safety.learning.calibration import PLAN, calibrate
 from drake_safety.learning.maps import held_out_segments
 from drake_safety.learning.segments import split, training_segments
 from drake_safety.robots.family import PlantFamily
@@ -178,3 +180,23 @@ def test_check_simulates_the_family(scenario, tmp_path):
     findings = {one.item: one for one in check_scenario(tmp_path / "one.yaml", num_episodes=4)}
     finding = findings["share of unsafe episodes in the family"]
     assert "of 4 episodes, each on a random plant" in finding.message
+
+
+def test_promises_over_the_family_are_judged_on_fresh_plants(scenario, sets, tmp_path):
+    nominal, family = sets
+    parameters = replace(scenario.assessment, epochs=3, perplexity=10.0)
+    gamma = SafetyAssessment(parameters).fit(nominal, family=family)
+    rates = {"miss_rate": 0.1, "false_alarm_rate": 0.1, "confidence": None}
+    label, score = np.arange(40) % 2 == 0, np.linspace(0.0, 1.0, 40)
+    made = {"scenario_hash": nominal.info.scenario_hash, **rates}
+    chosen = [calibrate(score, label, kind=PLAN, plants=plants, **made) for plants in (0, 40)]
+    gamma.adopt_calibrations(chosen)
+    evaluation = Evaluation(
+        scenario, {"sharpened": gamma}, tmp_path, tmp_path, {"evaluation": 77}, 1, lambda *a: None
+    )
+    add_family(evaluation, 30)
+    assert {key[0] for key in evaluation.estimates} == {"calibration.plan.family"}
+    drawn = run_episodes(scenario, 30, variation="family", seed=77, plants=30, num_workers=1)
+    missed = evaluation.estimates["calibration.plan.family", "sharpened", "miss_rate"]
+    assert missed.n == drawn.num_unsafe
+    assert {one.plant for one in drawn} == {*range(1, 31)}

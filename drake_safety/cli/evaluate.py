@@ -39,7 +39,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.calibration import PLAN, episode_scores
 from drake_safety.learning.seeds import EVALUATION, FRESH_MOTION, SHIFTS, SeedBlock, use_of
-from drake_safety.learning.segments import Episodes, split
+from drake_safety.learning.segments import Episodes, Segments, split
 from drake_safety.robots.family import FAMILY
 from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.motion import Motion
@@ -70,9 +70,17 @@ class Evaluation:
 
     def fresh(self, what: str, number: int, purpose: str) -> Episodes:
         """Fresh nominal episodes, kept in the run's folder."""
+        return self._fresh(what, number, purpose)
+
+    def fresh_on_family(self, number: int, purpose: str, num_plants: int) -> Episodes:
+        """Fresh episodes on fresh plants of the family, kept in the run's folder."""
+        what = "episodes on the family's plants"
+        return self._fresh(what, number, purpose, variation=FAMILY, plants=num_plants)
+
+    def _fresh(self, what: str, number: int, purpose: str, **options: Any) -> Episodes:
         seed, progress = self.seeds[purpose], partial(self.stages, what)
         return folders.run_fresh_episodes(
-            self.scenario, self.run_folder, number, seed, progress, self.workers
+            self.scenario, self.run_folder, number, seed, progress, self.workers, **options
         )
 
     def add(self, estimates: Mapping[Key, Estimate], **figures: Figure) -> None:
@@ -87,7 +95,9 @@ def evaluate(
     scenario: console.ScenarioArgument,
     assessment: console.AssessmentOption = None,
     episodes: Annotated[int, Option(help="Fresh nominal episodes.", min=1)] = 1000,
-    calibration_episodes: Annotated[int, Option(help="Others, for thresholds.", min=20)] = 300,
+    calibration_episodes: Annotated[
+        int, Option(help="Others, for thresholds; as many on the family's plants.", min=20)
+    ] = 300,
     throws: Annotated[
         int | None, Option(help="Throws at the actual plant; 600 for tasks with recovery.", min=0)
     ] = None,
@@ -125,6 +135,7 @@ def evaluate(
         other = evaluation.fresh("calibration episodes", calibration_episodes, "thresholds")
         add_verdicts(evaluation, evaluation.scorers, other, test)
         add_reliability(evaluation, test)
+        add_family(evaluation, calibration_episodes)
         if throws:
             add_throws(evaluation, throws)
 
@@ -196,10 +207,32 @@ def add_reliability(evaluation: Evaluation, test: Episodes) -> None:
         curves[f"{mode}, every row"] = rows
         estimates["calibration", mode, "expected_calibration_error"] = first.error
         estimates["calibration.rows", mode, "expected_calibration_error"] = rows.error
-        for one in evaluation.assessments[mode].calibrations_.values():
-            shares = verdict_shares(one, *episode_scores(segments, score, one.kind))
-            estimates |= {(f"calibration.{one.key}", mode, what): n for what, n in shares.items()}
+        estimates |= _promises(evaluation.assessments[mode], mode, segments, score, family=False)
     evaluation.add(estimates, reliability=reliability_figure(curves))
+
+
+def add_family(evaluation: Evaluation, num_episodes: int) -> None:
+    """Evaluates promises over a family, if Γ has learned one, a fresh plant for each episode."""
+    known = {mode: one for mode, one in evaluation.assessments.items() if one.knows_family}
+    if not known:
+        return
+    drawn = evaluation.fresh_on_family(num_episodes, "evaluation", num_episodes)
+    segments = split(drawn, stride=1, discount=1.0, shortest=1)
+    for mode, gamma in known.items():
+        score = assessment_scorer(mode, gamma).unsafe_score(segments)
+        evaluation.add(_promises(gamma, mode, segments, score, family=True))
+
+
+def _promises(
+    gamma: SafetyAssessment, mode: str, segments: Segments, score: np.ndarray, *, family: bool
+) -> dict[Key, Estimate]:
+    """Shares of the verdicts by thresholds whose promise is over the family, or the others."""
+    return {
+        (f"calibration.{one.key}", mode, what): share
+        for one in gamma.calibrations_.values()
+        if bool(one.plants) == family
+        for what, share in verdict_shares(one, *episode_scores(segments, score, one.kind)).items()
+    }
 
 
 def add_throws(
@@ -233,11 +266,7 @@ def _add_shifts(evaluation: Evaluation, num_episodes: int, num_nominal: int, hou
     kinds: dict[str, str] = {"nominal": "nominal"}
     if scenario.family is not None:
         number = _FAMILY_PLANTS * max(num_episodes // 4, 1)
-        options = {**scenario.options_for("evaluation"), "plants": _FAMILY_PLANTS}
-        report = partial(stages, "motions on the family's plants")
-        drawn = folders.run_fresh_episodes(
-            scenario, evaluation.run_folder, number, seed, report, workers, FAMILY, **options
-        )
+        drawn = evaluation.fresh_on_family(number, "shifts", _FAMILY_PLANTS)
         judged[FAMILY] = shift_study.shift_estimates(names, drawn)
         kinds[FAMILY] = "family"
     for i, (name, shift) in enumerate(shifts.items()):

@@ -62,8 +62,11 @@ _KINDS: dict[str, Kind] = {
         f"{_SCORES} {INPUTS}",
         (*_RECALLS, _AUC, _BRIER, Column("threshold", "threshold", "=")),
     ),
-    "calibration.plan": (f"{_CALIBRATION}: before the motion", _RATES, _CALIBRATIONS),
-    "calibration.motion": (f"{_CALIBRATION}: during the motion", _RATES, _CALIBRATIONS),
+    **{
+        f"calibration.{kind}{plants}": (f"{_CALIBRATION}: {when}{over}", _RATES, _CALIBRATIONS)
+        for plants, over in (("", ""), (".family", ", over the family"))
+        for kind, when in (("plan", "before the motion"), ("motion", "during the motion"))
+    },
 }
 """By judged set."""
 
