@@ -14,6 +14,8 @@ from drake_safety import load_assessment, load_scenario
 from drake_safety.logs.episodes import cut_log
 from drake_safety.logs.mcap_recorder import McapRecorder
 from drake_safety.logs.robot_log import read_pieces
+from drake_safety.logs.sequences import read_recording
+from drake_safety.plants.pushes import Push
 from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.rollouts import episode_rng
 from log_files import balancing_loop, recorded, write
@@ -103,9 +105,9 @@ def test_the_log_reader_needs_no_map(run):
     read = read_pieces(path, None, loop.robot)
     assert not read.cuts
     (log,) = read.pieces
-    measured = motion["measured_plant_state"][1:]  # A row shows the sample of the one before.
+    measured = motion["measured_plant_state"]
     np.testing.assert_allclose(np.hstack([log.q, log.v]), measured, atol=1e-12)
-    np.testing.assert_allclose(log.time_s, motion.time_s[:-1], atol=1e-12)
+    np.testing.assert_allclose(log.time_s, motion.time_s, atol=1e-12)
     episodes, _ = cut_log(read.pieces, load_scenario(SCENARIO))
     step = round(0.04 / STEP_S)
     previews = motion["desired_preview"][: step * len(episodes[0].time_s) : step]
@@ -123,6 +125,27 @@ def test_the_command_monitor_gives_the_alarm_of_the_run(run, monkeypatch, tmp_pa
     # The port shows an alarm in the row after that which raises it.
     assert alarm["begin_s"] == pytest.approx(seen_s - STEP_S)
     assert alarm["cause"] == motion["alarm_cause"][-1]
+
+
+def test_the_monitor_reads_a_walking_robot_between_pushes(tmp_path):
+    scenario, gamma = load_scenario("go2_walking"), load_assessment("go2_walking")
+    loop, path = scenario.make_loop(assessment=gamma), tmp_path / "run.mcap"
+    push = Push(body="base", time_s=0.5, force_n=[0.0, 20.0, 0.0])
+
+    def start(context):
+        loop.reset_undisturbed(context, episode_rng(0, 0), 2.0)
+        loop.set_push(context, push)
+
+    with McapRecorder(loop, path) as recorder:
+        run = simulate(loop, start, ["levels"], End(duration_s=1.6), monitor=recorder)
+    motions, left = read_recording(path, gamma.detector_, gamma.info_)
+    assert len(motions) == 2 and not left
+    seen, _ = gamma.detector_.watch([rows for _, rows in motions])
+    # The port shows levels in the row after.
+    after = np.searchsorted(run.time_s, np.concatenate([times for times, _ in motions]) + 0.01)
+    np.testing.assert_allclose(seen, run["levels"][after], atol=1e-5)
+    with pytest.raises(ValueError, match="which no log has"):
+        cut_log(read_pieces(path, None, loop.robot).pieces, loop)
 
 
 def test_a_log_without_a_map_is_refused(tmp_path, monkeypatch, capsys):

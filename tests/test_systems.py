@@ -46,7 +46,14 @@ ROWS = PERIOD | {"horizon": 4, "num_outlook": 3}
 PLAN = PiecewisePolynomial(np.zeros((3, 1)))
 LAIKAGO = {"n_q": 19, "n_v": 18, "n_j": 12, "n_p": 4, "n_s": 36, "n_z": 3, "H": 4, "M": 3}
 LAIKAGO |= {"n_c": 3, "n_f": len(SAFE_SET.feature_names)}
-SIZES = {"n_s": 36, "n_w": 36, "n_z": 3, "H": LEARNED.info_.horizon, "n_c": 3}
+SIZES = {
+    "n_s": 36,
+    "n_w": 36,
+    "n_u": len(LEARNED.detector_.columns),
+    "n_z": 3,
+    "H": LEARNED.info_.horizon,
+    "n_c": 3,
+}
 SIZES["n_f"] = len(LEARNED.info_.feature_names)
 DOUBLE = {"n_s": 2, "n_z": 3, "H": 2, "n_f": 3, "n_c": 2}
 RECORDED = {"n_s": 1, "n_z": 3, "H": 3, "n_f": 1, "n_c": 2, "n_q": 1, "n_v": 1, "n": 4}

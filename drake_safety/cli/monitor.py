@@ -19,7 +19,7 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import rows_of
 from drake_safety.logs.episodes import motions_from_log
 from drake_safety.logs.robot_log import FORMATS, read_pieces
-from drake_safety.logs.sequences import Motion, SequenceMap, read_sequences
+from drake_safety.logs.sequences import Motion, SequenceMap, read_recording, read_sequences
 from drake_safety.simulation.rollouts import worker_loop
 from drake_safety.simulation.scenario import Scenario
 
@@ -84,6 +84,11 @@ def _motions(
         sequences = read_sequences(file, sequence_map, gamma.detector_, gamma.info_)
         yield from ((entry | {"sequence": i}, motions) for i, motions in enumerate(sequences))
         return
+    if log_map is None and file.suffix.lower() == ".mcap":
+        if recorded := read_recording(file, gamma.detector_, gamma.info_):
+            motions, left = recorded
+            yield entry | {"left_safe_set": left}, motions
+            return
     loop = worker_loop(scenario, "actual")()
     read = read_pieces(file, log_map, loop.robot)
     if summary := read.summary():

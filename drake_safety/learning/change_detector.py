@@ -12,7 +12,8 @@ from threadpoolctl import threadpool_limits
 
 from drake_safety.extras import require_extra
 from drake_safety.files.progress import ignore
-from drake_safety.learning.segments import Episode, Episodes
+from drake_safety.learning.inputs import preview_names
+from drake_safety.learning.segments import Episode, Episodes, EpisodesInfo
 from drake_safety.learning.state_predictor import StatePredictor
 
 TIME_CONSTANTS_S = (0.1, 0.5, 2.0)  # Memories of the charts.
@@ -76,6 +77,11 @@ class ChangeDetector:
     def rates(self) -> np.ndarray:
         """Weight of the newest innovation in the charts of each memory, (3,)."""
         return np.minimum(1.0, self.step_s / np.array(TIME_CONSTANTS_S))
+
+    def input_names(self, info: EpisodesInfo) -> list[str]:
+        """Names of the inputs, (n_u,)."""
+        every = [*info.state_names, *preview_names(info), *info.feature_names]
+        return [every[i] for i in self.columns]
 
     def describe(self) -> str:
         """What the limits were learned from, and what they promise."""

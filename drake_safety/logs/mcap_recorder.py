@@ -24,6 +24,7 @@ _ROUNDING_S = 1e-6
 _BREAK_NS = 1_000_000_000  # Before a motion that begins anew.
 _STATE, _GOAL, _FEET = "measured_plant_state", "desired_output", "desired_foot_positions"
 _POSE = [f"base_{entry}" for entry in ("qw", "qx", "qy", "qz", "x", "y", "z")]
+WATCHED = "watched_inputs"  # Topic of the monitor's inputs.
 _RATES = [f"base_{entry}" for entry in ("wx", "wy", "wz", "vx", "vy", "vz")]
 _Monitor = Callable[[Context], object]
 _BELIEF = ["safe", "unsafe", "unknown"]
@@ -49,7 +50,6 @@ class McapRecorder:
         from rosbags.typesys import Stores, get_typestore
 
         is_loop = isinstance(diagram, ClosedLoop)
-        self._is_delayed = is_loop and diagram.assessment is not None
         self._period_s = diagram.scenario.monitor_step_s if is_loop else _PERIOD_S
         self._monitor, self._store = monitor, get_typestore(Stores.ROS2_HUMBLE)
         self._now_s = self._due_s = -math.inf
@@ -90,19 +90,12 @@ class McapRecorder:
         self._now_s = now_s
         if now_s < self._due_s - _ROUNDING_S:
             return
-        is_first = self._due_s == -math.inf
         is_late = now_s - self._due_s >= self._period_s  # The simulator's steps are longer.
         self._due_s = self._period_s + (now_s if is_late else self._due_s)
         self._stamp_ns = round(1e9 * now_s) + self._shift_ns
-        row = []
-        for topic, (channel, make) in self._topics.items():
-            # With a monitor a sample of the last row's time; at the start there is none.
-            is_delayed = self._is_delayed and topic == _STATE
-            delay_ns = round(1e9 * self._period_s) if is_delayed else 0
-            if not (delay_ns and is_first):
-                row.append((channel, self._stamp_ns - delay_ns, make(context)))
-        for channel, stamp_ns, data in row:  # Of complete rows, wherever Ctrl-C stops it.
-            self._writer.add_message(channel, stamp_ns, data, stamp_ns)
+        row = [(channel, make(context)) for channel, make in self._topics.values()]
+        for channel, data in row:  # Of complete rows, wherever Ctrl-C stops it.
+            self._writer.add_message(channel, self._stamp_ns, data, self._stamp_ns)
 
     def _of(self, kind: str, *values: Any) -> Any:
         """A message of a type such as ``std_msgs/String``."""
@@ -126,7 +119,7 @@ class McapRecorder:
         from rosbags.typesys import get_types_from_msg
 
         kind = f"drake_safety/{topic.title().replace('_', '')}"
-        if text := "".join(f"float64 {field}\n" for field in _fields(names)):
+        if text := "".join(f"float64 {field}\n" for field in field_names(names)):
             self._store.register(get_types_from_msg(text, kind.replace("/", "/msg/")))
             self._add(topic, kind, values)
 
@@ -193,6 +186,7 @@ def _entry_names(loop: ClosedLoop) -> dict[str, list[str]]:
     if loop.assessment is not None:
         names["desired_preview"] = preview_names(loop.assessment.info_)
         names["levels"] = [states[i] for i in loop.assessment.detector_.watched]
+        names[WATCHED] = loop.assessment.detector_.input_names(loop.assessment.info_)
     if isinstance(loop, LeggedLoop):
         joints = loop.kinematics.joint_names
         state = [*_POSE, *joints, *_RATES, *(f"{joint}_rate" for joint in joints)]
@@ -202,7 +196,7 @@ def _entry_names(loop: ClosedLoop) -> dict[str, list[str]]:
 
 def _log_map(loop: LeggedLoop, names: dict[str, list[str]]) -> dict[str, Any]:
     """The map of the file, as of a `LogMap`."""
-    joints, state = loop.kinematics.joint_names, _fields(names[_STATE])
+    joints, state = loop.kinematics.joint_names, field_names(names[_STATE])
     q, v = state[: loop.kinematics.num_positions], state[loop.kinematics.num_positions :]
     columns: dict[str, Any] = {
         "base_orientation": q[:4],
@@ -213,14 +207,14 @@ def _log_map(loop: LeggedLoop, names: dict[str, list[str]]) -> dict[str, Any]:
         "joint_velocities": dict(zip(joints, v[6:], strict=True)),
     }
     log_map = {name: {"topic": f"/{_STATE}", "columns": part} for name, part in columns.items()}
-    log_map[_GOAL] = {"topic": f"/{_GOAL}", "columns": _fields(names[_GOAL])}
+    log_map[_GOAL] = {"topic": f"/{_GOAL}", "columns": field_names(names[_GOAL])}
     if loop.HasOutputPort(_FEET):
         entries = [f"entry_{i}" for i in range(loop.GetOutputPort(_FEET).size())]
         log_map["foot_positions"] = {"topic": f"/{_FEET}", "columns": entries}
     return log_map
 
 
-def _fields(names: Iterable[str]) -> list[str]:
+def field_names(names: Iterable[str]) -> list[str]:
     """Names of fields: lower-case letters, digits and single underscores, each once."""
     fields: list[str] = []
     for name in names:

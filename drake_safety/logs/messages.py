@@ -91,6 +91,16 @@ def _channels(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel]:
     return channels
 
 
+def recorded_topics(path: Path) -> set[str]:
+    """Topics of an MCAP file."""
+    require_extra("logs", f"log '{path}'", "mcap")
+    from mcap.reader import make_reader
+
+    with reading(path, f"damaged{_REMEDIES['.mcap']}: log", Exception), path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    return {channel.topic for channel in summary.channels.values()} if summary else set()
+
+
 def attached_map(path: Path) -> LogMap:
     """The map that an MCAP file has as an attachment, as those of `McapRecorder` do."""
     if path.suffix.lower() == ".mcap":

@@ -1,4 +1,4 @@
-"""Sequences of observations in .npz files, such as a policy's, as rows of a ChangeDetector."""
+"""Rows of a ChangeDetector: recorded inputs, and observations in .npz files, such as a policy's."""
 
 import math
 from dataclasses import field
@@ -8,10 +8,14 @@ import numpy as np
 
 from drake_safety.files.reading import check_memory, reading
 from drake_safety.files.schema import NotNegative, schema
+from drake_safety.learning.causes import is_outside, violated
 from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.inputs import preview_names
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.logs.channel import listed
+from drake_safety.logs.log_map import LogTime
+from drake_safety.logs.mcap_recorder import WATCHED, field_names
+from drake_safety.logs.messages import read_messages, recorded_topics
 
 Motion = tuple[np.ndarray, np.ndarray]  # Times (K,) [s] of consecutive rows (K, n).
 
@@ -35,8 +39,7 @@ def read_sequences(
 ) -> list[list[Motion]]:
     """Reads the motions of each sequence in an ``.npz`` file; none reaches over a missing value."""
     # Only the detector's inputs are read; others are 0.
-    every = [*info.state_names, *preview_names(info), *info.feature_names]
-    inputs = {every[i]: i for i in detector.columns.tolist()}
+    inputs = dict(zip(detector.input_names(info), detector.columns.tolist(), strict=True))
     scale, offset = sequence_map.scale, sequence_map.offset
     for name in (*sequence_map.columns, *scale, *offset):
         if name not in inputs:
@@ -51,11 +54,45 @@ def read_sequences(
     if missing := [column for column in dict.fromkeys(columns.values()) if column not in names]:
         what = f"observations {missing}, which the monitor reads; they have {listed(names)}"
         raise ValueError(f"sequences '{path}' have no {what}: see 'columns' of the map")
-    rows = np.zeros((*data[:, ::stride].shape[:2], len(every)))
+    rows = np.zeros((*data[:, ::stride].shape[:2], _num_entries(info)))
     for name, column in columns.items():
         values = data[:, ::stride, names.index(column)] * scale.get(name, 1.0)
         rows[:, :, inputs[name]] = values + offset.get(name, 0.0)
     return [_motions(sequence, step_s) for sequence in rows]
+
+
+def read_recording(
+    path: Path, detector: ChangeDetector, info: EpisodesInfo
+) -> tuple[list[Motion], str] | None:
+    """Reads what the monitor saw in a file of `McapRecorder`; None of another file.
+
+    Returns:
+        Motions between disturbances, until the robot leaves the safe set, and the violated
+        constraint, "" if there is none.
+    """
+    inputs, margins = f"/{WATCHED}", "/margins"
+    if not {inputs, margins} <= recorded_topics(path):
+        return None
+    names = detector.input_names(info), info.constraint_names
+    wanted = dict(zip((inputs, margins), map(field_names, names), strict=True))
+    found = read_messages(path, wanted, LogTime())
+    leave_s, cause = math.inf, ""
+    for time_s, row in zip(found[margins].time_s, found[margins].frame.to_numpy(), strict=True):
+        if is_outside(row):
+            leave_s, cause = time_s, info.constraint_names[violated(row)]
+            break
+    # A row shows what the monitor took in the step before; while it waits there is none.
+    time_s = (found[inputs].time_s - detector.step_s).round(6)
+    time_s = time_s[time_s <= leave_s]
+    rows = np.zeros((len(time_s), _num_entries(info)))
+    rows[:, detector.columns] = found[inputs].frame.to_numpy()[: len(time_s)]
+    begins = np.flatnonzero(np.diff(time_s) > 1.5 * detector.step_s) + 1
+    parts = np.split(np.arange(len(time_s)), begins)
+    return [(time_s[part], rows[part]) for part in parts if len(part) > 2], cause
+
+
+def _num_entries(info: EpisodesInfo) -> int:
+    return len(info.state_names) + len(preview_names(info)) + len(info.feature_names)
 
 
 def _arrays(path: Path, sequence_map: SequenceMap) -> tuple[np.ndarray, list[str]]:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort, System
-from pydrake.systems.primitives import MatrixGain, ZeroOrderHold
+from pydrake.systems.primitives import MatrixGain
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import (
@@ -209,12 +209,6 @@ class LeggedLoop(PlannedLoop):
         read = {name: inputs.GetOutputPort(name) for name in ("state", "features")}
         of_robot = {"plant_state": self._physics.state, **self._observed, **read}
         of_robot["measured_plant_state"] = self._assessed_state
-        if self.assessment is not None:
-            # Drake draws noise before discrete updates: the monitor sees other noise than a row.
-            sample = ZeroOrderHold(self.scenario.monitor_step_s, self._assessed_state.size())
-            builder.AddNamedSystem("measurement_sample", sample)
-            builder.Connect(self._assessed_state, sample.get_input_port())
-            of_robot["measured_plant_state"] = sample.get_output_port()
         if self._physics.ball_state is not None:
             of_robot["ball_state"] = self._physics.ball_state
         assessor = self._finish(

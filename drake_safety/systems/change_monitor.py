@@ -21,7 +21,8 @@ class ChangeMonitor(LeafSystem):
         name: ChangeMonitor
         input_ports: [state: n_s, desired_preview: H n_z,
           features: n_f (only if the prediction reads some), hold: 1 (optional)]
-        output_ports: [alarm: 1, levels: n_w, alarm_cause: abstract, judged_share: 1]
+        output_ports: [alarm: 1, levels: n_w, alarm_cause: abstract, judged_share: 1,
+          watched_inputs: n_u]
 
     Every step of its training it predicts the state and updates the charts of a
     :class:`~drake_safety.learning.change_detector.ChangeDetector`. When a watched state's level
@@ -29,7 +30,8 @@ class ChangeMonitor(LeafSystem):
     five seconds. Inputs that are not finite, and the two after each, cannot be judged.
     ``judged_share`` is the share of the others over two seconds; below a half every level is above
     1. The charts wait while a known disturbance acts, by ``hold`` or :meth:`expect_disturbance`,
-    and `SETTLING_S` longer. The detector is a parameter of the Context.
+    and `SETTLING_S` longer. ``watched_inputs`` are the last ones, named `input_names`, NaN while
+    the charts wait. The detector is a parameter of the Context.
 
     Example: ``monitor = builder.AddSystem(ChangeMonitor(assessment))``
     """
@@ -38,6 +40,7 @@ class ChangeMonitor(LeafSystem):
         super().__init__()
         info, detector = assessment.info_, assessment.detector_
         self.level_names = [info.state_names[i] for i in detector.watched]
+        self.input_names = detector.input_names(info)
         self._detector = self.DeclareAbstractParameter(Value(detector))
         num_states, num_preview = len(info.state_names), info.horizon * len(info.output_names)
         self._state_port = self.DeclareVectorInputPort("state", num_states)
@@ -66,6 +69,7 @@ class ChangeMonitor(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(detector.step_s, 0.0, self._update)
         for name in ("alarm", "levels", "judged_share"):
             self.DeclareStateOutputPort(name, self._groups[name])
+        self.DeclareStateOutputPort("watched_inputs", self._groups["x"])
         self.DeclareAbstractOutputPort(
             "alarm_cause", lambda: Value(""), self._calc_alarm_cause, {self.xd_ticket()}
         )

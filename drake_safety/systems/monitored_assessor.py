@@ -30,7 +30,7 @@ class MonitoredSafetyAssessor(Diagram):
         output_ports: [safety_probability: 1, belief: 3, cause_probability: n_c, embedding: 2,
           predicted_margins: n_c, novelty: 1, probability_without_alarm: 1, belief_without_alarm: 3,
           fall_probability: 1, learned: abstract, alarm: 1, levels: n_w, alarm_cause: abstract,
-          judged_share: 1]
+          judged_share: 1, watched_inputs: n_u]
 
     Args:
         period_s: Time between two evaluations [s]; the step of the training episodes by default.
