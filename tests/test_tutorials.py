@@ -1,11 +1,14 @@
 """The tutorials: clean files that a newcomer can read, and every cell of them runs."""
 
+import base64
 import json
 import os
 import re
 from pathlib import Path
 
 import pytest
+
+from studies.tutorials import source_hash
 
 ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = sorted((ROOT / "tutorials").glob("*.ipynb"))
@@ -48,6 +51,23 @@ def test_links_of_a_tutorial_lead_somewhere(tutorial):
     assert links
     missing = [link for link in links if not (tutorial.parent / link).exists()]
     assert missing == []
+
+
+
+def test_the_stored_outputs_are_of_the_present_code_and_of_what_ships(tutorial):
+    file = ROOT / "tutorials/outputs" / f"{tutorial.stem}.json"
+    if not file.is_file():
+        pytest.skip(f"no outputs are kept: `python -m studies tutorials {tutorial.stem}`")
+    notebook, kept = (json.loads(path.read_text(encoding="utf-8")) for path in (tutorial, file))
+    assert kept["source_sha256"] == source_hash(notebook), f"run `studies tutorials {tutorial.stem}`"
+    assert len(kept["cells"]) == len(cells(tutorial, "code"))
+    shown = [output for cell in kept["cells"] for output in cell]
+    assert any("png" in output for output in shown)
+    for output in shown:
+        assert len(base64.b64decode(output.get("png", ""))) <= 60_000
+    later = next(cell for cell in notebook["cells"] if cell["cell_type"] == "code")
+    later["source"] = [*later["source"], "\npass"]
+    assert source_hash(notebook) != kept["source_sha256"]
 
 
 @pytest.mark.slow
