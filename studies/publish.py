@@ -54,7 +54,7 @@ def documents(root: Path = Path()) -> list[Path]:
 
 
 def printed(text: str) -> str:
-    """Replaces what ``<!-- printed: drake-safety … -->`` shows by the first lines of the command."""
+    """Replaces what is behind ``<!-- printed: drake-safety … -->`` by what the command prints."""
 
     def run(match: re.Match[str]) -> str:
         call = "from drake_safety.cli import main; main()"
@@ -83,8 +83,8 @@ def readme(
 ) -> None:
     """Rewrite the tables of README.md and docs from docs/results/NAME.json.
 
-    They stand between <!-- results: NAME -->, or another kind of table, and <!-- end -->. Figures of
-    sentences stand behind <!-- value: … -->, outputs behind <!-- printed: … -->. Without
+    They stand between <!-- results: NAME -->, or another kind of table, and <!-- end -->;
+    figures of sentences behind <!-- value: … -->, outputs behind <!-- printed: … -->. Without
     PATHS also the cards of the shipped assessments, from what ships.
     """
     for path in paths or documents():

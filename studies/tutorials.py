@@ -35,7 +35,7 @@ def tutorials(
 ) -> None:
     """Run the tutorials one by one and keep their outputs in tutorials/outputs/NAME.json.
 
-    A file has the outputs of every cell of code, the time of one core [s], and a hash of what made them.
+    A file has the outputs of every cell of code, the time of one core [s], and a hash of its code.
     """
     there = {path.stem: path for path in sorted(TUTORIALS.glob("*.ipynb"))}
     for name in names or there:
@@ -63,7 +63,7 @@ def source_hash(notebook: Mapping[str, Any]) -> str:
 
 
 def run(path: Path) -> dict[str, Any]:
-    """Runs a notebook in a folder of its own: its outputs by cell, time of one core [s], and hash."""
+    """Runs a notebook in a folder of its own: outputs by cell, time of one core [s], and hash."""
     require_extra("tutorials", "tutorials", "nbclient", "ipykernel")
     import nbclient
     import nbformat
@@ -81,7 +81,7 @@ def run(path: Path) -> dict[str, Any]:
         "source_sha256": source_hash(notebook),
         "core_s": round(_children_s() - before, 1),
         "cells": [
-            [kept for one in cell.outputs if (kept := _kept(one, [folder, os.getcwd()]))]
+            [kept for one in cell.outputs if (kept := _kept(one, [folder, str(Path.cwd())]))]
             for cell in notebook.cells
             if cell.cell_type == "code"
         ],
