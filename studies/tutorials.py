@@ -70,7 +70,7 @@ def run(path: Path) -> dict[str, Any]:
 
     paths = [str(Path.cwd()), os.environ.get("PYTHONPATH", "")]
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
-    notebook = nbformat.read(path, as_version=4)  # type: ignore[no-untyped-call]
+    notebook = nbformat.read(path, as_version=4)
     before = _children_s()
     with tempfile.TemporaryDirectory() as folder:
         resources = {"metadata": {"path": folder}}

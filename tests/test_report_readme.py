@@ -44,6 +44,7 @@ def test_no_page_states_a_result_that_is_not_generated(path):
     assert re.findall(r"\(−?\d[\d.]*(?:–| to )−?\d[\d.]*\)", by_hand) == []
     assert re.findall(r"(?:AUC|Brier score|recall) (?:of |is )?\d\S*", by_hand) == []
     assert "<!-- value:" not in re.sub(r"`[^`]*`", "", by_hand)
+    assert not re.search(r"^\s*<!-- value", text, re.MULTILINE)  # It would end the paragraph.
 
 
 def test_every_stored_evaluation_is_shown():

@@ -37,13 +37,13 @@ def tutorial_pages(outputs: Path = ROOT / "tutorials" / "outputs") -> dict[str, 
             shown += _shown(next(outputs_of, []))
             is_setup = False
         note = _NOTE.format(path.name, _RUN if file.is_file() else _NOT_RUN)
-        note = note.format(time=_time(kept.get("core_s", 0.0)))
+        note = note.format(time=_time(kept["core_s"] if file.is_file() else 0.0))
         pages[f"tutorials/{path.stem}.md"] = "\n\n".join([shown[0], note, *shown[1:]]) + "\n"
     return pages
 
 
 def _time(seconds: float) -> str:
-    minutes = math.ceil(seconds / 60)
+    minutes = max(1, math.ceil(seconds / 60))
     return "less than a minute" if minutes == 1 else f"{minutes} minutes"
 
 
