@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-_NOTE = "*As a notebook: `tutorials/{}`; {}.*"
-_RUN = "it takes {time} of one core"
-_NOT_RUN = "`python -m studies tutorials` adds its outputs"
+_NOTE = "*As a notebook: `tutorials/{}`{}.*"
+_RUN = "; it takes {time} of one core"
+_NOT_RUN = "; `python -m studies tutorials` adds its outputs"
 _SETUP = "<details markdown><summary>Setup</summary>\n\n{}\n\n</details>"
 
 
@@ -36,8 +36,10 @@ def tutorial_pages(outputs: Path = ROOT / "tutorials" / "outputs") -> dict[str, 
             shown.append(_SETUP.format(code) if is_setup else code)
             shown += _shown(next(outputs_of, []))
             is_setup = False
-        note = _NOTE.format(path.name, _RUN if file.is_file() else _NOT_RUN)
-        note = note.format(time=_time(kept["core_s"] if file.is_file() else 0.0))
+        note = _NOTE.format(
+            path.name, _RUN if "core_s" in kept else "" if kept["cells"] else _NOT_RUN
+        )
+        note = note.format(time=_time(kept.get("core_s", 0.0)))
         pages[f"tutorials/{path.stem}.md"] = "\n\n".join([shown[0], note, *shown[1:]]) + "\n"
     return pages
 
