@@ -24,7 +24,7 @@ TUTORIALS = Path("tutorials")
 OUTPUTS = TUTORIALS / "outputs"
 _MOST_BYTES = 60_000  # Of a picture.
 _COLOURS = (256, 64, 16)
-_WIDTHS = (1000, 800, 640)  # [px]
+_WIDTHS = (1000, 800, 640, 480, 320)  # [px]
 _TIME = """\
 import psutil
 _one = psutil.Process()
