@@ -58,11 +58,8 @@ bench: $(DEVELOPED) ## Measure costs beside limits and other libraries: a table,
 	mkdir -p $(dir $(BENCH))
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-quiet --benchmark-json=$(BENCH)
 
-tutorials: $(DEVELOPED) ## Run the tutorials, half an hour, so that `make docs` shows their outputs
-	mkdir -p build/tutorials
-	cp tutorials/*.ipynb build/tutorials
-	cd build/tutorials && for one in *.ipynb; do \
-		$(CURDIR)/$(BIN)/jupyter-execute --timeout=-1 --inplace $$one || exit 1; done
+tutorials: $(DEVELOPED) ## Run the tutorials, half an hour, and keep the outputs that the site shows
+	$(BIN)/python -m studies tutorials
 
 docs: $(DEVELOPED) ## Build the pages and the reference into build/site; a warning is an error
 	$(BIN)/mkdocs build --strict

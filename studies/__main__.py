@@ -14,6 +14,7 @@ from studies.gate import gate
 from studies.publish import readme, ship, store
 from studies.rapt import rapt
 from studies.rare import rare
+from studies.tutorials import tutorials
 from studies.walking import walking
 
 app = typer.Typer(
@@ -25,7 +26,7 @@ app = typer.Typer(
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
     *(evaluate, adaptation, gate, rapt, rare, walking),
-    *(figures, store, readme, ship),
+    *(figures, store, readme, ship, tutorials),
 )
 for _command in _COMMANDS:
     app.command()(_command)

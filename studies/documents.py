@@ -1,21 +1,24 @@
 """Tables in README, docs and cards, from stored results and the templates beside this file.
 
 The text between ``<!-- KIND: NAME -->`` and ``<!-- end -->`` is made by ``templates/KIND.md`` from
-``docs/results/NAME.json`` alone.
+``docs/results/NAME.json`` alone. A figure in a sentence is between ``<!-- value: EXPRESSION -->``
+and ``<!-- end -->``: EXPRESSION formats ``r(NAME, SET, METHOD, METRIC)`` or what ships.
 """
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import yaml
-from jinja2 import Environment, FileSystemLoader
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, UndefinedError
 
+from drake_safety.assessments import load_assessment
 from drake_safety.evaluation.figure_style import label_of
 from drake_safety.evaluation.push_card import COLUMNS, PushCard
 from drake_safety.evaluation.results import Results
@@ -26,20 +29,23 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import use_of
 from drake_safety.robots.family import PlantFamily
 from drake_safety.robots.robot import PlantVariation
-from drake_safety.simulation.scenario import Scenario
+from drake_safety.simulation.scenario import Scenario, load_scenario
 
 RESULTS_FOLDER = Path("docs/results")
 EVALUATION_FILE, CARD_FILE = "evaluation.json", "README.md"
 """Of a shipped folder."""
 _TEMPLATES = Path(__file__).with_name("templates")
-_KINDS = "monitoring|pushes|rare|results|summary|shifts|walking"
+_KINDS = "adaptation|anomalies|monitoring|pushes|rare|results|summary|shifts|walking"
 CARDS = {
     "pushes_go2": ["Drake", "MuJoCo"],
     "pushes_g1": ["fastsac", "ppo"],
 }
 """Loops of stored push cards, in their order."""
-_OPEN = rf"<!-- (?P<kind>{_KINDS}): (?P<name>[\w-]+) -->\n"
+_OPEN = rf"<!-- (?P<kind>{_KINDS}): (?P<name>[\w/-]+) -->\n"
 _BLOCK = re.compile(rf"(?P<start>{_OPEN}).*?(?P<end><!-- end -->)", re.DOTALL)
+_VALUE = re.compile(r"(<!-- value: (?P<expression>.*?) -->).*?(<!-- end -->)")
+GENERATED = re.compile(f"{_BLOCK.pattern}|{_VALUE.pattern}", re.DOTALL)
+"""All generated text of a page."""
 SAFE_RECALL, UNSAFE_RECALL = 0.952, 0.987
 """The paper's recalls on 1000 random targets."""
 _MODES = re.compile(r"^(sharpened|paper)\b")
@@ -55,6 +61,7 @@ _FORMATS = {
     "share_of": {"unit": "of"},
     "whole": {"unit": "=", "digits": 0},
     "tenths": {"unit": "=", "digits": 1},
+    "rounded": {"unit": "=%", "digits": 0},
 }
 """How columns write an estimate, by name."""
 
@@ -73,6 +80,7 @@ def render(kind: str, results: Results, **more: Any) -> str:
         "has": lambda *first: any(key[: len(first)] == first for key in results),
         "label_of": label_of,
         "table": lambda corner, rows, columns: _table(results, corner, rows, columns),
+        "delays": _delays(results),
         "verdicts": lambda set, corner: verdict_table(results, set, corner=corner),
         "INPUTS": INPUTS,
         "SAFE_RECALL": SAFE_RECALL,
@@ -148,10 +156,10 @@ def _with_columns(table: Table, shown: Sequence[int]) -> Table:
 
 
 def generate(text: str, folder: Path = RESULTS_FOLDER) -> str:
-    """Replaces every block of results in a text by the stored ones."""
+    """Replaces every block of results and every value in a text by the stored ones."""
     blocks = [match["name"] for match in _BLOCK.finditer(text)]
     opened = [match["name"] for match in re.finditer(_OPEN, text)]
-    if not blocks:
+    if not GENERATED.search(text):
         raise ValueError(
             "no block of results: put <!-- results: NAME --> and <!-- end --> where those of "
             f"{RESULTS_FOLDER}/NAME.json belong"
@@ -159,19 +167,53 @@ def generate(text: str, folder: Path = RESULTS_FOLDER) -> str:
     if blocks != opened:
         raise ValueError(f"results begin for {opened}, but <!-- end --> comes only after {blocks}")
 
+    read = cache(partial(_stored, folder))
+
     def block(match: re.Match[str]) -> str:
-        file = folder / f"{match['name']}.json"
-        if not file.is_file():
-            there = sorted(path.stem for path in folder.glob("*.json"))
-            raise ValueError(
-                f"there are no results '{match['name']}' in {folder}; there are {there}: "
-                "`python -m studies store RUN` writes them"
-            )
-        results, name = Results.read(file), match["name"]
+        results, name = read(match["name"]), match["name"]
         more = {"cards": cards_of(name, results), "COLUMNS": COLUMNS} if name in CARDS else {}
         return f"{match['start']}{render(match['kind'], results, **more)}\n{match['end']}"
 
-    return _BLOCK.sub(block, text)
+    return _VALUE.sub(partial(_value, read), _BLOCK.sub(block, text))
+
+
+def _stored(folder: Path, name: str) -> Results:
+    file = folder / f"{name}.json"
+    if not file.is_file():
+        there = sorted(path.stem for path in folder.glob("*.json"))
+        raise ValueError(
+            f"there are no results '{name}' in {folder}; there are {there}: "
+            "`python -m studies store RUN` writes them"
+        )
+    return Results.read(file)
+
+
+def _value(read: Callable[[str], Results], match: re.Match[str]) -> str:
+    """A value with its marks."""
+    environment = Environment(undefined=StrictUndefined)
+    environment.globals |= {name: _column("", "", name).text for name in _FORMATS}
+    environment.globals |= {
+        "r": lambda name, *key: read(name)[key],
+        "scenario": load_scenario,
+        "threshold": lambda name, kind: load_assessment(name).calibrations_[kind].threshold,
+        "delays": lambda name: _delays(read(name)),
+    }
+    try:
+        text = environment.from_string(f"{{{{ {match['expression']} }}}}").render()
+    except (KeyError, UndefinedError) as error:
+        raise ValueError(f"value '{match['expression']}': nothing is stored for {error}") from error
+    return f"{match[1]}{text}{match[3]}"
+
+
+def _delays(results: Results) -> dict[str, float]:
+    """Median delay of the monitor's alarm [s] by changed plant; infinite without an alarm."""
+    return {
+        (name if set == "monitor" else set.removeprefix("shifts.")): (
+            math.inf if math.isnan(one.value) else one.value
+        )
+        for (set, name, metric), one in results.items()
+        if metric == "delay_s" and (set == "monitor" or (name == "monitor" and "shifts." in set))
+    }
 
 
 def card_text(folder: Path, scenario: Scenario) -> str:

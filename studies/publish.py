@@ -7,8 +7,11 @@ episodes of its seed, which can be simulated again for comparison; and the card,
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
+import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
@@ -31,22 +34,38 @@ from drake_safety.simulation.dataset import read_info
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import Scenario, load_scenario
 from drake_safety.simulation.worker_processes import Progress
-from studies.documents import CARD_FILE, EVALUATION_FILE, card_text, generate
+from studies.documents import CARD_FILE, EVALUATION_FILE, GENERATED, card_text, generate
 
 NUM_EPISODES = 6
 """Number of fresh episodes whose verdicts are stored."""
 # Stored beside the evaluation.
 _STUDIES = ("shifts", "walking_results")
-DOCUMENTS = [
-    Path("README.md"),
-    *(
-        Path("docs") / f"{name}.md"
-        for name in ("monitoring", "pushes", "rate", "results", "shifts", "walking_results")
-    ),
-]
+_PRINTED = re.compile(r"(<!-- printed: drake-safety (.*?) -->\n```text\n).*?(```\n)", re.DOTALL)
+_PRINTED_LINES = 5
 _HASHES, _VERDICTS = "assessment_sha256", "first_episodes"
 _TOLERANCE = 1e-3  # Of Γ; above differences between processors, below those of assessments.
 _FOLDER_OPTIONS = ("--assessment", "--out")
+
+
+def documents(root: Path = Path()) -> list[Path]:
+    """README and the pages with generated text."""
+    paths = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+    return [path for path in paths if GENERATED.search(path.read_text(encoding="utf-8"))]
+
+
+def printed(text: str) -> str:
+    """Replaces what is behind ``<!-- printed: drake-safety … -->`` by what the command prints."""
+
+    def run(match: re.Match[str]) -> str:
+        call = "from drake_safety.cli import main; main()"
+        command = [sys.executable, "-c", call, *shlex.split(match[2])]
+        done = subprocess.run(command, capture_output=True, text=True)
+        shown = "".join(done.stdout.splitlines(keepends=True)[:_PRINTED_LINES])
+        if not shown:
+            raise ValueError(f"drake-safety {match[2]} prints nothing: {done.stderr}")
+        return f"{match[1]}{shown}{match[3]}"
+
+    return _PRINTED.sub(run, text)
 
 
 def store(
@@ -64,13 +83,14 @@ def readme(
 ) -> None:
     """Rewrite the tables of README.md and docs from docs/results/NAME.json.
 
-    They stand between <!-- results: NAME -->, or another kind of table, and <!-- end -->. Without
+    They stand between <!-- results: NAME -->, or another kind of table, and <!-- end -->;
+    figures of sentences behind <!-- value: … -->, outputs behind <!-- printed: … -->. Without
     PATHS also the cards of the shipped assessments, from what ships.
     """
-    for path in paths or DOCUMENTS:
+    for path in paths or documents():
         text = path.read_text(encoding="utf-8")
         try:
-            generated = generate(text)
+            generated = printed(generate(text))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
         path.write_text(generated, encoding="utf-8")

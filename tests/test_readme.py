@@ -24,7 +24,10 @@ from studies.__main__ import app as studies
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-COMMANDS = (ROOT / "docs/command_line.md").read_text(encoding="utf-8")
+COMMANDS = "".join(
+    (ROOT / f"docs/{page}.md").read_text(encoding="utf-8")
+    for page in ("command_line", "contributing")
+)
 MAKEFILE = (ROOT / "Makefile").read_text()
 CARDS = "".join(
     path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("assessments/*/README.md"))
@@ -81,10 +84,11 @@ def test_every_name_in_the_python_of_the_readme_is_defined_in_it():
         assert {one.id for one in names} - known == set()
 
 
-def test_the_refusal_of_the_readme_is_what_the_command_prints(monkeypatch, capsys):
+def test_the_refusal_of_the_readme_and_of_start_is_what_the_command_prints(monkeypatch, capsys):
     (call,) = [call for call in shell_commands("drake-safety") if call[0] == "ask"]
     assert command_line.call(monkeypatch, *call) == 1
     (shown,), printed = blocks("text"), capsys.readouterr().out.splitlines()
+    assert shown in blocks("text", (ROOT / "docs/start.md").read_text(encoding="utf-8"))
     number = re.compile(r"-?\d+(?:\.\d+)?")
     alike = {number.sub("#", line): line for line in printed}
     for line in shown.splitlines():
@@ -133,8 +137,6 @@ def test_every_relative_link_of_the_readme_leads_to_a_file(target):
 
 
 def test_the_numbers_in_the_readmes_prose_are_the_programs_defaults():
-    recovery = load_scenario("laikago_balancing").parameters.recovery
-    assert f"({recovery.threshold:g} in Laikago's scenario)" in README
     parameters = AssessmentParameters()
     assert f"{parameters.resolution} × {parameters.resolution} cells" in README
     assert parameters.ensemble_size == 3

@@ -155,20 +155,23 @@ def test_the_reference_builds_without_a_warning(tmp_path):
         assert not re.search(r":(class|meth|func|attr|mod):|={6}|\.\. \w+::", shown), page
 
 
-def test_every_tutorial_is_a_page_and_shows_the_outputs_of_one_that_was_run(tmp_path):
+def test_every_tutorial_is_a_page_and_shows_the_outputs_that_are_kept(tmp_path):
     paths = sorted((ROOT / "tutorials").glob("*.ipynb"))
     pages = notebook_pages.tutorial_pages(tmp_path)
     assert [*pages] == [f"tutorials/{path.stem}.md" for path in paths]
     first = next(iter(pages.values()))
     assert "](../concepts.md)" in first and "](6_compose.md)" in first
-    assert "`make tutorials` adds its outputs" in first
-    content = json.loads(paths[0].read_text(encoding="utf-8"))
-    code = next(cell for cell in content["cells"] if cell["cell_type"] == "code")
-    printed = {"output_type": "stream", "name": "stdout", "text": ["0.7 ", "0.3\n"]}
-    drawn = {"output_type": "display_data", "data": {"image/png": "iVBORw0KGgo=\n"}}
-    code["outputs"] = [printed, drawn, printed | {"name": "stderr", "text": ["busy"]}]
-    (tmp_path / paths[0].name).write_text(json.dumps(content), encoding="utf-8")
+    assert "`python -m studies tutorials` adds its outputs" in first
+    # The first cell of code is folded, the second is not.
+    setup, _, rest = first.partition("</details>")
+    assert setup.count("```python") == 1 and "DRAKE_SAFETY_FAST" in setup
+    assert rest.count("```python") > 1
+    outputs = [[{"text": "0.7 0.3"}, {"png": "iVBORw0KGgo="}]]
+    kept = {"core_s": 61.0, "cells": [*outputs, []]}
+    (tmp_path / f"{paths[0].stem}.json").write_text(json.dumps(kept), encoding="utf-8")
     first = next(iter(notebook_pages.tutorial_pages(tmp_path).values()))
-    assert "```text\n0.7 0.3\n```" in first and "busy" not in first
-    assert "![output](data:image/png;base64,iVBORw0KGgo=)" in first
-    assert "make tutorials" not in first
+    after = first.partition("</details>")[2]
+    assert after.startswith(
+        "\n\n```text\n0.7 0.3\n```\n\n![output](data:image/png;base64,iVBORw0KGgo=)"
+    )
+    assert "it takes 2 minutes of one core" in first and "adds its outputs" not in first

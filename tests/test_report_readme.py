@@ -6,11 +6,13 @@ import pytest
 from cart_episodes import make_episode, make_info
 from drake_safety.evaluation.results import Results
 from drake_safety.simulation.dataset import EpisodeWriter
+from drake_safety.simulation.scenario import load_scenario
 from report_runs import make_figures
-from studies.documents import generate
-from studies.publish import DOCUMENTS, evaluated
+from studies.documents import GENERATED, generate
+from studies.publish import documents, evaluated
 
 ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 STORED = sorted((ROOT / "docs/results").glob("*.json"))
 ENTRIES = {
     "command": "drake-safety evaluate lip --assessment /somebodys/own/lip --episodes 60",
@@ -28,17 +30,42 @@ def filled(folder, estimates, text=f"# Title\n\n{BLOCK}\nThe end.\n"):
     return generate(text, folder)
 
 
-@pytest.mark.parametrize("name", DOCUMENTS, ids=str)
-def test_the_committed_tables_are_what_the_stored_evaluations_generate(name):
-    text = (ROOT / name).read_text(encoding="utf-8")
+@pytest.mark.parametrize("path", documents(ROOT), ids=lambda path: path.stem)
+def test_the_committed_text_is_what_the_stored_evaluations_generate(path):
+    text = path.read_text(encoding="utf-8")
     assert generate(text, ROOT / "docs/results") == text
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_no_page_states_a_result_that_is_not_generated(path):
+    text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+    by_hand = GENERATED.sub("", text)
+    # Intervals, and scores with their names.
+    assert re.findall(r"\(−?\d[\d.]*(?:–| to )−?\d[\d.]*\)", by_hand) == []
+    assert re.findall(r"(?:AUC|Brier score|recall) (?:of |is )?\d\S*", by_hand) == []
+    assert "<!-- value:" not in re.sub(r"`[^`]*`", "", by_hand)
+    assert not re.search(r"^\s*<!-- value", text, re.MULTILINE)  # It would end the paragraph.
 
 
 def test_every_stored_evaluation_is_shown():
     # One that is not shown is as stale as one that is shown wrongly.
-    text = "".join((ROOT / name).read_text(encoding="utf-8") for name in DOCUMENTS)
+    text = "".join(path.read_text(encoding="utf-8") for path in PAGES)
     shown = set(re.findall(r"<!-- (?:pushes|rare|results|summary|walking): ([\w-]+) -->", text))
     assert shown == {path.stem for path in STORED}
+
+
+def test_a_value_in_a_sentence_is_rewritten_and_one_that_is_not_stored_is_an_error(tmp_path):
+    place = '"lip", "episodes", "sharpened", "auc"'
+    text = f"{BLOCK}Γ has <!-- value: share(r({place})) -->a stale value<!-- end -->, as said.\n"
+    made = filled(tmp_path, make_figures(), text)
+    estimate = make_figures()["episodes", "sharpened", "auc"]
+    value = f"{estimate.value:.3f} ({estimate.low:.3f}–{estimate.high:.3f})"
+    assert made.endswith(f"-->{value}<!-- end -->, as said.\n")
+    recovery = "scenario('laikago_balancing').parameters.recovery.threshold"
+    shipped = generate(f"Below <!-- value: {recovery} -->?<!-- end -->.", tmp_path)
+    assert f"-->{load_scenario('laikago_balancing').parameters.recovery.threshold}<!--" in shipped
+    with pytest.raises(ValueError, match=r"value 'share\(r\(.*nothing is stored for \('episodes',"):
+        generate(text.replace("sharpened", "blunt"), tmp_path)
 
 
 @pytest.mark.train

@@ -1,11 +1,14 @@
 """The tutorials: clean files that a newcomer can read, and every cell of them runs."""
 
+import base64
 import json
 import os
 import re
 from pathlib import Path
 
 import pytest
+
+from studies.tutorials import run, source_hash
 
 ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = sorted((ROOT / "tutorials").glob("*.ipynb"))
@@ -50,6 +53,24 @@ def test_links_of_a_tutorial_lead_somewhere(tutorial):
     assert missing == []
 
 
+def test_the_stored_outputs_are_of_the_present_code_and_of_what_ships(tutorial):
+    file = ROOT / "tutorials/outputs" / f"{tutorial.stem}.json"
+    if not file.is_file():
+        pytest.skip(f"no outputs are kept: `python -m studies tutorials {tutorial.stem}`")
+    notebook, kept = (json.loads(path.read_text(encoding="utf-8")) for path in (tutorial, file))
+    assert kept["source_sha256"] == source_hash(notebook), (
+        f"run `studies tutorials {tutorial.stem}`"
+    )
+    assert len(kept["cells"]) == len(cells(tutorial, "code"))
+    shown = [output for cell in kept["cells"] for output in cell]
+    assert any("png" in output for output in shown)
+    for output in shown:
+        assert len(base64.b64decode(output.get("png", ""))) <= 60_000
+    later = next(cell for cell in notebook["cells"] if cell["cell_type"] == "code")
+    later["source"] = [*later["source"], "\npass"]
+    assert source_hash(notebook) != kept["source_sha256"]
+
+
 @pytest.mark.slow
 def test_every_cell_of_a_tutorial_runs(tutorial, tmp_path, monkeypatch):
     nbclient = pytest.importorskip("nbclient", reason="the extra 'tutorials' is not installed")
@@ -67,3 +88,30 @@ def test_every_cell_of_a_tutorial_runs(tutorial, tmp_path, monkeypatch):
     client.execute()
     outputs = [out for cell in notebook.cells for out in cell.get("outputs", [])]
     assert any("image/png" in out.get("data", {}) for out in outputs)  # It shows a picture.
+
+
+@pytest.mark.slow
+def test_run_keeps_texts_without_folders_and_small_pictures_but_no_progress(tmp_path):
+    pytest.importorskip("nbclient", reason="the extra 'tutorials' is not installed")
+    import nbformat
+
+    tell = "import os, sys; print('in', os.getcwd() + '/a.txt'); print('42 %', file=sys.stderr); 7"
+    draw = """import io, numpy as np, PIL.Image, IPython.display as shown
+blocks = np.random.default_rng(0).integers(0, 255, (150, 200, 3), dtype=np.uint8)
+PIL.Image.fromarray(np.kron(blocks, np.ones((8, 8, 1), np.uint8))).save(file := io.BytesIO(), "PNG")
+print(len(file.getvalue()))
+shown.display(shown.Image(file.getvalue()))"""
+    notebook = nbformat.v4.new_notebook(
+        cells=[
+            nbformat.v4.new_markdown_cell("# Toy"),
+            *map(nbformat.v4.new_code_cell, (tell, draw)),
+        ]
+    )
+    path = tmp_path / "toy.ipynb"
+    nbformat.write(notebook, path)
+    found = run(path)
+    assert found["cells"][0] == [{"text": "in a.txt"}, {"text": "7"}]
+    (size, picture) = found["cells"][1]
+    assert len(base64.b64decode(picture["png"])) <= 60_000 < int(size["text"])
+    assert found["core_s"] > 0.0
+    assert found["source_sha256"] == source_hash(json.loads(path.read_text(encoding="utf-8")))
