@@ -63,7 +63,8 @@ def rate(
 
     By default Γ divides starts into strata, which saves episodes where it is sharp. With --rare the
     episodes approach failures level by level, which saves most where random ones hardly ever fail.
-    The estimate is unbiased either way. Episodes are kept in OUT: the same command continues.
+    The estimate is unbiased on average; a search that loses a kind of failure gives too low a rate.
+    Episodes are kept in OUT: the same command continues.
     """
     if rare or replay is not None:
         loaded = load_scenario(scenario)
