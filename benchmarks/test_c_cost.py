@@ -14,7 +14,7 @@ from costs import alternate
 
 from drake_safety import SafetyAssessment, load_scenario
 from drake_safety.assessments import assessed_scenarios, load_assessment
-from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
+from drake_safety.evaluation.shifts import plant_shifts
 from drake_safety.learning.change_detector import rows_of
 from drake_safety.simulation.rollouts import run_motion, worker_loop
 
@@ -32,7 +32,7 @@ def faulty_motions(name: str) -> list[np.ndarray]:
     names = [one for one in shifts if not one.startswith("variation")][:NUM_MOTIONS]
     motions = []
     for one in names:
-        shifted = shifted_scenario(scenario, one, shifts[one].variation)
+        shifted = scenario.with_variation(one, shifts[one].variation)
         loop = worker_loop(shifted, one, **shifts[one].options)()
         motion = run_motion(loop, seed=SEED, until_s=DURATION_S, with_features=True)
         motions.append(rows_of(motion))

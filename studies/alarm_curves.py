@@ -32,6 +32,7 @@ COSTS = {
     "without_fall": "do not fall",
 }
 """Other motions by key, and what is said of them."""
+_JUDGED = "without_leaving"  # Cost of the rows; the figure has all.
 _LABELS = {"sharpened": "Γ", "fall": "probability of a fall"}
 _BOOTSTRAP = Bootstrap()
 _SLACK_S = 1e-9
@@ -153,30 +154,24 @@ def equal_cost_estimates(
     Intervals are over pushed motions, those of differences paired.
     """
     estimates: dict[Key, Estimate] = {}
-    for cost in COSTS:
-        for share in SHARES:
-            at = f"at_{100 * share:.0f}"
-            statistics = {
-                name: [one.announced(cost, share) for one in seeds]
-                for name, seeds in watched.items()
-            }
-            for name, seeds in watched.items():
-                each = statistics[name]
-                key = f"alarm.{cost}", name
-                estimates[*key, f"announced_{at}"] = _over_motions(seeds[0], each)
-                counts = [one.num_false_alarms(one.threshold(cost, share)) for one in seeds]
-                estimates[*key, f"false_alarms_per_hour_{at}"] = rate_per_hour(
-                    float(np.mean(counts)), seeds[0].undisturbed_s, seeds[0].num_undisturbed
-                )
-                for i, one in enumerate(each if len(each) > 1 else ()):
-                    estimates[key[0], f"{name}_{i}", f"announced_{at}"] = _over_motions(
-                        seeds[0], [one]
-                    )
-            for own, rival in itertools.product(ours, rivals):
-                key = f"alarm.{cost}", f"{own}_minus_{rival}"
-                estimates[*key, f"announced_{at}"] = _over_motions(
-                    watched[own][0], statistics[own], statistics[rival]
-                )
+    for share in SHARES:
+        at = f"at_{100 * share:.0f}"
+        statistics = {
+            name: [one.announced(_JUDGED, share) for one in seeds]
+            for name, seeds in watched.items()
+        }
+        for name, seeds in watched.items():
+            key = f"alarm.{_JUDGED}", name
+            estimates[*key, f"announced_{at}"] = _over_motions(seeds[0], statistics[name])
+            counts = [one.num_false_alarms(one.threshold(_JUDGED, share)) for one in seeds]
+            estimates[*key, f"false_alarms_per_hour_{at}"] = rate_per_hour(
+                float(np.mean(counts)), seeds[0].undisturbed_s, seeds[0].num_undisturbed
+            )
+        for own, rival in itertools.product(ours, rivals):
+            key = f"alarm.{_JUDGED}", f"{own}_minus_{rival}"
+            estimates[*key, f"announced_{at}"] = _over_motions(
+                watched[own][0], statistics[own], statistics[rival]
+            )
     return estimates
 
 

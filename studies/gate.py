@@ -22,7 +22,6 @@ from drake_safety.cli.gate import changed_plant
 from drake_safety.evaluation.failure_rate import in_turns, strata_of, stratified_rate
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.paired_test import betting_log_e
-from drake_safety.evaluation.shifts import shifted_scenario
 from drake_safety.learning.seeds import GATE
 from drake_safety.learning.segments import Episodes
 from drake_safety.robots.shift import JointShift, Shift
@@ -76,7 +75,7 @@ def simulated(study: Study, variation: str, effort: float, number: int) -> Episo
     shift = Shift(joints={".*": JointShift(effort_scale=effort)})
     plant = replace(study.scenario.variation(variation), shift=shift if effort < 1 else None)
     name = f"effort {effort:g}"
-    shifted = shifted_scenario(study.scenario, name, plant)
+    shifted = study.scenario.with_variation(name, plant)
     options = study.scenario.options_for("pairs", variation)
     return run_episodes(
         shifted,

@@ -11,7 +11,7 @@ from c_programs import PORTS, Library, build, diagram_history
 from command_line import call
 from drake_safety import load_scenario
 from drake_safety.assessments import load_assessment
-from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
+from drake_safety.evaluation.shifts import plant_shifts
 from drake_safety.learning.causes import is_on, is_outside, violated
 from drake_safety.learning.change_detector import rows_of
 from drake_safety.simulation.rollouts import run_motion, worker_loop
@@ -42,7 +42,7 @@ def motions():
     """Rows at the ports of a nominal motion and of one with a joint that is locked."""
     scenario = load_scenario(SCENARIO)
     shift = plant_shifts(scenario, scenario.make_loop())["locked_joint"]
-    shifted = shifted_scenario(scenario, "locked_joint", shift.variation)
+    shifted = scenario.with_variation("locked_joint", shift.variation)
     rows = {}
     for name in ("nominal", "locked_joint"):
         loop = worker_loop(shifted, name)()

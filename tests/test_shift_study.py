@@ -16,7 +16,7 @@ from drake_safety.evaluation.shift_study import (
     run_monitored,
     shift_estimates,
 )
-from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
+from drake_safety.evaluation.shifts import plant_shifts
 from drake_safety.learning.change_detector import Alarm
 from drake_safety.learning.segments import Episodes
 
@@ -150,7 +150,7 @@ def test_the_catalogue_is_scaled_to_the_robot():
     assert math.isclose(force_n[1], 0.1 * 9.81 * mass_kg)
     assert {"slope", "hole", "weak_joint", "frozen", "variation actual"} <= set(shifts)
     assert {"icy_foot", "weakening_motor", "gravity_and_payload", "joint_drift"} <= set(shifts)
-    shifted = shifted_scenario(scenario, "slope", shifts["slope"].variation)
+    shifted = scenario.with_variation("slope", shifts["slope"].variation)
     assert "slope" in shifted.variations
     assert "slope" not in scenario.variations
     assert shifted.simulation_hash("slope") != scenario.simulation_hash("nominal")

@@ -31,7 +31,7 @@ from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
 from drake_safety.evaluation.results import Key, Results
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
-from drake_safety.evaluation.shifts import plant_shifts, shifted_scenario
+from drake_safety.evaluation.shifts import plant_shifts
 from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.verdict_tables import verdict_tables
 from drake_safety.files.progress import StageProgress
@@ -271,7 +271,7 @@ def _add_shifts(evaluation: Evaluation, num_episodes: int, num_nominal: int, hou
         kinds[FAMILY] = "family"
     for i, (name, shift) in enumerate(shifts.items()):
         stages("shifted motions", i, len(shifts))
-        shifted = shifted_scenario(scenario, name, shift.variation)
+        shifted = scenario.with_variation(name, shift.variation)
         options = {**scenario.options_for("evaluation"), **shift.options}
         episodes = folders.run_fresh_episodes(
             shifted, evaluation.run_folder, num_episodes, seed, None, workers, name, **options

@@ -14,6 +14,7 @@ from functools import partial
 
 import numpy as np
 
+from drake_safety.learning.calibration import checked_scores
 from drake_safety.learning.segments import Segments
 
 
@@ -113,7 +114,7 @@ def area_under_curve(
     unsafe_score: np.ndarray, is_unsafe: np.ndarray, weight: np.ndarray | None = None
 ) -> float:
     """Area under the ROC curve of scores, labels and weights, (N,); a tie counts one half."""
-    score, label = _checked(unsafe_score, is_unsafe)
+    score, label = checked_scores(unsafe_score, is_unsafe)
     weight = np.ones(len(score)) if weight is None else np.asarray(weight, dtype=float)
     return _ranked_area(np.unique(score, return_inverse=True)[1], label, weight)
 
@@ -126,7 +127,7 @@ def auc(
     bootstrap: Bootstrap = _BOOTSTRAP,
 ) -> Estimate:
     """The area under the ROC curve of samples (N,), with a bootstrap over their episodes (N,)."""
-    score, label = _checked(unsafe_score, is_unsafe)
+    score, label = checked_scores(unsafe_score, is_unsafe)
     rank = np.unique(score, return_inverse=True)[1]
     return bootstrap.over_episodes(lambda weight: _ranked_area(rank, label, weight), episode)
 
@@ -157,7 +158,7 @@ def segment_estimates(
     segments: Segments, unsafe_score: np.ndarray, *, threshold: float
 ) -> dict[str, Estimate]:
     """AUC, recalls and Brier score of unsafe scores (N,) in [0, 1], unsafe above the threshold."""
-    score, label = _checked(unsafe_score, segments.is_unsafe)
+    score, label = checked_scores(unsafe_score, segments.is_unsafe)
     episode, probability = segments.episode, np.minimum(score, 1.0)  # "Don't know" is infinite.
     return {
         "auc": auc(score, label, episode),
@@ -169,7 +170,7 @@ def segment_estimates(
 
 def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
     """The threshold of scores (N,) with the best balanced accuracy, midway between two scores."""
-    score, label = _checked(unsafe_score, is_unsafe)
+    score, label = checked_scores(unsafe_score, is_unsafe)
     finite = np.unique(score[np.isfinite(score)])
     if label.all() or not label.any() or finite.size == 0:
         numbers = f"{label.sum()} of {len(label)}"
@@ -184,15 +185,6 @@ def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
     balanced = 0.5 * (safe_recall + 1.0 - miss_rate)
     best = np.flatnonzero(balanced >= balanced.max() - 1e-12)
     return float(candidates[best[(len(best) - 1) // 2]])
-
-
-def _checked(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Scores, infinite where they are NaN, and labels."""
-    score, label = np.asarray(unsafe_score, dtype=float), np.asarray(is_unsafe)
-    if label.dtype != bool or score.ndim != 1 or score.shape != label.shape:
-        shapes = f"{score.shape}, {label.shape}"
-        raise ValueError(f"expected as many scores as boolean labels; got {shapes}")
-    return np.where(np.isnan(score), math.inf, score), label
 
 
 def _ranked_area(rank: np.ndarray, label: np.ndarray, weight: np.ndarray) -> float:

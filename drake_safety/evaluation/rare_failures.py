@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from pydrake.systems.framework import Diagram
@@ -71,15 +71,8 @@ class RareFailures:
     random: list[Sample]  # Random episodes, for comparison.
 
 
-class Simulate(Protocol):
-    """Simulates points of the normal space, None for random ones, and counts them."""
-
-    number: int
-
-    def __call__(
-        self, points: Sequence[np.ndarray | None], rng: np.random.Generator
-    ) -> list[Sample]:
-        """The samples of the points."""
+Simulate = Callable[[Sequence[np.ndarray | None], np.random.Generator], list[Sample]]
+"""Simulates points of the normal space, None for random ones."""
 
 
 class _Simulator:
@@ -93,7 +86,7 @@ class _Simulator:
         **options: Any,
     ):
         self._call, self._make, self._file, self._options = call, make, file, options
-        self.number, self._kept = 0, {}
+        self._number, self._kept = 0, {}
         if file is not None and file.is_file():
             self._kept = dict(json.loads(file.read_text(encoding="utf-8")))
 
@@ -102,14 +95,14 @@ class _Simulator:
     ) -> list[Sample]:
         """Simulates points of the normal space, or random ones."""
         seeds = rng.integers(2**62, size=len(points)).tolist()
-        first, self.number = self.number, self.number + len(points)
+        first, self._number = self._number, self._number + len(points)
         items = [
             (f"{first + i}-{seed}", seed, point)
             for i, (point, seed) in enumerate(zip(points, seeds, strict=True))
         ]
         missing = [item for item in items if item[0] not in self._kept]
         if missing:
-            done = self.number - len(missing)
+            done = self._number - len(missing)
             results = map_items(
                 self._call, missing, make=self._make, num_done=done, **self._options
             )
@@ -185,10 +178,9 @@ def search_and_sample(simulate: Simulate, samples: int, rng: np.random.Generator
     search = _search(simulate, samples, rng)
     num_failed = sum(one.has_failed for one in search.random)
     rate, failures = proportion(num_failed, samples), search.failures
-    plain = float(samples)
+    plain, drawn = float(samples), list[Sample]()
     if failures and num_failed < _SHARE * samples:
         proposal = Proposal.around(search)
-        drawn: list[Sample] = []
         for _ in range(_ROUNDS):
             proposal = proposal.refined([one for one in drawn if one.has_failed])
             points = [proposal.draw(rng) for _ in range(samples // _ROUNDS)]
@@ -200,7 +192,7 @@ def search_and_sample(simulate: Simulate, samples: int, rng: np.random.Generator
     return RareFailures(
         rate=rate,
         search_rate=search.rate,
-        simulations=simulate.number,
+        simulations=len(search.tried) + len(drawn),
         plain_rollouts=plain,
         failures=failures,
         random=search.random,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -98,10 +97,3 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
 def _whole(time_s: float, period_s: float) -> float:
     """The multiple of a period, at least one, that is nearest to a time."""
     return max(round(time_s / period_s), 1) * period_s
-
-
-def shifted_scenario(scenario: Scenario, name: str, variation: PlantVariation) -> Scenario:
-    """The scenario with a further variation."""
-    shifted = copy.copy(scenario)
-    shifted.variations = {**scenario.variations, name: variation}
-    return shifted

@@ -111,7 +111,7 @@ def calibrate(
 
     A score is 1 - probability; NaN counts as most unsafe.
     """
-    score, label = _checked(unsafe_score, is_unsafe)
+    score, label = checked_scores(unsafe_score, is_unsafe)
     above = score_threshold(score, label, miss_rate, confidence=confidence)
     # The same rule for the safe class, with the order of the scores reversed.
     below = -score_threshold(-score, ~label, false_alarm_rate, confidence=confidence, whose="safe")
@@ -167,7 +167,7 @@ def score_threshold(
 
     The k-th lowest is of the unsafe scores, the next lower one of either label.
     """
-    score, label = _checked(unsafe_score, is_unsafe)
+    score, label = checked_scores(unsafe_score, is_unsafe)
     if not np.isfinite(score).any():
         raise ValueError(f"calibration: none of the {len(score)} scores is finite")
     unsafe = np.sort(score[label])
@@ -218,7 +218,7 @@ def episode_scores(
     """
     if kind not in KINDS:
         raise ValueError(f"calibration: unknown kind '{kind}'; the kinds are {list(KINDS)}")
-    score, label = _checked(unsafe_score, segments.is_unsafe)
+    score, label = checked_scores(unsafe_score, segments.is_unsafe)
     if kind == PLAN:
         return score[segments.is_first], label[segments.is_first]
     _, first, member = np.unique(segments.episode, return_index=True, return_inverse=True)
@@ -227,13 +227,14 @@ def episode_scores(
     return worst, label[first]
 
 
-def _checked(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def checked_scores(
+    unsafe_score: np.ndarray, is_unsafe: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scores (N,), infinite where they are NaN, and boolean labels (N,)."""
     score, label = np.asarray(unsafe_score, dtype=float), np.asarray(is_unsafe)
     if label.dtype != bool or score.ndim != 1 or score.shape != label.shape:
-        raise ValueError(
-            f"calibration: expected scores and boolean labels, (N,) both; got {score.shape} and "
-            f"{label.shape} of {label.dtype}"
-        )
+        shapes = f"{score.shape} and {label.shape} of {label.dtype}"
+        raise ValueError(f"expected scores and boolean labels, (N,) both; got {shapes}")
     return np.where(np.isnan(score), math.inf, score), label
 
 

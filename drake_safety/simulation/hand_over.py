@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import math
+from bisect import bisect
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -271,24 +271,23 @@ def _smallest_commands(
 
 def _margins(loop: Any, command: np.ndarray, progress: Callable[[int, int], Any]) -> Finding:
     """The first rung of each ladder on which the robot falls, by bisection."""
-    scenario, num_tried, texts, is_small = loop.scenario, 0, [], False
+    num_tried, texts, is_small = 0, [], False
+
+    def falls(kind: str, plant: PlantVariation) -> bool:
+        nonlocal num_tried
+        progress(num_tried, 3 * len(_CHANGES))
+        num_tried += 1
+        other = loop.scenario.with_variation(kind, plant).make_loop(kind)
+        motion = _moved(other, other.standing_start(), [(0.5, command)], 0.5 + _MARGIN_S)
+        return motion.has_fallen or bool(motion.failure)
+
     for kind, values in _CHANGES.items():
         rungs = [_changed(loop, kind, x) for x in values]
-        low, high = 0, len(rungs)  # Numbers of rungs without a fall.
-        while low < high:
-            progress(num_tried, 3 * len(_CHANGES))
-            middle = (low + high) // 2
-            changed = copy.copy(scenario)
-            changed.variations = {**scenario.variations, kind: rungs[middle][1]}
-            other = changed.make_loop(kind)
-            motion = _moved(other, other.standing_start(), [(0.5, command)], 0.5 + _MARGIN_S)
-            falls = motion.has_fallen or bool(motion.failure)
-            low, high = (low, middle) if falls else (middle + 1, high)
-            num_tried += 1
-        parts = [f"falls at {text}" for text, _ in rungs[low : low + 1]]
-        parts += [f"no fall at {text}" for text, _ in rungs[:low][-1:]]
+        stands = bisect(rungs, False, key=lambda rung: falls(kind, rung[1]))
+        parts = [f"falls at {text}" for text, _ in rungs[stands : stands + 1]]
+        parts += [f"no fall at {text}" for text, _ in rungs[:stands][-1:]]
         texts.append(f"{kind}: {', '.join(parts)}")
-        is_small |= low < _ENOUGH
+        is_small |= stands < _ENOUGH
     progress(num_tried, num_tried)
     return passed(f"{ITEM}, margins", "; ".join(texts), _RANDOM_REMEDY * is_small)
 

@@ -25,8 +25,8 @@ from drake_safety.robots.family import FAMILY, plant_rng
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, port_sizes
 from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.rollouts import (
-    PlantLoops,
     collect_episodes,
+    loops_by_plant,
     run_on_plant,
     seed_random_sources,
 )
@@ -150,14 +150,9 @@ def prepare_recording(
     key = uuid.uuid4().hex
     build = partial(make_diagram, **dict(parameters or {}))
     make: MadeOnce[Any] = MadeOnce(key, CloudPickled(build))
-    if draw_plant is not None:
-        sampler = draw_plant
-
-        def build_on(number: int) -> Diagram:
-            return build(sampler(plant_rng(seed, number)))
-
-        make = MadeOnce(key, partial(PlantLoops, CloudPickled(build_on)))
-    first = make() if draw_plant is None else make().of(1)
+    if draw := draw_plant:
+        make = loops_by_plant(key, lambda number: build(draw(plant_rng(seed, number))))
+    first = make() if draw_plant is None else make()(1)
     warn_of_sampled_ports("record_episodes", [first])
     used, sizes = _used_ports(first, dict(ports or {}))
     # As the hash has always been made of it, so that kept sets stay valid.

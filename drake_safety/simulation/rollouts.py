@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import cache, partial
@@ -73,39 +73,31 @@ def worker_loop(
     return MadeOnce(key, partial(scenario.make_loop, variation, **options))
 
 
-class PlantLoops:
-    """The loops of a process for the plants of a family, each made when it is first needed."""
-
-    def __init__(self, make: Callable[[int], Any]) -> None:
-        self.of = cache(make)  # Called with the number of a plant, from 1 on.
+def loops_by_plant(key: Hashable, make: Callable[[int], Any]) -> MadeOnce[Callable[[int], Any]]:
+    """The loops of a process for a family's plants, from number 1 on, each made at first need."""
+    return MadeOnce(key, partial(cache, CloudPickled(make)))
 
 
 def run_on_plant(
-    run: Callable[..., Episode], info: EpisodesInfo, loops: PlantLoops, index: int
+    run: Callable[..., Episode], info: EpisodesInfo, loops: Callable[[int], Any], index: int
 ) -> Episode:
     """Runs the episode of an index with the loop of its plant."""
     number = info.plant_of(index)
-    return replace(run(loops.of(number), index), plant=number)
-
-
-def _family_loops(scenario: Scenario, seed: int, options: dict[str, Any]) -> MadeOnce[PlantLoops]:
-    def make_loop(number: int) -> ClosedLoop:
-        return scenario.with_plant(seed, number).make_loop(FAMILY, **options)
-
-    files, text = scenario.simulation_hash(FAMILY), scenario.to_yaml()
-    key = (files, text, FAMILY, seed, repr(sorted(options.items())))
-    return MadeOnce(key, partial(PlantLoops, CloudPickled(make_loop)))
+    return replace(run(loops(number), index), plant=number)
 
 
 def _loops(
     scenario: Scenario, variation: str, seed: int, options: dict[str, Any]
 ) -> tuple[MadeOnce[Any], ClosedLoop]:
     """Makes a process's loops, of a variation or of a family's plants; also returns one loop."""
-    if variation == FAMILY:
-        make: MadeOnce[Any] = _family_loops(scenario, seed, options)
-        return make, make().of(1)
-    make = worker_loop(scenario, variation, **options)
-    return make, make()
+    make: MadeOnce[Any] = worker_loop(scenario, variation, **options)
+    if variation != FAMILY:
+        return make, make()
+    make = loops_by_plant(
+        (make.key, seed),
+        lambda number: scenario.with_plant(seed, number).make_loop(FAMILY, **options),
+    )
+    return make, make()(1)
 
 
 def _with_plants(

@@ -121,10 +121,14 @@ class Scenario:
         """The scenario whose variation ``family`` is a random plant of the family."""
         if self.family is None:
             raise ValueError(f"scenario '{self.name}' has no family of plants: add `family:`")
-        drawn = copy.copy(self)
         plant = self.family.plant(self.variation("nominal"), seed, number)
-        drawn.variations = {**self.variations, FAMILY: plant}
-        return drawn
+        return self.with_variation(FAMILY, plant)
+
+    def with_variation(self, name: str, plant: PlantVariation) -> "Scenario":
+        """The scenario with a further variation."""
+        changed = copy.copy(self)
+        changed.variations = {**self.variations, name: plant}
+        return changed
 
     @property
     def robot_name(self) -> str:

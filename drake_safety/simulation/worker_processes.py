@@ -41,14 +41,14 @@ class MadeOnce(Generic[_Made]):
     _made: ClassVar[dict[Hashable, Any]] = {}
 
     def __init__(self, key: Hashable, make: Callable[[], _Made]) -> None:
-        self._key, self.make = key, make
+        self.key, self.make = key, make
 
     def __call__(self) -> _Made:
         """Returns the diagram."""
-        if self._key not in self._made:
+        if self.key not in self._made:
             self._made.clear()
-            self._made[self._key] = self.make()
-        return self._made[self._key]
+            self._made[self.key] = self.make()
+        return self._made[self.key]
 
 
 def map_items(

@@ -132,16 +132,11 @@ class SafetyAssessor(LeafSystem):
             if is_outside(margins):
                 without_alarm = without_alarm.outside(violated(margins))
         prediction = without_alarm.unknown() if self._is_alarmed(context) else without_alarm
-        values = {
-            "safety_probability": [prediction.probability],
-            "belief": prediction.belief,
-            "cause_probability": prediction.cause_probability,
-            "embedding": prediction.embedding,
-            "predicted_margins": prediction.predicted_margins,
-            "novelty": [min(prediction.novelty, _LARGEST_NOVELTY)],
-            "probability_without_alarm": [without_alarm.probability],
+        values = vars(prediction) | {
+            "safety_probability": prediction.probability,
+            "novelty": min(prediction.novelty, _LARGEST_NOVELTY),
+            "probability_without_alarm": without_alarm.probability,
             "belief_without_alarm": without_alarm.belief,
-            "fall_probability": [prediction.fall_probability],
         }
-        for name, value in values.items():
-            discrete_state.set_value(self._outputs[name], value)
+        for name, index in self._outputs.items():
+            discrete_state.set_value(index, np.atleast_1d(values[name]))
