@@ -49,6 +49,19 @@ def numbers(messages):
     return np.array([[getattr(one, name) for name in names] for one in messages])
 
 
+def record(loop, reset, path, ports, duration_s, monitor=None, **options):
+    """Records a motion into a file."""
+    with McapRecorder(loop, path, monitor) as recorder:
+        return simulate(
+            loop,
+            lambda context: reset(context, episode_rng(0, 0)),
+            ports,
+            End(duration_s=duration_s),
+            monitor=recorder,
+            **options,
+        )
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A loop whose plant is not that of training, its motion, and the file of it."""
@@ -62,15 +75,7 @@ def run(tmp_path_factory):
         own = plant.GetMyContextFromRoot(context)
         poses.append([plant.EvalBodyPoseInWorld(own, body).translation() for body in bodies])
 
-    with McapRecorder(loop, path) as recorder:
-        motion = simulate(
-            loop,
-            lambda context: loop.reset_calm(context, episode_rng(0, 0)),
-            PORTS,
-            End(duration_s=1.0),
-            each_row=each_row,
-            monitor=recorder,
-        )
+    motion = record(loop, loop.reset_calm, path, PORTS, 1.0, each_row=each_row)
     return loop, motion, np.array(poses), path
 
 
@@ -161,14 +166,7 @@ def test_a_log_without_a_map_is_refused(tmp_path, monkeypatch, capsys):
 def test_mujoco_has_the_frames_too(tmp_path):
     loop = load_scenario(SCENARIO).make_loop("mujoco", ball=False)
     path = tmp_path / "run.mcap"
-    with McapRecorder(loop, path) as recorder:
-        motion = simulate(
-            loop,
-            lambda context: loop.reset_calm(context, episode_rng(0, 0)),
-            ["plant_state"],
-            End(duration_s=0.1),
-            monitor=recorder,
-        )
+    motion = record(loop, loop.reset_calm, path, ["plant_state"], 0.1)
     found, _ = messages(path)
     base = [t for t in found["/tf"][1][-1].transforms if t.child_frame_id == loop.robot.base]
     place = base[0].transform.translation
@@ -185,14 +183,8 @@ def test_a_file_is_complete_after_ctrl_c_in_a_simulation(tmp_path):
         if context.get_time() > 0.5:
             signal.raise_signal(signal.SIGINT)
 
-    with pytest.raises(KeyboardInterrupt), McapRecorder(loop, path, stop) as recorder:
-        simulate(
-            loop,
-            lambda context: loop.reset(context, episode_rng(0, 0)),
-            ["state"],
-            End(duration_s=2.0),
-            monitor=recorder,
-        )
+    with pytest.raises(KeyboardInterrupt):
+        record(loop, loop.reset, path, ["state"], 2.0, stop)
     found, summary = messages(path)
     assert summary.statistics.message_end_time == 500_000_000
     assert {len(times) for times, _ in found.values()} == {26}
