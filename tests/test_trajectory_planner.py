@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate, plan_shape
+from drake_safety.systems.trajectory_planner import TrajectoryPlanner, interpolate
 from toy_tasks import evaluated
 
 START, GOAL = np.array([0.0, 0.1, 0.4]), np.array([0.2, -0.1, 0.5])
-DETOUR = np.array([-0.1, 0.15, 0.05])
-STEP_S, DURATION_S = 0.1, 3.0
 
 
 def planner_at(time, plan, stance_pose=None, **options):
@@ -86,18 +84,3 @@ def test_a_connected_stance_pose_overrides_the_parameter():
     planner, context = planner_at(0.5, ramp(), np.array([1.0, 0.0, 0.0]))
     planner.GetInputPort("stance_pose").FixValue(context, [5.0, 6.0, 0.0])
     np.testing.assert_allclose(evaluated(planner, context, "desired_output"), [5.5, 7.0, 0.0])
-
-
-def preview_of(num_samples, detour=None):
-    plan = interpolate(START, GOAL, DURATION_S, detour=detour)
-    return plan.vector_values(STEP_S * np.arange(num_samples)).T
-
-
-@pytest.mark.parametrize("num_samples", [12, 31, 40])
-@pytest.mark.parametrize("detour", [None, DETOUR], ids=["straight", "detour"])
-def test_start_goal_and_detour_are_found_though_the_preview_ends_before_or_after_the_plan(
-    num_samples, detour
-):
-    shape = plan_shape(preview_of(num_samples, detour), STEP_S, DURATION_S)
-    expected = [START, GOAL, np.zeros(3) if detour is None else detour]
-    np.testing.assert_allclose(shape, expected, atol=1e-9)

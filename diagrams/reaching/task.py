@@ -16,7 +16,6 @@ from drake_safety.control.mirror import Mirror
 from drake_safety.diagrams.reaching.parameters import ReachingParameters
 from drake_safety.diagrams.reaching.safe_set import ReachingSafeSet
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.segments import Episode
 from drake_safety.plants.obstacles import Clearance
 from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
@@ -25,7 +24,7 @@ from drake_safety.simulation.closed_loop import Purpose
 from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.scenario import Scenario
-from drake_safety.systems.trajectory_planner import interpolate, plan_shape
+from drake_safety.systems.trajectory_planner import interpolate
 from drake_safety.systems.whole_body_controller import WholeBodyController
 
 _USUAL_SHARES = (0.1, 0.5)  # Of the way to a target, in undisturbed motion.
@@ -144,16 +143,6 @@ class Reaching(LeggedLoop):
 
     def _reflected_push(self, push: Push) -> Push:
         return replace(push, force_n=self._reflected(np.array(push.force_n)).tolist())
-
-    def goal_of(self, episode: Episode) -> np.ndarray:
-        """The target of an episode in the world, (3,) [m], up to errors of the feet's placement."""
-        # The preview has no noise, but it may end before the motion does.
-        preview = episode.desired_preview[0].reshape(-1, 3)
-        duration_s = self.scenario.parameters.plan_duration_s
-        goal = self._reflected(plan_shape(preview, self.scenario.preview_step_s, duration_s)[1])
-        # An episode begins on the feet of the standing posture.
-        goal[:2] -= self.kinematics.nominal_base_offset
-        return goal
 
     def reset(
         self, context: Context, rng: np.random.Generator, goal: np.ndarray | None = None

@@ -17,7 +17,6 @@ from drake_safety.diagrams.walking.command_guard import CommandGuard
 from drake_safety.diagrams.walking.parameters import WalkingParameters, profile
 from drake_safety.diagrams.walking.safe_set import WalkingSafeSet
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.segments import Episode
 from drake_safety.models import load_robot
 from drake_safety.plants.physics import Scene
 from drake_safety.plants.pushes import Push
@@ -199,10 +198,6 @@ class Walking(LeggedLoop):
     def sample_push(self, rng: np.random.Generator) -> Push:
         """Samples a push, which no training episode has: they begin in the state after one."""
         return self.scenario.parameters.random_pushes.draw(rng, self.robot.base)
-
-    def goal_of(self, episode: Episode) -> np.ndarray:
-        """First command of an episode, (3,) [m/s, rad/s]."""
-        return episode.desired_output[0]
 
     def command_plan(self, command: np.ndarray) -> PiecewisePolynomial:
         """The plan of a constant command (3,) [m/s, rad/s]."""

@@ -41,7 +41,6 @@ EVALUATION = SeedBlock(
     1_000_000, ("evaluation", "disturbances", "disturbance thresholds", "thresholds")
 )
 CALIBRATION = SeedBlock(2_000_000, ("calibration", "calibration over the family"))
-PLANNING = SeedBlock(3_000_000, ("planning",))
 # Nominal twins have the seed of their actual episodes.
 ADAPTATION = SeedBlock(4_000_000, ("adaptation", "evaluation of the adaptation"))
 WALKING = SeedBlock(6_000_000, ("calibration", "tour", "push", "command"))
@@ -50,7 +49,6 @@ SHIFTS = SeedBlock(8_000_000, ("shifts",))  # Conditions that training does not 
 # Undisturbed motion, from which a monitor learns; fresh one shows how often it alarms.
 MOTION = SeedBlock(9_000_000, ("motion", "motion of the actual robot"))
 FRESH_MOTION = SeedBlock(9_100_000, ("fresh motion",))
-ANOMALIES = SeedBlock(10_000_000, ("unperturbed", "perturbed", "thresholds"))
 GATE = SeedBlock(11_000_000, ("pairs of two loops",))
 RATE = SeedBlock(12_000_000, ("failure rate",))
 PUSHES = SeedBlock(14_000_000, ("pushes",))  # Of the card.

@@ -13,7 +13,6 @@ from pydrake.systems.framework import Context
 from typing_extensions import Protocol, runtime_checkable
 
 if TYPE_CHECKING:
-    from drake_safety.learning.segments import Episode
     from drake_safety.plants.pushes import Push
     from drake_safety.simulation.episode_start import EpisodeStart
 
@@ -40,9 +39,6 @@ class HasGoals(Protocol):
         self, context: Context, goal: np.ndarray, rng: np.random.Generator | None = None
     ) -> None:
         """Starts at rest in the standing posture, without noise, with a plan to a goal (3,)."""
-
-    def goal_of(self, episode: Episode) -> np.ndarray:
-        """Goal of an episode's plan, in the world, (3,) [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)

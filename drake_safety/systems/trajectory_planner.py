@@ -40,18 +40,6 @@ def interpolate(
     return PiecewisePolynomial([segment], [start_time_s, start_time_s + duration_s])
 
 
-def plan_shape(preview: np.ndarray, step_s: float, duration_s: float) -> np.ndarray:
-    """Start, goal and detour, (3, n_z), of a plan of :func:`interpolate` from its first samples."""
-    check_times("plan", step_s=step_s)
-    times_s = step_s * np.arange(len(preview))
-    motion = interpolate(np.zeros(1), np.ones(1), duration_s)
-    progress = motion.vector_values(times_s.tolist()).ravel()
-    # Shares of start, goal and detour in each sample; see `interpolate`.
-    shares = np.stack([1 - progress, progress, 4 * progress * (1 - progress)], axis=1)
-    shape, *_ = np.linalg.lstsq(shares, preview, rcond=None)
-    return shape
-
-
 def to_world(stance_pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Transforms points (..., 3) [m] from the stance frame ``[x, y, yaw]`` to the world."""
     x, y, yaw = stance_pose.tolist()
