@@ -150,8 +150,9 @@ def prepare_recording(
     key = uuid.uuid4().hex
     build = partial(make_diagram, **dict(parameters or {}))
     make: MadeOnce[Any] = MadeOnce(key, CloudPickled(build))
-    if draw := draw_plant:
-        make = loops_by_plant(key, lambda number: build(draw(plant_rng(seed, number))))
+    if draw_plant is not None:
+        sampler = draw_plant
+        make = loops_by_plant(key, lambda number: build(sampler(plant_rng(seed, number))))
     first = make() if draw_plant is None else make()(1)
     warn_of_sampled_ports("record_episodes", [first])
     used, sizes = _used_ports(first, dict(ports or {}))
