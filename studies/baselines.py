@@ -176,22 +176,9 @@ def classifier_scorers(
 
 
 def auc_difference(
-    unsafe_score: np.ndarray,
-    other_score: np.ndarray,
-    is_unsafe: np.ndarray,
-    episode: np.ndarray,
-    *,
-    bootstrap: Bootstrap | None = None,
-) -> Estimate:
-    """The AUC of one scorer minus that of another on the same samples, from paired resamples."""
-    difference = auc_difference_of(unsafe_score, other_score, is_unsafe)
-    return (bootstrap or Bootstrap()).over_episodes(difference, episode)
-
-
-def auc_difference_of(
     unsafe_score: np.ndarray, other_score: np.ndarray, is_unsafe: np.ndarray
 ) -> Callable[[np.ndarray], float]:
-    """The difference of `auc_difference` as a function of the samples' weights, (N,)."""
+    """The AUC of one scorer minus that of another, as a function of samples' weights, (N,)."""
 
     def difference(weight: np.ndarray) -> float:
         return area_under_curve(unsafe_score, is_unsafe, weight) - area_under_curve(
@@ -222,7 +209,7 @@ def classifier_differences(
         own = scores[gamma.name][rows]
         for kind in KINDS:
             others = [one[rows] for name, one in scores.items() if name.startswith(kind)]
-            each = [auc_difference_of(own, other, label) for other in others]
+            each = [auc_difference(own, other, label) for other in others]
             found[f"difference.{place}", kind, "auc"] = Bootstrap().over_episodes(
                 partial(_mean_of, each), episode
             )

@@ -34,9 +34,6 @@ from drake_safety.simulation.worker_processes import Progress, map_items
 
 EpisodesOption = Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)]
 CalibrationOption = Annotated[int, typer.Option(help="Other ones, for thresholds.", min=20)]
-SeedOption = Annotated[
-    int, typer.Option(help="First seed of the fresh ones: that of `evaluate` by default.")
-]
 ReleaseOption = Annotated[
     bool, typer.Option("--release", help="Use the release's seeds: once, for published figures.")
 ]
