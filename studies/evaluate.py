@@ -58,7 +58,6 @@ from studies.harness import CalibrationOption, EpisodesOption, ReleaseOption
 from studies.throws import classifier_rules
 
 _CLASSIFIER_SEEDS = (0, 1, 2)
-_PLANT = "actual"
 _PROGRAM = "python -m studies"
 
 

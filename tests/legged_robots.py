@@ -153,9 +153,6 @@ def edited(path, **changes):
     return path
 
 
-ROBOT_NAMES = ("laikago", "hexapod", "biped")
-
-
 @functools.cache
 def robot_model(name: str) -> RobotModel:
     """A robot of the package by name, or one of the made-up ones."""

@@ -9,7 +9,6 @@ import naive
 from drake_safety.evaluation.paired_test import _SHARES, _WEIGHTS, betting_log_e, interim_estimate
 
 ALPHA = 0.05
-OUTCOMES = np.array([-1.0, 0.0, 1.0])
 NUM_REPLAYS = 500
 
 
