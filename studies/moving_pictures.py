@@ -165,7 +165,8 @@ def first_saved(
         told = [(start_s, why), (start_s + _ACTS_S, acts), (end_s, "stands")]
         falls = Take("without recovery", fallen, [(fallen.fall_time_s, "falls")])
         return one, [falls, Take("with recovery", saved, told)]
-    raise ValueError(f"no disturbance of '{guarded.scenario.name}' calls for recovery")
+    name = guarded.scenario.name
+    raise ValueError(f"'{name}': after no disturbance recovery saves it and Γ comes back")
 
 
 def save_moving_picture(
