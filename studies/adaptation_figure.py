@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -33,14 +35,19 @@ def adaptation_figure(prior: SafetyAssessment, adapted: SafetyAssessment, words:
         for number, cell in enumerate(np.argsort(-change)[:_NUM_MARKED].tolist(), start=1):
             corner = grid.centres[cell] - 0.5 * grid.cell_length
             for axes in panels:
-                look = {"fill": False, "edgecolor": style.INK, "linewidth": 2.0}
-                axes.add_patch(Rectangle(corner, grid.cell_length, grid.cell_length, **look))
-                look = {"boxstyle": "circle,pad=0.15", "fc": "white", "ec": style.INK, "lw": 0.8}
-                place = {"ha": "center", "va": "center", "fontsize": 8}
+                edge: dict[str, Any] = {"fill": False, "edgecolor": style.INK, "linewidth": 2.0}
+                axes.add_patch(Rectangle(corner, grid.cell_length, grid.cell_length, **edge))
+                look: dict[str, Any] = {
+                    "boxstyle": "circle,pad=0.15",
+                    "fc": "white",
+                    "ec": style.INK,
+                    "lw": 0.8,
+                }
+                place: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8}
                 axes.text(*grid.centres[cell], f"{number}", bbox=look, **place)
             lines.append(f"{number}: {before[cell]:.2f} → {after[cell]:.2f}")
         panels[1].set_xlabel(",  ".join(lines))
         label = "safe share of a cell's belief; hatched: don't know"
         draw_bar(fig, panels, label)
-        show_beliefs(panels, grid, empty[0] & empty[1], room=1.4)
+        show_beliefs(fig, panels, grid, empty[0] & empty[1], room=1.4)
     return fig

@@ -46,7 +46,7 @@ def path_figure(
     with drawing_style():
         fig = new_figure(PAGE_WIDTH, PAGE_WIDTH)
         upper, lower = fig.subplots(2, 1, height_ratios=(2.0, 1.0))
-        show_beliefs([upper], grid, is_empty, room=3.4)
+        show_beliefs(fig, [upper], grid, is_empty, room=3.4)
         draw_values(upper, grid, safe_share(cells), is_empty)
         draw_bar(fig, upper, "safe share of a cell's belief")
         upper.plot(*points[known].T, "o", color="white", mec=INK, mew=0.5, markersize=3.5)

@@ -258,9 +258,10 @@ def _timeline(loop: Any, shown: _Shown) -> Figure:
             if at_s - max(instants, default=0.0) > _AFTER_EVENT_S:
                 instants.append(at_s)
         times_s = still_times(motion.time_s, instants[:_MOST_EVENTS], num_stills=_NUM_STILLS)
-        motion_and_times = motion.time_s, stack_positions(loop, states), times_s[-_MOST_STILLS:]
-        size = {"width": _STILL_PIXELS, "height": _STILL_PIXELS}
-        options["stills"] = render_stills(loop, *motion_and_times, **size)
+        shown_s, positions = times_s[-_MOST_STILLS:], stack_positions(loop, states)
+        options["stills"] = render_stills(
+            loop, motion.time_s, positions, shown_s, width=_STILL_PIXELS, height=_STILL_PIXELS
+        )
     return timeline_figure(
         motion.time_s,
         motion["safety_probability"][:, 0],

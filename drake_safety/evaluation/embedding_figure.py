@@ -45,11 +45,13 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
             _draw_causes(last, grid, cells, assessment.info_.constraint_names)
         label = "safe: 1 − λ of a segment, share of a cell's belief; hatched: don't know"
         draw_bar(fig, panels, label)
-        show_beliefs(panels, grid, is_empty, room=1.2 + 0.3 * has_causes)
+        show_beliefs(fig, panels, grid, is_empty, room=1.2 + 0.3 * has_causes)
     return fig
 
 
-def show_beliefs(panels: Sequence[Axes], grid: Grid, is_empty: np.ndarray, *, room: float) -> None:
+def show_beliefs(
+    fig: Figure, panels: Sequence[Axes], grid: Grid, is_empty: np.ndarray, *, room: float
+) -> None:
     """Limits panels side by side to the cells that are not empty, (R*R,), and a cell around them.
 
     The figure becomes as high as the panels, with room [inches] for all else.
@@ -62,7 +64,7 @@ def show_beliefs(panels: Sequence[Axes], grid: Grid, is_empty: np.ndarray, *, ro
     for axes in panels:
         axes.set(xlim=(x0, x1), ylim=(y0, y1))
     height = style.PAGE_WIDTH / len(panels) * (y1 - y0) / (x1 - x0)
-    axes.figure.set_size_inches(style.PAGE_WIDTH, height + room)
+    fig.set_size_inches(style.PAGE_WIDTH, height + room)
 
 
 def draw_values(
@@ -88,7 +90,8 @@ def _draw_segments(axes: Axes, gamma: SafetyAssessment, episodes: Episodes) -> N
     result = gamma.predict(segments.state, segments.desired_preview, segments.features)
     look: dict[str, Any] = {"cmap": _SAFETY, "vmin": 0.0, "vmax": 1.0, "alpha": 0.85}
     look |= {"s": 6.0, "linewidths": 0.0, "rasterized": True}
-    axes.scatter(*result.embedding.T, c=1.0 - segments.score, **look)
+    x, y = result.embedding.T
+    axes.scatter(x, y, c=1.0 - segments.score, **look)
     axes.set_title(f"{len(segments)} segments")
 
 
