@@ -6,6 +6,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,6 +18,7 @@ from drake_safety.assessments import shipped_folder
 from drake_safety.cli.console import say
 from drake_safety.cli.run import run
 from drake_safety.cli.training_folder import MODES, load_assessment
+from drake_safety.diagrams.balancing.throw_study import PAPER_THRESHOLD
 from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.figure_style import save
@@ -26,11 +28,13 @@ from drake_safety.evaluation.push_figure import push_figure
 from drake_safety.evaluation.results import Results
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import DEMONSTRATION
+from drake_safety.simulation.feedback import run_pairs
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
+from studies.adaptation_figure import adaptation_figure
 from studies.documents import CARDS, cards_of
 from studies.glance_figures import blocks, glance
-from studies.moving_pictures import recovery, walking
+from studies.moving_pictures import recovery
 from studies.path_figure import path_figure
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -38,8 +42,9 @@ _SEED = DEMONSTRATION.first
 _REACHING: dict[str, Any] = {"target": "blue_box", "push": ["torso"], "force": True}
 _WALKING: dict[str, Any] = {"target": "0.5 0 0", "push": ["side"], "force": True}
 _WALKING |= {"variation": "nominal"}  # On another one the monitor may alarm before the push.
+_SHOWN, _PAIRS = 300, 160  # Episodes in the embedding, and pairs of feedback.
 _ELSEWHERE = (
-    "adaptation.png and region.png, of commit f358026; compose.svg, which "
+    "compose.svg, which "
     "`python docs/generator/diagram_picture.py` draws by GraphViz; alarms_*.png of "
     "`python -m studies walking`"
 )
@@ -52,8 +57,10 @@ def _of_run(picture: str, scenario: str, folder: Path, **options: Any) -> Path:
 
 
 def _path(folder: Path) -> Figure:
-    """Two balls thrown at Laikago, in the plane of the paper's Γ."""
+    """Two balls thrown at Laikago, in the plane of the paper's Γ, with the paper's threshold."""
     scenario = load_scenario("laikago_balancing")
+    recovery = replace(scenario.parameters.recovery, threshold=PAPER_THRESHOLD)
+    scenario.parameters = replace(scenario.parameters, recovery=recovery)
     gamma = load_assessment(shipped_folder(scenario.name), "paper")
     throws = scenario.parameters.demonstration
     motion = run_throw(
@@ -69,14 +76,21 @@ def _path(folder: Path) -> Figure:
     events |= {f"recovery {i}": begin_s for i, begin_s in enumerate(steps, start=1)}
     is_known = ~is_unknown(motion["belief"], gamma.parameters.initial_uncertainty)
     curve = motion.time_s, motion["embedding"], is_known, motion["safety_probability"][:, 0]
-    threshold = scenario.parameters.recovery.threshold
-    return path_figure(gamma, *curve, threshold, {"start": 0.0} | events)
+    return path_figure(gamma, *curve, PAPER_THRESHOLD, {"start": 0.0} | events)
 
 
 def _embedding(folder: Path) -> Figure:
     scenario = load_scenario("atlas_reaching")
-    episodes = run_episodes(scenario, 100, seed=_SEED, **scenario.options_for("evaluation"))
+    episodes = run_episodes(scenario, _SHOWN, seed=_SEED, **scenario.options_for("evaluation"))
     return embedding_figure(load_assessment(shipped_folder(scenario.name), MODES[0]), episodes)
+
+
+def _adaptation(folder: Path) -> Figure:
+    """Laikago with a payload, in mode `paper`, whose grid alone decides."""
+    scenario = load_scenario("laikago_balancing")
+    prior = load_assessment(shipped_folder(scenario.name), "paper")
+    pairs = run_pairs(scenario, _PAIRS, variation="payload").feedback()
+    return adaptation_figure(prior, prior.adapt(pairs), f"{len(pairs)} pairs with a payload")
 
 
 def _shifts(name: str, folder: Path) -> Figure:
@@ -115,12 +129,12 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
     "glance": glance,
     "blocks": blocks,
     "recovery": recovery,
-    "walking": walking,
     "timeline": partial(_of_run, "timeline.png", "laikago_balancing", push=["ball"]),
     "path": _path,
     "reaching": partial(_of_run, "timeline.png", "atlas_reaching", **_REACHING),
     "walking_timeline": partial(_of_run, "timeline.png", "g1_walking", **_WALKING),
     "embedding": _embedding,
+    "adaptation": _adaptation,
     "adaptation_study": _adaptation_study,
     "shifts_laikago": partial(_shifts, "laikago"),
     "shifts_atlas": partial(_shifts, "atlas"),

@@ -14,7 +14,7 @@ from matplotlib.patches import FancyBboxPatch
 from drake_safety.assessments import load_assessment
 from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.evaluation import figure_style as style
-from drake_safety.evaluation.embedding_figure import draw_values
+from drake_safety.evaluation.embedding_figure import draw_bar, draw_values
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import SAFE, UNCERTAINTY
 from drake_safety.learning.seeds import DEMONSTRATION
@@ -34,8 +34,8 @@ def glance(folder: Path) -> Figure:
     scenario, gamma = load_scenario("laikago_balancing"), load_assessment("laikago_balancing")
     episodes = run_episodes(scenario, _EPISODES, seed=DEMONSTRATION.first)
     with style.drawing_style():
-        fig = style.new_figure(14.5, 3.4)
-        rollouts, plane, grid, verdicts = fig.subplots(1, 4, width_ratios=(1.1, 1.0, 1.15, 1.3))
+        fig = style.new_figure(style.PAGE_WIDTH, 4.8)
+        rollouts, plane, grid, verdicts = fig.subplots(2, 2).ravel()
         for episode in episodes[:_LINES]:
             margin = episode.margins.min(axis=1)
             colour = _COLOURS[not episode.is_safe]
@@ -51,14 +51,14 @@ def glance(folder: Path) -> Figure:
         plane.scatter(x[order], y[order], c=colours[order], s=5.0, linewidths=0.0, alpha=0.7)
         half = gamma.grid_.half_width
         plane.set(title="2  Segments in a plane", xticks=[], yticks=[], aspect="equal")
-        plane.set(xlim=(-half, half), xlabel="by Ψ: alike means close")
+        plane.set_xlabel("by Ψ: alike means close")
         cells = gamma.beliefs_[0]
         is_empty, most = cells[:, UNCERTAINTY] >= 1.0, 1.0 - gamma.parameters.initial_uncertainty
-        draw_values(fig, grid, gamma.grid_, cells[:, SAFE], is_empty, "belief: safe", most)
+        draw_values(grid, gamma.grid_, cells[:, SAFE], is_empty, most)
+        draw_bar(fig, grid, "belief: safe", most)
         grid.set(title="3  Beliefs on a grid", xlabel="hatched: don't know")
         for axes in (plane, grid):
-            axes.set_ylim(-0.6 * half, 0.6 * half)
-            axes.set_anchor("N")
+            axes.set(xlim=(-half, half), ylim=(-0.6 * half, 0.6 * half))
         _draw_verdicts(verdicts, scenario, gamma)
     return fig
 

@@ -1,9 +1,8 @@
-"""The moving pictures of README and docs: one disturbance without and with recovery, and Γ."""
+"""The moving picture of README and docs: a ball without and with recovery, and Γ."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,14 +17,12 @@ from drake_safety.assessments import shipped_folder
 from drake_safety.cli.training_folder import MODES, load_assessment
 from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.evaluation import figure_style as style
-from drake_safety.evaluation.stills import SUPERSAMPLING, StillCamera, stack_positions
+from drake_safety.evaluation.stills import StillCamera, stack_positions
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.plants.balls import Throw
-from drake_safety.plants.pushes import Push
 from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.motion import Motion
-from drake_safety.simulation.rollouts import run_to_goal
 from drake_safety.simulation.scenario import load_scenario
 
 _WIDTH, _PICTURE, _CAPTION, _CURVE = 8.8, 3.7, 0.45, 1.5  # [inches]
@@ -34,7 +31,6 @@ _STEP_S, _FRAME_MS, _EVENT_MS, _END_MS = 0.06, 120, 1000, 2500  # At half of rea
 _BEFORE_S, _AFTER_S = 0.32, 0.6  # Shown before the disturbance and after the last event.
 _ACTS_S = 0.12  # From the trigger until the recovery is seen.
 _NUM_COLOURS = 127
-_ARROW_M = 0.5
 _GROUND, _LINES = Rgba(0.78, 0.80, 0.83), Rgba(0.55, 0.58, 0.62)
 _LINE_M, _TILE_M, _NUM_LINES = 0.012, 0.5, 33
 _PORTS = ("safety_probability", "belief")
@@ -44,7 +40,7 @@ _COLOURS = (style.INK, style.UNSAFE_COLOUR, style.RECOVERY_COLOUR, style.SAFE_CO
 
 
 class SceneCamera(StillCamera):
-    """A camera that also draws the ground, and knows where bodies are in its last still."""
+    """A camera that also draws the ground."""
 
     def draw_ground(self) -> None:
         """Adds a wide ground, with lines by which motions of the robot are seen."""
@@ -65,17 +61,6 @@ class SceneCamera(StillCamera):
         for at in _TILE_M * (np.arange(_NUM_LINES) - _NUM_LINES // 2):
             draw([length, _LINE_M, 0.002], [0.0, at, 0.0], _LINES, f"line along x at {at}")
             draw([_LINE_M, length, 0.002], [at, 0.0, 0.0], _LINES, f"line along y at {at}")
-
-    def position(self, body: str) -> np.ndarray:
-        """Centre of mass of a body of the robot in the last still, in the world, (3,) [m]."""
-        found, context = self._plant.GetBodyByName(body, self._instance), self._plant_context
-        return found.EvalPoseInWorld(context) @ found.CalcCenterOfMassInBodyFrame(context)
-
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Column and row of points (N, 3) of the world [m] in the last still, (N, 2)."""
-        intrinsics = self._camera.core().intrinsics().intrinsic_matrix()
-        seen = intrinsics @ self._X_WC.inverse().multiply(points.T)
-        return (seen[:2] / seen[2]).T / SUPERSAMPLING
 
 
 class Take(NamedTuple):
@@ -102,25 +87,6 @@ def recovery(folder: Path) -> Path:
     ball, takes = first_saved(loops, balls, run, "steps until it stands")
     hit = ball.time_s, f"hit by a ball of 3 kg at {ball.speed_m_s:g} m/s"
     return save_moving_picture(guarded, takes, hit, folder / "recovery.gif")
-
-
-def walking(folder: Path) -> Path:
-    """A walking G1 and the strongest push from a side that makes it fall without recovery only."""
-    plain, guarded = loops = _loops("g1_walking", "nominal")
-    parameters = plain.scenario.parameters
-    side = parameters.pushes["side"]
-    pushes = [
-        replace(side, time_s=1.0, force_n=[share * force for force in side.force_n])
-        for share in np.linspace(1.0, 0.3, 15)
-    ]
-
-    def run(loop: Any, push: Push, ports: Sequence[str]) -> Motion:
-        command = np.array(parameters.named_commands["forward"])
-        return run_to_goal(loop, command, push=push, ports=ports, **_OPTIONS)
-
-    push, takes = first_saved(loops, pushes, run, "stops walking")
-    hit = push.time_s, f"pushed with {push.strength_n:.0f} N for {push.duration_s:g} s"
-    return save_moving_picture(guarded, takes, hit, folder / "walking.gif", push)
 
 
 def _loops(name: str, variation: str = "actual", **options: Any) -> list[Any]:
@@ -163,7 +129,6 @@ def save_moving_picture(
     takes: Sequence[Take],
     hit: tuple[float, str],
     path: Path,
-    push: Push | None = None,
 ) -> Path:
     """Writes a GIF of runs side by side, with the probability of the last one below."""
     takes = [one._replace(captions=[hit, *one.captions]) for one in takes]
@@ -180,8 +145,7 @@ def save_moving_picture(
         canvas, frames = FigureCanvasAgg(fig), []
         place = 1.0 - _PICTURE / height, share - 0.004, _PICTURE / height
         updates = [
-            _draw_scene(fig.add_axes((i * share, *place)), loop, one, push)
-            for i, one in enumerate(takes)
+            _draw_scene(fig.add_axes((i * share, *place)), loop, one) for i, one in enumerate(takes)
         ]
         curve = fig.add_axes((0.04, 0.42 / height, 0.82, (_CURVE - 0.75) / height))
         curve.set_xlim(begin_s, end_s)
@@ -205,9 +169,7 @@ def save_moving_picture(
     return path
 
 
-def _draw_scene(
-    axes: Any, loop: LeggedLoop, take: Take, push: Push | None
-) -> Callable[[float], None]:
+def _draw_scene(axes: Any, loop: LeggedLoop, take: Take) -> Callable[[float], None]:
     """Prepares the picture of a run, with captions below; returns what draws an instant [s]."""
     motion = take.motion
     states = {loop.robot.name: motion["plant_state"]}
@@ -223,20 +185,12 @@ def _draw_scene(
     place: dict[str, Any] = {"transform": axes.transAxes, "ha": "center", "weight": "bold"}
     axes.text(0.5, 0.97, take.title, va="top", fontsize=13, **place)
     words = axes.text(0.5, -0.03, "", va="top", fontsize=12.5, **place)
-    look = {"arrowstyle": "-|>,head_width=0.5,head_length=0.9", "color": style.BALL_COLOUR}
-    arrow = axes.annotate("", (0, 0), (0, 0), arrowprops=look | {"lw": 5.0})
 
     def update(instant: float) -> None:
         picture.set_data(render(int(np.abs(motion.time_s - instant).argmin())))
         count = sum(time_s <= instant + 0.01 for time_s, _ in take.captions)
         words.set_text(take.captions[count - 1][1] if count else "")
         words.set_color(_COLOURS[count - 1])
-        arrow.set_visible(False)
-        if push is not None and 0.0 <= instant - push.time_s <= push.duration_s:
-            head = camera.position(push.body)
-            tail = head - _ARROW_M * np.array(push.force_n) / push.strength_n
-            arrow.xy, arrow.xyann = camera.project(np.array([head, tail]))
-            arrow.set_visible(True)
 
     return update
 

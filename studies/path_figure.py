@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from drake_safety.evaluation.embedding_figure import draw_values
+from drake_safety.evaluation.embedding_figure import draw_bar, draw_values, show_beliefs
 from drake_safety.evaluation.figure_style import (
     INK,
+    PAGE_WIDTH,
     SAFE_COLOUR,
     UNKNOWN_COLOUR,
     UNSAFE_COLOUR,
@@ -43,28 +44,26 @@ def path_figure(
     is_empty = cells[:, UNCERTAINTY] >= 1.0
     known = np.flatnonzero(is_known)
     with drawing_style():
-        fig = new_figure(12.0, 4.4)
-        left, right = fig.subplots(1, 2, width_ratios=(1.25, 1.0))
-        draw_values(fig, left, grid, safe_share(cells), is_empty, "safe share of a cell's belief")
-        left.plot(*points[known].T, "o", color="white", mec=INK, mew=0.5, markersize=3.5)
+        fig = new_figure(PAGE_WIDTH, PAGE_WIDTH)
+        upper, lower = fig.subplots(2, 1, height_ratios=(2.0, 1.0))
+        show_beliefs(fig, [upper], grid, is_empty, room=3.4)
+        draw_values(upper, grid, safe_share(cells), is_empty)
+        draw_bar(fig, upper, "safe share of a cell's belief")
+        upper.plot(*points[known].T, "o", color="white", mec=INK, mew=0.5, markersize=3.5)
         for a, b in pairwise(known.tolist()):
             if math.dist(points[a], points[b]) > grid.cell_length:
                 style: dict[str, Any] = {"linestyle": "-" if b == a + 1 else (0, (1, 1.5))}
                 style |= {"arrowstyle": "-|>", "color": INK, "linewidth": 1.3, "mutation_scale": 12}
                 style["connectionstyle"] = "arc3,rad=0.15"
-                left.annotate("", points[b], points[a], arrowprops=style)
-        shown = np.vstack([grid.centres[~is_empty], points[known]])
-        low, high = shown.min(axis=0) - grid.cell_length, shown.max(axis=0) + grid.cell_length
-        left.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        left.set_title("Path through the embedding")
-        # Below the numbers, which stand around the path.
-        left.set_xlabel("hatched, and dotted arrows: don't know", labelpad=16.0)
+                upper.annotate("", points[b], points[a], arrowprops=style)
+        upper.set_title("Path through the embedding")
+        upper.set_xlabel("hatched, and dotted arrows: don't know")
         wait: dict[str, Any] = {"step": "post", "color": UNKNOWN_COLOUR, "linewidth": 0}
-        right.fill_between(time_s, -0.04, 1.0, where=~np.asarray(is_known), **wait)
-        right.step(time_s, probability, where="post", color=SAFE_COLOUR, linewidth=2.0)
-        draw_threshold(right, threshold, UNSAFE_COLOUR)
-        right.set(title="Probability over time, grey: don't know", ylim=(-0.04, 1.22))
-        right.set_yticks([0.0, 0.5, 1.0])
+        lower.fill_between(time_s, -0.04, 1.0, where=~np.asarray(is_known), **wait)
+        lower.step(time_s, probability, where="post", color=SAFE_COLOUR, linewidth=2.0)
+        draw_threshold(lower, threshold, UNSAFE_COLOUR)
+        lower.set(title="Probability over time, grey: don't know", ylim=(-0.04, 1.22))
+        lower.set_yticks([0.0, 0.5, 1.0])
         ordered = sorted(events.items(), key=lambda event: event[1])
         box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": INK, "lw": 0.8}
         number_style: dict[str, Any] = {"fontsize": 9, "ha": "center", "va": "center", "bbox": box}
@@ -76,11 +75,11 @@ def path_figure(
             beside["xytext"] = 38.0 * math.cos(angle), 38.0 * math.sin(angle)
             after = known[time_s[known] >= at_s - 1e-9]
             if len(after):
-                left.annotate(f"{number}", points[after[0]], **beside, **number_style)
-                left.plot(*points[after[0]], "o", color=INK, markersize=5)
-            right.axvline(at_s, color=INK, linewidth=0.6, alpha=0.5)
+                upper.annotate(f"{number}", points[after[0]], **beside, **number_style)
+                upper.plot(*points[after[0]], "o", color=INK, markersize=5)
+            lower.axvline(at_s, color=INK, linewidth=0.6, alpha=0.5)
             # Alternating heights, as events may be close together.
-            right.annotate(f"{number}", (at_s, 1.07 + 0.09 * (number % 2)), **number_style)
+            lower.annotate(f"{number}", (at_s, 1.07 + 0.09 * (number % 2)), **number_style)
         words = [f"{number} {name}" for number, (name, _) in enumerate(ordered, start=1)]
-        right.set_xlabel(f"time [s]\n{', '.join(words)}")
+        lower.set_xlabel(f"time [s]\n{', '.join(words)}")
     return fig

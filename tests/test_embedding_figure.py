@@ -1,12 +1,10 @@
-from copy import copy
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from drake_safety.evaluation.embedding_figure import embedding_figure
-from drake_safety.learning.beliefs import from_scores, fuse_cells
+from drake_safety.learning.beliefs import UNCERTAINTY, from_scores, fuse_cells
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import split
 from drake_safety.learning.training_scores import TrainingScores
@@ -45,21 +43,19 @@ def fresh():
     return make_episodes(20, seed=5)
 
 
-def test_the_map_shows_every_segment_at_its_point_and_every_count(assessment, fresh):
+def test_the_map_shows_every_segment_at_its_point_and_the_cells_that_hold_a_belief(
+    assessment, fresh
+):
     left, middle, *_ = embedding_figure(assessment, fresh).axes
     segments = split(fresh, stride=5, discount=0.99)
     drawn = left.collections[-1]
     order = np.lexsort(drawn.get_offsets().T)
     expected = np.lexsort(segments.state[:, :2].T)
     np.testing.assert_allclose(drawn.get_offsets()[order], segments.state[expected, :2], rtol=1e-12)
-    np.testing.assert_allclose(np.sort(drawn.get_array()), np.sort(segments.score))
-    points = assessment.training_.points[0]
-    inside = np.abs(points).max(axis=1) < assessment.grid_.half_width
-    assert sum(int(count) for count in [text.get_text() for text in middle.texts]) == inside.sum()
-
-
-def test_an_assessment_from_which_no_segment_was_left_out_has_the_same_map(assessment, fresh):
-    texts = [text.get_text() for text in embedding_figure(assessment, fresh).axes[1].texts]
-    whole = copy(assessment)
-    whole.training_ = replace(assessment.training_, count=None)
-    assert [one.get_text() for one in embedding_figure(whole, fresh).axes[1].texts] == texts
+    np.testing.assert_allclose(np.sort(drawn.get_array()), np.sort(1.0 - segments.score))
+    centres = assessment.grid_.centres[assessment.beliefs_[0][:, UNCERTAINTY] < 1.0]
+    (x0, x1), (y0, y1) = middle.get_xlim(), middle.get_ylim()
+    assert (([x0, y0] < centres) & (centres < [x1, y1])).all()
+    assert {f"{len(segments)} segments", "Beliefs of the cells"} == {
+        one.get_title(loc="left") for one in (left, middle)
+    }

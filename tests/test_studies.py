@@ -141,13 +141,6 @@ def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypat
     assert [path.name for path in tmp_path.iterdir()] == ["adaptation_study.png"]
     assert study(monkeypatch, "figures", "nothing", "--out", tmp_path) == 2
     there = {path.stem for path in (ROOT / "docs/pictures").iterdir()}
-    assert there == {
-        *PICTURES,
-        "adaptation",
-        "region",
-        "path",
-        "compose",
-        "alarms_go2_walking",
-    }
+    assert there == {*PICTURES, "compose", "alarms_go2_walking"}
     text = "".join(path.read_text() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
     assert set(re.findall(r"pictures/(\w+)\.", text)) == there

@@ -28,22 +28,24 @@ def run():
 
 def test_names_of_events_are_above_the_curve_and_cover_neither_another_nor_its_instant(run):
     throws = [SimpleNamespace(time_s=at_s, mass_kg=3.0, speed_m_s=8.0) for at_s in (0.3, 1.9)]
-    events = {"trigger_times_s": [1.96], "recovery_intervals_s": [(1.96, 2.0)]}
+    events = {"trigger_times_s": [1.96], "recovery_intervals_s": [(1.97, 2.0)]}
     fig = timeline_figure(**run | {"throws": throws} | events)
     fig.draw_without_rendering()
     gamma = fig.axes[2]
-    boxes = [
-        text.get_window_extent().transformed(gamma.transData.inverted())
-        for text in gamma.texts
-        if not text.get_text().startswith("threshold")
-    ]
+    to_data = gamma.transData.inverted()
+    names = [one for one in gamma.texts if not one.get_text().startswith("threshold")]
+    boxes = [one.get_window_extent().transformed(to_data) for one in names]
     assert len(boxes) == 4
+    lines = np.concatenate([one.get_segments() for one in gamma.collections if one.get_segments()])
+    assert sorted(lines[:, 0, 0]) == [0.3, 1.9, 1.96, 1.97]
     for i, box in enumerate(boxes):
         assert box.y0 > 1.0
         assert box.y1 < gamma.get_ylim()[1]
-        assert gamma.get_xlim()[0] <= box.x0
-        assert box.x1 <= gamma.get_xlim()[1]
+        assert fig.bbox.x0 < gamma.transData.transform((box.x1, 0.0))[0] < fig.bbox.x1
         assert not any(box.overlaps(other) for other in boxes[i + 1 :])
+        # No line crosses it.
+        crosses = (box.x0 <= lines[:, 0, 0]) & (lines[:, 0, 0] <= box.x1)
+        assert not (crosses & (lines[:, 1, 1] >= box.y0)).any()
 
 
 def test_the_timeline_s_belief_is_stacked_to_one_and_margins_are_in_centimetres(run):

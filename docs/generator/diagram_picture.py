@@ -9,20 +9,25 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from itertools import zip_longest
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PICTURE = ROOT / "docs" / "pictures" / "compose.svg"
 _NODE = re.compile(r"^(s\d+) \[shape=none, border=0, label=<\n(.*?)>\];$", re.DOTALL | re.MULTILINE)
 _PORT = re.compile(r'<TD PORT="([uy]\d+)"[^>]*>(?:<FONT[^>]*>)?(\w+)')
-_EDGE = re.compile(r"^(s\d+):(y\d+):e -> (s\d+(?:out)?):(u?\d+):w", re.MULTILINE)
+_EDGE = re.compile(r"^(s\d+):(y\d+):e -> (s\d+):(u\d+):w", re.MULTILINE)
+_GAMMA = "#e6eef8"  # Colour of Γ in the block diagram too.
+_TABLE = 'BORDER="0" CELLSPACING="0" CELLPADDING="3"'
+_HEAD = """digraph {
+bgcolor=white; nodesep=0.2; ranksep=0.5
+node [fontname="Helvetica", fontsize=12]; edge [color="#5a626d", arrowsize=0.7]"""
 
 
 def connected(graph: str) -> str:
     """A diagram's GraphViz string without the ports that nothing is connected to.
 
-    Systems stand in the order in which they were added. The SceneGraph is left out.
+    Systems stand below each other in the order in which they were added: inputs above the name,
+    outputs below. The SceneGraph and the diagram's own ports are left out.
     """
     (scene,) = re.findall(r"^(s\d+) .*\n.*\n.*\n<B>SceneGraph</B>", graph, re.MULTILINE)
     graph = re.sub(rf"^(?:{scene}:.*|s\d+:.* {scene}:.*)\n", "", graph, flags=re.MULTILINE)
@@ -34,27 +39,28 @@ def connected(graph: str) -> str:
             return ""
         kind, name = re.findall(r"<B>(?:\w+\.)*(\w+)</B><BR/>\nname=(\w+)", label)[0]
         ports = [port for port in _PORT.findall(label) if (key, port[0]) in ends]
-        sides = ([one for one in ports if one[0][0] == side] for side in "uy")
-        rows = [
+        above, below = (
             "".join(
-                f'<TD PORT="{port[0]}" BORDER="1">{port[1]}</TD>' if port else "<TD></TD>"
-                for port in row
+                f'<TD PORT="{one}" BORDER="1">{text}</TD>' for one, text in ports if one[0] == end
             )
-            for row in zip_longest(*sides)
+            for end in "uy"
+        )
+        colour = _GAMMA if kind.endswith("SafetyAssessor") else "white"
+        head = f'<TR><TD BGCOLOR="{colour}" BORDER="1"><B>{kind}</B> {name}</TD></TR>'
+        rows = [
+            f"<TR><TD><TABLE {_TABLE}><TR>{row}</TR></TABLE></TD></TR>" * bool(row)
+            for row in (above, below)
         ]
-        cells = "".join(f"<TR>{row}</TR>\n" for row in rows)
-        head = f'<TR><TD BORDER="1" COLSPAN="2"><B>{kind}</B><BR/>{name}</TD></TR>\n'
-        options = 'BORDER="0" CELLSPACING="0" CELLPADDING="4"'
-        return f"{key} [shape=none, label=<<TABLE {options}>\n{head}{cells}</TABLE>>];"
+        return f"{key} [shape=none, label=<<TABLE {_TABLE}>{rows[0]}{head}{rows[1]}</TABLE>>];"
 
     def ordered(edge: re.Match[str]) -> str:
-        one, _, other, _ = edge.groups()
-        is_back = "out" not in other and int(one[1:]) > int(other[1:])
-        return f"{edge.group()} [constraint=false]" if is_back else edge.group()
+        one, y, other, u = edge.groups()
+        is_back = int(one[1:]) > int(other[1:])
+        return f"{one}:{y}:s -> {other}:{u}:n" + " [constraint=false]" * is_back
 
-    graph = _EDGE.sub(ordered, _NODE.sub(table, graph))
-    graph = graph.replace("color=black", "color=white", 1).replace("<B>Diagram</B>", "", 1)
-    return graph.replace("rankdir=LR", 'rankdir=LR\nnode [fontname="Courier"]', 1)
+    nodes = [table(node) for node in _NODE.finditer(graph)]
+    edges = [ordered(edge) for edge in _EDGE.finditer(graph)]
+    return "\n".join([_HEAD, *nodes, *edges, "}"])
 
 
 if __name__ == "__main__":

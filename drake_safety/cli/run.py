@@ -43,7 +43,8 @@ _WITH_BALLS_S = 5.0  # Duration of a run with balls.
 _AFTER_EPISODE_S = 1.0  # Beyond an episode, to show whether the robot stays at the target.
 _AFTER_LEAVING_S = 0.5  # Time for which a motion without a goal goes on outside the safe set.
 _AFTER_EVENT_S = 0.15  # Time of a still: when the effect of a push or a trigger is visible.
-_NUM_STILLS, _MOST_EVENTS = 3, 5  # Stills of the motion, and the most stills of events.
+_NUM_STILLS, _MOST_EVENTS = 3, 3  # Stills of the motion, and the most stills of events.
+_MOST_STILLS, _STILL_PIXELS = 4, 480  # The last ones are kept; the side of the square.
 _GAMMA = ("safety_probability", "belief", "cause_probability", "predicted_margins")
 _WITHOUT_ALARM = ("probability_without_alarm", "belief_without_alarm")  # What recovery heeds.
 _COLUMNS = ("time [s]", "event", "probability")  # Of events.
@@ -257,8 +258,10 @@ def _timeline(loop: Any, shown: _Shown) -> Figure:
             if at_s - max(instants, default=0.0) > _AFTER_EVENT_S:
                 instants.append(at_s)
         times_s = still_times(motion.time_s, instants[:_MOST_EVENTS], num_stills=_NUM_STILLS)
-        positions = stack_positions(loop, states)
-        options["stills"] = render_stills(loop, motion.time_s, positions, times_s)
+        shown_s, positions = times_s[-_MOST_STILLS:], stack_positions(loop, states)
+        options["stills"] = render_stills(
+            loop, motion.time_s, positions, shown_s, width=_STILL_PIXELS, height=_STILL_PIXELS
+        )
     return timeline_figure(
         motion.time_s,
         motion["safety_probability"][:, 0],

@@ -15,12 +15,11 @@ from matplotlib.patches import Patch, Rectangle
 
 from drake_safety.evaluation import figure_style as style
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, UNSAFE
+from drake_safety.learning.beliefs import UNCERTAINTY, UNSAFE, safe_share
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import Episodes, split
 
 _MAX_POINTS = 12000
-_BAR: dict[str, Any] = {"shrink": 0.8, "pad": 0.02}
 _LEAST_CAUSE = 0.05
 _PALE = ("#f0b48f", "#f2efe9", "#a3c4e2")
 _SAFETY = LinearSegmentedColormap.from_list(
@@ -31,65 +30,69 @@ _SAFETY = LinearSegmentedColormap.from_list(
 def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure:
     """Plots the first map: segments, beliefs of the cells, and causes if two have 5 % or more."""
     cells, grid = assessment.beliefs_[0], assessment.grid_
-    training = assessment.training_
-    if training.count is None:  # No segment was left out.
-        inside = grid.locate(training.points[0])
-        count = np.bincount(inside[inside >= 0], minlength=grid.num_cells)
-    else:
-        count = training.count[0]
-    unsafe = (count[:, None] * cells[:, 3:]).sum(axis=0)  # By cause; see `learning.beliefs`.
+    is_empty = cells[:, UNCERTAINTY] >= 1.0
+    unsafe = cells[~is_empty, 3:].sum(axis=0)  # By cause; see `learning.beliefs`.
     has_causes = (unsafe >= _LEAST_CAUSE * unsafe.sum()).sum() > 1
     with style.drawing_style():
-        fig = style.new_figure(14.0 if has_causes else 9.4, 4.6)
-        left, middle, *others = fig.subplots(1, 2 + has_causes)
-        _draw_segments(fig, left, assessment, episodes)
-        most = max(1.0 - assessment.parameters.initial_uncertainty, cells[:, SAFE].max())
-        is_empty = cells[:, UNCERTAINTY] >= 1.0
-        colours = draw_values(fig, middle, grid, cells[:, SAFE], is_empty, "belief: safe", most)
-        is_bright = colours[:, :3] @ [0.299, 0.587, 0.114] > 0.6
-        ink = np.where(is_empty, style.FAINT_INK, np.where(is_bright, style.INK, "white"))
-        place: dict[str, Any] = {"ha": "center", "va": "center_baseline", "fontsize": 6.5}
-        for i in np.flatnonzero(count):
-            text = f"{count[i]}" if count[i] < 1000 else f"{count[i] / 1000:.1f}k"
-            middle.text(*grid.centres[i], text, color=ink[i], **place)
-        middle.set_title("Belief of each cell: safe")
-        middle.set_xlabel("numbers: training segments; hatched: don't know")
+        fig = style.new_figure(style.PAGE_WIDTH, style.PAGE_WIDTH)
+        panels = fig.subplots(1, 2 + has_causes).tolist()
+        left, middle, *others = panels
+        _draw_grid(left, grid)
+        _draw_segments(left, assessment, episodes)
+        draw_values(middle, grid, safe_share(cells), is_empty)
+        middle.set_title("Beliefs of the cells")
         for last in others:
             _draw_causes(last, grid, cells, assessment.info_.constraint_names)
+        label = "safe: 1 − λ of a segment, share of a cell's belief; hatched: don't know"
+        draw_bar(fig, panels, label)
+        show_beliefs(fig, panels, grid, is_empty, room=1.2 + 0.3 * has_causes)
     return fig
 
 
+def show_beliefs(
+    fig: Figure, panels: Sequence[Axes], grid: Grid, is_empty: np.ndarray, *, room: float
+) -> None:
+    """Limits panels side by side to the cells that are not empty, (R*R,), and a cell around them.
+
+    The figure becomes as high as the panels, with room [inches] for all else.
+    """
+    shown, length = grid.centres[~is_empty], 1.5 * grid.cell_length
+    ends = np.clip(
+        [shown.min(axis=0) - length, shown.max(axis=0) + length], -grid.half_width, grid.half_width
+    )
+    (x0, y0), (x1, y1) = ends
+    for axes in panels:
+        axes.set(xlim=(x0, x1), ylim=(y0, y1))
+    height = style.PAGE_WIDTH / len(panels) * (y1 - y0) / (x1 - x0)
+    fig.set_size_inches(style.PAGE_WIDTH, height + room)
+
+
 def draw_values(
-    fig: Figure,
-    axes: Axes,
-    grid: Grid,
-    value: np.ndarray,
-    is_empty: np.ndarray,
-    label: str,
-    most: float = 1.0,
-) -> np.ndarray:
-    """Draws cells coloured by a value (R*R,), with a colour bar; returns the colours (R*R, 4)."""
-    shade = ScalarMappable(Normalize(0.0, most), _SAFETY)
-    colours = shade.to_rgba(value)
+    axes: Axes, grid: Grid, value: np.ndarray, is_empty: np.ndarray, most: float = 1.0
+) -> None:
+    """Draws cells coloured by a value (R*R,); empty ones, (R*R,), are hatched."""
+    colours = ScalarMappable(Normalize(0.0, most), _SAFETY).to_rgba(value)
     _draw_cells(axes, grid, colours, is_empty)
-    fig.colorbar(shade, ax=axes, label=label, **_BAR).outline.set_visible(False)
-    return colours
 
 
-def _draw_segments(fig: Figure, axes: Axes, gamma: SafetyAssessment, episodes: Episodes) -> None:
+def draw_bar(fig: Figure, axes: Axes | list[Axes], label: str, most: float = 1.0) -> None:
+    """Draws the colour bar of `draw_values` below axes."""
+    look: dict[str, Any] = {"location": "bottom", "aspect": 45, "shrink": 0.7, "pad": 0.03}
+    bar = fig.colorbar(ScalarMappable(Normalize(0.0, most), _SAFETY), ax=axes, label=label, **look)
+    bar.outline.set_visible(False)
+
+
+def _draw_segments(axes: Axes, gamma: SafetyAssessment, episodes: Episodes) -> None:
     parameters = gamma.parameters
     segments = split(episodes, stride=max(parameters.horizon // 2, 1), discount=parameters.discount)
     # Drawn in random order, so that neither class hides the other.
     segments = segments.take(np.random.default_rng(0).permutation(len(segments))[:_MAX_POINTS])
     result = gamma.predict(segments.state, segments.desired_preview, segments.features)
-    _draw_grid(axes, gamma.grid_)
-    shade = ScalarMappable(Normalize(0.0, 1.0), _SAFETY.reversed())
-    dots: dict[str, Any] = {"s": 5.0, "linewidths": 0.0, "alpha": 0.85, "rasterized": True}
+    look: dict[str, Any] = {"cmap": _SAFETY, "vmin": 0.0, "vmax": 1.0, "alpha": 0.85}
+    look |= {"s": 6.0, "linewidths": 0.0, "rasterized": True}
     x, y = result.embedding.T
-    axes.scatter(x, y, c=segments.score, cmap=shade.cmap, vmin=0.0, vmax=1.0, **dots)
-    axes.set_title("Segments in the embedding")
-    axes.set_xlabel(f"{len(segments)} segments of {len(episodes)} episodes")
-    fig.colorbar(shade, ax=axes, label="unsafety score λ", **_BAR).outline.set_visible(False)
+    axes.scatter(x, y, c=1.0 - segments.score, **look)
+    axes.set_title(f"{len(segments)} segments")
 
 
 def _draw_causes(axes: Axes, grid: Grid, cells: np.ndarray, names: Sequence[str]) -> None:
@@ -103,19 +106,19 @@ def _draw_causes(axes: Axes, grid: Grid, cells: np.ndarray, names: Sequence[str]
     colours = np.column_stack([1.0 - depth * (1.0 - palette[cause]), np.ones(len(cells))])
     colours[:, :3] *= 0.97
     _draw_cells(axes, grid, colours, is_empty)
-    axes.set_title("Most likely cause")
+    axes.set_title("Likely cause, pale: safe")
     handles = [Patch(color=palette[i], label=style.spoken(n)) for i, n in enumerate(names)]
-    look: dict[str, Any] = {"bbox_to_anchor": (1.0, 0.5), "handlelength": 1.0, "handleheight": 1.0}
-    axes.legend(handles=handles, title="pale: unlikely", loc="center left", **look)
+    look: dict[str, Any] = {"bbox_to_anchor": (0.5, -0.03), "handlelength": 1.0, "ncols": 2}
+    axes.legend(handles=handles, loc="upper center", columnspacing=1.0, **look)
 
 
 def _draw_grid(axes: Axes, grid: Grid) -> None:
-    """Draws the lines between the cells, and fits the axes to them."""
+    """Draws the lines between the cells."""
     half = grid.half_width
     edges = np.linspace(-half, half, grid.resolution + 1)
     for draw in (axes.vlines, axes.hlines):
         draw(edges, -half, half, color="#e3e5e8", linewidth=0.6, zorder=0)
-    axes.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
+    axes.set(xticks=[], yticks=[], aspect="equal")
 
 
 def _draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarray) -> None:
@@ -126,4 +129,3 @@ def _draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarra
     axes.add_collection(PatchCollection(hollow, fc="#f1f2f4", ec="#dadde1", lw=0.5, hatch="////"))
     axes.add_collection(PatchCollection(filled, fc=colours[~is_empty], ec="white", lw=0.8))
     _draw_grid(axes, grid)
-    axes.set_xlabel(f"{len(filled)} of {grid.num_cells} cells hold a belief")

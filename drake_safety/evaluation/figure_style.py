@@ -26,6 +26,9 @@ SERIES_COLOURS = (SAFE_COLOUR, UNSAFE_COLOUR, RECOVERY_COLOUR, "#8e5ea2", "#c997
 SERIES_DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
 """Dashes of these curves, which distinguish them in print."""
 
+PAGE_WIDTH = 8.0
+"""Width [inches] at which fonts are readable on a page of 680 pixels."""
+
 _STYLE: dict[Any, Any] = {
     "font.size": 10.0,
     "axes.titlesize": 11.0,

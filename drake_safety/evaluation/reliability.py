@@ -70,23 +70,30 @@ def _bins(p: np.ndarray, num_bins: int) -> list[np.ndarray]:
 
 
 def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
-    """Plots the observed share of unsafe ends over the predicted probability."""
+    """Plots the observed share of unsafe ends over the predicted probability.
+
+    Curves have the names "MODE, ROWS"; each mode has a panel.
+    """
+    modes = [*dict.fromkeys(name.partition(", ")[0] for name in curves)]
     with style.drawing_style():
-        fig = style.new_figure(5.4, 6.6)
-        axes = fig.subplots()
-        axes.axline((0, 0), slope=1, color=style.FAINT_INK, linewidth=0.8)
-        axes.set_prop_cycle(color=style.SERIES_COLOURS, linestyle=style.SERIES_DASHES)
-        look: dict[str, Any] = {"marker": "o", "markersize": 5, "linewidth": 1.4, "elinewidth": 0.8}
-        for name, one in curves.items():
-            value, low, high = np.array([(s.value, s.low, s.high) for s in one.observed]).T
-            interval = np.clip([value - low, high - value], 0.0, None)
-            label = f"{name}   {one.error.value:.3f}"
-            axes.errorbar(one.expected, value, yerr=interval, label=label, **look)
-        axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal", title="Reliability")
-        axes.set_xlabel("predicted probability of an unsafe end")
-        axes.set_ylabel("share of unsafe ends, 95 % intervals over episodes")
-        axes.grid(color="#eceef0", linewidth=0.7)
-        # Outside: intervals may be anywhere in the axes.
-        title = "expected calibration error"
-        fig.legend(loc="outside lower center", ncols=2, title=title, alignment="left")
+        width = style.PAGE_WIDTH / 2
+        fig = style.new_figure(width * len(modes), width + 1.0)
+        panels = fig.subplots(1, len(modes), squeeze=False, sharey=True)[0]
+        for axes, mode in zip(panels, modes, strict=True):
+            axes.axline((0, 0), slope=1, color=style.FAINT_INK, linewidth=0.8)
+            axes.set_prop_cycle(color=style.SERIES_COLOURS, linestyle=style.SERIES_DASHES)
+            look: dict[str, Any] = {"marker": "o", "markersize": 5, "elinewidth": 0.8}
+            for name, one in curves.items():
+                own, _, rows = name.partition(", ")
+                if own == mode:
+                    value, low, high = np.array([(s.value, s.low, s.high) for s in one.observed]).T
+                    interval = np.clip([value - low, high - value], 0.0, None)
+                    label = f"{rows}: error {one.error.value:.3f}"
+                    axes.errorbar(one.expected, value, yerr=interval, label=label, **look)
+            axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal", title=mode)
+            axes.set_xlabel("predicted probability of an unsafe end")
+            axes.grid(color="#eceef0", linewidth=0.7)
+            # Outside: intervals may be anywhere in the axes.
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14))
+        panels[0].set_ylabel("share of unsafe ends")
     return fig

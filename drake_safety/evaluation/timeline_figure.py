@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 
 from drake_safety.evaluation import figure_style as style
 from drake_safety.learning.beliefs import SAFE, UNCERTAINTY, UNSAFE
@@ -17,8 +16,7 @@ from drake_safety.learning.change_detector import Alarm
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.pushes import Push
 
-_WIDTH = 12.0  # All sizes are in inches.
-_CURVE_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 2.4, 1.0, 1.3
+_CURVE_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 1.6, 0.8, 1.2  # All sizes are in inches.
 _MAX_STILL_HEIGHT, _STILL_TITLE_HEIGHT, _AXIS_LABEL_HEIGHT = 2.6, 0.35, 0.6
 _LABEL_ROW_HEIGHT, _NUM_LABEL_ROWS = 0.2, 8  # Of names above the curve.
 _NUM_LEVELS, _MOST_POINTS = 4, 4000  # Curves of levels, and points of each.
@@ -84,7 +82,7 @@ def timeline_figure(
             _draw_belief(others.pop(0), time_s, belief)
         if margins is not None:
             _draw_margins(others.pop(0), time_s, margins, constraint_names, angular_constraints)
-        for panel in panels:
+        for panel in panels[1:]:
             for event in events:
                 panel.axvline(event.time_s, color=event.colour, linewidth=0.9)
         for start, end in recovery_intervals_s:
@@ -133,8 +131,10 @@ def _lay_out(
     height, strip = sum(heights), 0.0
     if images:
         aspect = max(image.shape[0] / image.shape[1] for image in images)
-        strip = min(aspect * _WIDTH / len(images), _MAX_STILL_HEIGHT) + _STILL_TITLE_HEIGHT
-    fig = style.new_figure(_WIDTH, height + strip + _AXIS_LABEL_HEIGHT)
+        strip = (
+            min(aspect * style.PAGE_WIDTH / len(images), _MAX_STILL_HEIGHT) + _STILL_TITLE_HEIGHT
+        )
+    fig = style.new_figure(style.PAGE_WIDTH, height + strip + _AXIS_LABEL_HEIGHT)
     lower: Any = fig
     pictures: list[Axes] = []
     if images:
@@ -182,15 +182,18 @@ def _span(axes: Axes, start_s: float, end_s: float, colour: str) -> None:
 
 
 def _write_names(axes: Axes, events: Sequence[_Event], ends: tuple[float, float]) -> None:
-    """Writes names in rows above an axis with these ends."""
+    """Writes names in rows above an axis with these ends, the earliest on top.
+
+    Lines go down from the names, so that none crosses another name.
+    """
     row_height = (ends[1] - ends[0]) * _LABEL_ROW_HEIGHT / _CURVE_HEIGHT
     top = ends[1] + row_height * min(len(events), _NUM_LABEL_ROWS)
     axes.set_ylim(ends[0], top)
-    for i, event in enumerate(events):
-        is_left = event.time_s > np.mean(axes.get_xlim())
-        place = (event.time_s, top - (i % _NUM_LABEL_ROWS + 0.5) * row_height)
-        look: dict[str, Any] = {"xytext": (-7, 0), "ha": "right"} if is_left else {"xytext": (7, 0)}
-        look |= {"textcoords": "offset points", "va": "center", "fontsize": 9, "zorder": 6}
-        # Lines of events pass behind.
-        behind = [withStroke(linewidth=3.0, foreground="white")]
-        axes.annotate(event.words, place, color=event.colour, path_effects=behind, **look)
+    axes.spines["left"].set_bounds(ends[0], ends[1])
+    look: dict[str, Any] = {"xytext": (6, 0), "textcoords": "offset points", "va": "center"}
+    for i, event in enumerate(sorted(events, key=lambda one: one.time_s)):
+        height = top - (i % _NUM_LABEL_ROWS + 0.5) * row_height
+        axes.vlines(event.time_s, ends[0], height, color=event.colour, linewidth=0.9)
+        axes.plot(event.time_s, height, "o", color=event.colour, markersize=3.5)
+        place = (event.time_s, height)
+        axes.annotate(event.words, place, color=event.colour, fontsize=9, zorder=6, **look)
