@@ -59,7 +59,7 @@ def timeline_figure(
     unsafe = style.UNSAFE_COLOUR
     events = []
     for ball in throws:
-        words = f"{ball.mass_kg:.1f} kg, {ball.speed_m_s:.1f} m/s"
+        words = f"ball of {ball.mass_kg:.1f} kg, {ball.speed_m_s:.1f} m/s"
         events.append(_Event(ball.time_s, words, style.BALL_COLOUR))
     for push in pushes:
         words = f"push of {push.strength_n:.0f} N for {push.duration_s:g} s"
