@@ -31,7 +31,7 @@ def test_without_an_assessment_that_of_the_package_is_evaluated_and_not_written(
     @contextmanager
     def evaluating(scenario, learned, folder, *others):
         given.append((scenario.name, learned, folder))
-        yield SimpleNamespace(entries={}, fresh=lambda *_: None, scorers=[])
+        yield SimpleNamespace(entries={}, assessments={}, fresh=lambda *_: None, scorers=[])
 
     monkeypatch.chdir(tmp_path)
     for name, stands_for in (("evaluating", evaluating), ("add_verdicts", None)):

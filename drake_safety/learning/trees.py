@@ -12,6 +12,7 @@ MOST_TREES = 300
 MOST_LEAVES = 31
 _WITHOUT_GAIN = 20
 """Trees that may follow without a gain on the held-out inputs."""
+_NUM_BINS = 255
 _CHUNK = 16  # Rows, whose comparisons fit into the cache.
 
 
@@ -65,7 +66,8 @@ class Trees:
         from sklearn.ensemble import HistGradientBoostingClassifier
         from threadpoolctl import threadpool_limits
 
-        data = x.astype(np.float32), is_unsafe, weight
+        known = x if is_held_out is None else x[~is_held_out]
+        data = binned(x, like=known), is_unsafe, weight
         learned, judged = data, (None, None, None)
         if is_held_out is not None:
             learned = tuple(part[~is_held_out] for part in data)
@@ -127,3 +129,19 @@ class Trees:
         # The lowest bit that is not set.
         leaf = np.frexp(~excluded & (excluded + 1))[1] - 1
         return np.add.reduce(self._value.take(self._first + leaf), axis=1)
+
+
+def binned(x: np.ndarray, *, like: np.ndarray) -> np.ndarray:
+    """Moves inputs x (N, n_x) to the nearest of 255 quantiles of each column of `like`.
+
+    scikit-learn then splits between these, as it does by itself. With sample weights it would look
+    for each quantile singly, which takes longer than learning.
+    """
+    x, like = x.astype(np.float32), like.astype(np.float32)
+    shares, moved = np.linspace(0.0, 1.0, _NUM_BINS), np.empty_like(x)
+    every = np.quantile(like, shares, axis=0, method="inverted_cdf")
+    for column, quantiles in enumerate(every.T):
+        values = np.unique(quantiles)
+        middle = (values[1:].astype(float) + values[:-1]) / 2.0
+        moved[:, column] = values[np.searchsorted(middle, x[:, column])]
+    return moved
