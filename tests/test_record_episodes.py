@@ -191,7 +191,7 @@ def test_from_an_empty_file_to_gamma_in_a_diagram_of_pydrakes_own():
         plant.GetMyMutableContextFromRoot(context).SetContinuousState(start)
         simulator.Initialize()
         gamma.append(diagram.GetOutputPort("gamma").Eval(context)[0])
-    assert gamma[0] > 0.6 > gamma[1]
+    assert gamma[0] > 0.5 > gamma[1]
 
 
 @pytest.mark.train
