@@ -17,7 +17,7 @@ _NUM_MARKED = 3
 
 
 def adaptation_figure(prior: SafetyAssessment, adapted: SafetyAssessment, words: str) -> Figure:
-    """Plots the cells of the first map; those that changed most are numbered."""
+    """Plots the cells of the first map, and numbers the cells that changed most."""
     grid, cells = prior.grid_, [one.beliefs_[0] for one in (prior, adapted)]
     shares, empty = map(safe_share, cells), [one[:, UNCERTAINTY] >= 1.0 for one in cells]
     before, after = shares
@@ -37,12 +37,7 @@ def adaptation_figure(prior: SafetyAssessment, adapted: SafetyAssessment, words:
             for axes in panels:
                 edge: dict[str, Any] = {"fill": False, "edgecolor": style.INK, "linewidth": 2.0}
                 axes.add_patch(Rectangle(corner, grid.cell_length, grid.cell_length, **edge))
-                look: dict[str, Any] = {
-                    "boxstyle": "circle,pad=0.15",
-                    "fc": "white",
-                    "ec": style.INK,
-                    "lw": 0.8,
-                }
+                look = {"boxstyle": "circle,pad=0.15", "fc": "white", "ec": style.INK, "lw": 0.8}
                 place: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8}
                 axes.text(*grid.centres[cell], f"{number}", bbox=look, **place)
             lines.append(f"{number}: {before[cell]:.2f} → {after[cell]:.2f}")

@@ -95,7 +95,7 @@ def run(path: Path) -> dict[str, Any]:
 
 
 def _kept(output: Mapping[str, Any], folders: Sequence[str]) -> dict[str, str] | None:
-    """What the site shows of an output: a picture, or a text that is no progress."""
+    """An output as the site shows it: a picture, or a text without progress."""
     data = output.get("data", {})
     if "image/png" in data:
         return {"png": _small(data["image/png"])}

@@ -46,7 +46,8 @@ from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.rollouts import MOTION_PIECE_S, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
-_FAMILY_PLANTS = 20  # Fresh ones.
+_FAMILY_PLANTS = 20  # Fresh plants.
+_ON_FAMILY = "episodes on the family's plants"
 
 
 @dataclass
@@ -68,16 +69,8 @@ class Evaluation:
         """The probability of either mode."""
         return [assessment_scorer(mode, one) for mode, one in self.assessments.items()]
 
-    def fresh(self, what: str, number: int, purpose: str) -> Episodes:
-        """Fresh nominal episodes, kept in the run's folder."""
-        return self._fresh(what, number, purpose)
-
-    def fresh_on_family(self, number: int, purpose: str, num_plants: int) -> Episodes:
-        """Fresh episodes on fresh plants of the family, kept in the run's folder."""
-        what = "episodes on the family's plants"
-        return self._fresh(what, number, purpose, variation=FAMILY, plants=num_plants)
-
-    def _fresh(self, what: str, number: int, purpose: str, **options: Any) -> Episodes:
+    def fresh(self, what: str, number: int, purpose: str, **options: Any) -> Episodes:
+        """Fresh episodes, nominal unless options say otherwise, kept in the run's folder."""
         seed, progress = self.seeds[purpose], partial(self.stages, what)
         return folders.run_fresh_episodes(
             self.scenario, self.run_folder, number, seed, progress, self.workers, **options
@@ -216,7 +209,8 @@ def add_family(evaluation: Evaluation, num_episodes: int) -> None:
     known = {mode: one for mode, one in evaluation.assessments.items() if one.knows_family}
     if not known:
         return
-    drawn = evaluation.fresh_on_family(num_episodes, "evaluation", num_episodes)
+    options: dict[str, Any] = {"variation": FAMILY, "plants": num_episodes}
+    drawn = evaluation.fresh(_ON_FAMILY, num_episodes, "evaluation", **options)
     segments = split(drawn, stride=1, discount=1.0, shortest=1)
     for mode, gamma in known.items():
         score = assessment_scorer(mode, gamma).unsafe_score(segments)
@@ -266,7 +260,8 @@ def _add_shifts(evaluation: Evaluation, num_episodes: int, num_nominal: int, hou
     kinds: dict[str, str] = {"nominal": "nominal"}
     if scenario.family is not None:
         number = _FAMILY_PLANTS * max(num_episodes // 4, 1)
-        drawn = evaluation.fresh_on_family(number, "shifts", _FAMILY_PLANTS)
+        plants: dict[str, Any] = {"variation": FAMILY, "plants": _FAMILY_PLANTS}
+        drawn = evaluation.fresh(_ON_FAMILY, number, "shifts", **plants)
         judged[FAMILY] = shift_study.shift_estimates(names, drawn)
         kinds[FAMILY] = "family"
     for i, (name, shift) in enumerate(shifts.items()):
