@@ -260,8 +260,8 @@ def _add_shifts(evaluation: Evaluation, num_episodes: int, num_nominal: int, hou
     kinds: dict[str, str] = {"nominal": "nominal"}
     if scenario.family is not None:
         number = _FAMILY_PLANTS * max(num_episodes // 4, 1)
-        plants: dict[str, Any] = {"variation": FAMILY, "plants": _FAMILY_PLANTS}
-        drawn = evaluation.fresh(_ON_FAMILY, number, "shifts", **plants)
+        on_family: dict[str, Any] = {"variation": FAMILY, "plants": _FAMILY_PLANTS}
+        drawn = evaluation.fresh(_ON_FAMILY, number, "shifts", **on_family)
         judged[FAMILY] = shift_study.shift_estimates(names, drawn)
         kinds[FAMILY] = "family"
     for i, (name, shift) in enumerate(shifts.items()):
