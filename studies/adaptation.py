@@ -79,7 +79,7 @@ def adaptation(
 ) -> None:
     """Evaluate Γ before and after feedback of a simulated plant, on independent pools.
 
-    Episodes are shared with `drake-safety adapt`; study.json and its plot are written to
+    Episodes are shared with `drake-safety adapt`; study.json is written to
     ASSESSMENT/adapted-VARIATION.
     """
     learned = assessment_folder(load_scenario(scenario), assessment)
@@ -92,10 +92,6 @@ def adaptation(
         release=release,
         workers=workers,
         out=folder,
-        plotted=lambda key: (
-            key[0] in ("sharpened.calibrated", "paper.grid")
-            and key[2] in ("brier", "auc", "unsafe_recall")
-        ),
     ) as study:
         loaded, stages = study.scenario, study.stages
         seeds = [ADAPTATION.seeds(study.seed + _POOL_STRIDE * i) for i in range(pools)]

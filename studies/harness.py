@@ -19,8 +19,7 @@ import typer
 
 from drake_safety.cli.console import console, made_by, open_stages, say
 from drake_safety.cli.training_folder import check_fresh, load_assessment, run_fresh_episodes
-from drake_safety.evaluation.figure_style import label_of, save, spoken
-from drake_safety.evaluation.interval_figure import interval_figure
+from drake_safety.evaluation.figure_style import label_of, spoken
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Key, Results
 from drake_safety.evaluation.tables import Column, Table, rows_of
@@ -101,9 +100,8 @@ def open_study(
     release: bool = False,
     workers: int | None = None,
     out: Path | None = None,
-    plotted: Callable[[Key], bool] | None = None,
 ) -> Iterator[Study]:
-    """Runs a study in the block; afterwards its rows are written, printed and plotted."""
+    """Runs a study in the block; afterwards its rows are written and printed."""
     loaded, seed = load_scenario(scenario), seed + RELEASE * release
     with open_stages() as stages:
         study = Study(
@@ -123,9 +121,6 @@ def open_study(
         table = Table(corner=set_, columns=columns, rows=rows_of(results, labels, columns))
         console.print(table.to_rich())
     say("figures", file)
-    drawn = {key: one for key, one in results.items() if plotted and plotted(key)}
-    for picture in save(interval_figure(drawn), file) if drawn else ():
-        say("picture", picture)
 
 
 def kept(
