@@ -35,10 +35,8 @@ from drake_safety.cli.training_folder import (
 )
 from drake_safety.diagrams.balancing.throws import HasBall, run_throws
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.results import Key, Results
+from drake_safety.evaluation.results import Key
 from drake_safety.evaluation.scorers import Scorer
-from drake_safety.evaluation.tables import Table
-from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
 from drake_safety.learning.seeds import EVALUATION, RELEASE
 from drake_safety.simulation.capabilities import (
     CanFall,
@@ -48,7 +46,6 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import load_scenario
 from studies.alarms import (
-    ALARMS,
     evaluate_alarms,
     scorer_alarm,
     threshold_alarms,
@@ -84,9 +81,7 @@ def evaluate(
     loop = loaded.make_loop()
     if throws:
         require(loop, HasBall)
-    with evaluating(
-        loaded, learned, folder, EVALUATION, first, workers, _tables, _PROGRAM
-    ) as evaluation:
+    with evaluating(loaded, learned, folder, EVALUATION, first, workers, _PROGRAM) as evaluation:
         evaluation.entries["calibration_episodes"] = calibration_episodes
         test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
         other = evaluation.fresh("calibration episodes", calibration_episodes, "thresholds")
@@ -104,11 +99,6 @@ def evaluate(
         add_family(evaluation, calibration_episodes)
         if throws:
             _add_throws(evaluation, loop, classifiers, throws, calibration_throws)
-
-
-def _tables(results: Results) -> list[Table]:
-    alarms = verdict_table(results, "monitoring", corner="alarm", kind=ALARMS)
-    return [*verdict_tables(results), *([alarms] if alarms.rows else [])]
 
 
 def _add_throws(
