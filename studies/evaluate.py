@@ -51,7 +51,7 @@ from studies.alarms import (
     threshold_alarms,
 )
 from studies.baselines import classifier_differences, classifier_scorers
-from studies.harness import CalibrationOption, EpisodesOption, ReleaseOption
+from studies.harness import ReleaseOption
 from studies.throws import classifier_rules
 
 _CLASSIFIER_SEEDS = (0, 1, 2)
@@ -61,9 +61,11 @@ _PROGRAM = "python -m studies"
 def evaluate(
     scenario: ScenarioArgument,
     assessment: TrainingOption,
-    episodes: EpisodesOption = 1000,
+    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
     throws: Annotated[int, typer.Option(help="Fresh throws at the actual plant.", min=0)] = 0,
-    calibration_episodes: CalibrationOption = 300,
+    calibration_episodes: Annotated[
+        int, typer.Option(help="Other ones, for thresholds.", min=20)
+    ] = 300,
     calibration_throws: Annotated[
         int, typer.Option(help="Other throws, for thresholds of the classifiers.", min=1)
     ] = 200,
