@@ -30,7 +30,7 @@ STUDIES = {
     "adaptation --feedback 40 --evaluate 20 --pools 2 --scratch": (
         "adapted-actual/study",
         "sharpened.calibrated.adapted 40.brier, paper.grid.scratch 40.auc, "
-        "boosting.refitted 40.auc, paper.grid.adapted 40.pools_won",
+        "boosting.refitted 40.auc, paper.grid.adapted 40.brier",
     ),
 }
 
