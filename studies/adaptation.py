@@ -198,10 +198,10 @@ def boosting_estimates(
     pools: Sequence[Pool],
     shortest: int,
     progress: StageProgress,
-    sizes: Sequence[int] = _BOOSTED_SIZES,
 ) -> dict[Key, Estimate]:
     """Gradient boosting before feedback ("prior"), and on it and the training ("refitted N")."""
-    sizes = [size for size in sizes if size <= min(len(feedback) for feedback, _ in pools)]
+    least = min(len(feedback) for feedback, _ in pools)
+    sizes = [size for size in _BOOSTED_SIZES if size <= least]
     prior = DirectClassifier("gradient_boosting").fit(nominal)
     found: dict[str, list[dict[str, float]]] = {}
     for i, (feedback, test) in enumerate(pools):

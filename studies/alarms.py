@@ -132,7 +132,6 @@ def evaluate_alarms(
     calibration: Sequence[Motion],
     test: Sequence[Motion],
     *,
-    false_alarm_share: float = FALSE_ALARM_SHARE,
     num_rows: int = NUM_ROWS,
 ) -> dict[Key, Estimate]:
     """Compares alarms at the same share of false alarms on calibration motions.
@@ -147,7 +146,7 @@ def evaluate_alarms(
     estimates = {("monitoring", "motions", "leave_safe_set"): left}
     for alarm in alarms:
         lowest = np.array([lowest_value(m, persisting(alarm.value(m), num_rows)) for m in calm])
-        threshold = equal_share_threshold(lowest, false_alarm_share)
+        threshold = equal_share_threshold(lowest, FALSE_ALARM_SHARE)
         values = [persisting(alarm.value(motion), num_rows) for motion in judged]
         score = -np.array([lowest_value(m, v) for m, v in zip(judged, values, strict=True)])
         found = _alarm_estimates(judged, values, threshold)
