@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from functools import partial
 from typing import Annotated
 
@@ -20,6 +19,7 @@ from drake_safety.cli.training_folder import (
 from drake_safety.evaluation.metrics import segment_estimates
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.inputs import kept_features
 from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.dataset import load_episodes
@@ -65,7 +65,7 @@ def features(
 def fewer_features(episodes: Episodes, patterns: list[str]) -> Episodes:
     """The episodes as a scenario with these `without_features` records them."""
     names = episodes.info.feature_names
-    kept = [i for i, n in enumerate(names) if not any(fnmatchcase(n, p) for p in patterns)]
+    kept = kept_features(names, patterns)
     info = replace(episodes.info, feature_names=[names[i] for i in kept], monitored_features=[])
     return Episodes(info, [replace(one, features=one.features[:, kept]) for one in episodes])
 

@@ -27,6 +27,10 @@ STUDIES = {
         "evaluation",
         "plans.mlp.auc, plans.gradient_boosting.safe_recall, difference.first.mlp.brier",
     ),
+    "features --without to_the_* --episodes 40": (
+        "features",
+        "rows.all.auc, first.all.brier, rows.without to_the_*.auc, first.without to_the_*.brier",
+    ),
     "adaptation --feedback 40 --evaluate 20 --pools 2 --scratch": (
         "adapted-actual/study",
         "sharpened.calibrated.adapted 40.brier, paper.grid.scratch 40.auc, "
@@ -70,6 +74,8 @@ def test_a_study_of_a_run_writes_its_figures(monkeypatch, run, line):
     if name == "adapted-actual/study":
         assert found["sharpened.calibrated", "scratch 40", "brier"].n == 40
         assert found.entries["feedback_sets"] == [40, 40]
+    if name == "features":
+        assert found.entries["all"] - found.entries["without to_the_*"] == 2
     if name == "evaluation":
         # Beside baselines Γ has the figures that `drake-safety evaluate` gives.
         alone = ("evaluate", scenario, "--assessment", folder, "--workers", 1, *FRESH.split(" "))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import fnmatch
+from collections.abc import Sequence
+
 import numpy as np
 
 from drake_safety.learning.assessment_parameters import AssessmentParameters
@@ -11,6 +14,15 @@ from drake_safety.learning.segments import Episode, EpisodesInfo, Segments, floa
 def preview_names(info: EpisodesInfo) -> list[str]:
     """Returns the names of the preview's entries, (H*n_z,), counted from 0."""
     return [f"desired {name} [{k}]" for k in range(info.horizon) for name in info.output_names]
+
+
+def kept_features(names: Sequence[str], without: Sequence[str]) -> list[int]:
+    """Places of the names that match no pattern of `without`, each of which must match some."""
+    matches = {pattern: fnmatch.filter(names, pattern) for pattern in without}
+    if unknown := [pattern for pattern, matched in matches.items() if not matched]:
+        raise ValueError(f"without_features: {unknown} match no feature; there are {list(names)}")
+    left_out = set().union(*matches.values())
+    return [i for i, name in enumerate(names) if name not in left_out]
 
 
 class InputColumns:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from fnmatch import fnmatchcase
-from itertools import compress
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -18,6 +16,7 @@ from drake_safety.control.observation import (
     walking_state,
     walking_state_names,
 )
+from drake_safety.learning.inputs import kept_features
 from drake_safety.learning.segments import floats
 from drake_safety.systems.safety_monitor import SafeSet, finite_margins
 
@@ -77,11 +76,8 @@ class AssessorInputs(LeafSystem):
         if memory:
             self.feature_names += memory
             self._memory_port = self.DeclareVectorInputPort("controller_memory", len(memory))
-        every = self.feature_names
-        if unknown := [p for p in without if not any(fnmatchcase(name, p) for name in every)]:
-            raise ValueError(f"without_features: {unknown} match no feature; there are {every}")
-        self._is_read = [not any(fnmatchcase(name, p) for p in without) for name in every]
-        self.feature_names = [*compress(every, self._is_read)]
+        self._kept = kept_features(self.feature_names, without)
+        self.feature_names = [self.feature_names[i] for i in self._kept]
         ticket = {self.input_port_ticket(self._state_port.get_index())}
         n_s, n_f, n_c = map(len, (self.state_names, self.feature_names, self.constraint_names))
         self.DeclareVectorOutputPort("state", BasicVector(n_s), self._calc_state, ticket)
@@ -108,7 +104,7 @@ class AssessorInputs(LeafSystem):
             parts.append(self._command_port.Eval(context)[: len(joints)] - joints)
         if self._memory_port is not None:
             parts.append(self._memory_port.Eval(context))
-        output.SetFromVector(np.concatenate(parts)[self._is_read])
+        output.SetFromVector(np.concatenate(parts)[self._kept])
 
     def _calc_margins(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(finite_margins(self._safe_set, *self._measured(context)))
