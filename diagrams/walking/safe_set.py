@@ -138,7 +138,7 @@ class WalkingSafeSet:
         )
 
     def with_commands(self, features: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """Features (C, n_f) as if constant commands (C, 3) [m/s, rad/s] had been asked for."""
+        """Features (C, n_f) with constant commands (C, 3) [m/s, rad/s] in place of the plan."""
         changed = np.tile(features, (len(commands), 1))
         for axis, name in enumerate(_AXES):
             column = self.feature_names.index
