@@ -75,9 +75,9 @@ class Watched:
             is_in_time &= motion.has_fallen
             warning.append(value[is_in_time].min(initial=math.inf))
             lowest.append(value.min())
-        calm = [_values(alarm, motion) for motion in undisturbed]
-        before = [np.concatenate([[math.inf], value[:-1]]) for value in calm]
-        rows = np.concatenate([*calm, np.zeros(0)])
+        quiet = [_values(alarm, motion) for motion in undisturbed]
+        before = [np.concatenate([[math.inf], value[:-1]]) for value in quiet]
+        rows = np.concatenate([*quiet, np.zeros(0)])
         return cls(
             is_fall=np.array([motion.has_fallen for motion in pushed], dtype=bool),
             others={

@@ -155,7 +155,7 @@ def evaluate_alarms(
 
     Motions that leave the safe set before the push are left out.
     """
-    calm = [motion for motion in calibration if not motion.has_left]
+    safe = [motion for motion in calibration if not motion.has_left]
     judged = [motion for motion in test if not motion.leave_time_s < motion.push_time_s]
     is_unsafe = np.array([motion.has_left for motion in judged], dtype=bool)
     index = np.array([motion.index for motion in judged])
@@ -166,13 +166,13 @@ def evaluate_alarms(
         ("monitoring", "motions", "push_to_leaving_s"): median(until_s),
     }
     for alarm in alarms:
-        lowest = np.array([lowest_value(m, persisting(alarm.value(m), num_rows)) for m in calm])
+        lowest = np.array([lowest_value(m, persisting(alarm.value(m), num_rows)) for m in safe])
         threshold = equal_share_threshold(lowest, false_alarm_share)
         values = [persisting(alarm.value(motion), num_rows) for motion in judged]
         score = -np.array([lowest_value(m, v) for m, v in zip(judged, values, strict=True)])
         found = _alarm_estimates(judged, values, threshold)
         found["auc"] = auc(score, is_unsafe, index)
-        found["threshold"] = Estimate.exact(threshold, len(calm))
+        found["threshold"] = Estimate.exact(threshold, len(safe))
         estimates |= {("monitoring", alarm.name, key): one for key, one in found.items()}
     return estimates
 

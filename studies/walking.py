@@ -135,9 +135,9 @@ def walking(
         study.rows |= tour_estimates(toured)
         # A motion that leaves the safe set before the push is not judged.
         pushed = [motion for motion in pushed if not motion.leave_time_s < motion.push_time_s]
-        calm = [motion for motion in toured if not motion.has_left]
+        safe = [motion for motion in toured if not motion.has_left]
         watched = {
-            name: [Watched.of(alarm, pushed, calm) for alarm in seeds]
+            name: [Watched.of(alarm, pushed, safe) for alarm in seeds]
             for name, seeds in alarms.items()
         }
         pairs = ([name for name in names if name in watched] for names in (_OURS, _RIVALS))
@@ -202,11 +202,11 @@ def push_estimates(pushed: Sequence[Motion], push_s: float) -> dict[Key, Estimat
 
 def tour_estimates(tours: Sequence[Motion]) -> dict[Key, Estimate]:
     """Share of undisturbed tours without a fall, and the hours of those that stay safe."""
-    calm = [motion for motion in tours if not motion.has_left]
-    hours = sum(float(motion.time_s[-1]) for motion in calm) / 3600.0
+    safe = [motion for motion in tours if not motion.has_left]
+    hours = sum(float(motion.time_s[-1]) for motion in safe) / 3600.0
     return {
         ("tours", "", "without_fall"): proportion(sum(not m.has_fallen for m in tours), len(tours)),
-        ("tours", "", "hours"): Estimate.exact(hours, len(calm)),
+        ("tours", "", "hours"): Estimate.exact(hours, len(safe)),
     }
 
 

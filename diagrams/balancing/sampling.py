@@ -89,7 +89,7 @@ class PushSampling:
         )
 
 
-def calm_start(
+def throw_start(
     kinematics: RobotKinematics,
     rng: np.random.Generator,
     *,

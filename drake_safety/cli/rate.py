@@ -59,10 +59,10 @@ def rate(
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
 ) -> None:
-    """Estimate a failure rate from few episodes, chosen where they tell most.
+    """Estimate a failure rate from few, informative episodes.
 
     By default Γ divides starts into strata, which saves episodes where it is sharp. With --rare the
-    episodes approach failures level by level, which saves most where random ones hardly ever fail.
+    episodes approach failures level by level, which saves most if random episodes hardly ever fail.
     The estimate is unbiased on average; a search that loses a kind of failure gives too low a rate.
     Episodes are kept in OUT: the same command continues.
     """
@@ -123,7 +123,7 @@ def _report_rare(
     """Prints a rate and the kinds of failures that make it, and writes them with a picture."""
     plain = "" if math.isnan(found.plain_rollouts) else str(round(found.plain_rollouts))
     row = (_exponent(found.rate), f"{found.search_rate:.1e}", found.simulations, plain)
-    columns = ("failure rate", "by the search", "episodes", "random ones of the same variance")
+    columns = ("failure rate", "by the search", "episodes", "random episodes of the same variance")
     title = f"{loaded.name}, {variation}: {metric}"
     show_rows(title, columns, [row])
     names = telling_facts(found)

@@ -259,14 +259,14 @@ class ChangeDetector:
             alarms.append(Alarm(first, places[end], cause))
         return levels, alarms
 
-    def next_alarm(self, alarm: float, calm_s: float, level: float) -> tuple[float, float]:
+    def next_alarm(self, alarm: float, below_s: float, level: float) -> tuple[float, float]:
         """Alarm (0 or 1), and time for which all levels have been low [s], after one more level."""
         if not level <= self.alarm_level:  # Also for NaN.
             return 1.0, 0.0
-        calm_s = calm_s + self.step_s if level < RECOVERED_LEVEL else 0.0
-        if alarm == 0.0 or calm_s > RECOVERY_S - 0.5 * self.step_s:
+        below_s = below_s + self.step_s if level < RECOVERED_LEVEL else 0.0
+        if alarm == 0.0 or below_s > RECOVERY_S - 0.5 * self.step_s:
             return 0.0, 0.0
-        return 1.0, calm_s
+        return 1.0, below_s
 
     def with_motions(self, motions: Sequence[np.ndarray]) -> ChangeDetector:
         """Returns the nominal detector for which an actual robot's motions (K, n) are known too.

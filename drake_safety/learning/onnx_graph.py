@@ -243,10 +243,10 @@ def _add_checks(graph: Graph, inner: str, num_causes: int) -> None:
     belief = is_inside.Where(belief, outside, output="belief_without_alarm")
     probability = is_inside.Where(probability.Unsqueeze([1]), 0.0)
     probability.Squeeze([1], output="probability_without_alarm")
-    is_calm = alarm.Greater(-np.inf).And(alarm.LessOrEqual(0.5))
-    is_calm.Where(belief, EMPTY, output="belief")
-    is_calm.Where(probability, 0.0).Squeeze([1], output="safety_probability")
-    is_calm.Where(cause, 0.0, output="cause_probability")
+    is_silent = alarm.Greater(-np.inf).And(alarm.LessOrEqual(0.5))
+    is_silent.Where(belief, EMPTY, output="belief")
+    is_silent.Where(probability, 0.0).Squeeze([1], output="safety_probability")
+    is_silent.Where(cause, 0.0, output="cause_probability")
 
 
 def _maps(x: Value, embedding: Embedding) -> tuple[Value, tuple[Value, Value] | None, Value]:
