@@ -151,7 +151,7 @@ class TestSet:
 def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, float]]:
     """Metrics of an assessment on the test set, by form of Γ and metric.
 
-    "FORM.k0" are those of first rows alone; "unknown" is the share of "don't know".
+    "FORM.k0" uses first rows alone; "unknown" is the share of "don't know".
     """
     segments = test.segments
     result = assessment.predict_rows(segments, test.episodes.info.variation)

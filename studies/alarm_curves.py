@@ -1,9 +1,8 @@
 """Falls that alarms announce, over all thresholds: at equal cost, and as curves.
 
 An alarm announces a fall if its value falls below the threshold between the push and `EARLY_S`
-before the fall. What a threshold costs is the share of other pushed motions that have an alarm, or
-the false alarms an hour on undisturbed motion. Thresholds need no choice: methods are compared at
-the same cost.
+before the fall. The cost of a threshold is the share of other pushed motions that have an alarm, or
+the false alarms an hour on undisturbed motion. Methods are compared at the same cost.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ COSTS = {
     "without_leaving": "never leave the safe set",
     "without_fall": "do not fall",
 }
-"""Other motions by key, and what is said of them."""
+"""Other motions by key, and their description."""
 _JUDGED = "without_leaving"  # Cost of the rows; the figure has all.
 _LABELS = {"sharpened": "Γ", "fall": "probability of a fall"}
 _BOOTSTRAP = Bootstrap()
@@ -50,7 +49,7 @@ class Watched:
             a fall, and of one that comes earlier.
         lowest: Lowest value of each pushed motion, (N,).
         rows: Values of the rows of all undisturbed motions, sorted, (M,).
-        pairs: The larger of each value and the one before it, sorted, (M,).
+        pairs: The larger of each value and its predecessor, sorted, (M,).
         undisturbed_s: Duration of these motions [s].
         num_undisturbed: Their number.
     """
@@ -151,7 +150,7 @@ def equal_cost_estimates(
 ) -> dict[Key, Estimate]:
     """Shares of falls announced at equal cost, their differences, and false alarms an hour.
 
-    Intervals are over pushed motions, those of differences paired.
+    Intervals are over pushed motions; for differences they are paired.
     """
     estimates: dict[Key, Estimate] = {}
     for share in SHARES:

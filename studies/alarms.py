@@ -130,7 +130,7 @@ def lowest_value(motion: Motion, value: np.ndarray) -> float:
 
 
 def persisting(value: np.ndarray, num_rows: int) -> np.ndarray:
-    """The largest of each value and those before it, `num_rows` in all, (N,)."""
+    """The largest of each value and its predecessors, `num_rows` in all, (N,)."""
     value = np.where(np.isnan(value), -math.inf, value)
     padded = np.concatenate([np.full(num_rows - 1, math.inf), value])
     return np.lib.stride_tricks.sliding_window_view(padded, num_rows).max(axis=1)

@@ -146,7 +146,7 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
 
 def figures(
     names: Annotated[
-        list[str] | None, typer.Argument(help=f"Of {', '.join(PICTURES)}; all by default.")
+        list[str] | None, typer.Argument(help=f"Among {', '.join(PICTURES)}; all by default.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the pictures.")] = Path("docs/pictures"),
 ) -> None:

@@ -1,4 +1,4 @@
-"""What all studies share: their options, fresh episodes, kept work, and how rows become files.
+"""Common parts of studies: options, fresh episodes, kept work, and files of rows.
 
 A study gives rows of the table of results: set, method, metric and an estimate. Work that takes
 long is kept in the folder of the training as it finishes: a stopped study continues.
@@ -33,7 +33,7 @@ from drake_safety.simulation.scenario import Scenario, load_scenario
 from drake_safety.simulation.worker_processes import Progress, map_items
 
 EpisodesOption = Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)]
-CalibrationOption = Annotated[int, typer.Option(help="Other ones, for thresholds.", min=20)]
+CalibrationOption = Annotated[int, typer.Option(help="Other episodes, for thresholds.", min=20)]
 ReleaseOption = Annotated[
     bool, typer.Option("--release", help="Use the release's seeds: once, for published figures.")
 ]
@@ -46,7 +46,7 @@ class Study:
 
     Attributes:
         seed: First seed of the fresh episodes.
-        entries: What the file says besides rows.
+        entries: Entries of the file besides rows.
         rows: By set, method and metric.
     """
 
@@ -69,7 +69,7 @@ class Study:
         return EVALUATION.seeds(self.seed)
 
     def load(self, mode: str, seeds: Iterable[int] | None = None) -> SafetyAssessment:
-        """The assessment of a mode, which has not used these seeds; those of `evaluate` if None."""
+        """The assessment of a mode, which has not used the seeds; None: `evaluate`'s."""
         assessment = load_assessment(self.folder, mode)
         check_fresh(assessment, self.scenario, self.seeds.values() if seeds is None else seeds)
         return assessment

@@ -30,7 +30,7 @@ from studies.baselines import KINDS, classifier_scorers
 from studies.harness import ReleaseOption, open_study
 from studies.walking_motions import run_motions
 
-_LEAST = 1e-6  # Of a probability and its complement, in logits.
+_LEAST = 1e-6  # Least probability, and complement, in logits.
 _DURATIONS_S = {"tour": 60.0, "push": 5.0, "command": 4.0}
 _SPEED_S = 12.0
 _CLASSIFIER_SEEDS = (0, 1, 2)
@@ -56,8 +56,7 @@ def walking(
     """Judge a walking robot: falls on tours, alarms on pushes, guard, recovery, MuJoCo.
 
     Alarms are compared at the same share of pushed motions that they alarm without need. Motions
-    are kept in ASSESSMENT/walking: a stopped study continues. With more tours, only those are
-    simulated that are not there yet.
+    are kept in ASSESSMENT/walking: a stopped study continues, and simulates missing tours only.
     """
     with open_study(
         "walking",
@@ -201,7 +200,7 @@ def push_estimates(pushed: Sequence[Motion], push_s: float) -> dict[Key, Estimat
 
 
 def tour_estimates(tours: Sequence[Motion]) -> dict[Key, Estimate]:
-    """Share of undisturbed tours without a fall, and the hours of those that stay safe."""
+    """Share of undisturbed tours without a fall, and the hours of tours that stay safe."""
     safe = [motion for motion in tours if not motion.has_left]
     hours = sum(float(motion.time_s[-1]) for motion in safe) / 3600.0
     return {
@@ -213,7 +212,7 @@ def tour_estimates(tours: Sequence[Motion]) -> dict[Key, Estimate]:
 def recovery_estimates(
     branch: str, alone: Sequence[Motion], again: Sequence[Motion]
 ) -> dict[Key, Estimate]:
-    """Share of falls saved by a branch, and impact speeds of those that it does not save."""
+    """Share of falls saved by a branch, and impact speeds of the remaining falls."""
     not_saved = [(a, b) for a, b in zip(alone, again, strict=True) if b.has_fallen]
     return {
         ("recovery", branch, "saved"): proportion(len(alone) - len(not_saved), len(alone)),

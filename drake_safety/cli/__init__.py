@@ -157,10 +157,7 @@ def main() -> None:
 
 
 def run_app(commands: Callable[..., Any], program: str) -> None:
-    """Runs a command; user errors are printed as one line, with --debug as a traceback.
-
-    SIGTERM stops it as Ctrl-C does.
-    """
+    """Runs a command; user errors are one line, with --debug a traceback; SIGTERM is as Ctrl-C."""
     # A program that reads a pipe gets results alone.
     log = console.console if console.console.is_terminal else Console(stderr=True)
     handler = RichHandler(console=log, show_path=False)

@@ -182,10 +182,7 @@ def _span(axes: Axes, start_s: float, end_s: float, colour: str) -> None:
 
 
 def _write_names(axes: Axes, events: Sequence[_Event], ends: tuple[float, float]) -> None:
-    """Writes names in rows above an axis with these ends, the earliest on top.
-
-    Lines go down from the names, so that none crosses another name.
-    """
+    """Writes names in rows above an axis, the earliest on top: no line crosses another name."""
     row_height = (ends[1] - ends[0]) * _LABEL_ROW_HEIGHT / _CURVE_HEIGHT
     top = ends[1] + row_height * min(len(events), _NUM_LABEL_ROWS)
     axes.set_ylim(ends[0], top)

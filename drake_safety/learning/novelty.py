@@ -9,7 +9,7 @@ import numpy as np
 
 NUM_QUADRATIC = 3  # Distances that are quadratic forms.
 _NUM_FOLDS = 5  # Folds of the episodes: every distance is from inputs of other episodes.
-_SMALLEST_SPREAD = 1e-2  # Of a column [its unit]; a constant column would be divided by zero.
+_SMALLEST_SPREAD = 1e-2  # Least scale of a column [its unit]: a column may be constant.
 # Variances of the standardised inputs along an axis:
 _REDUNDANT_VARIANCE = 1e-7  # Below this, the axis is a redundancy of the inputs.
 _LEAST_REDUNDANT_VARIANCE = 1e-8  # Lower bound along redundancies.
@@ -217,10 +217,7 @@ class Novelty:
         return np.abs((x - self.centre) * self.inverse_half_width)
 
     def of(self, x: np.ndarray) -> np.ndarray:
-        """Returns the largest distance of inputs (N, n_x) in units of its limit, (N,).
-
-        An input is novel above 1, and one that is not finite infinitely far.
-        """
+        """Largest distance of inputs (N, n_x) by its limit, (N,); novel above 1, inf for NaN."""
         with np.errstate(invalid="ignore", over="ignore"):
             largest = np.maximum.reduce(self.quadratic.squared(x, self._shares), axis=1)
             offset = (x - self.centre) * self._range_share

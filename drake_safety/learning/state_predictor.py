@@ -12,7 +12,7 @@ from drake_safety.files.progress import ignore
 from drake_safety.learning.maps import one_torch_thread
 
 HIDDEN_SIZES = (256, 256)
-_SMALLEST_SPREAD = 1e-4  # Of a column [its unit]; a constant column would be divided by zero.
+_SMALLEST_SPREAD = 1e-4  # Least scale of a column [its unit]: a column may be constant.
 LARGEST_INPUT = 10.0  # In standard deviations.
 _OUTSIDE = 0.005  # Share of training below and above the usual range of an input.
 _VECTORS = ("mean", "scale", "low", "high", "unit")

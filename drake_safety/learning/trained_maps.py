@@ -108,10 +108,7 @@ class Embedding:
         return Embedding(weights, self.input_range)
 
     def evaluate(self, x: np.ndarray) -> EmbeddingOutput:
-        """Evaluates all members at inputs (N, n_x); rows that are not finite give NaN.
-
-        A row has the same bits whatever the others are.
-        """
+        """Evaluates all members at inputs (N, n_x), each row by itself; NaN if not finite."""
         if np.ndim(x) != 2 or np.shape(x)[1] != self.num_inputs:
             expected = f"expected (N, {self.num_inputs})"
             raise ValueError(f"Embedding: inputs have shape {np.shape(x)}, {expected}")

@@ -24,9 +24,9 @@ class PolicyController(LeafSystem):
           memory: n]
 
     ``command`` is (v_x, v_y, ω_z) in the base's heading frame [m/s, rad/s]. ``memory`` has all that
-    a clone needs. ``action_state`` is the last action (n_a,), its largest change in a period (1,),
-    sine and cosine of the phases (2 n_p,), and the applied command (3,), after the policy's limits
-    of change. The last action replaces an action that is not finite; ``status`` is then ``HELD``,
+    a clone needs. ``action_state`` has the last action (n_a,), its largest change in a period (1,),
+    sine and cosine of the phases (2 n_p,), and the applied command (3,); the policy may limit its
+    change. The last action replaces an action that is not finite; ``status`` is then ``HELD``,
     and ``num_failures`` counts it.
     """
 
