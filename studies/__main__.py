@@ -9,6 +9,7 @@ import typer
 from drake_safety.cli import run_app
 from studies.adaptation import adaptation
 from studies.evaluate import evaluate
+from studies.features import features
 from studies.figures import figures
 from studies.gate import gate
 from studies.publish import readme, ship, store
@@ -25,7 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _COMMANDS: tuple[Callable[..., None], ...] = (
-    *(evaluate, adaptation, gate, rapt, rare, walking),
+    *(evaluate, adaptation, features, gate, rapt, rare, walking),
     *(figures, store, readme, ship, tutorials),
 )
 for _command in _COMMANDS:

@@ -48,6 +48,31 @@ def test_a_robot_walks_as_commanded_inside_its_safe_set(name):
     assert [finding for finding in check_contract(loop) if not finding.is_ok] == []
 
 
+def test_a_scenario_leaves_features_out(loop):
+    without = ["foot_height_*", "capture_point_*", "clearance_margin", "action_change"]
+    fewer = load_scenario("go2_walking", {"without_features": without}).make_loop()
+    left_out = {*loop.feature_names} - {*fewer.feature_names}
+    assert len(left_out) == 9 and not left_out & {*fewer.monitored["features"]}
+    values = []
+    for one in (loop, fewer):
+        context = one.CreateDefaultContext()
+        one.reset(context, episode_rng(0, 3))
+        values.append(one.GetOutputPort("features").Eval(context))
+    kept = [loop.feature_names.index(name) for name in fewer.feature_names]
+    np.testing.assert_array_equal(values[1], values[0][kept])
+    assert fewer.scenario.simulation_hash() != loop.scenario.simulation_hash()
+    with pytest.raises(ValueError, match=r"\['toe_\*'\] match no feature; there are .*tilt"):
+        load_scenario("go2_walking", {"without_features": ["toe_*"]}).make_loop()
+    with pytest.raises(ValueError, match=r"'Pendulum' keeps features of .* \['track\*'\]"):
+        load_scenario("pendulum", {"without_features": ["track*"]}).make_loop()
+    assessment = load_assessment("go2_walking")
+    with pytest.raises(ValueError, match=r"a guard needs the features \['largest_command_yaw'\]"):
+        assessment.info_.feature_names = [
+            name for name in loop.feature_names if name != "largest_command_yaw"
+        ]
+        loop.scenario.make_loop(assessment=assessment, guard=True)
+
+
 def test_episodes_begin_in_mid_stride_and_depend_on_their_number_alone(loop):
     states = []
     for index in (3, 4, 3):

@@ -102,7 +102,8 @@ class Balancing(LeggedLoop):
             recovery=switch,
             hold=switch and switch.GetOutputPort("recovery_active"),
         )
-        self.monitored = {"features": self.feature_names[-kinematics.num_joints :]}
+        loads = [name for name in self.feature_names if name.startswith("servo_load_")]
+        self.monitored = {"features": loads}
         builder.BuildInto(self)
 
     @classmethod

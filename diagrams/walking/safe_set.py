@@ -1,6 +1,7 @@
 """The safe set of a walking robot: upright, high enough, and only its feet on the ground."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import field
 from types import MappingProxyType
 from typing import Annotated
@@ -50,6 +51,11 @@ class WalkingSafeSet:
     names = ("tilt", "height", "clearance", "joint_limits", "fall")
     fall_name = "fall"
     angular_names = ("tilt", "joint_limits")
+    command_features = tuple(
+        f"{kind}_{axis}"
+        for kind in ("command", "last_command", "largest_command", "tracking_error")
+        for axis in _AXES
+    )
     watched_features = MappingProxyType(
         {"tilt": "tilt_margin", "capture_point_margin": "capture_point_support"}
     )
@@ -65,10 +71,7 @@ class WalkingSafeSet:
         self._fallen_m = limits.fall_height_share * kinematics.standing_height
         self.feature_names = [
             *("tilt_margin", "height_margin", "clearance_margin", "joint_margin"),
-            *(f"command_{axis}" for axis in _AXES),
-            *(f"last_command_{axis}" for axis in _AXES),
-            *(f"largest_command_{axis}" for axis in _AXES),
-            *(f"tracking_error_{axis}" for axis in _AXES),
+            *self.command_features,
             "tilt_rate",
             "capture_point_support",
             "capture_point_x",
@@ -137,17 +140,18 @@ class WalkingSafeSet:
             ]
         )
 
-    def with_commands(self, features: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """Features (C, n_f) with constant commands (C, 3) [m/s, rad/s] in place of the plan."""
-        changed = np.tile(features, (len(commands), 1))
-        for axis, name in enumerate(_AXES):
-            column = self.feature_names.index
-            asked, error = column(f"command_{name}"), column(f"tracking_error_{name}")
-            velocity = features[asked] - features[error]
-            for prefix in ("", "last_", "largest_"):
-                changed[:, column(f"{prefix}command_{name}")] = commands[:, axis]
-            changed[:, error] = commands[:, axis] - velocity
-        return changed
+
+def with_commands(names: Sequence[str], features: np.ndarray, commands: np.ndarray) -> np.ndarray:
+    """Named features (C, n_f) with constant commands (C, 3) [m/s, rad/s] in place of the plan."""
+    column = {name: i for i, name in enumerate(names)}
+    changed = np.tile(features, (len(commands), 1))
+    for axis, name in enumerate(_AXES):
+        asked, error = column[f"command_{name}"], column[f"tracking_error_{name}"]
+        velocity = features[asked] - features[error]
+        for prefix in ("", "last_", "largest_"):
+            changed[:, column[f"{prefix}command_{name}"]] = commands[:, axis]
+        changed[:, error] = commands[:, axis] - velocity
+    return changed
 
 
 def _tilt(q: np.ndarray) -> float:

@@ -1,7 +1,7 @@
 """Walking: a legged robot follows velocity commands by a trained policy."""
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics
 from drake_safety.diagrams.walking.command_guard import CommandGuard
 from drake_safety.diagrams.walking.parameters import WalkingParameters, profile
-from drake_safety.diagrams.walking.safe_set import WalkingSafeSet
+from drake_safety.diagrams.walking.safe_set import WalkingSafeSet, with_commands
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.models import load_robot
 from drake_safety.plants.physics import Scene
@@ -100,9 +100,12 @@ class Walking(LeggedLoop):
         safe_set = WalkingSafeSet(standing.kinematics, parameters.safe_set)
         self._guard: CommandGuard | None = None
         if guard and assessment is not None:
+            read = assessment.feature_names
+            if missing := [n for n in safe_set.command_features if n not in read]:
+                raise ValueError(f"walking: a guard needs the features {missing}, which Γ lacks")
             self._guard = CommandGuard(
                 assessment,
-                safe_set.with_commands,
+                partial(with_commands, read),
                 self.policy.parameters.command,
                 threshold=parameters.guard.threshold,
                 period_s=parameters.guard.period_s,
@@ -146,9 +149,10 @@ class Walking(LeggedLoop):
         # Inputs of the policy: its last actions, its phase and the command.
         self.memory_features = controller.action_names
         self.memory_period_s = self.policy.parameters.period_s
+        known = {*self.feature_names} - {_UNCOMMANDED}
         self.monitored = {
             "states": [name for name in self.state_names if name != _POSITION],
-            "features": [name for name in self.memory_features if name != _UNCOMMANDED],
+            "features": [n for n in self.memory_features if n in known],
         }
         builder.BuildInto(self)
 

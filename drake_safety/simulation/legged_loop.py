@@ -199,6 +199,7 @@ class LeggedLoop(PlannedLoop):
             gravity=self.plant.gravity_field().gravity_vector() if has_gravity else None,
             servo_loads=command is not None,
             memory=memory[1] if memory else (),
+            without=self.scenario.without_features,
             **self._assessor_options,
         )
         builder.AddNamedSystem("assessor_inputs", inputs)

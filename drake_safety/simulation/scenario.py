@@ -1,6 +1,7 @@
 """Scenarios: YAML files that combine a robot and a task."""
 
 import copy
+import fnmatch
 import hashlib
 import importlib
 import inspect
@@ -61,6 +62,8 @@ class Scenario:
     on_alarm: OnAlarm = "unknown"
     """Effect of the monitor's alarm: ``unknown`` makes every belief "don't know", so that plans are
     refused; ``report`` only reports it. Recovery ignores alarms."""
+    without_features: list[str] = field(default_factory=list)
+    """Patterns such as ``foot_height_*`` of a legged robot's features that Γ does not read."""
     variations: dict[str, PlantVariation] = field(default_factory=dict)
     """Plants by name; training episodes are of ``nominal`` and of the family."""
     family: PlantFamily | None = None
@@ -170,6 +173,8 @@ class Scenario:
             options["meshcat"] = meshcat
         loop: ClosedLoop = task(self, variation, assessment=assessment, **options)
         check_ports(loop)
+        if kept := [p for p in self.without_features if fnmatch.filter(loop.feature_names, p)]:
+            raise ValueError(f"task '{task.__name__}' keeps features of without_features: {kept}")
         return loop
 
     def options_for(self, purpose: Purpose, variation: str = "nominal") -> dict[str, Any]:
@@ -207,6 +212,8 @@ class Scenario:
             self.variation(variation)
         text = self._values()
         del text["on_alarm"]  # No episode depends on it.
+        if not self.without_features:
+            del text["without_features"]  # As the hash has always been.
         family = text.pop(FAMILY, {})
         if variation == FAMILY:
             text[FAMILY] = family.get("ranges")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from itertools import compress
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -40,6 +42,7 @@ class AssessorInputs(LeafSystem):
         gravity: Gravity in the world of ``plant_state``, (3,) [m/s²].
         memory: Names of the entries of ``controller_memory``.
         mirror: If given, state and gravity are mirrored.
+        without: Patterns such as ``foot_height_*`` of features that are left out.
         is_walking: See :class:`~drake_safety.systems.state_observer.StateObserver`.
     """
 
@@ -54,6 +57,7 @@ class AssessorInputs(LeafSystem):
         memory: Sequence[str] = (),
         mirror: Mirror | None = None,
         is_walking: bool = False,
+        without: Sequence[str] = (),
     ):
         super().__init__()
         self._kinematics, self._safe_set, self._mirror = kinematics, safe_set, mirror
@@ -73,6 +77,11 @@ class AssessorInputs(LeafSystem):
         if memory:
             self.feature_names += memory
             self._memory_port = self.DeclareVectorInputPort("controller_memory", len(memory))
+        every = self.feature_names
+        if unknown := [p for p in without if not any(fnmatchcase(name, p) for name in every)]:
+            raise ValueError(f"without_features: {unknown} match no feature; there are {every}")
+        self._is_read = [not any(fnmatchcase(name, p) for p in without) for name in every]
+        self.feature_names = [*compress(every, self._is_read)]
         ticket = {self.input_port_ticket(self._state_port.get_index())}
         n_s, n_f, n_c = map(len, (self.state_names, self.feature_names, self.constraint_names))
         self.DeclareVectorOutputPort("state", BasicVector(n_s), self._calc_state, ticket)
@@ -99,7 +108,7 @@ class AssessorInputs(LeafSystem):
             parts.append(self._command_port.Eval(context)[: len(joints)] - joints)
         if self._memory_port is not None:
             parts.append(self._memory_port.Eval(context))
-        output.SetFromVector(np.concatenate(parts))
+        output.SetFromVector(np.concatenate(parts)[self._is_read])
 
     def _calc_margins(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(finite_margins(self._safe_set, *self._measured(context)))
