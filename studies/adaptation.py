@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Annotated
 
@@ -22,16 +22,15 @@ from drake_safety.cli.training_folder import (
     episodes_folder,
     feedback_options,
 )
-from drake_safety.evaluation.metrics import Estimate, area_under_curve, proportion
+from drake_safety.evaluation.metrics import Estimate, area_under_curve
 from drake_safety.evaluation.results import Key
-from drake_safety.files.progress import StageProgress
-from drake_safety.learning.assessment import Prediction, SafetyAssessment
+from drake_safety.files.progress import StageProgress, ignore
+from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.feedback import EpisodePair
-from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import ADAPTATION
-from drake_safety.learning.segments import Episode, Episodes, Segments, split
+from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.feedback import run_pairs
 from drake_safety.simulation.rollouts import run_episodes
@@ -42,16 +41,10 @@ from studies.harness import ReleaseOption, open_study
 
 SIZES = (40, 80, 120, 160, 400)
 """Numbers of pairs of episodes after which an assessment is evaluated."""
-THRESHOLD = 0.5
-"""Γ below which a segment is classified unsafe."""
-PUBLISHED: dict[str, Callable[[Prediction], np.ndarray]] = {
-    "calibrated": lambda result: result.probability,
-    "grid": lambda result: safe_share(result.belief),
-}
-"""By the key of results: the probability, and the safe share of the grid's belief."""
 _SCRATCH_SIZES = (40, 160, 400)
 _BOOSTED_SIZES = (40, 160)
 _POOL_STRIDE = 10  # Between the first seeds of two pools.
+Pool = tuple[Sequence[EpisodePair], Episodes]  # Feedback, and the test set that judges it.
 
 
 def adaptation(
@@ -79,7 +72,7 @@ def adaptation(
 ) -> None:
     """Evaluate Γ before and after feedback of a simulated plant, on independent pools.
 
-    Episodes are shared with `drake-safety adapt`; study.json and its plot are written to
+    Episodes are shared with `drake-safety adapt`; study.json is written to
     ASSESSMENT/adapted-VARIATION.
     """
     learned = assessment_folder(load_scenario(scenario), assessment)
@@ -92,10 +85,6 @@ def adaptation(
         release=release,
         workers=workers,
         out=folder,
-        plotted=lambda key: (
-            key[0] in ("sharpened.calibrated", "paper.grid")
-            and key[2] in ("brier", "auc", "unsafe_recall")
-        ),
     ) as study:
         loaded, stages = study.scenario, study.stages
         seeds = [ADAPTATION.seeds(study.seed + _POOL_STRIDE * i) for i in range(pools)]
@@ -113,18 +102,21 @@ def adaptation(
             report = partial(stages, "fresh actual episodes")
             fresh.append(run_episodes(loaded, evaluate, seed=fresh_seed, progress=report, **kept))
         sets = [pairs.feedback() for pairs in drawn]
+        judged = list(zip(sets, fresh, strict=True))
         sizes = [size for size in _SCRATCH_SIZES if scratch and size <= feedback]
-        learned_from = {f"scratch {size}": drawn[0].actual[:size] for size in sizes}
         for mode, prior in priors.items():
-            baselines = train_baselines(prior, learned_from, num_workers=workers, progress=stages)
-            judged = [
-                Pool(feedback=one, test=TestSet.of(episodes, prior.settings.shortest))
-                for one, episodes in zip(sets, fresh, strict=True)
-            ]
+            learned_anew = map_items(
+                partial(_learned, prior.parameters),
+                [drawn[0].actual[:size] for size in reversed(sizes)],  # The longest first.
+                num_workers=workers,
+                batch_size=1,
+                progress=partial(stages, "learning from scratch"),
+            )
+            baselines = {f"scratch {one.used_[0].num_episodes}": one for one in learned_anew}
             study.rows |= pool_estimates(prior, judged, baselines=baselines, progress=stages)
             if mode == MODES[0] and scratch:
                 nominal = load_episodes(episodes_folder(learned.path))
-                study.rows |= boosting_estimates(nominal, judged, stages)
+                study.rows |= boosting_estimates(nominal, judged, prior.settings.shortest, stages)
         study.entries |= {
             "variation": variation,
             "pools": pools,
@@ -133,35 +125,13 @@ def adaptation(
         }
 
 
-@dataclass(frozen=True)
-class TestSet:
-    """Fresh actual episodes for evaluation, and their segments from every row."""
-
-    __test__ = False  # Not one of pytest's.
-
-    episodes: Episodes
-    segments: Segments
-
-    @classmethod
-    def of(cls, episodes: Episodes, shortest: int) -> TestSet:
-        """Cuts episodes at every row."""
-        return cls(episodes, split(episodes, stride=1, discount=1.0, shortest=shortest))
-
-
-def scores(assessment: SafetyAssessment, test: TestSet) -> dict[str, dict[str, float]]:
-    """Metrics of an assessment on the test set, by form of Γ and metric.
-
-    "FORM.k0" uses first rows alone; "unknown" is the share of "don't know".
-    """
-    segments = test.segments
-    result = assessment.predict_rows(segments, test.episodes.info.variation)
-    unknown = is_unknown(result.belief, assessment.parameters.initial_uncertainty)
-    found = {}
-    for name, published in PUBLISHED.items():
-        unsafe, label = 1.0 - published(result), segments.is_unsafe
-        found[name] = _metrics(unsafe, label) | {"unknown": float(unknown.mean())}
-        found[f"{name}.k0"] = _metrics(unsafe[segments.is_first], label[segments.is_first])
-    return found
+def scores(assessment: SafetyAssessment, test: Episodes) -> dict[str, float]:
+    """Metrics of an assessment on every row of fresh actual episodes."""
+    segments = split(test, stride=1, discount=1.0, shortest=assessment.settings.shortest)
+    result = assessment.predict_rows(segments, test.info.variation)
+    is_paper = assessment.settings.is_paper
+    safe = safe_share(result.belief) if is_paper else result.probability
+    return _metrics(1.0 - safe, segments.is_unsafe)
 
 
 def _metrics(unsafe: np.ndarray, label: np.ndarray) -> dict[str, float]:
@@ -170,18 +140,10 @@ def _metrics(unsafe: np.ndarray, label: np.ndarray) -> dict[str, float]:
 
     return {
         "brier": float(np.mean((unsafe - label) ** 2)),
-        "auc": area_under_curve(unsafe, label),
-        "unsafe_recall": share(unsafe > 1.0 - THRESHOLD, label),
-        "safe_recall": share(unsafe <= 1.0 - THRESHOLD, ~label),
+        "auc": area_under_curve(unsafe, label)(np.ones(len(label))),
+        "unsafe_recall": share(unsafe > 0.5, label),
+        "safe_recall": share(unsafe <= 0.5, ~label),
     }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pool:
-    """Feedback and the test set on which it is judged, with seeds of their own."""
-
-    feedback: Sequence[EpisodePair]
-    test: TestSet
 
 
 def pool_estimates(
@@ -190,7 +152,7 @@ def pool_estimates(
     *,
     sizes: Sequence[int] = SIZES,
     baselines: Mapping[str, SafetyAssessment] | None = None,
-    progress: StageProgress | None = None,
+    progress: StageProgress = ignore,
 ) -> dict[Key, Estimate]:
     """Evaluates an assessment before and after feedback, on independent pools.
 
@@ -198,117 +160,65 @@ def pool_estimates(
 
     Returns:
         By "FORM.ASSESSMENT.METRIC", where ASSESSMENT is "prior", "adapted N" or the name of a
-        baseline, the mean over pools, with minimum and maximum as interval. "gap" is the share of
-        pairs that differ, `pools_won` that of pools in which the Brier score is better than the
-        prior's.
+        baseline, the mean over pools, with minimum and maximum as interval. FORM is the probability
+        of the sharpened mode, and the safe share of the grid's belief in the paper's.
     """
-    least = min(len(pool.feedback) for pool in pools)
+    least = min(len(feedback) for feedback, _ in pools)
     sizes = [size for size in sizes if size <= least]
     if not sizes:
         raise ValueError(f"adaptation study: there are only {least} pairs of episodes")
-    found: dict[str, list[dict[str, dict[str, float]]]] = {}
-    stage = f"{assessment.parameters.mode}: pools of feedback"
-    for i, pool in enumerate(pools):
-        for name, one in {"prior": assessment, **(baselines or {})}.items():
-            found.setdefault(name, []).append(scores(one, pool.test))
-        for k, size in enumerate(sizes):
-            adapted = assessment.adapt(pool.feedback[:size])
-            found.setdefault(f"adapted {size}", []).append(scores(adapted, pool.test))
-            if progress is not None:
-                progress(stage, i * len(sizes) + k + 1, len(pools) * len(sizes))
-    num_test = sum(len(pool.test.episodes) for pool in pools)
-    everything = [one for pool in pools for one in pool.feedback]
-    gap = proportion(sum(one.differs for one in everything), len(everything))
-    mode = assessment.parameters.mode
-    estimates: dict[Key, Estimate] = {(mode, "", "gap"): gap}
-    for form in found["prior"][0]:
-        for who, of_pools in found.items():
-            for metric in of_pools[0][form]:
-                values = [one[form][metric] for one in of_pools]
-                estimates[f"{mode}.{form}", who, metric] = Estimate(
-                    float(np.mean(values)), min(values), max(values), num_test
-                )
-        brier = {who: np.array([p[form]["brier"] for p in ps]) for who, ps in found.items()}
-        before = brier["prior"]
-        for who in (f"adapted {size}" for size in sizes):
-            won = proportion(int(np.sum(brier[who] < before)), len(pools))
-            estimates[f"{mode}.{form}", who, "pools_won"] = won
-    return estimates
-
-
-def boosting_estimates(
-    nominal: Episodes,
-    pools: Sequence[Pool],
-    progress: StageProgress,
-    sizes: Sequence[int] = _BOOSTED_SIZES,
-) -> dict[Key, Estimate]:
-    """Gradient boosting before feedback, on the feedback alone, and on it and the training.
-
-    Returns:
-        By "WHO.METRIC", where WHO is "prior", "alone N" or "refitted N", the mean over pools, with
-        minimum and maximum as interval.
-    """
-    sizes = [size for size in sizes if size <= min(len(pool.feedback) for pool in pools)]
-    prior = DirectClassifier("gradient_boosting").fit(nominal)
     found: dict[str, list[dict[str, float]]] = {}
-    for i, pool in enumerate(pools):
-        progress("gradient boosting on feedback", i, len(pools))
-        judged = {"prior": prior}
-        for size in sizes:
-            actual = [pair.actual for pair in pool.feedback[:size]]
-            for who, before in {"alone": [], "refitted": list(nominal)}.items():
-                together = Episodes(nominal.info, _renumbered([*before, *actual]))
-                judged[f"{who} {size}"] = DirectClassifier("gradient_boosting").fit(together)
-        segments = pool.test.segments
-        for who, one in judged.items():
-            rows = segments.state, segments.desired_preview, segments.features
-            unsafe = one.predict_unsafe(*rows)
-            found.setdefault(who, []).append(_metrics(unsafe, segments.is_unsafe))
-    num_test = sum(len(pool.test.episodes) for pool in pools)
+    mode = assessment.parameters.mode
+    for i, (feedback, test) in enumerate(pools):
+        for name, one in {"prior": assessment, **(baselines or {})}.items():
+            found.setdefault(name, []).append(scores(one, test))
+        for k, size in enumerate(sizes):
+            adapted = assessment.adapt(feedback[:size])
+            found.setdefault(f"adapted {size}", []).append(scores(adapted, test))
+            done = i * len(sizes) + k + 1
+            progress(f"{mode}: pools of feedback", done, len(pools) * len(sizes))
+    form = "grid" if assessment.settings.is_paper else "calibrated"
+    return _over_pools(f"{mode}.{form}", found, pools)
+
+
+def _over_pools(
+    set_: str, found: Mapping[str, list[dict[str, float]]], pools: Sequence[Pool]
+) -> dict[Key, Estimate]:
+    num_test = sum(len(test) for _, test in pools)
     return {
-        ("boosting", who, metric): Estimate(
-            float(np.mean(values)), float(min(values)), float(max(values)), num_test
-        )
+        (set_, who, metric): Estimate(float(np.mean(values)), min(values), max(values), num_test)
         for who, of_pools in found.items()
         for metric in of_pools[0]
         if (values := [one[metric] for one in of_pools])
     }
 
 
-def _renumbered(episodes: Sequence[Episode]) -> list[Episode]:
-    return [replace(episode, index=i) for i, episode in enumerate(episodes)]
+def boosting_estimates(
+    nominal: Episodes,
+    pools: Sequence[Pool],
+    shortest: int,
+    progress: StageProgress,
+) -> dict[Key, Estimate]:
+    """Gradient boosting before feedback ("prior"), and on it and the training ("refitted N")."""
+    least = min(len(feedback) for feedback, _ in pools)
+    sizes = [size for size in _BOOSTED_SIZES if size <= least]
+    prior = DirectClassifier("gradient_boosting").fit(nominal)
+    found: dict[str, list[dict[str, float]]] = {}
+    for i, (feedback, test) in enumerate(pools):
+        progress("gradient boosting on feedback", i, len(pools))
+        judged = {"prior": prior}
+        for size in sizes:
+            every = [*nominal, *(pair.actual for pair in feedback[:size])]
+            together = [replace(episode, index=k) for k, episode in enumerate(every)]
+            classifier = DirectClassifier("gradient_boosting")
+            judged[f"refitted {size}"] = classifier.fit(Episodes(nominal.info, together))
+        segments = split(test, stride=1, discount=1.0, shortest=shortest)
+        for who, one in judged.items():
+            rows = segments.state, segments.desired_preview, segments.features
+            unsafe = one.predict_unsafe(*rows)
+            found.setdefault(who, []).append(_metrics(unsafe, segments.is_unsafe))
+    return _over_pools("boosting", found, pools)
 
 
-def train_baselines(
-    assessment: SafetyAssessment,
-    episodes: Mapping[str, Episodes],
-    *,
-    num_workers: int | None = None,
-    progress: StageProgress | None = None,
-) -> dict[str, SafetyAssessment]:
-    """Trains assessments from scratch on actual episodes, with the parameters of the prior.
-
-    Those with too few episodes for t-SNE are left out.
-    """
-    # The largest first, so that no worker is left with it at the end.
-    wanted = sorted(episodes.items(), key=lambda item: -len(item[1]))
-    learned = dict(
-        map_items(
-            partial(_learned, assessment.parameters),
-            wanted,
-            num_workers=num_workers,
-            batch_size=1,
-            progress=None if progress is None else partial(progress, "learning from scratch"),
-        )
-    )
-    return {name: one for name in episodes if (one := learned[name]) is not None}
-
-
-def _learned(
-    parameters: AssessmentParameters, item: tuple[str, Episodes]
-) -> tuple[str, SafetyAssessment | None]:
-    name, episodes = item
-    try:
-        return name, SafetyAssessment(parameters).fit(episodes)
-    except ValueError:
-        return name, None
+def _learned(parameters: AssessmentParameters, episodes: Episodes) -> SafetyAssessment:
+    return SafetyAssessment(parameters).fit(episodes)

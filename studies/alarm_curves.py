@@ -7,7 +7,6 @@ the false alarms an hour on undisturbed motion. Methods are compared at the same
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -146,11 +145,11 @@ def _values(alarm: Alarm, motion: Motion) -> np.ndarray:
 
 
 def equal_cost_estimates(
-    watched: Mapping[str, Sequence[Watched]], ours: Sequence[str], rivals: Sequence[str]
+    watched: Mapping[str, Sequence[Watched]], own: str, rival: str
 ) -> dict[Key, Estimate]:
-    """Shares of falls announced at equal cost, their differences, and false alarms an hour.
+    """Shares of falls announced at equal cost, a paired difference, and false alarms an hour.
 
-    Intervals are over pushed motions; for differences they are paired.
+    Intervals are over pushed motions.
     """
     estimates: dict[Key, Estimate] = {}
     for share in SHARES:
@@ -166,10 +165,9 @@ def equal_cost_estimates(
             estimates[*key, f"false_alarms_per_hour_{at}"] = rate_per_hour(
                 float(np.mean(counts)), seeds[0].undisturbed_s, seeds[0].num_undisturbed
             )
-        for own, rival in itertools.product(ours, rivals):
-            key = f"alarm.{_JUDGED}", f"{own}_minus_{rival}"
-            estimates[*key, f"announced_{at}"] = _over_motions(
-                watched[own][0], statistics[own], statistics[rival]
+        if {own, rival} <= watched.keys():
+            estimates[f"alarm.{_JUDGED}", f"{own}_minus_{rival}", f"announced_{at}"] = (
+                _over_motions(watched[own][0], statistics[own], statistics[rival])
             )
     return estimates
 

@@ -17,28 +17,12 @@ from drake_safety.evaluation.metrics import Estimate, auc, median, proportion, r
 from drake_safety.evaluation.results import Key
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.evaluation.shift_study import SEEN
-from drake_safety.evaluation.tables import Column
-from drake_safety.evaluation.verdict_tables import Kind
 from drake_safety.simulation.motion import Motion
 
 FALSE_ALARM_SHARE = 0.05
 """Allowed share of safe calibration motions with a false alarm, the same for all alarms."""
 NUM_ROWS = 2
 """Successive rows that give an alarm: a blow itself can make one row "don't know"."""
-ALARMS: Kind = (
-    "Alarms on pushed motions",
-    "Thresholds are chosen for the same share of false alarms on calibration motions.",
-    (
-        Column("detected", "detection rate", "%", 1, 1),
-        Column("lead_to_leaving_s", "lead time to leaving", "s", 1, 2),
-        Column("falls_detected", "detection rate of falls", "%", 1, 1),
-        Column("lead_to_fall_s", "lead time to the fall", "s", 1, 2),
-        Column("false_alarms_per_hour", "false-alarm rate", "/h", -1, 0),
-        Column("undisturbed_false_alarms_per_hour", "false-alarm rate, undisturbed", "/h", -1, 0),
-        Column("auc", "AUC", "", 1),
-    ),
-)
-"""The table of the set "monitoring"."""
 _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 TRACKING = "tracking_error_"
 """Beginning of the names of features."""
@@ -148,7 +132,6 @@ def evaluate_alarms(
     calibration: Sequence[Motion],
     test: Sequence[Motion],
     *,
-    false_alarm_share: float = FALSE_ALARM_SHARE,
     num_rows: int = NUM_ROWS,
 ) -> dict[Key, Estimate]:
     """Compares alarms at the same share of false alarms on calibration motions.
@@ -159,20 +142,15 @@ def evaluate_alarms(
     judged = [motion for motion in test if not motion.leave_time_s < motion.push_time_s]
     is_unsafe = np.array([motion.has_left for motion in judged], dtype=bool)
     index = np.array([motion.index for motion in judged])
-    left = [motion for motion in judged if motion.has_left]
-    until_s = np.array([motion.leave_time_s - motion.push_time_s for motion in left])
-    estimates = {
-        ("monitoring", "motions", "leave_safe_set"): proportion(len(left), len(judged)),
-        ("monitoring", "motions", "push_to_leaving_s"): median(until_s),
-    }
+    left = proportion(int(is_unsafe.sum()), len(judged))
+    estimates = {("monitoring", "motions", "leave_safe_set"): left}
     for alarm in alarms:
         lowest = np.array([lowest_value(m, persisting(alarm.value(m), num_rows)) for m in safe])
-        threshold = equal_share_threshold(lowest, false_alarm_share)
+        threshold = equal_share_threshold(lowest, FALSE_ALARM_SHARE)
         values = [persisting(alarm.value(motion), num_rows) for motion in judged]
         score = -np.array([lowest_value(m, v) for m, v in zip(judged, values, strict=True)])
         found = _alarm_estimates(judged, values, threshold)
         found["auc"] = auc(score, is_unsafe, index)
-        found["threshold"] = Estimate.exact(threshold, len(safe))
         estimates |= {("monitoring", alarm.name, key): one for key, one in found.items()}
     return estimates
 
@@ -184,23 +162,11 @@ def _alarm_estimates(
     safe = [(motion, value) for motion, value in watched if not motion.has_left]
     left = [(motion, value) for motion, value in watched if motion.has_left]
     false = sum(math.isfinite(first_alarm(motion, value, threshold)) for motion, value in safe)
-    early = sum(
-        first_alarm(motion, value, threshold) < motion.push_time_s - _SLACK_S
-        for motion, value in watched
-    )
     safe_s = sum(float(motion.time_s[-1]) for motion, _ in safe)
-    undisturbed_s = sum(min(motion.push_time_s, float(motion.time_s[-1])) for motion in judged)
     alarm_s = np.array([first_alarm(m, v, threshold, since_s=m.push_time_s) for m, v in left])
     leave = np.array([motion.leave_time_s for motion, _ in left])
-    fall = np.array([motion.fall_time_s for motion, _ in left])
-    has_fallen = np.isfinite(fall)
     return {
         "detected": proportion(int(np.sum(alarm_s < leave - _SLACK_S)), len(left)),
         "lead_to_leaving_s": median(leave - alarm_s),
-        "falls_detected": proportion(
-            int(np.sum(alarm_s[has_fallen] < fall[has_fallen] - _SLACK_S)), int(has_fallen.sum())
-        ),
-        "lead_to_fall_s": median(fall[has_fallen] - alarm_s[has_fallen]),
         "false_alarms_per_hour": rate_per_hour(false, safe_s, len(safe)),
-        "undisturbed_false_alarms_per_hour": rate_per_hour(early, undisturbed_s, len(judged)),
     }

@@ -20,6 +20,7 @@ KINDS = ("gradient_boosting", "mlp")
 _VALIDATION_SHARE = 0.1
 _MLP_EPOCHS = 60
 _MLP_PATIENCE = 20
+Statistic = Callable[[np.ndarray], float]  # Of weights of samples.
 
 
 class DirectClassifier:
@@ -175,21 +176,9 @@ def classifier_scorers(
     return scorers
 
 
-def auc_difference(
-    unsafe_score: np.ndarray, other_score: np.ndarray, is_unsafe: np.ndarray
-) -> Callable[[np.ndarray], float]:
-    """The AUC of one scorer minus that of another, as a function of samples' weights, (N,)."""
-
-    def difference(weight: np.ndarray) -> float:
-        return area_under_curve(unsafe_score, is_unsafe, weight) - area_under_curve(
-            other_score, is_unsafe, weight
-        )
-
-    return difference
-
-
-def _mean_of(statistics: Sequence[Callable[[np.ndarray], float]], weight: np.ndarray) -> float:
-    return float(np.mean([one(weight) for one in statistics]))
+def _ahead(own: Statistic, others: Sequence[Statistic], weight: np.ndarray) -> float:
+    area = own(weight)
+    return float(np.mean([area - other(weight) for other in others]))
 
 
 def classifier_differences(
@@ -207,12 +196,12 @@ def classifier_differences(
     for place, rows in {"rows": every, "first": segments.is_first}.items():
         label, episode = segments.is_unsafe[rows], segments.episode[rows]
         own = scores[gamma.name][rows]
+        own_area = area_under_curve(own, label)
         for kind in KINDS:
             others = [one[rows] for name, one in scores.items() if name.startswith(kind)]
-            each = [auc_difference(own, other, label) for other in others]
-            found[f"difference.{place}", kind, "auc"] = Bootstrap().over_episodes(
-                partial(_mean_of, each), episode
-            )
+            areas = [area_under_curve(other, label) for other in others]
+            ahead = partial(_ahead, own_area, areas)
+            found[f"difference.{place}", kind, "auc"] = Bootstrap().over_episodes(ahead, episode)
             error = np.mean([(other - label) ** 2 for other in others], axis=0)
             found[f"difference.{place}", kind, "brier"] = mean(
                 (own - label) ** 2 - error, episode, bootstrap=Bootstrap()

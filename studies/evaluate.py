@@ -35,10 +35,8 @@ from drake_safety.cli.training_folder import (
 )
 from drake_safety.diagrams.balancing.throws import HasBall, run_throws
 from drake_safety.evaluation.metrics import Estimate
-from drake_safety.evaluation.results import Key, Results
+from drake_safety.evaluation.results import Key
 from drake_safety.evaluation.scorers import Scorer
-from drake_safety.evaluation.tables import Table
-from drake_safety.evaluation.verdict_tables import verdict_table, verdict_tables
 from drake_safety.learning.seeds import EVALUATION, RELEASE
 from drake_safety.simulation.capabilities import (
     CanFall,
@@ -48,13 +46,12 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import load_scenario
 from studies.alarms import (
-    ALARMS,
     evaluate_alarms,
     scorer_alarm,
     threshold_alarms,
 )
 from studies.baselines import classifier_differences, classifier_scorers
-from studies.harness import CalibrationOption, EpisodesOption, ReleaseOption
+from studies.harness import ReleaseOption
 from studies.throws import classifier_rules
 
 _CLASSIFIER_SEEDS = (0, 1, 2)
@@ -64,9 +61,11 @@ _PROGRAM = "python -m studies"
 def evaluate(
     scenario: ScenarioArgument,
     assessment: TrainingOption,
-    episodes: EpisodesOption = 1000,
+    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
     throws: Annotated[int, typer.Option(help="Fresh throws at the actual plant.", min=0)] = 0,
-    calibration_episodes: CalibrationOption = 300,
+    calibration_episodes: Annotated[
+        int, typer.Option(help="Other ones, for thresholds.", min=20)
+    ] = 300,
     calibration_throws: Annotated[
         int, typer.Option(help="Other throws, for thresholds of the classifiers.", min=1)
     ] = 200,
@@ -84,9 +83,7 @@ def evaluate(
     loop = loaded.make_loop()
     if throws:
         require(loop, HasBall)
-    with evaluating(
-        loaded, learned, folder, EVALUATION, first, workers, _tables, _PROGRAM
-    ) as evaluation:
+    with evaluating(loaded, learned, folder, EVALUATION, first, workers, _PROGRAM) as evaluation:
         evaluation.entries["calibration_episodes"] = calibration_episodes
         test = evaluation.fresh("fresh nominal episodes", episodes, "evaluation")
         other = evaluation.fresh("calibration episodes", calibration_episodes, "thresholds")
@@ -104,11 +101,6 @@ def evaluate(
         add_family(evaluation, calibration_episodes)
         if throws:
             _add_throws(evaluation, loop, classifiers, throws, calibration_throws)
-
-
-def _tables(results: Results) -> list[Table]:
-    alarms = verdict_table(results, "monitoring", corner="alarm", kind=ALARMS)
-    return [*verdict_tables(results), *([alarms] if alarms.rows else [])]
 
 
 def _add_throws(

@@ -11,14 +11,20 @@ import numpy as np
 import typer
 
 from drake_safety.cli.console import AssessmentOption, ScenarioArgument, WorkersOption
-from drake_safety.cli.training_folder import assessment_folder, episodes_folder, family_folder
+from drake_safety.cli.training_folder import (
+    assessment_folder,
+    episodes_folder,
+    family_folder,
+    run_fresh_episodes,
+)
 from drake_safety.evaluation.metrics import segment_estimates
 from drake_safety.evaluation.scorers import assessment_scorer
 from drake_safety.learning.assessment import SafetyAssessment
+from drake_safety.learning.seeds import EVALUATION
 from drake_safety.learning.segments import Episodes, split
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.scenario import load_scenario
-from studies.harness import EpisodesOption, ReleaseOption, Study, open_study
+from studies.harness import ReleaseOption, Study, open_study
 
 _THRESHOLD = 0.5
 
@@ -29,7 +35,7 @@ def features(
         list[str], typer.Option(help="Features left out: patterns, separated by commas.")
     ],
     assessment: AssessmentOption = None,
-    episodes: EpisodesOption = 600,
+    episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 600,
     release: ReleaseOption = False,
     workers: WorkersOption = None,
 ) -> None:
@@ -39,7 +45,9 @@ def features(
     """
     folder = assessment_folder(load_scenario(scenario), assessment).path
     with open_study("features", scenario, folder, release=release, workers=workers) as study:
-        gamma, fresh = study.load("sharpened"), study.fresh(episodes)
+        seed = EVALUATION.seeds(study.seed)["evaluation"]
+        gamma, report = study.load("sharpened", [seed]), partial(study.stages, "fresh episodes")
+        fresh = run_fresh_episodes(study.scenario, folder, episodes, seed, report, workers)
         _judge(study, "all", gamma, fresh)
         nominal = load_episodes(episodes_folder(folder))
         family = load_episodes(family_folder(folder)) if gamma.knows_family else None

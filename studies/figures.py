@@ -5,12 +5,13 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from matplotlib.figure import Figure
 
@@ -20,12 +21,11 @@ from drake_safety.cli.run import run
 from drake_safety.cli.training_folder import MODES, load_assessment
 from drake_safety.diagrams.balancing.throw_study import PAPER_THRESHOLD
 from drake_safety.diagrams.balancing.throws import run_throw
+from drake_safety.evaluation import figure_style as style
 from drake_safety.evaluation.embedding_figure import embedding_figure
-from drake_safety.evaluation.figure_style import save
-from drake_safety.evaluation.interval_figure import interval_figure
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.push_figure import push_figure
-from drake_safety.evaluation.results import Results
+from drake_safety.evaluation.results import Key, Results
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.simulation.feedback import run_pairs
@@ -91,6 +91,39 @@ def _adaptation(folder: Path) -> Figure:
     prior = load_assessment(shipped_folder(scenario.name), "paper")
     pairs = run_pairs(scenario, _PAIRS, variation="payload").feedback()
     return adaptation_figure(prior, prior.adapt(pairs), f"{len(pairs)} pairs with a payload")
+
+
+def interval_figure(estimates: Mapping[Key, Estimate]) -> Figure:
+    """Plots a panel for each metric: methods below each other, sets side by side in colours."""
+    sets, methods, metrics = ([*dict.fromkeys(names)] for names in zip(*estimates, strict=True))
+    with style.drawing_style():
+        height = 1.1 + 0.13 * len(methods) * (1 + len(sets))
+        fig = style.new_figure(2.2 + 2.6 * len(metrics), height)
+        panels = fig.subplots(1, len(metrics), sharey=True)
+        for axes, metric in zip(panels, metrics, strict=True):
+            for i, name in enumerate(sets):
+                keys = [key for key in estimates if (key[0], key[2]) == (name, metric)]
+                shown = (estimates[key] for key in keys)
+                # NaN ends, such as those of a value without interval, draw no bar.
+                ends = np.array([[one.value, one.low, one.high] for one in shown])
+                value, low, high = ends.reshape(-1, 3).T
+                axes.errorbar(
+                    value,
+                    [methods.index(k[1]) + 0.7 * ((i + 0.5) / len(sets) - 0.5) for k in keys],
+                    xerr=np.maximum([value - low, high - value], 0.0),
+                    fmt="os"[i],
+                    color=style.SERIES_COLOURS[i],
+                    markersize=5.0,
+                    capsize=2.5,
+                    label=style.spoken(name).replace(".", ", "),
+                )
+            axes.set_title(style.label_of(metric))
+            axes.grid(axis="x", color=style.FAINT_INK, alpha=0.25)
+        panels[0].set_yticks(range(len(methods)), [style.label_of(method) for method in methods])
+        panels[0].set_ylim(len(methods) - 0.5, -0.5)
+        handles = panels[0].get_legend_handles_labels()
+        fig.legend(*handles, loc="outside lower center", ncols=len(sets))
+    return fig
 
 
 def _shifts(name: str, folder: Path) -> Figure:
@@ -159,7 +192,7 @@ def figures(
         with tempfile.TemporaryDirectory() as folder:
             drawn = PICTURES[name](Path(folder))
             if isinstance(drawn, Figure):
-                drawn = save(drawn, Path(folder) / name)[0]
+                drawn = style.save(drawn, Path(folder) / name)[0]
             picture = out / f"{name}{drawn.suffix}"
             shutil.copyfile(drawn, picture)
         say(f"{time.monotonic() - begin_s:4.0f} s ", picture)

@@ -18,9 +18,8 @@ import numpy as np
 import typer
 
 from drake_safety.cli.console import console, made_by, open_stages, say
-from drake_safety.cli.training_folder import check_fresh, load_assessment, run_fresh_episodes
-from drake_safety.evaluation.figure_style import label_of, save, spoken
-from drake_safety.evaluation.interval_figure import interval_figure
+from drake_safety.cli.training_folder import check_fresh, load_assessment
+from drake_safety.evaluation.figure_style import label_of, spoken
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.results import Key, Results
 from drake_safety.evaluation.tables import Column, Table, rows_of
@@ -28,12 +27,9 @@ from drake_safety.files.atomic import replacing
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.seeds import EVALUATION, RELEASE, use_of
-from drake_safety.learning.segments import Episodes
 from drake_safety.simulation.scenario import Scenario, load_scenario
 from drake_safety.simulation.worker_processes import Progress, map_items
 
-EpisodesOption = Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)]
-CalibrationOption = Annotated[int, typer.Option(help="Other episodes, for thresholds.", min=20)]
 ReleaseOption = Annotated[
     bool, typer.Option("--release", help="Use the release's seeds: once, for published figures.")
 ]
@@ -63,25 +59,11 @@ class Study:
         """Adds the rows of a method by metric."""
         self.rows |= {(set, method, metric): one for metric, one in estimates.items()}
 
-    @property
-    def seeds(self) -> dict[str, int]:
-        """Seeds of fresh episodes by purpose."""
-        return EVALUATION.seeds(self.seed)
-
-    def load(self, mode: str, seeds: Iterable[int] | None = None) -> SafetyAssessment:
-        """The assessment of a mode, which has not used the seeds; None: `evaluate`'s."""
+    def load(self, mode: str, seeds: Iterable[int]) -> SafetyAssessment:
+        """The assessment of a mode, which has not used these seeds."""
         assessment = load_assessment(self.folder, mode)
-        check_fresh(assessment, self.scenario, self.seeds.values() if seeds is None else seeds)
+        check_fresh(assessment, self.scenario, seeds)
         return assessment
-
-    def fresh(self, count: int, purpose: str = "evaluation") -> Episodes:
-        """Fresh nominal episodes, shared with `evaluate`."""
-        seed = self.seeds[purpose]
-        progress = partial(self.stages, f"episodes, {purpose}")
-        episodes = run_fresh_episodes(
-            self.scenario, self.folder, count, seed, progress, self.workers
-        )
-        return episodes[:count]
 
     def results(self) -> Results:
         """The rows, and what made them."""
@@ -101,9 +83,8 @@ def open_study(
     release: bool = False,
     workers: int | None = None,
     out: Path | None = None,
-    plotted: Callable[[Key], bool] | None = None,
 ) -> Iterator[Study]:
-    """Runs a study in the block; afterwards its rows are written, printed and plotted."""
+    """Runs a study in the block; afterwards its rows are written and printed."""
     loaded, seed = load_scenario(scenario), seed + RELEASE * release
     with open_stages() as stages:
         study = Study(
@@ -123,9 +104,6 @@ def open_study(
         table = Table(corner=set_, columns=columns, rows=rows_of(results, labels, columns))
         console.print(table.to_rich())
     say("figures", file)
-    drawn = {key: one for key, one in results.items() if plotted and plotted(key)}
-    for picture in save(interval_figure(drawn), file) if drawn else ():
-        say("picture", picture)
 
 
 def kept(

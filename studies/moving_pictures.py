@@ -33,7 +33,7 @@ _ACTS_S = 0.12  # From the trigger until the recovery is seen.
 _NUM_COLOURS = 127
 _GROUND, _LINES = Rgba(0.78, 0.80, 0.83), Rgba(0.55, 0.58, 0.62)
 _LINE_M, _TILE_M, _NUM_LINES = 0.012, 0.5, 33
-_PORTS = ("safety_probability", "belief")
+_PORTS = ("safety_probability", "belief", "ball_state")
 _OPTIONS: dict[str, Any] = {"seed": DEMONSTRATION.first, "duration_s": 3.0, "after_fall_s": 0.8}
 _TURNS = np.radians([90.0, -90.0, 135.0, 45.0, -135.0, -45.0])  # From the camera's direction.
 _COLOURS = (style.INK, style.UNSAFE_COLOUR, style.RECOVERY_COLOUR, style.SAFE_COLOUR)
@@ -73,55 +73,42 @@ class Take(NamedTuple):
 
 def recovery(folder: Path) -> Path:
     """Laikago and the fastest ball of 3 kg that makes it fall without recovery only."""
-    plain, guarded = loops = _loops("laikago_balancing", ball=True)
-    slowest, fastest = plain.scenario.parameters.push.speed_m_s
+    scenario = load_scenario("laikago_balancing")
+    gamma = load_assessment(shipped_folder(scenario.name), MODES[0])
+    options: dict[str, Any] = {"assessment": gamma, "ball": True}
+    plain, guarded = (scenario.make_loop("actual", recovery=on, **options) for on in (False, True))
+    slowest, fastest = scenario.parameters.push.speed_m_s
     balls = [
         Throw(time_s=0.5, mass_kg=3.0, speed_m_s=speed, direction_rad=direction)
         for direction in plain.view.azimuth_rad + _TURNS
         for speed in np.arange(fastest, slowest, -1.0).tolist()
     ]
-
-    def run(loop: Any, ball: Throw, ports: Sequence[str]) -> Motion:
-        return run_throw(loop, 0, throws=[ball], ports=(*ports, "ball_state"), **_OPTIONS)
-
-    ball, takes = first_saved(loops, balls, run, "steps until it stands")
+    ball, takes = _first_saved(plain, guarded, balls)
     hit = ball.time_s, f"hit by a ball of 3 kg at {ball.speed_m_s:g} m/s"
     return save_moving_picture(guarded, takes, hit, folder / "recovery.gif")
 
 
-def _loops(name: str, variation: str = "actual", **options: Any) -> list[Any]:
-    """A loop without and with recovery."""
-    scenario, gamma = load_scenario(name), load_assessment(shipped_folder(name), MODES[0])
-    options |= {"assessment": gamma}
-    return [scenario.make_loop(variation, recovery=is_on, **options) for is_on in (False, True)]
-
-
-def first_saved(
-    loops: Sequence[Any],
-    disturbances: Iterable[Any],
-    run: Callable[[Any, Any, Sequence[str]], Motion],
-    acts: str,
-) -> tuple[Any, list[Take]]:
-    """The first disturbance after which a robot falls without recovery only, and both runs."""
-    plain, guarded = loops
+def _first_saved(plain: Any, guarded: Any, balls: Iterable[Throw]) -> tuple[Throw, list[Take]]:
+    """The first ball after which a robot falls without recovery only, and both runs."""
     threshold = guarded.scenario.parameters.recovery.threshold
-    for one in disturbances:
-        fallen = run(plain, one, _PORTS)
+    for ball in balls:
+        fallen = run_throw(plain, 0, throws=[ball], ports=_PORTS, **_OPTIONS)
         is_down = fallen["margins"][-1, plain.constraint_names.index(plain.fall_name)] < 0.0
         if not is_down:  # It may have got up again.
             continue
-        saved = run(guarded, one, (*_PORTS, "recovery_active"))
-        is_implausible = saved.ports.get("violations", np.zeros(1)).any()
-        if saved.has_fallen or is_implausible or len(saved.recovery_intervals_s) != 1:
+        saved = run_throw(guarded, 0, throws=[ball], ports=_PORTS, **_OPTIONS)
+        is_one = len(saved.recovery_intervals_s) == 1
+        if saved.has_fallen or saved["violations"].any() or not is_one:
             continue
         ((start_s, end_s),) = saved.recovery_intervals_s
         belief = saved["belief"][np.abs(saved.time_s - start_s).argmin()]
         is_lost = is_unknown(belief, guarded.assessment.parameters.initial_uncertainty)
         why = "don't know" if is_lost else f"probability below {threshold:g}"
-        told = [(start_s, f"{why}: recovery"), (start_s + _ACTS_S, acts), (end_s, "stands")]
+        acts = start_s + _ACTS_S, "steps until it stands"
+        told = [(start_s, f"{why}: recovery"), acts, (end_s, "stands")]
         falls = Take("without recovery", fallen, [(fallen.fall_time_s, "falls")])
-        return one, [falls, Take("with recovery", saved, told)]
-    raise ValueError(f"no disturbance of '{guarded.scenario.name}' calls for recovery")
+        return ball, [falls, Take("with recovery", saved, told)]
+    raise ValueError(f"no ball at '{guarded.scenario.name}' calls for recovery")
 
 
 def save_moving_picture(
@@ -172,9 +159,7 @@ def save_moving_picture(
 def _draw_scene(axes: Any, loop: LeggedLoop, take: Take) -> Callable[[float], None]:
     """Prepares the picture of a run, with captions below; returns what draws an instant [s]."""
     motion = take.motion
-    states = {loop.robot.name: motion["plant_state"]}
-    if "ball_state" in motion.ports:
-        states["ball"] = motion["ball_state"]
+    states = {loop.robot.name: motion["plant_state"], "ball": motion["ball_state"]}
     positions = stack_positions(loop, states)
     width, height = (round(size * _DOTS_PER_INCH) for size in (_WIDTH / 2, _PICTURE))
     camera = SceneCamera(loop, positions[0], width=width, height=height)

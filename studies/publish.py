@@ -292,14 +292,10 @@ def _check_simulation(
 
 
 def _agree(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    if before.keys() != now.keys():
+    modes = [key for key, value in now.items() if isinstance(value, Mapping)]
+    if before.keys() != now.keys() or any(before[k] != now[k] for k in now if k not in modes):
         return False
-    for key, value in now.items():
-        if not isinstance(value, Mapping):
-            if before[key] != value:
-                return False
-        elif before[key]["verdict"] != value["verdict"]:
-            return False
-        elif abs(before[key]["safety_probability"] - value["safety_probability"]) > _TOLERANCE:
-            return False
-    return True
+    pairs = [(before[mode], now[mode]) for mode in modes]
+    apart = [abs(one["safety_probability"] - two["safety_probability"]) for one, two in pairs]
+    is_same = all(one["verdict"] == two["verdict"] for one, two in pairs)
+    return is_same and max(apart, default=0.0) <= _TOLERANCE

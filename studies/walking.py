@@ -34,8 +34,6 @@ _LEAST = 1e-6  # Least probability, and complement, in logits.
 _DURATIONS_S = {"tour": 60.0, "push": 5.0, "command": 4.0}
 _SPEED_S = 12.0
 _CLASSIFIER_SEEDS = (0, 1, 2)
-_OURS = (MODES[0], "fall")
-_RIVALS = ("gradient_boosting", "capture_point_margin")
 
 
 def walking(
@@ -139,8 +137,7 @@ def walking(
             name: [Watched.of(alarm, pushed, safe) for alarm in seeds]
             for name, seeds in alarms.items()
         }
-        pairs = ([name for name in names if name in watched] for names in (_OURS, _RIVALS))
-        study.rows |= equal_cost_estimates(watched, *pairs)
+        study.rows |= equal_cost_estimates(watched, MODES[0], "gradient_boosting")
         for picture in save(alarm_figure(watched), assessment / "walking_alarms"):
             say("picture", picture)
 
@@ -148,7 +145,7 @@ def walking(
 def walking_alarms(
     scenario: Scenario, assessment: SafetyAssessment, classifiers: Sequence[Scorer]
 ) -> dict[str, list[Alarm]]:
-    """Alarms on Γ, classifiers, tilt, capture point and the policy's own change of action.
+    """Alarms on Γ, classifiers, tilt and capture point.
 
     Returns:
         By method; one for each seed of a kind.
@@ -164,9 +161,7 @@ def walking_alarms(
         alarms |= {kind: seeds} if seeds else {}
     for alarm in threshold_alarms(loop.state_names, loop.feature_names, watched):
         alarms[alarm.name] = [alarm]
-    column = loop.feature_names.index("action_change")
-    action_change = Alarm(name="action_change", value=lambda one: -one["features"][:, column])
-    return alarms | {action_change.name: [action_change]}
+    return alarms
 
 
 def _stays_up(assessment: SafetyAssessment, *inputs: np.ndarray) -> np.ndarray:

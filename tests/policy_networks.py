@@ -2,6 +2,7 @@
 
 import warnings
 
+import yaml
 from typer.testing import CliRunner
 
 from drake_safety.cli import make_app
@@ -9,6 +10,8 @@ from legged_robots import write_hexapod
 
 TERMS = ["projected_gravity", "velocity_commands", "joint_pos_rel", "last_action"]
 """42 entries of observation of a hexapod."""
+LEGS = [f"{part}_{i}" for i in range(6) for part in ("swing", "lift", "knee")]
+GAINS = {"stiffness": 200.0, "damping": 4.0}
 
 
 def new(folder, policy, *more):
@@ -18,6 +21,21 @@ def new(folder, policy, *more):
     words = ["new", "walker", "--urdf", str(urdf), "--out", str(out), "--task", "walking"]
     result = CliRunner().invoke(make_app(), [*words, "--policy", str(policy), *more])
     return out, result
+
+
+def walker(folder, network):
+    """The scenario of a hexapod that walks by a network."""
+    out, _ = new(folder, network)
+    stated = {
+        "network": network.name,
+        "joints": LEGS,
+        "default_positions": yaml.safe_load((out / "robot.yaml").read_text())["posture"],
+        "action_scale": {".*": 0.25},
+        "gains": {".*": GAINS},
+        "observation": [{"name": name} for name in TERMS],
+    }
+    (out / "policy.yaml").write_text(yaml.safe_dump(stated))
+    return out / "walking.yaml"
 
 
 def save_script(path, module, batch=None):

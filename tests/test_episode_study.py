@@ -7,7 +7,7 @@ from drake_safety.evaluation.episode_study import (
     evaluate_plans,
     promised_miss_rate,
 )
-from drake_safety.evaluation.metrics import area_under_curve
+from drake_safety.evaluation.metrics import auc
 from drake_safety.evaluation.scorers import Scorer
 from drake_safety.learning.segments import split
 from lip_episodes import SUPPORT, make_episodes
@@ -38,8 +38,8 @@ def calibration():
 def test_every_segment_counts_and_at_planning_time_every_episode_once(fresh, calibration):
     estimates = evaluate_episodes(SCORERS, calibration, fresh)
     segments = split(fresh, stride=1, discount=1.0)
-    area = area_under_curve(SCORERS[0].unsafe_score(segments), segments.is_unsafe)
-    assert estimates["segments", "sharpened", "auc"].value == area
+    area = auc(SCORERS[0].unsafe_score(segments), segments.is_unsafe, segments.episode)
+    assert estimates["segments", "sharpened", "auc"] == area
     assert estimates["segments", "blind", "auc"].value == 0.5
     recalls = [estimates["episodes", "sharpened", f"{kind}_recall"] for kind in ("safe", "unsafe")]
     assert [estimate.n for estimate in recalls] == [fresh.num_safe, fresh.num_unsafe]

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import yaml
 
 from command_line import call
 from drake_safety import load_scenario
@@ -13,25 +12,7 @@ from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation import hand_over
 from drake_safety.simulation.hand_over import MotorLoads, check_hand_over
 from drake_safety.simulation.motion import Motion
-from policy_networks import TERMS, new, save_network, save_script
-
-LEGS = [f"{part}_{i}" for i in range(6) for part in ("swing", "lift", "knee")]
-GAINS = {"stiffness": 200.0, "damping": 4.0}
-
-
-def walker(folder, network):
-    """The scenario of a hexapod that walks by a network."""
-    out, _ = new(folder, network)
-    stated = {
-        "network": network.name,
-        "joints": LEGS,
-        "default_positions": yaml.safe_load((out / "robot.yaml").read_text())["posture"],
-        "action_scale": {".*": 0.25},
-        "gains": {".*": GAINS},
-        "observation": [{"name": name} for name in TERMS],
-    }
-    (out / "policy.yaml").write_text(yaml.safe_dump(stated))
-    return out / "walking.yaml"
+from policy_networks import save_network, save_script, walker
 
 
 @pytest.fixture(scope="module")

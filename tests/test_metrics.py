@@ -53,16 +53,17 @@ def test_the_area_agrees_with_scikit_learn_with_weights_and_ties():
     score = rng.integers(0, 9, 300).astype(float)
     label, weight = rng.random(300) < 0.3, rng.integers(0, 4, 300)
     expected = roc_auc_score(label, score, sample_weight=weight)
-    assert area_under_curve(score, label, weight) == pytest.approx(expected)
+    assert area_under_curve(score, label)(weight) == pytest.approx(expected)
 
 
 def test_a_score_that_is_nan_counts_as_the_most_unsafe():
     label = np.array([False, True, True, False])
     known = np.array([0.1, 0.2, 5.0, 0.3])
     unknown = np.array([0.1, 0.2, np.nan, 0.3])
-    assert area_under_curve(unknown, label) == area_under_curve(known, label)
+    each = np.arange(4)
+    assert auc(unknown, label, each) == auc(known, label, each)
     assert threshold_at(unknown, label) <= 0.3
-    assert math.isnan(area_under_curve(known, np.ones(4, dtype=bool)))
+    assert math.isnan(auc(known, np.ones(4, dtype=bool), each).value)
     assert threshold_at(np.array([np.inf, 0.2, np.inf]), label[1:]) < math.inf
 
 
@@ -110,7 +111,7 @@ def test_segment_recalls_are_shares_of_segments_with_episodes_behind_them(segmen
     assert estimates["unsafe_recall"].value == pytest.approx((score[label] > 0.6).mean())
     assert estimates["safe_recall"].value == pytest.approx((score[~label] <= 0.6).mean())
     assert estimates["brier"].value == pytest.approx(((score - label) ** 2).mean())
-    assert estimates["auc"].value == area_under_curve(score, label)
+    assert estimates["auc"] == auc(score, label, segments.episode)
     assert estimates["auc"].n == estimates["brier"].n == len(np.unique(segments.episode))
     assert estimates["safe_recall"].n == len(np.unique(segments.episode[~label]))
     for estimate in estimates.values():

@@ -17,10 +17,9 @@ from drake_safety.policies.policy_network import (
 )
 from drake_safety.simulation.scenario import load_scenario
 from drake_safety.simulation.scenario_check import check_scenario
-from policy_networks import TERMS, new, save_network, save_onnx
+from policy_networks import GAINS, TERMS, new, save_network, save_onnx, walker
 
 SWINGS = [f"swing_{i}" for i in range(6)]
-LEGS = [name for i in range(6) for name in (f"swing_{i}", f"lift_{i}", f"knee_{i}")]
 
 
 def problems(scenario):
@@ -55,7 +54,7 @@ def test_a_network_alone_leaves_what_it_cannot_tell_to_be_asked_for(tmp_path):
     # Done as it says, the check passes, but for a network that rests.
     uncommented(out / "policy.yaml", "joints:", "default_positions:", "action_scale:")
     stated = yaml.safe_load((out / "policy.yaml").read_text())
-    stated["gains"] = {".*": {"stiffness": 200.0, "damping": 4.0}}
+    stated["gains"] = {".*": GAINS}
     stated["observation"] = [{"name": name} for name in TERMS]
     (out / "policy.yaml").write_text(yaml.safe_dump(stated))
     (finding,) = problems(scenario)
@@ -142,17 +141,8 @@ def test_more_joints_named_than_moved_are_observed_and_the_moved_ones_asked_for(
 @pytest.mark.train
 def test_a_policy_that_reads_its_observation_wrongly_is_told_about_its_policy(tmp_path):
     network = save_network(tmp_path / "walk.pt", 42, 18, scale=-0.0005)
-    out, _ = new(tmp_path, network)
-    stated = {
-        "network": network.name,
-        "joints": LEGS,
-        "default_positions": yaml.safe_load((out / "robot.yaml").read_text())["posture"],
-        "action_scale": {".*": 0.25},
-        "gains": {".*": {"stiffness": 200.0, "damping": 4.0}},
-        "observation": [{"name": name} for name in TERMS],
-    }
-    (out / "policy.yaml").write_text(yaml.safe_dump(stated))
-    findings = {f.item: f for f in check_scenario(out / "walking.yaml", num_episodes=0)}
+    scenario = walker(tmp_path, network)
+    findings = {f.item: f for f in check_scenario(scenario, num_episodes=0)}
     assert f"{network.name} is TorchScript: code of its author" in findings["network"].message
     assert list(findings).index("network") < list(findings).index("diagram")
     walks = findings["takes over and walks, from standing"]

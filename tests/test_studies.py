@@ -30,7 +30,7 @@ STUDIES = {
     "adaptation --feedback 40 --evaluate 20 --pools 2 --scratch": (
         "adapted-actual/study",
         "sharpened.calibrated.adapted 40.brier, paper.grid.scratch 40.auc, "
-        "boosting.refitted 40.auc, paper.grid.adapted 40.pools_won",
+        "boosting.refitted 40.auc, paper.grid.adapted 40.brier",
     ),
 }
 
@@ -70,7 +70,6 @@ def test_a_study_of_a_run_writes_its_figures(monkeypatch, run, line):
     if name == "adapted-actual/study":
         assert found["sharpened.calibrated", "scratch 40", "brier"].n == 40
         assert found.entries["feedback_sets"] == [40, 40]
-        assert (folder / f"{name}.png").is_file()
     if name == "evaluation":
         # Beside baselines Γ has the figures that `drake-safety evaluate` gives.
         alone = ("evaluate", scenario, "--assessment", folder, "--workers", 1, *FRESH.split(" "))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -32,7 +32,6 @@ from drake_safety.evaluation.reliability import reliability, reliability_figure,
 from drake_safety.evaluation.results import Key, Results
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
 from drake_safety.evaluation.shifts import plant_shifts
-from drake_safety.evaluation.tables import Table
 from drake_safety.evaluation.verdict_tables import verdict_tables
 from drake_safety.files.progress import StageProgress
 from drake_safety.learning.assessment import SafetyAssessment
@@ -141,7 +140,6 @@ def evaluating(
     block: SeedBlock,
     seed: int | None,
     workers: int | None,
-    tables: Callable[[Results], Sequence[Table]] = verdict_tables,
     program: str = "drake-safety",
 ) -> Iterator[Evaluation]:
     """Yields an evaluation of a run; after the `with` statement its results are written."""
@@ -168,7 +166,7 @@ def evaluating(
     results = Results(evaluation.estimates, made | evaluation.entries)
     file = folder / ("shifts.json" if block is SHIFTS else "evaluation.json")
     results.write(file)
-    for table in [*tables(results), *shift_study.shifts_tables(results)]:
+    for table in [*verdict_tables(results), *shift_study.shifts_tables(results)]:
         console.show(table.to_rich())
     console.say(sharpened.detector_.describe())
     console.say("figures", file)

@@ -111,12 +111,20 @@ def rate_per_hour(count: float, duration_s: float, n: int) -> Estimate:
 
 
 def area_under_curve(
-    unsafe_score: np.ndarray, is_unsafe: np.ndarray, weight: np.ndarray | None = None
-) -> float:
-    """Area under the ROC curve of scores, labels and weights, (N,); a tie counts one half."""
+    unsafe_score: np.ndarray, is_unsafe: np.ndarray
+) -> Callable[[np.ndarray], float]:
+    """Area under the ROC curve as a function of the samples' weights, (N,); a tie counts half."""
     score, label = checked_scores(unsafe_score, is_unsafe)
-    weight = np.ones(len(score)) if weight is None else np.asarray(weight, dtype=float)
-    return _ranked_area(np.unique(score, return_inverse=True)[1], label, weight)
+    rank = np.unique(score, return_inverse=True)[1]
+
+    def area(weight: np.ndarray) -> float:
+        unsafe, safe = (np.bincount(rank, weights=weight * one) for one in (label, ~label))
+        pairs = unsafe.sum() * safe.sum()
+        # A safe sample below counts one, a tie half.
+        won = unsafe @ (np.cumsum(safe) - 0.5 * safe)
+        return float(won / pairs) if pairs else math.nan
+
+    return area
 
 
 def auc(
@@ -127,9 +135,7 @@ def auc(
     bootstrap: Bootstrap = _BOOTSTRAP,
 ) -> Estimate:
     """The area under the ROC curve of samples (N,), with a bootstrap over their episodes (N,)."""
-    score, label = checked_scores(unsafe_score, is_unsafe)
-    rank = np.unique(score, return_inverse=True)[1]
-    return bootstrap.over_episodes(lambda weight: _ranked_area(rank, label, weight), episode)
+    return bootstrap.over_episodes(area_under_curve(unsafe_score, is_unsafe), episode)
 
 
 def share(
@@ -185,12 +191,3 @@ def threshold_at(unsafe_score: np.ndarray, is_unsafe: np.ndarray) -> float:
     balanced = 0.5 * (safe_recall + 1.0 - miss_rate)
     best = np.flatnonzero(balanced >= balanced.max() - 1e-12)
     return float(candidates[best[(len(best) - 1) // 2]])
-
-
-def _ranked_area(rank: np.ndarray, label: np.ndarray, weight: np.ndarray) -> float:
-    unsafe, safe = (np.bincount(rank, weights=weight * one) for one in (label, ~label))
-    pairs = unsafe.sum() * safe.sum()
-    if pairs == 0.0:
-        return math.nan
-    # A safe sample below counts one, a tie half.
-    return float(unsafe @ (np.cumsum(safe) - 0.5 * safe) / pairs)

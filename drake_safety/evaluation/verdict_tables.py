@@ -31,8 +31,9 @@ _CALIBRATIONS = (
 )
 _CALIBRATION = "Stored calibrations on fresh motions"
 _RATES = "Promised and observed rates of the thresholds of the probability."
-Kind = tuple[str, str, Sequence[Column]]  # Title, explanation and columns of a table.
-_KINDS: dict[str, Kind] = {
+
+# By set: title, explanation and columns of its table.
+_KINDS: dict[str, tuple[str, str, Sequence[Column]]] = {
     "segments": (
         "Every segment of the motion",
         f"Does a motion stay safe from a segment to its end? {_SCORES} Recalls are at the "
@@ -71,11 +72,9 @@ _KINDS: dict[str, Kind] = {
 """By judged set."""
 
 
-def verdict_table(
-    results: Results, set: str, *, corner: str = "method", kind: Kind | None = None
-) -> Table:
+def verdict_table(results: Results, set: str, *, corner: str = "method") -> Table:
     """The table of a judged set: a row for each method that has the second column of its kind."""
-    title, meaning, columns = kind or _KINDS[set]
+    title, meaning, columns = _KINDS[set]
     methods = [key[1] for key in results if (key[0], key[2]) == (set, columns[1].key) and key[1]]
     if methods and (first := results.get((set, methods[0], "auc"))):
         meaning += f" Evaluated on {first.n} fresh motions."
