@@ -20,7 +20,7 @@ KINDS = ("gradient_boosting", "mlp")
 _VALIDATION_SHARE = 0.1
 _MLP_EPOCHS = 60
 _MLP_PATIENCE = 20
-Statistic = Callable[[np.ndarray], float]  # Of weights of samples.
+Statistic = Callable[[np.ndarray], float]  # Weights of samples.
 
 
 class DirectClassifier:

@@ -104,7 +104,7 @@ def interval_figure(estimates: Mapping[Key, Estimate]) -> Figure:
             for i, name in enumerate(sets):
                 keys = [key for key in estimates if (key[0], key[2]) == (name, metric)]
                 shown = (estimates[key] for key in keys)
-                # NaN ends, such as those of a value without interval, draw no bar.
+                # NaN ends, as of a value without interval, draw no bar.
                 ends = np.array([[one.value, one.low, one.high] for one in shown])
                 value, low, high = ends.reshape(-1, 3).T
                 axes.errorbar(
