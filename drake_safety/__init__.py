@@ -104,5 +104,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Lists the names not resolved yet beside the resolved ones."""
+    """Lists all names, resolved or not."""
     return sorted({*globals(), *__all__})

@@ -17,16 +17,16 @@ MODULES = {
     "train": ("dtaidistance", "openTSNE", "pyarrow", "sklearn", "torch", "tslearn"),
     "walking": ("onnx", "onnxruntime"),
 }
-"""What the library imports of each extra."""
+"""Modules that the library imports, by extra."""
 
 
 class MissingExtraError(ValueError):
     """Packages that pip can install are not installed.
 
     Args:
-        message: Who needs what.
-        needs: What pip is to install; appended to the message as its command.
-        options: Options of that command.
+        message: The feature, and the packages that it needs.
+        needs: Packages for pip; the message ends with the command that installs them.
+        options: Options of the command.
     """
 
     def __init__(self, message: str, needs: str, options: str = ""):

@@ -1,9 +1,8 @@
 """Falls that alarms announce, over all thresholds: at equal cost, and as curves.
 
 An alarm announces a fall if its value falls below the threshold between the push and `EARLY_S`
-before the fall. What a threshold costs is the share of other pushed motions that have an alarm, or
-the false alarms an hour on undisturbed motion. Thresholds need no choice: methods are compared at
-the same cost.
+before the fall. The cost of a threshold is the share of other pushed motions that have an alarm, or
+the false alarms an hour on undisturbed motion. Methods are compared at the same cost.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ COSTS = {
     "without_leaving": "never leave the safe set",
     "without_fall": "do not fall",
 }
-"""Other motions by key, and what is said of them."""
+"""Other motions by key, and their description."""
 _JUDGED = "without_leaving"  # Cost of the rows; the figure has all.
 _LABELS = {"sharpened": "Γ", "fall": "probability of a fall"}
 _BOOTSTRAP = Bootstrap()
@@ -49,7 +48,7 @@ class Watched:
             a fall, and of one that comes earlier.
         lowest: Lowest value of each pushed motion, (N,).
         rows: Values of the rows of all undisturbed motions, sorted, (M,).
-        pairs: The larger of each value and the one before it, sorted, (M,).
+        pairs: The larger of each value and its predecessor, sorted, (M,).
         undisturbed_s: Duration of these motions [s].
         num_undisturbed: Their number.
     """
@@ -74,9 +73,9 @@ class Watched:
             is_in_time &= motion.has_fallen
             warning.append(value[is_in_time].min(initial=math.inf))
             lowest.append(value.min())
-        calm = [_values(alarm, motion) for motion in undisturbed]
-        before = [np.concatenate([[math.inf], value[:-1]]) for value in calm]
-        rows = np.concatenate([*calm, np.zeros(0)])
+        quiet = [_values(alarm, motion) for motion in undisturbed]
+        before = [np.concatenate([[math.inf], value[:-1]]) for value in quiet]
+        rows = np.concatenate([*quiet, np.zeros(0)])
         return cls(
             is_fall=np.array([motion.has_fallen for motion in pushed], dtype=bool),
             others={

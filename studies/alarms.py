@@ -114,7 +114,7 @@ def lowest_value(motion: Motion, value: np.ndarray) -> float:
 
 
 def persisting(value: np.ndarray, num_rows: int) -> np.ndarray:
-    """The largest of each value and those before it, `num_rows` in all, (N,)."""
+    """The largest of each value and its predecessors, `num_rows` in all, (N,)."""
     value = np.where(np.isnan(value), -math.inf, value)
     padded = np.concatenate([np.full(num_rows - 1, math.inf), value])
     return np.lib.stride_tricks.sliding_window_view(padded, num_rows).max(axis=1)
@@ -138,14 +138,14 @@ def evaluate_alarms(
 
     Motions that leave the safe set before the push are left out.
     """
-    calm = [motion for motion in calibration if not motion.has_left]
+    safe = [motion for motion in calibration if not motion.has_left]
     judged = [motion for motion in test if not motion.leave_time_s < motion.push_time_s]
     is_unsafe = np.array([motion.has_left for motion in judged], dtype=bool)
     index = np.array([motion.index for motion in judged])
     left = proportion(int(is_unsafe.sum()), len(judged))
     estimates = {("monitoring", "motions", "leave_safe_set"): left}
     for alarm in alarms:
-        lowest = np.array([lowest_value(m, persisting(alarm.value(m), num_rows)) for m in calm])
+        lowest = np.array([lowest_value(m, persisting(alarm.value(m), num_rows)) for m in safe])
         threshold = equal_share_threshold(lowest, FALSE_ALARM_SHARE)
         values = [persisting(alarm.value(motion), num_rows) for motion in judged]
         score = -np.array([lowest_value(m, v) for m, v in zip(judged, values, strict=True)])

@@ -20,15 +20,15 @@ KINDS = ("gradient_boosting", "mlp")
 _VALIDATION_SHARE = 0.1
 _MLP_EPOCHS = 60
 _MLP_PATIENCE = 20
-Statistic = Callable[[np.ndarray], float]  # Of weights of samples.
+Statistic = Callable[[np.ndarray], float]  # Weights of samples.
 
 
 class DirectClassifier:
     """Predicts from x whether an episode ends unsafely, without embedding or beliefs.
 
-    It learns from the segments that the assessment learns from (every start row, labelled by the
-    end of its episode), with early stopping on a held-out tenth of the *episodes* and plants. It
-    runs on one thread, so that the same seed gives the same bits.
+    It learns from the assessment's segments: every start row, labelled by the end of its episode.
+    It stops early by a held-out tenth of the *episodes* and plants, and runs on one thread, so that
+    the same seed gives the same bits.
     """
 
     def __init__(

@@ -33,7 +33,7 @@ from drake_safety.simulation.scenario import Scenario, load_scenario
 
 RESULTS_FOLDER = Path("docs/results")
 EVALUATION_FILE, CARD_FILE = "evaluation.json", "README.md"
-"""Of a shipped folder."""
+"""Files of a shipped folder."""
 _TEMPLATES = Path(__file__).with_name("templates")
 _KINDS = "adaptation|anomalies|features|monitoring|pushes|rare|results|summary|shifts|walking"
 CARDS = {
@@ -156,12 +156,12 @@ def _with_columns(table: Table, shown: Sequence[int]) -> Table:
 
 
 def generate(text: str, folder: Path = RESULTS_FOLDER) -> str:
-    """Replaces every block of results and every value in a text by the stored ones."""
+    """Replaces every block of results and every value in a text by the stored results."""
     blocks = [match["name"] for match in _BLOCK.finditer(text)]
     opened = [match["name"] for match in re.finditer(_OPEN, text)]
     if not GENERATED.search(text):
         raise ValueError(
-            "no block of results: put <!-- results: NAME --> and <!-- end --> where those of "
+            "no block of results: put <!-- results: NAME --> and <!-- end --> where the results of "
             f"{RESULTS_FOLDER}/NAME.json belong"
         )
     if blocks != opened:
@@ -182,7 +182,7 @@ def _stored(folder: Path, name: str) -> Results:
     if not file.is_file():
         there = sorted(path.stem for path in folder.glob("*.json"))
         raise ValueError(
-            f"there are no results '{name}' in {folder}; there are {there}: "
+            f"{folder} has no results '{name}'; it has {there}: "
             "`python -m studies store RUN` writes them"
         )
     return Results.read(file)
@@ -266,7 +266,7 @@ def _commands(
     for assessment in assessments.values():
         for one in assessment.calibrations_.values():
             if one.plants:
-                continue  # Chosen beside those of the nominal plant.
+                continue  # Chosen with the nominal plant's.
             confidence = "" if one.confidence is None else f"--confidence {one.confidence:g} "
             commands.append(
                 f"drake-safety calibrate {name} --assessment {folder} --miss-rate "

@@ -64,7 +64,7 @@ def evaluate(
     episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 1000,
     throws: Annotated[int, typer.Option(help="Fresh throws at the actual plant.", min=0)] = 0,
     calibration_episodes: Annotated[
-        int, typer.Option(help="Other ones, for thresholds.", min=20)
+        int, typer.Option(help="Other episodes, for thresholds.", min=20)
     ] = 300,
     calibration_throws: Annotated[
         int, typer.Option(help="Other throws, for thresholds of the classifiers.", min=1)

@@ -39,7 +39,7 @@ def features(
     release: ReleaseOption = False,
     workers: WorkersOption = None,
 ) -> None:
-    """Train Γ anew without features, on the episodes of a run, and judge it on fresh ones.
+    """Train Γ anew without features, on the episodes of a run, and judge it on fresh episodes.
 
     features.json is written to the run's folder.
     """

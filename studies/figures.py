@@ -104,7 +104,7 @@ def interval_figure(estimates: Mapping[Key, Estimate]) -> Figure:
             for i, name in enumerate(sets):
                 keys = [key for key in estimates if (key[0], key[2]) == (name, metric)]
                 shown = (estimates[key] for key in keys)
-                # NaN ends, such as those of a value without interval, draw no bar.
+                # NaN ends, as of a value without interval, draw no bar.
                 ends = np.array([[one.value, one.low, one.high] for one in shown])
                 value, low, high = ends.reshape(-1, 3).T
                 axes.errorbar(
@@ -179,7 +179,7 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
 
 def figures(
     names: Annotated[
-        list[str] | None, typer.Argument(help=f"Of {', '.join(PICTURES)}; all by default.")
+        list[str] | None, typer.Argument(help=f"Among {', '.join(PICTURES)}; all by default.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the pictures.")] = Path("docs/pictures"),
 ) -> None:

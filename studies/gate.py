@@ -30,7 +30,7 @@ from studies.harness import Study, open_study
 
 _ALPHA, _POWER = 0.05, 0.9
 _OUTCOMES = np.array([-1.0, 0.0, 1.0])
-_STARTS, _ROLLOUTS = 5000, 200  # Of an estimated failure rate.
+_STARTS, _ROLLOUTS = 5000, 200  # For an estimated failure rate.
 _LOOKS = np.arange(16, 5001, 16)
 
 
@@ -49,10 +49,9 @@ def gate(
 ) -> None:
     """Count wrong verdicts of `gate`, and the pairs until a verdict, on real episodes drawn again.
 
-    The rows: how many failed; false "worse" of two loops that are equal (a side of each pair is the
-    candidate's by a coin), and ends of intervals that excluded the true difference, at any look;
-    pairs until "worse", beside episodes of each loop of a batch test with power 0.9, and of a
-    sequential one without pairs.
+    The rows: share of failures; false "worse" of two equal loops, whose sides a coin swaps; ends of
+    intervals that excluded the true difference, at any look; pairs until "worse", beside episodes
+    of each loop for a batch test with power 0.9, and for a sequential test without pairs.
     """
     with open_study("gate", scenario, out, seed=GATE.first, workers=workers, out=out) as study:
         shipped = study.scenario.name

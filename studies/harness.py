@@ -1,4 +1,4 @@
-"""What all studies share: their options, fresh episodes, kept work, and how rows become files.
+"""Common parts of studies: options, fresh episodes, kept work, and files of rows.
 
 A study gives rows of the table of results: set, method, metric and an estimate. Work that takes
 long is kept in the folder of the training as it finishes: a stopped study continues.
@@ -42,7 +42,7 @@ class Study:
 
     Attributes:
         seed: First seed of the fresh episodes.
-        entries: What the file says besides rows.
+        entries: Entries of the file besides rows.
         rows: By set, method and metric.
     """
 

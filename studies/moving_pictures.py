@@ -64,7 +64,7 @@ class SceneCamera(StillCamera):
 
 
 class Take(NamedTuple):
-    """A run, and what is told of it: times [s] in order, and words."""
+    """A run, and its captions: times [s] in order, and words."""
 
     title: str
     motion: Motion

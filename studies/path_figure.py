@@ -37,8 +37,8 @@ def path_figure(
     """Plots Ψ(x) (N, 2) over the beliefs of the cells, and the probability (N,) over time [s].
 
     As in the lower half of the paper's Fig. 6. It shows the first map of an ensemble. Points where
-    the belief is known, (N,), are dots; arrows join those farther apart than a cell, dotted ones
-    over "don't know". Events are times [s] by name, marked and numbered in both panels.
+    the belief is known, (N,), are dots; arrows join points farther apart than a cell, dotted over
+    "don't know". Events are times [s] by name, marked and numbered in both panels.
     """
     grid, cells = assessment.grid_, assessment.beliefs_[0]
     is_empty = cells[:, UNCERTAINTY] >= 1.0

@@ -1,8 +1,8 @@
 """``python -m studies store``, ``readme`` and ``ship``: publishing the results of a run.
 
-A shipped folder holds the files of a run and `evaluation.json`: results, commands, seeds and
-versions of the evaluation, the SHA-256 of every evaluated file, and the verdicts on the first fresh
-episodes of its seed, which can be simulated again for comparison; and the card, `README.md`.
+A shipped folder holds the files of a run, the card `README.md`, and `evaluation.json`: results,
+commands, seeds and versions of the evaluation, and the SHA-256 of every evaluated file. It also
+has verdicts on the first fresh episodes of its seed, to compare with a new simulation.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _STUDIES = ("shifts", "walking_results")
 _PRINTED = re.compile(r"(<!-- printed: drake-safety (.*?) -->\n```text\n).*?(```\n)", re.DOTALL)
 _PRINTED_LINES = 5
 _HASHES, _VERDICTS = "assessment_sha256", "first_episodes"
-_TOLERANCE = 1e-3  # Of Γ; above differences between processors, below those of assessments.
+_TOLERANCE = 1e-3  # Γ differs less between processors, and more between assessments.
 _FOLDER_OPTIONS = ("--assessment", "--out")
 
 
@@ -115,8 +115,8 @@ def ship(
     results = evaluated(assessment)
     if "train_command" not in results.entries:
         raise ValueError(
-            f"ship: the training command of {assessment} is unknown: there is no "
-            f"command in {episodes_folder(assessment)}"
+            f"ship: the training command of {assessment} is unknown: no command in "
+            f"{episodes_folder(assessment)}"
         )
     scenario = load_scenario(str(results.entries["scenario"]))
     files = {mode: assessment_file(assessment, mode) for mode in MODES}

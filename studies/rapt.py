@@ -47,10 +47,10 @@ _COLUMNS = (
 class Recordings(NamedTuple):
     """A split of N sequences."""
 
-    names: list[str]  # Of the n observations.
-    actions: list[str]  # Of the m actions.
+    names: list[str]  # Names of the n observations.
+    actions: list[str]  # Names of the m actions.
     sequences: list[np.ndarray]  # Observations and actions, (T, n + m), a row every 0.02 s.
-    kinds: np.ndarray  # Of each sequence's anomaly, or `NOMINAL`, (N,).
+    kinds: np.ndarray  # Each sequence's anomaly, or `NOMINAL`, (N,).
 
 
 def rapt(
@@ -96,7 +96,7 @@ def read(file: Path) -> Recordings:
         labelled = ["labels", "fault"] if file.stem == "test" else []
         wanted = ["dim_names", *labelled, *keys, *pairs.values()]
         if missing := [key for key in wanted if key not in arrays]:
-            text = f"there is no array '{missing[0]}', but {arrays.files[:6]}"
+            text = f"no array '{missing[0]}', but {arrays.files[:6]}"
             raise ValueError(f"{text}; expected {LAYOUT}")
         names, sequences = arrays["dim_names"].astype(str).tolist(), []
         actions = [f"action {i}" for i in range(arrays[pairs[keys[0]]].shape[-1])]

@@ -37,7 +37,7 @@ class System:
     scenario: str
     changes: Mapping[str, Any] = field(default_factory=dict)
     variation: str = "nominal"
-    episodes: int  # Random ones.
+    episodes: int  # Random episodes.
     repetitions: int
 
 
@@ -125,13 +125,13 @@ KNOWN: dict[str, tuple[float, Callable[[np.random.Generator], float]]] = {
     ),
 }
 """Margins of draws, with the rates at which they are negative."""
-_REPETITIONS = 20  # Of these.
+_REPETITIONS = 20
 
 
 def rare(
     systems: Annotated[
         list[str] | None,
-        typer.Argument(help=f"Of {[*KNOWN, *SYSTEMS]}; by default all whose rate is known."),
+        typer.Argument(help=f"Among {[*KNOWN, *SYSTEMS]}; by default all whose rate is known."),
     ] = None,
     samples: Annotated[int, typer.Option(help="Episodes of a level.", min=40)] = 256,
     out: Annotated[Path, typer.Option(help="Folder of episodes and results.")] = Path("runs/rare"),
@@ -140,7 +140,7 @@ def rare(
     """Estimate rates of rare failures by other seeds, and compare them with random episodes.
 
     The rows: failures of a million, known or of random episodes; the mean of the estimates;
-    intervals that hold the rate; episodes of an estimate, and random ones with its variance by it.
+    intervals that hold the rate; episodes of an estimate, and the ratio of random episodes to them.
     Where fewer than 20 random episodes fail, the mean of the estimates takes the share's place.
     Systems whose rate is known are functions of random draws, without a simulation.
     """

@@ -22,7 +22,7 @@ from drake_safety.learning.assessment_file import file_hash
 
 TUTORIALS = Path("tutorials")
 OUTPUTS = TUTORIALS / "outputs"
-_MOST_BYTES = 60_000  # Of a picture.
+_MOST_BYTES = 60_000  # Largest picture.
 _COLOURS = (256, 64, 16)
 _WIDTHS = (1000, 800, 640, 480, 320)  # [px]
 _TIME = """\
@@ -30,7 +30,7 @@ import psutil
 _one = psutil.Process()
 _times = [_one.cpu_times()[:4], *(of.cpu_times()[:2] for of in _one.children(recursive=True))]
 print(sum(map(sum, _times)))"""
-# Of the kernel and its processes [s].
+"""Prints the time of the kernel and its processes [s]."""
 
 
 def tutorials(
@@ -46,7 +46,7 @@ def tutorials(
     for name in names or there:
         found = [stem for stem in there if stem == name or stem.partition("_")[0] == name]
         if not found:
-            raise ValueError(f"there is no tutorial '{name}'; there are {list(there)}")
+            raise ValueError(f"no tutorial '{name}'; the tutorials are {list(there)}")
         file = OUTPUTS / f"{found[0]}.json"
         file.parent.mkdir(exist_ok=True)
         text = json.dumps(run(there[found[0]]), indent=1, ensure_ascii=False)

@@ -30,7 +30,7 @@ from studies.baselines import KINDS, classifier_scorers
 from studies.harness import ReleaseOption, open_study
 from studies.walking_motions import run_motions
 
-_LEAST = 1e-6  # Of a probability and its complement, in logits.
+_LEAST = 1e-6  # Least probability, and complement, in logits.
 _DURATIONS_S = {"tour": 60.0, "push": 5.0, "command": 4.0}
 _SPEED_S = 12.0
 _CLASSIFIER_SEEDS = (0, 1, 2)
@@ -54,8 +54,7 @@ def walking(
     """Judge a walking robot: falls on tours, alarms on pushes, guard, recovery, MuJoCo.
 
     Alarms are compared at the same share of pushed motions that they alarm without need. Motions
-    are kept in ASSESSMENT/walking: a stopped study continues. With more tours, only those are
-    simulated that are not there yet.
+    are kept in ASSESSMENT/walking: a stopped study continues, and simulates missing tours only.
     """
     with open_study(
         "walking",
@@ -133,9 +132,9 @@ def walking(
         study.rows |= tour_estimates(toured)
         # A motion that leaves the safe set before the push is not judged.
         pushed = [motion for motion in pushed if not motion.leave_time_s < motion.push_time_s]
-        calm = [motion for motion in toured if not motion.has_left]
+        safe = [motion for motion in toured if not motion.has_left]
         watched = {
-            name: [Watched.of(alarm, pushed, calm) for alarm in seeds]
+            name: [Watched.of(alarm, pushed, safe) for alarm in seeds]
             for name, seeds in alarms.items()
         }
         study.rows |= equal_cost_estimates(watched, MODES[0], "gradient_boosting")
@@ -196,19 +195,19 @@ def push_estimates(pushed: Sequence[Motion], push_s: float) -> dict[Key, Estimat
 
 
 def tour_estimates(tours: Sequence[Motion]) -> dict[Key, Estimate]:
-    """Share of undisturbed tours without a fall, and the hours of those that stay safe."""
-    calm = [motion for motion in tours if not motion.has_left]
-    hours = sum(float(motion.time_s[-1]) for motion in calm) / 3600.0
+    """Share of undisturbed tours without a fall, and the hours of tours that stay safe."""
+    safe = [motion for motion in tours if not motion.has_left]
+    hours = sum(float(motion.time_s[-1]) for motion in safe) / 3600.0
     return {
         ("tours", "", "without_fall"): proportion(sum(not m.has_fallen for m in tours), len(tours)),
-        ("tours", "", "hours"): Estimate.exact(hours, len(calm)),
+        ("tours", "", "hours"): Estimate.exact(hours, len(safe)),
     }
 
 
 def recovery_estimates(
     branch: str, alone: Sequence[Motion], again: Sequence[Motion]
 ) -> dict[Key, Estimate]:
-    """Share of falls saved by a branch, and impact speeds of those that it does not save."""
+    """Share of falls saved by a branch, and impact speeds of the remaining falls."""
     not_saved = [(a, b) for a, b in zip(alone, again, strict=True) if b.has_fallen]
     return {
         ("recovery", branch, "saved"): proportion(len(alone) - len(not_saved), len(alone)),

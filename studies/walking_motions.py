@@ -21,7 +21,7 @@ _AFTER_FALL_S = 0.6  # Until the robot lies.
 
 
 def unusual_command(loop: Any, rng: np.random.Generator) -> np.ndarray:
-    """A command past the policy's ranges, but within those of training, (3,)."""
+    """A command past the policy's ranges, but within the ranges of training, (3,)."""
     limits = loop.policy.parameters.command
     while True:
         command = rng.uniform(*loop.target_box)
@@ -98,7 +98,7 @@ def run_motions(
     num_workers: int | None = None,
     progress: Progress | None = None,
 ) -> list[Motion]:
-    """Simulates motions in worker processes; those that the folder holds are reused."""
+    """Simulates motions in worker processes, and reuses the motions in the folder."""
     # The folder is named after all that a loop depends on.
     loop = partial(scenario.make_loop, variation, assessment=assessment, **(options or {}))
     make = MadeOnce(str(folder), loop)

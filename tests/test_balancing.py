@@ -9,7 +9,7 @@ from pydrake.systems.analysis import Simulator
 from balancing_loops import PACKAGED, packaged_loop, standing_loop, started
 from drake_safety import load_assessment, load_scenario, run_episode
 from drake_safety.control.safe_sets import BalanceSafeSet
-from drake_safety.diagrams.balancing.sampling import calm_start
+from drake_safety.diagrams.balancing.sampling import throw_start
 from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.plants.balls import Throw
 from legged_robots import robot_kinematics
@@ -128,7 +128,7 @@ def test_servo_load_is_the_commanded_minus_the_measured_position():
 def test_a_calm_start_is_a_point_of_its_motion_with_the_motions_velocity(elapsed_s):
     kinematics = robot_kinematics(PACKAGED)
     options = {"half_widths_m": [0.05, 0.03], "plan_duration_s": [1.0, 1.0]}
-    start = calm_start(kinematics, np.random.default_rng(1), elapsed_s=elapsed_s, **options)
+    start = throw_start(kinematics, np.random.default_rng(1), elapsed_s=elapsed_s, **options)
     assert start.plan.start_time() == -elapsed_s
     np.testing.assert_allclose(start.q[4:7], start.plan.value(0.0).ravel())
     np.testing.assert_allclose(contact_velocities(kinematics, start), 0.0, atol=1e-6)

@@ -141,7 +141,7 @@ def test_efforts_that_no_motor_has_are_estimated_asked_for_and_warned_of(text, a
     assert "12 joints have limits that no motor of a robot of 8" in note
     assert asked in " ".join(written.asked)
     findings = findings_of(written, is_imported=False)
-    assert "those of 12 joints are estimates" in findings["effort limits"].message
+    assert "the limits of 12 joints are estimates" in findings["effort limits"].message
     assert "motor limits" not in findings
     # robot.yaml replaces the limits of the file, which come back without it.
     file = written.folder / "robot.yaml"

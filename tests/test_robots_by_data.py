@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from drake_safety.diagrams.balancing.sampling import calm_start
+from drake_safety.diagrams.balancing.sampling import throw_start
 from drake_safety.diagrams.balancing.throws import Violations
 from drake_safety.extras import MissingExtraError
 from drake_safety.models import load_robot, robot_names
@@ -25,7 +25,7 @@ def test_it_stands(name, duration_s=2.0):
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
     rng = np.random.default_rng(0)
-    start = calm_start(loop.kinematics, rng, half_widths_m=[0, 0], plan_duration_s=[1.0, 1.0])
+    start = throw_start(loop.kinematics, rng, half_widths_m=[0, 0], plan_duration_s=[1.0, 1.0])
     loop.reset_calm(context, rng)
     loop.reset_to(context, rng, start)
     simulator.Initialize()

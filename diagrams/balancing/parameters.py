@@ -39,13 +39,13 @@ class BalancingParameters:
     online: ClassVar = ("recovery", "demonstration")
 
     scale_to_robot: bool = False
-    """Whether defaults are scaled to the robot's standing height, foot spacing and mass; values in
-    the file are not. Unscaled, they are those of a robot 0.42 m high, of 25 kg."""
+    """Whether defaults scale with the robot's standing height, foot spacing and mass; values in the
+    file do not. Unscaled defaults suit a robot 0.42 m high, of 25 kg."""
     safe_set: BalanceLimits = field(default_factory=BalanceLimits)
     start: StartSampling = field(default_factory=StartSampling)
     push: PushSampling = field(default_factory=PushSampling)
     recovery: RecoveryParameters = field(default_factory=RecoveryParameters)
-    demonstration: list[Throw] = field(default_factory=list)  # Of `run --push ball`.
+    demonstration: list[Throw] = field(default_factory=list)  # Balls of `run --push ball`.
 
     @classmethod
     def completed(cls, stated: dict[str, Any], robot: str) -> dict[str, Any]:

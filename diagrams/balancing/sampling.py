@@ -21,14 +21,14 @@ from drake_safety.simulation.episode_start import EpisodeStart
 from drake_safety.systems.trajectory_planner import interpolate
 
 _RESTS_S = (0.2, 1.0)  # Shortest and longest rest between two undisturbed motions.
-_USUAL_SHARE = 0.5  # Share of the range of training's plans in which undisturbed ones end.
+_USUAL_SHARE = 0.5  # Ends of undisturbed plans, as a share of the range in training.
 
 
 @schema(kw_only=True)
 class StartSampling:
     """Random initial states and plans. Offsets are half-widths about the standing posture."""
 
-    foot_offset_m: float = 0.02  # Of every contact point, along x and along y.
+    foot_offset_m: float = 0.02  # Half-width for every contact point, along x and y.
     base_offset_m: Pair[FiniteFloat] = field(default_factory=lambda: [0.08, 0.05])
     base_height_m: Bounds[FiniteFloat] = field(default_factory=lambda: [0.36, 0.45])
     tilt_rad: float = 0.1  # Half-width of roll, pitch and yaw, each.
@@ -36,8 +36,8 @@ class StartSampling:
     angular_velocity_std_rad_s: float = 0.4
     joint_std_rad: float = 0.02
     tracking_offset_m: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """Of the base from the plan's start, along x, y and z: the initial tracking error. "We also add
-    a random offset to the initial state to simulate the disturbances" (paper)."""
+    """Initial tracking error of the base, along x, y and z. "We also add a random offset to the
+    initial state to simulate the disturbances" (paper)."""
     target_offset_m: Pair[FiniteFloat] = field(default_factory=lambda: [0.20, 0.11])
     target_height_m: Bounds[FiniteFloat] = field(default_factory=lambda: [0.34, 0.46])
     plan_duration_s: Bounds[Positive] = field(default_factory=lambda: [0.8, 1.6])
@@ -70,7 +70,7 @@ class StartSampling:
 class PushSampling:
     """Random balls, and the undisturbed motion during which they are thrown."""
 
-    share: Share = 0.25  # Of nominal episodes that begin with the impact of a ball.
+    share: Share = 0.25  # Share of nominal episodes that begin with the impact of a ball.
     mass_kg: Bounds[Positive] = field(default_factory=lambda: [2.0, 4.0])
     speed_m_s: Bounds[Positive] = field(default_factory=lambda: [2.0, 11.0])
     offset_m: float = 0.0
@@ -89,7 +89,7 @@ class PushSampling:
         )
 
 
-def calm_start(
+def throw_start(
     kinematics: RobotKinematics,
     rng: np.random.Generator,
     *,

@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 
 from drake_safety.control.safe_sets import BalanceSafeSet
 from drake_safety.diagrams.balancing.parameters import BalancingParameters
-from drake_safety.diagrams.balancing.sampling import calm_start, undisturbed_start
+from drake_safety.diagrams.balancing.sampling import throw_start, undisturbed_start
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.physics import Scene
@@ -133,7 +133,7 @@ class Balancing(LeggedLoop):
     ) -> None:
         """Samples an undisturbed motion near the stance, for throws, which began before [s]."""
         parameters = self.scenario.parameters
-        start = calm_start(
+        start = throw_start(
             self.kinematics,
             rng,
             half_widths_m=parameters.push.target_offset_m,

@@ -103,7 +103,7 @@ def run_throw(
     ports: Iterable[str] = (),
     **options: Any,
 ) -> Motion:
-    """Throws one random ball, or given ones, at a robot in undisturbed motion, until it falls.
+    """Throws a random ball, or given balls, at a robot in undisturbed motion, until it falls.
 
     It logs the assessor's inputs, ``margins``, ``plant_state``, ``recovery_active`` if there is
     one, ``violations`` (N, 4) and further ports; it ends at ``duration_s``, by default 5 s after

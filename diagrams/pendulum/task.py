@@ -30,8 +30,8 @@ class PendulumParameters:
 
     mass_kg: Positive = 1.0
     length_m: Positive = 0.5
-    damping: Positive = 0.05  # Of the hinge [N·m·s/rad].
-    # The motor's torque; 1 holds the pendulum when it is horizontal, and every episode is safe.
+    damping: Positive = 0.05  # Damping of the hinge [N·m·s/rad].
+    # The motor's torque; at 1 it holds the horizontal pendulum, and every episode is safe.
     effort_share: Annotated[float, Field(gt=0, lt=1)] = 0.35
     stiffness: Positive = 20.0  # Gain of the angle's error [N·m/rad].
     rate_gain: Positive = 3.0  # Gain of the rate's error [N·m·s/rad].
@@ -39,7 +39,7 @@ class PendulumParameters:
     start_angle_rad: Positive = 0.6  # Half-width of the angles at which episodes begin.
     start_rate_rad_s: Positive = 2.0  # Half-width of the rates at which episodes begin.
     plan_angle_rad: Positive = 0.3  # Half-width of the angles at which plans begin and end.
-    plan_duration_s: Bounds[Positive] = field(default_factory=lambda: [0.5, 1.5])  # Of motions.
+    plan_duration_s: Bounds[Positive] = field(default_factory=lambda: [0.5, 1.5])
 
     @property
     def hold_angle_rad(self) -> float:

@@ -17,7 +17,7 @@ class ReachingParameters:
 
     online: ClassVar = ("decorations", "named_targets", "pushes", "assessment_period_s", "view")
 
-    hand: str = ""  # Of the training episodes; by default the robot's first reaching frame.
+    hand: str = ""  # Hand of the training episodes; by default the robot's first reaching frame.
     plan_duration_s: Positive = 3.0
     monitor_period_s: Positive = 0.02
     clearance_range_m: Positive = 0.1  # Distances to obstacles are clipped to this.

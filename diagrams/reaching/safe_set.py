@@ -53,7 +53,7 @@ class ReachingSafeSet:
     - ``fall``: the smaller of the height over the lowest height and the height that a rigid
       pendulum of the standing height loses before ``fall_tilt_rad`` [m].
 
-    With ``is_mirrored``, the features of a hand are those of the other hand in the mirrored scene.
+    With ``is_mirrored``, a hand has the features of the other hand in the mirrored scene.
     """
 
     names = ("support_polygon", "collision", "joint_limits", "fall")

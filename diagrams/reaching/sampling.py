@@ -21,7 +21,7 @@ class PostureSampling:
     base_offset_m: Pair[NotNegative] = field(default_factory=lambda: [0.02, 0.02])
     base_lowering_m: NotNegative = 0.08
     tilt_rad: NotNegative = 0.03  # Half-width of roll, pitch and yaw of the base, each.
-    joint_offset_rad: NotNegative = 0.1  # Of every joint that is not of a leg.
+    joint_offset_rad: NotNegative = 0.1  # Half-width for every joint outside the legs.
     clearance_m: NotNegative = 0.02  # Least distance of the arms to an obstacle.
     joint_margin_rad: NotNegative = 0.0  # Least distance of joints to the end of the safe range.
     sink_m: NotNegative = 0.0  # Initial penetration into the compliant ground, as at rest.

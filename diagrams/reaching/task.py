@@ -27,7 +27,7 @@ from drake_safety.simulation.scenario import Scenario
 from drake_safety.systems.trajectory_planner import interpolate
 from drake_safety.systems.whole_body_controller import WholeBodyController
 
-_USUAL_SHARES = (0.1, 0.5)  # Of the way to a target, in undisturbed motion.
+_USUAL_SHARES = (0.1, 0.5)  # Shares of the way to a target, in undisturbed motion.
 _NUM_OUTLOOK = 31  # Samples of the whole plan: dense enough for thin obstacles.
 
 

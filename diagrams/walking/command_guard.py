@@ -12,11 +12,11 @@ from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.policies.policy import CommandLimits
 from drake_safety.systems.periodic_update import declare_update
 
-_SHARES = np.linspace(0.0, 1.0, 6)  # Of each entry of the asked command.
+_SHARES = np.linspace(0.0, 1.0, 6)  # Factors on each entry of the asked command.
 
 
 class CommandGuard(LeafSystem):
-    """Stands between whoever commands a walking robot and its policy.
+    """Replaces commands to a walking robot's policy that Γ does not accept.
 
     .. pydrake_system::
 
@@ -25,10 +25,10 @@ class CommandGuard(LeafSystem):
         output_ports: [desired_output: n_z, desired_preview: H n_z, desired_outlook: M n_z,
           is_changed: 1, safety_probability: 1]
 
-    Every ``period_s`` the asked command, held from now on, is assessed. It is passed on if its
-    probability, ``safety_probability``, reaches the threshold. Otherwise ``desired_output`` is the
-    accepted command nearest to it, measured in the policy's ranges, among commands whose entries
-    are shares of the asked ones; if none is accepted, the most probable one. ``learned`` of a
+    Every ``period_s`` the guard assesses the asked command, held from now on. It passes on a
+    command whose probability, ``safety_probability``, reaches the threshold. Otherwise
+    ``desired_output`` is the nearest accepted candidate, measured in the policy's ranges, or the
+    most probable. Candidates scale each entry of the asked command down. ``learned`` of a
     :class:`~drake_safety.systems.safety_assessor.SafetyAssessor` replaces the assessment's beliefs.
     ``with_commands`` maps features (n_f,) and commands (C, 3) to the commands' features (C, n_f).
     """

@@ -21,7 +21,7 @@ class CommandSampling:
     """Random velocity profiles."""
 
     reach: Positive = 3.0  # Factor on the policy's ranges, beyond which commands go.
-    inside_share: Share = 0.3  # Of profiles inside the policy's ranges.
+    inside_share: Share = 0.3  # Share of profiles inside the policy's ranges.
     num_segments: Bounds[Count] = field(default_factory=lambda: [1, 3])  # Constant commands.
     standing_share: Share = 0.1
 
@@ -62,12 +62,12 @@ def profile(
 class WalkingStart:
     """Random initial states: standing or in mid-stride, some with an offset as after a push."""
 
-    standing_share: Share = 0.25  # Of episodes that begin at rest in the standing posture.
-    # Of the others, the shortest and longest time since the robot stood.
+    standing_share: Share = 0.25  # Share of episodes that begin at rest in the standing posture.
+    # Time since the robot stood, in the other episodes.
     walked_s: Bounds[NotNegative] = field(default_factory=lambda: [0.2, 1.6])
-    push_share: Share = 0.5  # Of episodes with an offset.
+    push_share: Share = 0.5  # Share of episodes with an offset.
     velocity_m_s: float = 2.0  # Largest horizontal velocity offset of the base.
-    angular_velocity_rad_s: float = 1.5  # Half-width of the base's, per axis.
+    angular_velocity_rad_s: float = 1.5  # Half-width of the base's offset, per axis.
     tilt_rad: float = 0.15
     joint_rad: float = 0.05  # Standard deviation of the joints' offsets.
 
@@ -103,7 +103,7 @@ class GuardParameters:
 
 @schema(kw_only=True)
 class WalkingRecovery:
-    """What the robot does when the probability falls below a threshold."""
+    """Reaction of the robot when the probability falls below a threshold."""
 
     branch: Literal["stop", "slower"] = "stop"  # A command of zero, or a share of the command.
     threshold: float = 0.5  # Γ_thre, of the probability; not tuned.
@@ -127,8 +127,8 @@ class WalkingParameters:
     )
 
     policy: str = "policy.yaml"
-    """Policy file, relative to the folder of the robot's YAML file; or a network in place of the
-    one that ``policy.yaml`` there names."""
+    """Policy file, relative to the folder of the robot's YAML file; or a network that replaces the
+    network of ``policy.yaml`` there."""
     safe_set: WalkingLimits = field(default_factory=WalkingLimits)
     commands: CommandSampling = field(default_factory=CommandSampling)
     start: WalkingStart = field(default_factory=WalkingStart)

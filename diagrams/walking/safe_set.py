@@ -142,7 +142,7 @@ class WalkingSafeSet:
 
 
 def with_commands(names: Sequence[str], features: np.ndarray, commands: np.ndarray) -> np.ndarray:
-    """Named features (C, n_f) as if constant commands (C, 3) [m/s, rad/s] had been asked for."""
+    """Named features (C, n_f) with constant commands (C, 3) [m/s, rad/s] in place of the plan."""
     column = {name: i for i, name in enumerate(names)}
     changed = np.tile(features, (len(commands), 1))
     for axis, name in enumerate(_AXES):

@@ -33,7 +33,7 @@ from drake_safety.systems.recovery_trigger import RecoveryTrigger
 _NUM_OUTLOOK = 9  # Samples of the commands from now to the end, for the features.
 _SETTLING_S = 1.0
 _HELD_S = (2.0, 6.0)  # Shortest and longest time for which undisturbed motion holds a command.
-_STANDING_SHARE = 0.1  # Of its commands.
+_STANDING_SHARE = 0.1  # Share of zero commands in undisturbed motion.
 _POSITION = "base_height"  # No sensor of a robot measures it.
 _UNCOMMANDED = "action_change"
 
@@ -146,7 +146,7 @@ class Walking(LeggedLoop):
             recovery=trigger,
             guard=self._guard,
         )
-        # What the policy sees: its last actions, its phase and the command.
+        # Inputs of the policy: its last actions, its phase and the command.
         self.memory_features = controller.action_names
         self.memory_period_s = self.policy.parameters.period_s
         known = {*self.feature_names} - {_UNCOMMANDED}
@@ -180,7 +180,7 @@ class Walking(LeggedLoop):
 
     @classmethod
     def model_files(cls, scenario: Scenario) -> list[Path]:
-        """The robot's files and those of the policy."""
+        """The files of the robot and of the policy."""
         of_robot = super().model_files(scenario)  # First, so that its package is asked for first.
         path, network = policy_files(scenario)
         named = network_file(read_policy_file(path, network), str(path.parent))
@@ -337,7 +337,7 @@ class Walking(LeggedLoop):
 
 
 def policy_files(scenario: Scenario) -> tuple[Path, str]:
-    """The policy file of a scenario, and a network in place of the one that it names, or ""."""
+    """The policy file of a scenario, and the network that replaces the file's network, or ""."""
     folder = Path(load_robot(scenario.robot).source_dir)
     named = folder / scenario.parameters.policy
     is_network = named.suffix not in (".yaml", ".yml")

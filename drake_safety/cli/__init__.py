@@ -80,7 +80,7 @@ class _Command(TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Writes arguments and options, with words in capitals for their values."""
-        write, word = formatter.write_dl, lambda found: (found[1] or found[2]).upper()
+        write, word = formatter.write_dl, lambda match: (match[1] or match[2]).upper()
         formatter.write_dl = lambda rows: write([(_TYPED.sub(word, n), text) for n, text in rows])
         super().format_options(ctx, formatter)
 
@@ -109,7 +109,7 @@ def join_targets(args: Sequence[str]) -> list[str]:
 
 
 def make_app(called: Container[str] = tuple(COMMANDS)) -> typer.Typer:
-    """The commands; those that are not called have a name and a line of help."""
+    """Builds the commands; a command that is not called has a name and a line of help."""
     app = typer.Typer(
         cls=_Group,
         help="Γ, learned from simulated episodes, predicts from a robot's state and plan whether "
@@ -157,10 +157,7 @@ def main() -> None:
 
 
 def run_app(commands: Callable[..., Any], program: str) -> None:
-    """Runs a command; user errors are printed as one line, with --debug as a traceback.
-
-    SIGTERM stops it as Ctrl-C does.
-    """
+    """Runs a command; user errors are one line, with --debug a traceback; SIGTERM is as Ctrl-C."""
     # A program that reads a pipe gets results alone.
     log = console.console if console.console.is_terminal else Console(stderr=True)
     handler = RichHandler(console=log, show_path=False)

@@ -28,8 +28,8 @@ from drake_safety.simulation.feedback import pair_starts, run_pairs
 from drake_safety.simulation.rollouts import run_motions
 from drake_safety.simulation.scenario import load_scenario
 
-_NUM_FOLDS = 5  # Of the feedback, each of which is judged after adapting to the others.
-_MOTION_S = 1.25 * LEAST_MOTION_S  # Of a simulated actual plant, some of which may leave.
+_NUM_FOLDS = 5  # Folds of the feedback; each is judged after adapting to the others.
+_MOTION_S = 1.25 * LEAST_MOTION_S  # Motion of a simulated actual plant; some may leave.
 
 
 def adapt(

@@ -26,7 +26,7 @@ def ask(
     hand: console.HandOption = None,
     duration: Annotated[
         float | None,
-        Option(help="Of a command [s], then it stops; by default an episode.", min=0.1),
+        Option(help="Duration of a command [s], then a stop; by default an episode.", min=0.1),
     ] = None,
     mode: console.ModeOption = MODES[0],
 ) -> None:
@@ -34,7 +34,7 @@ def ask(
 
     Exit code: 0 accepted, 1 refused ("don't know" is a refusal), 2 error.
     """
-    with console.console.capture() as origin:  # Of Γ, printed last.
+    with console.console.capture() as origin:  # The origin of Γ, printed last.
         loaded, _, gamma = folders.open_assessment(scenario, assessment, mode)
     loop = loaded.make_loop(assessment=gamma, **console.given(hand=hand, command_s=duration))
     if not isinstance(loop, HasGoals):

@@ -130,7 +130,7 @@ def command_line(program: str = "drake-safety", *options: str) -> str:
 
 
 def made_by(scenario: str, program: str = "drake-safety") -> dict[str, Any]:
-    """What made results: the command line, the scenario and the versions."""
+    """Provenance of results: the command line, the scenario and the versions."""
     return {"command": command_line(program), "scenario": scenario, "versions": versions()}
 
 

@@ -20,10 +20,10 @@ def export(
         Path, Option(help="The file: ONNX, or C if its name ends in .c.", dir_okay=False)
     ] = Path("gamma.onnx"),
     part: Annotated[
-        str, Option(help="Of an ONNX file: 'gamma', 'assessor' or 'monitor'; C has all.")
+        str, Option(help="Part in an ONNX file: 'gamma', 'assessor' or 'monitor'; C has all.")
     ] = "gamma",
     prefix: Annotated[
-        str | None, Option(help="Of all names in C; by default the file's name.")
+        str | None, Option(help="Prefix of all names in C; by default the file's name.")
     ] = None,
 ) -> None:
     """Write Γ as one ONNX or C file, which runs without this package and without Drake."""

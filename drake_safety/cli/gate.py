@@ -46,7 +46,7 @@ from drake_safety.policies.policy_network import network_kinds
 from drake_safety.simulation.rollouts import run_episode
 from drake_safety.simulation.scenario import load_scenario
 
-_MOST_SHOWN = 10  # Of a table of episodes.
+_MOST_SHOWN = 10  # Rows of a table of episodes.
 _PANELS = """<!doctype html><meta charset="utf-8">
 <style>body { display: flex; height: 95vh } iframe { flex: 1 }</style>"""
 
@@ -61,7 +61,7 @@ def gate(
         list[str] | None,
         Option(
             metavar="KEY=VALUE",
-            help="What a candidate changes: policy=FILE, variation=NAME, or a scenario's key.",
+            help="Change of a candidate: policy=FILE, variation=NAME, or a scenario's key.",
         ),
     ] = None,
     baseline: Annotated[str, Option(metavar="KEY=VALUE", help="The same for all loops.")] = "",
@@ -251,7 +251,7 @@ def _report(
 
 
 def show_episodes(title: str, episodes: Sequence[Outcome], metric: str) -> None:
-    """Prints episodes that failed, the first ones in full."""
+    """Prints failed episodes, the first in full."""
     if len(episodes) > _MOST_SHOWN:
         title += f": the first {_MOST_SHOWN} of {len(episodes)}"
     rows = []

@@ -24,7 +24,7 @@ from drake_safety.simulation.rollouts import worker_loop
 from drake_safety.simulation.scenario import Scenario
 
 _SEQUENCES = ".npz"
-_LEAST_S = 1.0  # Of motion in which no alarm says something.
+_LEAST_S = 1.0  # Shortest motion in which the lack of an alarm is evidence.
 
 
 def monitor(
@@ -75,7 +75,7 @@ def _files(path: Path) -> list[Path]:
 def _motions(
     file: Path, log_map: Path | None, scenario: Scenario, gamma: SafetyAssessment
 ) -> Iterator[tuple[dict[str, Any], list[Motion]]]:
-    """What identifies a log, or each sequence of a file, and its motions."""
+    """Identifies a log, or each sequence of a file, with its motions."""
     entry = {"log": str(file), "sequence": None, "left_safe_set": ""}
     if file.suffix.lower() == _SEQUENCES:
         if log_map is None:

@@ -31,13 +31,13 @@ def play(
     seed: Annotated[int, Option(help="Seed of start and noise.")] = DEMONSTRATION.first,
     mode: console.ModeOption = MODES[0],
     mcap: console.McapOption = None,
-    port: Annotated[int | None, Option(help="Of the page; by default a free one.")] = None,
+    port: Annotated[int | None, Option(help="Port of the page; by default a free port.")] = None,
     host: Annotated[
-        str, Option(help="Address that serves the page; whoever reaches it can use the controls.")
+        str, Option(help="Address that serves the page; everyone who reaches it has the controls.")
     ] = console.LOOPBACK,
 ) -> None:
     """Simulate a task on a page in the browser, in real time, until Stop or Ctrl-C."""
-    from drake_safety.live.page import serve_page  # Of the extra "live".
+    from drake_safety.live.page import serve_page  # Needs the extra "live".
 
     loaded, _, gamma = folders.open_assessment(scenario, assessment, mode)
     options = console.given(hand=hand, recovery=recovery)

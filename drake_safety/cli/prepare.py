@@ -57,7 +57,7 @@ def new(
     ] = None,
     task: Annotated[str, Option(help="'balancing', 'reaching' or 'walking'.")] = "balancing",
     policy: Annotated[
-        Path | None, Option(help="Of walking: network, deploy.yaml or config.yaml.", dir_okay=False)
+        Path | None, Option(help="Walking: network, deploy.yaml or config.yaml.", dir_okay=False)
     ] = None,
     motors: Annotated[
         str | None, Option(help="Joints in the order of a deploy.yaml's motors, with commas.")

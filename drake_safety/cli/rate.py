@@ -59,10 +59,10 @@ def rate(
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,
 ) -> None:
-    """Estimate a failure rate from few episodes, chosen where they tell most.
+    """Estimate a failure rate from few, informative episodes.
 
     By default Γ divides starts into strata, which saves episodes where it is sharp. With --rare the
-    episodes approach failures level by level, which saves most where random ones hardly ever fail.
+    episodes approach failures level by level, which saves most if random episodes hardly ever fail.
     The estimate is unbiased on average; a search that loses a kind of failure gives too low a rate.
     Episodes are kept in OUT: the same command continues.
     """
@@ -71,7 +71,7 @@ def rate(
         folder = out or Path("runs") / f"{loaded.name}-rare"
         folders.check_writable(folder)
         with console.open_stages() as stages:
-            found = estimate_rare_failure(
+            searched = estimate_rare_failure(
                 loaded,
                 variation=variation,
                 metric=metric,
@@ -82,11 +82,11 @@ def rate(
                 progress=partial(stages, "episodes"),
             )
         if replay is not None:
-            if replay > len(found.failures):
-                raise ValueError(f"rate: failures are 1 to {len(found.failures)}; got {replay}")
-            motion = partial(_record, loaded, variation, found.failures[replay - 1])
+            if replay > len(searched.failures):
+                raise ValueError(f"rate: failures are 1 to {len(searched.failures)}; got {replay}")
+            motion = partial(_record, loaded, variation, searched.failures[replay - 1])
             return record_motions({f"failure {replay}": motion}, folder / f"failure-{replay}.html")
-        return _report_rare(loaded, variation, metric, found, folder, seed)
+        return _report_rare(loaded, variation, metric, searched, folder, seed)
     loaded, _, gamma = folders.open_assessment(scenario, assessment)
     gamma.check_unused(seed)
     folder = out or Path("runs") / f"{loaded.name}-rate"
@@ -118,29 +118,29 @@ def rate(
 
 
 def _report_rare(
-    loaded: Scenario, variation: str, metric: str, found: RareFailures, folder: Path, seed: int
+    loaded: Scenario, variation: str, metric: str, rare: RareFailures, folder: Path, seed: int
 ) -> None:
     """Prints a rate and the kinds of failures that make it, and writes them with a picture."""
-    plain = "" if math.isnan(found.plain_rollouts) else str(round(found.plain_rollouts))
-    row = (_exponent(found.rate), f"{found.search_rate:.1e}", found.simulations, plain)
-    columns = ("failure rate", "by the search", "episodes", "random ones of the same variance")
+    plain = "" if math.isnan(rare.plain_rollouts) else str(round(rare.plain_rollouts))
+    row = (_exponent(rare.rate), f"{rare.search_rate:.1e}", rare.simulations, plain)
+    columns = ("failure rate", "by the search", "episodes", "random episodes of the same variance")
     title = f"{loaded.name}, {variation}: {metric}"
     show_rows(title, columns, [row])
-    names = telling_facts(found)
+    names = telling_facts(rare)
     kinds = [
         (i + 1, f"{100 * one.weight:.0f} %", spoken(one.cause or metric), f"{one.time_s:.2f}")
         + tuple(f"{one.facts[name]:.3g}" for name in names)
-        for i, one in enumerate(found.failures[:_MOST_SHOWN])
+        for i, one in enumerate(rare.failures[:_MOST_SHOWN])
     ]
     headings = ("failure", "share", "cause", "at [s]", *map(spoken, names))
     show_rows("Kinds of failures, by their share of the rate", headings, kinds)
-    figures = {("", "", "failure_rate"): found.rate}
-    kept: dict[str, Any] = {"failures": [asdict(one) for one in found.failures[:_MOST_SHOWN]]}
-    kept |= {"search_rate": found.search_rate, "simulations": found.simulations}
-    entries = {"seed": seed, "metric": metric, "plain_rollouts": found.plain_rollouts} | kept
+    figures = {("", "", "failure_rate"): rare.rate}
+    kept: dict[str, Any] = {"failures": [asdict(one) for one in rare.failures[:_MOST_SHOWN]]}
+    kept |= {"search_rate": rare.search_rate, "simulations": rare.simulations}
+    entries = {"seed": seed, "metric": metric, "plain_rollouts": rare.plain_rollouts} | kept
     write_results(folder / "rare.json", ComparedPlant(loaded, variation), Results(figures, entries))
-    if found.failures:
-        for picture in save(rare_figure(found, title), folder / "rare"):
+    if rare.failures:
+        for picture in save(rare_figure(rare, title), folder / "rare"):
             console.say("picture", picture)
         console.say("to see one:", console.command_line("drake-safety", "--replay=1"))
 

@@ -44,10 +44,10 @@ _AFTER_EPISODE_S = 1.0  # Beyond an episode, to show whether the robot stays at 
 _AFTER_LEAVING_S = 0.5  # Time for which a motion without a goal goes on outside the safe set.
 _AFTER_EVENT_S = 0.15  # Time of a still: when the effect of a push or a trigger is visible.
 _NUM_STILLS, _MOST_EVENTS = 3, 3  # Stills of the motion, and the most stills of events.
-_MOST_STILLS, _STILL_PIXELS = 4, 480  # The last ones are kept; the side of the square.
+_MOST_STILLS, _STILL_PIXELS = 4, 480  # The last stills are kept; side of a square still.
 _GAMMA = ("safety_probability", "belief", "cause_probability", "predicted_margins")
-_WITHOUT_ALARM = ("probability_without_alarm", "belief_without_alarm")  # What recovery heeds.
-_COLUMNS = ("time [s]", "event", "probability")  # Of events.
+_WITHOUT_ALARM = ("probability_without_alarm", "belief_without_alarm")  # Recovery reads these.
+_COLUMNS = ("time [s]", "event", "probability")  # Table of events.
 # Keys of a ball on the command line, and fields of a throw.
 _THROW_FIELDS = {field.name.partition("_")[0]: field.name for field in fields(Throw)}
 
@@ -82,7 +82,7 @@ def run(
     folders.check_writable(folder)
     rule = folders.goal_threshold(gamma)
     options = console.given(hand=hand, recovery=recovery)
-    # The verdict is on what is asked, whatever a guard would pass on.
+    # The verdict is on the asked goal, also if a guard would replace it.
     loop = loaded.make_loop(variation, assessment=gamma, **options)
     duration_s, simulated = loaded.episode_duration_s, partial(_move, rule=rule)
     if target is not None:
@@ -322,7 +322,7 @@ def named_push(loop: ClosedLoop, names: list[str] | None) -> Push | None:
 
 
 def parse_pushes(scenario: Scenario, pushes: list[str]) -> list[Throw]:
-    """The balls of ``--push``: each 'ball', those of the scenario, or KEY=NUMBER pairs."""
+    """The balls of ``--push``: each is 'ball', as in the scenario, or KEY=NUMBER pairs."""
     throws: list[Throw] = []
     for text in pushes:
         if text == "ball":

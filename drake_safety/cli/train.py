@@ -25,7 +25,7 @@ from drake_safety.simulation.dataset import completed, load_episodes
 from drake_safety.simulation.rollouts import motion_piece_s, run_episodes, run_motions
 from drake_safety.simulation.scenario import load_scenario
 
-_WATCHED = 128  # Of the episodes, which the monitor watches too.
+_WATCHED = 128  # Episodes that the monitor watches too.
 
 
 def train(
@@ -53,9 +53,8 @@ def train(
 ) -> None:
     """Simulate the closed loop of the nominal and of random plants, and train Γ.
 
-    The scenario's family says which plants, and how many episodes they get beside the nominal ones;
-    `paper` learns from the nominal plant alone. Episodes are kept as they finish: a stopped run
-    continues with --resume.
+    The scenario's family defines the random plants and their number of episodes; `paper` learns
+    from the nominal plant alone. Finished episodes are kept: a stopped run continues with --resume.
     """
     if mode not in (*MODES, "both"):
         raise ValueError(f"train: mode must be one of {[*MODES, 'both']}; got '{mode}'")
@@ -137,7 +136,7 @@ def train(
             parameters = replace(loaded.assessment, mode=name)  # type: ignore[arg-type]  # Checked.
             data = load_episodes(folders.episodes_folder(out, name))
             on_family = load_episodes(drawn) if name == MODES[0] and num_drawn else None
-            # Γ is that of the scenario's diagram, whatever the options of its training episodes.
+            # Γ belongs to the scenario's diagram; options of training episodes do not count.
             data.info = replace(data.info, scenario_hash=loaded.simulation_hash())
             gamma = SafetyAssessment(parameters).fit(
                 data,

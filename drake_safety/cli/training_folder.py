@@ -18,7 +18,7 @@ from drake_safety.simulation.worker_processes import Progress
 
 MODES = ("sharpened", "paper")
 """Modes, the default first."""
-_DEFAULT_THRESHOLD = 0.5  # Of goals, where no promise has chosen one.
+_DEFAULT_THRESHOLD = 0.5  # For goals, without a calibration.
 
 
 class AssessmentFolder(NamedTuple):
@@ -71,7 +71,7 @@ def run_fresh_episodes(
     variation: str = "nominal",
     **loop_options: Any,
 ) -> Episodes:
-    """Simulates fresh episodes, and keeps them in a training's folder; existing ones are reused."""
+    """Simulates fresh episodes in a training's folder, and reuses existing episodes."""
     options: dict[str, Any] = {**scenario.options_for("evaluation"), **loop_options}
     kept = fresh_episodes_folder(folder, scenario.simulation_hash(variation), seed, options)
     options |= {"variation": variation, "seed": seed, "num_workers": num_workers}

@@ -67,7 +67,7 @@ def walking_state(kinematics: RobotKinematics, q: np.ndarray, v: np.ndarray) -> 
 
     Departure: feet that swing define no stance frame. Height is over the ground z = 0, and the
     direction of gravity and the velocities are in the base's frame. The (10 + 2 n_j,) entries,
-    named by :func:`walking_state_names`, are NaN as those of :func:`stance_state`.
+    named by :func:`walking_state_names`, are NaN as in :func:`stance_state`.
     """
     if not is_state(q, v):
         return np.full(10 + 2 * kinematics.num_joints, np.nan)

@@ -23,7 +23,7 @@ class RecoveryStepParameters:
     # Offset of the desired base yaw from the heading against the yaw rate, per yaw rate [s].
     yaw_damping_s: float = 0.1
     min_steps: Count = 2
-    max_steps: int = 100  # Of swings; a robot that stops before it can stand falls.
+    max_steps: int = 100  # Most swings; a robot that stops before it can stand falls.
     settle_heading_rad: float = 0.35  # Largest difference of yaw and heading for stopping [rad].
     settle_margin_m: float = 0.08  # Least depth of the capture point in the polygon to stop [m].
     resume_margin_m: float = 0.02  # Depth of this point below which a robot steps again [m].

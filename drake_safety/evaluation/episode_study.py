@@ -28,7 +28,7 @@ def evaluate_episodes(
     rows_of = {
         "segments": (np.ones(len(segments), dtype=bool), np.ones(len(others), dtype=bool)),
         "episodes": (segments.is_first, others.is_first),
-    }  # Of the test set and of the calibration set.
+    }  # For the test set and the calibration set.
     estimates: dict[Key, Estimate] = {}
     for scorer in scorers:
         check_unused(scorer.used, [calibration.info.seed, test.info.seed], f"'{scorer.name}'")
@@ -75,7 +75,7 @@ def evaluate_plans(
 
 
 def _first_segments(episodes: Episodes) -> Segments:
-    """The first segment of each episode, however early it ends; diverged ones have none."""
+    """The first segment of each episode that has not diverged, even if it ends early."""
     segments = split(episodes, stride=episodes.info.horizon, discount=1.0, shortest=1)
     return segments.take(segments.is_first)
 

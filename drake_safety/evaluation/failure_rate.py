@@ -119,8 +119,8 @@ def stratified_rate(
 ) -> tuple[Estimate, float]:
     """The failure rate of all starts, from numbers of starts, rollouts and failures by stratum.
 
-    Its 95 % interval is the exact one of the number of random episodes that is also returned, whose
-    share of failures would have the same variance (Korn and Graubard, Survey Methodology 1998).
+    The effective number of random episodes, also returned, has the same variance; its exact 95 %
+    interval is that of the estimate (Korn and Graubard, Survey Methodology 1998).
     """
     from scipy.stats import beta
 
@@ -130,7 +130,7 @@ def stratified_rate(
     likely = (failures + 0.5) / (rollouts + 1)
     mean = share @ likely
     variance = share**2 @ (likely * (1.0 - likely) / rollouts)
-    variance += share @ (likely - mean) ** 2 / starts.sum()  # Of the strata's shares.
+    variance += share @ (likely - mean) ** 2 / starts.sum()  # Variance of the strata's shares.
     number = float(mean * (1.0 - mean) / variance)
     failed, passed = number * value, number * (1.0 - value)
     low = beta.ppf(0.025, failed, passed + 1.0) if failed else 0.0

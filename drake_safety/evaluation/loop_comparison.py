@@ -54,7 +54,7 @@ class Verdict:
     """Episodes in which the candidate does worse, by time, with Γ's belief of the baseline's."""
     no_longer_failing: list[Outcome]
     worse_by: float
-    outcomes: list[tuple[Outcome, Outcome]]  # Of all pairs, the baseline's first.
+    outcomes: list[tuple[Outcome, Outcome]]  # All pairs, the baseline's outcome first.
     is_paired: bool = True  # Whether both outcomes of a pair belong to the same episode.
 
 
@@ -176,7 +176,7 @@ def check_pair(
 def verdict_of(
     pairs: Sequence[tuple[Outcome, Outcome]], looks: Sequence[Estimate], worse_by: float
 ) -> Verdict:
-    """What is known of all pairs so far, the baseline's outcomes first."""
+    """Judges all pairs so far, the baseline's outcomes first."""
     low, high = looks[-1].low, looks[-1].high
     known = WORSE if low > 0.0 else BETTER if high < 0.0 else NOT_WORSE
     newly = [replace(two, belief=one.belief) for one, two in pairs if two.value > one.value]
@@ -200,7 +200,7 @@ def make_paired(pair: tuple[ComparedPlant, ComparedPlant], side: int, **options:
 
 
 def _pair_options(pair: tuple[ComparedPlant, ComparedPlant], side: int) -> dict[str, Any]:
-    """Options of one of two loops, whose starts may be those of the other."""
+    """Options of one of two loops; the candidate may take the baseline's starts."""
     one, two = (scenario.options_for("pairs", variation) for scenario, variation in pair)
     # Whether a task's starts depend on its controller, and can be another's.
     takes_starts = "starts_of" in signature(pair[side].scenario.task_class()).parameters

@@ -33,7 +33,7 @@ class Estimate:
         return cls(value, value, value, n)
 
 
-_CONFIDENCE = 0.95  # Of all intervals.
+_CONFIDENCE = 0.95  # All intervals.
 _ENDS = [0.5 - 0.5 * _CONFIDENCE, 0.5 + 0.5 * _CONFIDENCE]
 
 

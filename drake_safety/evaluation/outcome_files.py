@@ -35,12 +35,12 @@ def write_outcomes(file: Path, outcomes: Iterable[Outcome]) -> None:
 
 
 def read_outcomes(path: Path, metric: str = FAILED) -> dict[str, float]:
-    """Reads outcomes from 0 to 1 by episode, of which larger ones are worse.
+    """Reads outcomes from 0 to 1 by episode; larger is worse.
 
     Args:
         path: A CSV file with the column ``episode``, or LeRobot's ``eval_info.json``.
-        metric: A column: ``failed`` has 0 or 1, any other one values from 0 to 1; or
-            ``COLUMN=BOUND``: an episode fails whose value exceeds the bound.
+        metric: A column: ``failed`` has 0 or 1, any other column values from 0 to 1. With
+            ``COLUMN=BOUND`` an episode fails if its value exceeds the bound.
     """
     outcomes: dict[str, float] = {}
     with reading(path, "outcomes", (ValueError, csv.Error)):
@@ -85,14 +85,14 @@ def _lerobot(info: Any) -> Iterator[tuple[str, str, float]]:
         where = "per_task" if "per_task" in info else "per_episode"
         if where == "per_task":
             tasks = [(f"{t['task_group']}/{t['task_id']}", t["metrics"]) for t in info[where]]
-            found = [(f"{n}/{k}", x) for n, m in tasks for k, x in enumerate(m["successes"])]
+            pairs = [(f"{n}/{k}", x) for n, m in tasks for k, x in enumerate(m["successes"])]
         else:
             key = "episode_ix" if any(r.get("seed") is None for r in info[where]) else "seed"
-            found = [(f"{key} {r[key]}", r["success"]) for r in info[where]]
+            pairs = [(f"{key} {r[key]}", r["success"]) for r in info[where]]
     except (KeyError, TypeError, AttributeError) as error:
-        what = "expected 'per_task' with 'task_group', 'task_id' and 'metrics: successes'"
-        raise ValueError(f"it is no eval_info.json of LeRobot: {what}, or 'per_episode'") from error
-    for name, success in found:
+        what = "'per_task' with 'task_group', 'task_id' and 'metrics: successes', or 'per_episode'"
+        raise ValueError(f"it is not an eval_info.json of LeRobot: expected {what}") from error
+    for name, success in pairs:
         if success not in (0, 1):
             raise ValueError(f"episode '{name}': success must be true or false; got {success!r}")
         yield where, name, 1.0 - success

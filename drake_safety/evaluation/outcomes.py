@@ -1,4 +1,4 @@
-"""What counts as the failure of an episode, and what is kept of each."""
+"""Failure of an episode: metrics, and the record that is kept."""
 
 from __future__ import annotations
 

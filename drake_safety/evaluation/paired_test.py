@@ -1,8 +1,8 @@
-"""Sequential tests of paired outcomes, valid however often one looks and whenever one stops.
+"""Sequential tests of paired outcomes, valid for any number of looks and any time of stopping.
 
-By Ville's inequality a nonnegative supermartingale that starts at 1, an *e-process*, reaches 1/α
-under its null hypothesis with a probability of at most α, at any time (Ramdas, Grünwald, Vovk and
-Shafer, Game-theoretic statistics and safe anytime-valid inference, Statistical Science 2023).
+An *e-process* is a nonnegative supermartingale that starts at 1. By Ville's inequality it ever
+reaches 1/α under its null hypothesis with a probability of at most α. Source: Ramdas, Grünwald,
+Vovk and Shafer, Game-theoretic statistics and safe anytime-valid inference, Stat. Science 2023.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ import numpy as np
 from drake_safety.evaluation.metrics import Estimate
 
 _SHARES = 0.95 * 0.5 ** np.arange(8)
-"""Shares u of the capital that are bet. Large ones have larger weights: failures are rare."""
+"""Shares u of the capital to bet. Large shares have larger weights: failures are rare."""
 _WEIGHTS = np.sqrt(_SHARES) / np.sqrt(_SHARES).sum()
-_EDGE = 1e-9  # Of the range of means, where a bet would be infinite.
+_EDGE = 1e-9  # Distance from the ends of the range of means, where a bet would be infinite.
 
 
 def betting_log_e(values: np.ndarray, counts: np.ndarray, mean: float) -> np.ndarray:
     """Logarithm of the capital of bets that the mean of outcomes in [-1, 1] is above m.
 
-    Each value (V,) was seen so often, (..., V). The factor of an outcome d is 1 + λ(d - m) with
-    λ = u / (1 + m) for a share u of the capital; that is a weighted mean over fixed shares, and
-    monotone in m (Waudby-Smith and Ramdas, Estimating means of bounded random variables by betting,
-    JRSS B 2024).
+    Values are (V,), their counts (..., V). The factor of an outcome d is 1 + λ(d - m) with
+    λ = u / (1 + m) for a share u of the capital. The capital is a weighted mean over fixed shares,
+    and monotone in m. Source: Waudby-Smith and Ramdas, Estimating means of bounded random variables
+    by betting, JRSS B 2024.
     """
     from scipy.special import logsumexp
 
@@ -41,7 +41,7 @@ def interim_estimate(
     """A look at a confidence sequence: the mean of all outcomes so far, (N,) in ±1, and its ends.
 
     Each end holds at all looks at once with a probability of at least 1 - alpha, and both with
-    1 - 2 alpha. What earlier looks have excluded stays so.
+    1 - 2 alpha. Means that an earlier look excluded stay excluded.
     """
     values, counts = np.unique(outcomes, return_counts=True)
     low, high = (sign * _low(sign * values, counts, alpha) for sign in (1.0, -1.0))

@@ -34,7 +34,7 @@ from drake_safety.simulation.rollouts import episode_rng
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import MadeOnce, Progress, map_items
 
-_BEFORE_S, _AFTER_S = 2.0, 3.0  # Of motion before the first phase, and from a push on.
+_BEFORE_S, _AFTER_S = 2.0, 3.0  # Motion before the first phase, and from a push on.
 _PERIODS_S = 0.2, 1.5  # Shortest and longest of gaits.
 _STANDING_RAD = 0.01  # Largest spread of the joints of a robot that stands.
 _PERIODIC = 0.3  # Least correlation of a gait with itself, a period later.
@@ -52,14 +52,14 @@ _PORTS = ("state", "output", "desired_preview", "margins", "safe", "plant_state"
 class PushPlan:
     """The pushes to try on a robot."""
 
-    body: str = ""  # That of the scenario's random pushes by default, else the base.
+    body: str = ""  # By default the body of the scenario's random pushes, else the base.
     duration_s: float = 0.1
     directions: int = 16
-    phases: int = 8  # Of a gait; a robot that stands has one.
+    phases: int = 8  # Phases of a gait; a standing robot has one.
     command: Sequence[float] | None = None
     """Goal (3,) of the motion: a command or a target; the first named one but zero by default."""
     metric: Metric = ""  # As in `compare_loops`; a fall by default, of a robot that can fall.
-    precision: float = 0.05  # Of the critical impulse, relative.
+    precision: float = 0.05  # Relative precision of the critical impulse.
     seed: int = PUSHES.first
 
 
@@ -71,7 +71,7 @@ class PushCell:
     phase: int
     impulses_n_s: list[float]
     has_failed: list[bool]
-    speeds: list[float]  # The largest of any joint, by its stated one.
+    speeds: list[float]  # Largest joint speed, by the joint's limit.
     num_islands: int  # Failures in two trials of random smaller impulses.
     foreseen_n_s: float | None  # From which on Γ expects a failure; None without Γ.
 
@@ -94,7 +94,7 @@ class PushCard:
 
     plan: PushPlan
     unit_n_s: float  # mass · sqrt(g · standing height), which makes robots comparable.
-    period_s: float  # Of the gait; 0 of a robot that stands.
+    period_s: float  # Period of the gait; 0 for a standing robot.
     cells: list[PushCell]
 
     @classmethod
@@ -165,7 +165,7 @@ class PushRig:
         options = scenario.options_for("pairs", variation) | options
         loop = scenario.make_loop(variation, assessment=in_loop, **options)
         if not isinstance(loop, LeggedLoop):
-            raise ValueError(f"pushes: task '{type(loop).__name__}' is no LeggedLoop")
+            raise ValueError(f"pushes: task '{type(loop).__name__}' is not a LeggedLoop")
         self.loop, self._assessment = loop, assessment
         random = getattr(scenario.parameters, "random_pushes", None)
         body = plan.body or (random and random.body) or loop.robot.base
@@ -295,7 +295,7 @@ class PushRig:
         return 1.0 if math.isnan(safe) else 1.0 - safe
 
     def cell(self, place: tuple[int, int]) -> PushCell:
-        """Finds the critical impulse by doubling and bisection, and tries smaller ones."""
+        """Finds the critical impulse by doubling and bisection, and tries smaller impulses."""
         tried: dict[float, tuple[bool, float]] = {}
 
         def fails(impulse_n_s: float) -> bool:

@@ -31,12 +31,12 @@ from drake_safety.simulation.worker_processes import CloudPickled, MadeOnce, Pro
 if TYPE_CHECKING:
     from sklearn.mixture import GaussianMixture
 
-_SHARE = 0.1  # Of the samples of a level that reach the next one.
-_FIRST_STEP, _SMALLEST_STEP, _ACCEPTED = 0.45, 0.05, 0.44  # Of moves, and share of these to accept.
+_SHARE = 0.1  # Share of a level's samples that reach the next level.
+_FIRST_STEP, _SMALLEST_STEP, _ACCEPTED = 0.45, 0.05, 0.44  # Sizes of moves; share to accept.
 _MOST_LEVELS = 8
 _PLAIN = 0.15  # Share of samples that do not depend on the search, in case that it missed a mode.
 _MOST_PLACES, _MATTERS = 16, 0.1  # Draws that matter, and the least weight of one.
-_ROUNDS = 4  # Of importance sampling, each by what the one before found.
+_ROUNDS = 4  # Rounds of importance sampling; each fits the failures of the round before.
 _MIXED = 4  # Moves of failures, twice: before and while they are fitted.
 _MODES = 6  # Most components of the mixture.
 _BLUR = 0.15  # Variance of a mean of failures that share ancestors, by which means shrink.
@@ -48,7 +48,7 @@ _APART = 1.5  # Distance of two failures of different kinds.
 class Sample:
     """An episode by its draws; its weight is by importance sampling, or of a kind its share."""
 
-    seed: int  # Of the draws beyond ``z``.
+    seed: int  # Seed of the draws beyond ``z``.
     z: list[float]
     is_discrete: list[bool]
     margins: list[float]  # Smallest of each constraint.
@@ -64,7 +64,7 @@ class RareFailures:
     """A failure rate, and failures that make it, the most likely kind first."""
 
     rate: Estimate
-    search_rate: float  # Of the subset simulation alone.
+    search_rate: float  # Rate by the subset simulation alone.
     simulations: int
     plain_rollouts: float  # Random episodes whose share of failures has the same variance.
     failures: list[Sample]
@@ -72,11 +72,11 @@ class RareFailures:
 
 
 Simulate = Callable[[Sequence[np.ndarray | None], np.random.Generator], list[Sample]]
-"""Simulates points of the normal space, None for random ones."""
+"""Simulates points of the normal space; None is a random point."""
 
 
 class _Simulator:
-    """Simulates samples in workers; finished ones are kept in a file."""
+    """Simulates samples in workers, and keeps finished samples in a file."""
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class _Simulator:
     def __call__(
         self, points: Sequence[np.ndarray | None], rng: np.random.Generator
     ) -> list[Sample]:
-        """Simulates points of the normal space, or random ones."""
+        """Simulates points of the normal space; None is a random point."""
         seeds = rng.integers(2**62, size=len(points)).tolist()
         first, self._number = self._number, self._number + len(points)
         items = [
@@ -130,13 +130,12 @@ def estimate_rare_failure(
 ) -> RareFailures:
     """Estimates a failure rate down to 1e-6 and less, and finds the failures that make it.
 
-    All numbers that an episode draws are a point of a space of standard normal numbers. A subset
-    simulation (Au and Beck 2001) searches failures there: the tenth of the samples that came
-    closest to one starts Markov chains, whose closest tenth starts the next ones. Then as many
-    samples are drawn from normal distributions around the failures, and weighted by their
-    likelihood; they give the rate and its 95 % interval. The rate has no bias however wrong the
-    distributions are, but a kind of failures that the search missed shows up in random samples
-    alone.
+    The random numbers of an episode are a point of a space of standard normal numbers. A subset
+    simulation (Au and Beck 2001) searches failures there: at each level, the tenth of the samples
+    closest to a failure starts the next Markov chains. Then as many samples from normal
+    distributions around the failures, weighted by likelihood, give the rate and its 95 % interval.
+    The rate is unbiased for any distributions, but only random samples show a kind of failures that
+    the search missed.
 
     Args:
         loop: A scenario, or a function that builds any diagram, with ``reset``, ``duration_s``,
@@ -184,8 +183,8 @@ def search_and_sample(simulate: Simulate, samples: int, rng: np.random.Generator
         for _ in range(_ROUNDS):
             proposal = proposal.refined([one for one in drawn if one.has_failed])
             points = [proposal.draw(rng) for _ in range(samples // _ROUNDS)]
-            weights = proposal.weights(found := simulate(points, rng))
-            drawn += [replace(one, weight=w) for one, w in zip(found, weights, strict=True)]
+            weights = proposal.weights(simulated := simulate(points, rng))
+            drawn += [replace(one, weight=w) for one, w in zip(simulated, weights, strict=True)]
         values = np.array([one.weight * one.has_failed for one in drawn])
         rate, plain = _rate(values, search.rate)
         failures = proposal.kinds([one for one in drawn if one.has_failed] or search.failures)
@@ -272,10 +271,10 @@ def _search(simulate: Simulate, number: int, rng: np.random.Generator) -> _Searc
     def walk(chains: list[Sample], below: float) -> tuple[list[Sample], float]:
         """Moves chains that stay below a level; returns them, and the share that moved."""
         points = [moved(np.array(x.z), np.array(x.is_discrete), step, rng) for x in chains]
-        found = simulate(points, rng)
-        tried.extend((one, level(one)) for one in found)
-        is_kept = [level(one) < below for one in found]
-        pairs = zip(found, chains, is_kept, strict=True)
+        proposed = simulate(points, rng)
+        tried.extend((one, level(one)) for one in proposed)
+        is_kept = [level(one) < below for one in proposed]
+        pairs = zip(proposed, chains, is_kept, strict=True)
         return [new if kept else old for new, old, kept in pairs], float(np.mean(is_kept))
 
     tried, rate, step = [(one, level(one)) for one in random], 1.0, _FIRST_STEP
@@ -314,8 +313,8 @@ def _search(simulate: Simulate, number: int, rng: np.random.Generator) -> _Searc
 class Proposal:
     """A mixture of normal distributions of the draws that matter, (k,), and of random samples."""
 
-    places: np.ndarray  # Of these draws.
-    share: np.ndarray  # Of components.
+    places: np.ndarray  # Indices of these draws.
+    share: np.ndarray  # Weights of the components.
     mean: np.ndarray
     variance: np.ndarray
 
@@ -368,7 +367,7 @@ class Proposal:
         )
 
     def draw(self, rng: np.random.Generator) -> np.ndarray | None:
-        """Draws a point; None is a random one."""
+        """Draws a point; None is a random point."""
         if rng.random() < _PLAIN or not len(self.places):
             return None
         z = rng.standard_normal(self.places[-1] + 1)
@@ -377,7 +376,7 @@ class Proposal:
         return z
 
     def weights(self, samples: Sequence[Sample]) -> list[float]:
-        """How much more likely each sample is among random ones."""
+        """Likelihood of each sample among random samples, relative to this proposal."""
         weights = []
         for sample in samples:
             # A draw that no episode reads says nothing.

@@ -23,7 +23,7 @@ def write_report(folder: Path, *, episodes: Path, versions: Mapping[str, str]) -
     from jinja2 import Environment, StrictUndefined
 
     if not folder.is_dir():
-        raise ValueError(f"report: there is no folder '{folder}'")
+        raise ValueError(f"report: folder '{folder}' does not exist")
     files_of_modes = sorted(folder.glob("*.safetensors"), reverse=True)  # "sharpened" first.
     assessments = {path.stem: SafetyAssessment.load(path) for path in files_of_modes}
     results = [

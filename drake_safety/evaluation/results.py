@@ -18,8 +18,8 @@ from drake_safety.files.schema import load_typed
 SCHEMA = "drake_safety.results"
 
 Key = tuple[str, str, str]
-"""What was judged, such as "episodes"; what judged it, such as "sharpened", or "" for a figure of
-the set itself; and what was measured, such as "auc"."""
+"""Set, such as "episodes"; method, such as "sharpened", or "" for a figure of the set itself; and
+metric, such as "auc"."""
 _Number = float | None
 
 

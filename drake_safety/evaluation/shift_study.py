@@ -29,7 +29,7 @@ SEEN = ("state", "desired_preview", "features")  # Ports that assessor and monit
 CONFIDENT = 0.9  # Least safety probability of a confident verdict.
 BOOTSTRAP = Bootstrap(num_resamples=200)
 SPANS_S = (10.0, 60.0)  # Times since a change over which confident errors are counted.
-_FIRST_S = 12.0  # Simulated of each motion; only those without an alarm go on.
+_FIRST_S = 12.0  # First part of each motion; only motions without an alarm continue.
 _UNKNOWN = Column("unknown", "don't know", "=%", digits=1)
 _ERROR = Column("confident_error", "sure and wrong", "=%", digits=1)
 _AUC = Column("auc", "AUC", "=")
@@ -102,7 +102,7 @@ def run_monitored(
     options: Mapping[str, Any],
     num_workers: int | None = None,
 ) -> list[Episode]:
-    """Simulates undisturbed motions of a plant; those without an alarm last a minute."""
+    """Simulates undisturbed motions of a plant; a motion without an alarm lasts a minute."""
     make = worker_loop(scenario, variation, **options)
 
     def simulated(indices: list[int], until_s: float) -> dict[int, Episode]:
@@ -118,7 +118,7 @@ def run_monitored(
 
 
 class Minute(NamedTuple):
-    """A minute that begins with a motion and goes on with the next ones; infinite is never."""
+    """Times in a minute that begins with a motion and continues with the next; infinite: never."""
 
     alarm_s: float
     leave_s: float
@@ -127,7 +127,7 @@ class Minute(NamedTuple):
 
 
 def monitored(motions: Sequence[Episode], assessment: SafetyAssessment) -> list[Minute]:
-    """What the monitor and Γ say in the minute that begins with each of some motions."""
+    """Judges the minute that begins with each motion, by the monitor and Γ."""
     detector = assessment.detector_
     rows = [rows_of(one) for one in motions]
     every = max(1, round(assessment.info_.step_s / detector.step_s))

@@ -1,4 +1,4 @@
-"""Catalogue of shifts: plants and faulty sensors unlike those of training, scaled to the robot."""
+"""Catalogue of shifts: plants and faulty sensors absent from training, scaled to the robot."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PlantShift:
 
     kind: Literal["plant", "sensor"]
     variation: PlantVariation
-    options: Mapping[str, Any] = field(default_factory=dict)  # Of its diagram.
+    options: Mapping[str, Any] = field(default_factory=dict)  # Options of its diagram.
 
 
 def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
@@ -48,7 +48,7 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     loads = dict(zip(kinematics.joint_names, torques.tolist(), strict=True))
     joint = max((name for name in loads if name in limits), key=loads.__getitem__)
     key, period_s = as_pattern(joint), scenario.control_period_s
-    # Of a servo the desired position and velocity, otherwise the torque.
+    # A servo has a desired position and velocity, another motor a torque.
     actuators = [one.name() for one in motors if one.joint().name() == joint]
     motor = ["|".join(map(as_pattern, [joint, f"{joint}_rate", *actuators]))]
     lasting = {

@@ -18,7 +18,7 @@ from drake_safety.plants.pushes import Push
 
 _CURVE_HEIGHT, _BELIEF_HEIGHT, _MARGINS_HEIGHT = 1.6, 0.8, 1.2  # All sizes are in inches.
 _MAX_STILL_HEIGHT, _STILL_TITLE_HEIGHT, _AXIS_LABEL_HEIGHT = 2.6, 0.35, 0.6
-_LABEL_ROW_HEIGHT, _NUM_LABEL_ROWS = 0.2, 8  # Of names above the curve.
+_LABEL_ROW_HEIGHT, _NUM_LABEL_ROWS = 0.2, 8  # Rows of names above the curve.
 _NUM_LEVELS, _MOST_POINTS = 4, 4000  # Curves of levels, and points of each.
 _Style = Mapping[str, Any]
 _BESIDE: _Style = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
@@ -103,7 +103,7 @@ def levels_figure(
     time_s: np.ndarray, levels: np.ndarray, names: list[str], alarms: list[Alarm], limit: float
 ) -> Figure:
     """Plots the largest levels (N, n_w) of the states that a monitor watches, and its alarms."""
-    # Of a long log the largest of some rows.
+    # A long log is reduced to the largest of successive rows.
     firsts = np.arange(0, len(time_s), max(1, len(time_s) // _MOST_POINTS))
     peaks, levels = levels.max(axis=0), np.maximum.reduceat(levels, firsts)
     events = [_Event(float(time_s[one.begin]), one.cause, style.UNSAFE_COLOUR) for one in alarms]
@@ -163,7 +163,7 @@ def _draw_margins(
     angular: Sequence[str],
 ) -> None:
     axes.axhline(0.0, color=style.FAINT_INK, linewidth=0.8)
-    # The first two colours are those of safe and unsafe.
+    # The first two colours mean safe and unsafe.
     colours = style.SERIES_COLOURS[2:] + style.SERIES_COLOURS[:2]
     axes.set_prop_cycle(color=colours, linestyle=style.SERIES_DASHES, linewidth=[1.5] * 6)
     for name, values in zip(names, margins.T, strict=True):
@@ -182,10 +182,7 @@ def _span(axes: Axes, start_s: float, end_s: float, colour: str) -> None:
 
 
 def _write_names(axes: Axes, events: Sequence[_Event], ends: tuple[float, float]) -> None:
-    """Writes names in rows above an axis with these ends, the earliest on top.
-
-    Lines go down from the names, so that none crosses another name.
-    """
+    """Writes names in rows above an axis, the earliest on top: no line crosses another name."""
     row_height = (ends[1] - ends[0]) * _LABEL_ROW_HEIGHT / _CURVE_HEIGHT
     top = ends[1] + row_height * min(len(events), _NUM_LABEL_ROWS)
     axes.set_ylim(ends[0], top)

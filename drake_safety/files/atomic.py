@@ -23,7 +23,7 @@ def replacing(final: Path) -> Iterator[Path]:
         temporary.replace(final)
     except OSError as error:
         why = os.strerror(error.errno) if error.errno else error
-        text = f"{final} cannot be written: {why}; what had been written before is kept"
+        text = f"{final} cannot be written: {why}; its earlier content is kept"
         raise OSError(text) from error
     finally:
         temporary.unlink(missing_ok=True)

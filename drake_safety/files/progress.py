@@ -22,7 +22,7 @@ def open_stages(
 ) -> Iterator[StageProgress]:
     """Shows stages while the block runs: bars on a terminal, else a line every `period_s` [s]."""
     console = console or Console(stderr=True)
-    # A log file that is to have colours is no terminal either.
+    # A log file with forced colours is not a terminal.
     is_live = console.is_jupyter or (console.is_interactive and console.file.isatty())
     numbers = [
         columns.MofNCompleteColumn(),
@@ -43,7 +43,7 @@ def open_stages(
 
     def report(stage: str, done: int, total: int) -> None:
         if stage not in tasks:
-            # What an earlier run has done says nothing about the time left.
+            # Work of an earlier run does not predict the time left.
             tasks[stage] = bars.add_task(stage, total=total, completed=done)
         task = bars.tasks[tasks[stage]]
         was_finished = task.finished

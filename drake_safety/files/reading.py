@@ -14,7 +14,7 @@ import yaml
 
 _LONGEST_MESSAGE = 500  # Characters, without the name of the file.
 _MOST_BYTES = 2**33
-_MOST_VALUES = 200_000  # Of a YAML document, with every alias written out.
+_MOST_VALUES = 200_000  # Values of a YAML document, with aliases expanded.
 
 
 @contextmanager

@@ -78,13 +78,13 @@ def check_times(who: str, *, or_zero: Collection[str] = (), **times: Any) -> Non
 
 
 def load_typed(schema: type[_Value], raw: Any, who: str) -> _Value:
-    """Reads plain values, such as those of a YAML document, into a dataclass.
+    """Reads plain values, as in a YAML document, into a dataclass.
 
     A nested mapping that leaves keys out keeps their values in the field's default.
     """
     try:
         text = json.dumps({"value": _merged(schema, raw)}, default=_plain)
-    except TypeError as error:  # A key that is no text.
+    except TypeError as error:  # A key is not text.
         raise ValueError(f"{who}: {error}") from None
     known: Any = schema  # For mypy, the cache wants what can be hashed.
     try:
@@ -111,7 +111,7 @@ def _document(schema: Any) -> type[pydantic.BaseModel]:
 
 
 def _merged(default: Any, raw: Any) -> Any:
-    """What is stated, with the rest of defaults that are stated in part, to any depth."""
+    """Fills a partial value with its default, to any depth."""
     if not (is_dataclass(default) and isinstance(raw, dict)):
         return raw
     known = {}

@@ -129,7 +129,7 @@ class _Entries:
 def _network(path: Path, *names: str) -> str:
     if files := [path.parent / name for name in names if (path.parent / name).is_file()]:
         return str(files[0].resolve())
-    raise ValueError(f"{path}: there is no network of {list(names)} beside it")
+    raise ValueError(f"{path}: expected a network beside it, one of {list(names)}")
 
 
 def _joined(factors: list[float]) -> list[float]:

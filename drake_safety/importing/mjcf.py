@@ -21,14 +21,14 @@ from drake_safety.importing.urdf_copy import as_text
 from drake_safety.robots.urdf import DRAKE, as_number
 
 _SIZES = ("count", "nrow", "ncol", "width", "height")
-_MOST_CELLS, _MOST_COPIES = 1e8, 1e4  # Of a height field or a picture, and of all replicates.
+_MOST_CELLS, _MOST_COPIES = 1e8, 1e4  # Cells of a height field or picture; copies of replicates.
 _GREY = [0.5, 0.5, 0.5, 1.0]  # MuJoCo's colour of a geom that states none.
 _STL = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
 
 
 @dataclass(kw_only=True)
 class ModelFacts:
-    """What a model file says of a robot beyond a URDF, by the names of its joints and bodies."""
+    """Facts in a model file that a URDF lacks, by the names of joints and bodies."""
 
     # Stiffness and damping of position servos [N·m/rad, N·m·s/rad].
     gains: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -139,7 +139,7 @@ class _Robot:
         model, mujoco = self.model, self.mujoco
         gains = {j: np.zeros(2) for j in self.joints}
         armature = {j: float(model.joint(j).armature[0]) for j in self.joints}
-        others: dict[int, int] = {}  # Joints of actuators that are no motors.
+        others: dict[int, int] = {}  # Joints of other actuators than motors.
         of_joint = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
         for i in range(model.nu):
             one, j = model.actuator(i), int(model.actuator_trnid[i, 0])

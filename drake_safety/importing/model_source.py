@@ -19,7 +19,7 @@ def is_xacro(path: Path) -> bool:
 
 
 def expanded(path: Path, arguments: Mapping[str, str]) -> str:
-    """The URDF of a xacro file; its packages are those above it and in ROS_PACKAGE_PATH."""
+    """The URDF of a xacro file; its packages lie above it or in ROS_PACKAGE_PATH."""
     require_extra("robots", f"new: '{path}' is xacro", "xacrodoc")
     from xacrodoc import XacroDoc, packages
 
@@ -28,9 +28,9 @@ def expanded(path: Path, arguments: Mapping[str, str]) -> str:
     packages.walk_up_from(path)
     included, options = [str(path.resolve())], {"subargs": dict(arguments), "rootdir": path.parent}
     try:
-        # An include, so that those in it are relative to it.
+        # An include, so that nested includes are relative to it.
         document = XacroDoc.from_includes(included, resolve_packages=False, **options)
-    except Exception as error:  # Of a kind of xacro's own, of XML, or of its expressions.
+    except Exception as error:  # Errors of xacro, of XML, or of its expressions.
         missing = str(error).partition("Undefined substitution argument ")[2]
         remedy = f"; pass --xacro-arg {missing}=VALUE" if missing else ""
         raise ValueError(f"new: xacro of '{path}': {shortened(str(error))}{remedy}") from error
@@ -39,10 +39,10 @@ def expanded(path: Path, arguments: Mapping[str, str]) -> str:
 
 
 def model_file(name: str) -> Path:
-    """A file, or that of a robot of robot_descriptions, which git downloads on first use."""
+    """A model file, or the file of a name in robot_descriptions, which git downloads first."""
     if (path := Path(name)).suffix or path.exists():
         return path
-    who = f"new: '{name}' is no file"
+    who = f"new: '{name}' is not a file"
     require_extra("robots", who, "robot_descriptions")
     known = import_module("robot_descriptions").DESCRIPTIONS
     if name not in known:
@@ -50,7 +50,7 @@ def model_file(name: str) -> Path:
         raise ValueError(f"{who}, and none of {len(known)} robot_descriptions; near are {near}")
     try:
         module = import_module(f"robot_descriptions.{name}")
-    except Exception as error:  # Of git, or of a network.
+    except Exception as error:  # Errors of git, or of a network.
         what = shortened(" ".join(str(error).split()))
         raise ValueError(f"new: git cannot download '{name}': {what}") from error
     return Path(next(getattr(module, key) for key in _PATHS if hasattr(module, key)))

@@ -15,7 +15,7 @@ from drake_safety.simulation.contract import Finding, failed, passed
 
 
 def check_urdf(kinematics: RobotKinematics) -> Iterator[Finding]:
-    """Checks couplings, wheels and lost collision shapes; nothing is said of what is in order."""
+    """Checks couplings, wheels and lost collision shapes; yields problems only."""
     robot = kinematics.robot
     path = model_file(robot.urdf, robot.source_dir, robot.requires)
     if path.suffix != ".urdf":
@@ -41,6 +41,6 @@ def check_urdf(kinematics: RobotKinematics) -> Iterator[Finding]:
             "collision shapes",
             f"{len(bare)} links have none, as their meshes were left out; everything passes "
             f"through {', '.join(bare)}",
-            "add a <collision> with a box, sphere or capsule [m] to those that touch something, in "
+            "add a <collision> with a box, sphere or capsule [m] to links that touch something, in "
             f"{Path(robot.urdf).name}, or delete them from 'without_collision' in robot.yaml",
         )

@@ -67,7 +67,7 @@ class NewRobot:
 
     @property
     def decided(self) -> list[str]:
-        """What was decided for it, and why; the scenario says so too."""
+        """Decisions and reasons, as in the scenario."""
         text = self.files[-1].read_text(encoding="utf-8")
         lines = [line.strip() for line in text.splitlines() if "# DECIDED" in line]
         if self.fixed:
@@ -129,10 +129,10 @@ def write_robot(
     """Writes a robot's folder: a URDF that Drake can simulate, robot.yaml, README and a scenario.
 
     Args:
-        feet: Links that touch the ground; found by their height by default.
-        hands: Links that arms end in; those of limbs of four joints or more by default.
+        feet: Links that touch the ground; by default the lowest.
+        hands: Links that arms end in; by default ends of limbs of four joints or more.
         moved: Joints that a policy moves, which are not fixed; None for all.
-        xacro_arguments: Of a model in xacro, which have no default in it.
+        xacro_arguments: Arguments of a xacro model without a default.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise ValueError(f"new: a robot's name is letters, digits and _; got '{name}'")

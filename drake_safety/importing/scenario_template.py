@@ -38,7 +38,7 @@ def _variations(sizes: Sizes, mass_scale: float, position: float, velocity: floa
     noise = f"{{position: {position:g}, velocity: {velocity:g}}}  # of your sensors [m, rad; 1/s]"
     reason = "Γ learns from the masses of the URDF"
     if mass_scale < 1:
-        reason = "Γ learns from lighter links, a reality gap as the paper's; 1: those of the URDF"
+        reason = "Γ learns from lighter links, a reality gap as in the paper; 1: the URDF's masses"
     load = _numbers([0.02 * sizes.mass_kg, 0.12 * sizes.mass_kg])
     return f"""family:  # random plants around the nominal one; Γ learns on them too
   ranges:  # ASK how widely your robot, its load and its ground differ; `check` says if it falls

@@ -28,8 +28,8 @@ _IGNORED |= {"transmission/actuator": ["mechanicalReduction"]}
 _PLACED = "origin", "geometry"  # Parts that a collision shape and a visual share.
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ROWS, _COLUMNS = np.triu_indices(3)
-_ROUNDING = 1e-6  # Of the digits of moments of inertia.
-_NOISE = 1e-12  # Of moments of inertia that should be zero [kg·m²].
+_ROUNDING = 1e-6  # Rounding of the digits of moments of inertia.
+_NOISE = 1e-12  # Noise of moments of inertia that should be zero [kg·m²].
 
 
 def simulatable_copy(path: Path, source: Path | None = None) -> UrdfCopy:
@@ -134,7 +134,7 @@ def _gather_meshes(copy: UrdfCopy) -> None:
         return next(target for target in targets if copy.meshes.setdefault(target, file) == file)
 
     def converted(kind: str, url: str, convert: Callable[[Path], str]) -> str:
-        """What a mesh becomes; "", with the reason in ``lost``, if it is left out."""
+        """Converts a mesh; "", with the reason in ``lost``, if it is left out."""
         name, why = url, "are not where the URDF says are left out"
         try:
             if (file := _mesh_file(url, copy.source)) is not None:

@@ -54,7 +54,7 @@ class UrdfCopy:
     warnings: list[str] = field(default_factory=list)  # Notes that the user should see at once.
     left_out: list[str] = field(default_factory=list)  # Notes about meshes that were removed.
     mesh_urls: dict[str, list[str]] = field(default_factory=dict)  # Collision meshes by link.
-    lost_links: set[str] = field(default_factory=set)  # Of collision meshes that were removed.
+    lost_links: set[str] = field(default_factory=set)  # Links whose collision meshes were removed.
     joint_friction: dict[str, float] = field(default_factory=dict)  # Removed, by joint [N·m].
     meshes: dict[str, Path] = field(default_factory=dict)  # Files by name relative to the copy.
     # Convex hulls in place of collision meshes, by link, in its frame [m].
@@ -135,7 +135,7 @@ class UrdfCopy:
         self.notes.append(f"link '{link_name}' collides as {len(points)} spheres on the ground")
 
     def set_hulls(self, link_name: str, hulls: list[trimesh.Trimesh]) -> None:
-        """Sets the convex hulls in place of a link's collision meshes; earlier ones go."""
+        """Sets the convex hulls in place of a link's collision meshes and earlier hulls."""
         link = self.link(link_name)
         for shape in link.findall("collision"):
             if shape.get("name", "").startswith(f"{link_name}_hull_"):
@@ -194,7 +194,7 @@ def as_text(values: Iterable[float]) -> str:
 
 
 def _hull_file(link: str, index: int) -> str:
-    """Names are data: what is no part of a file's name is replaced, and told apart by a hash."""
+    """A link's hull file; a hash keeps names apart whose characters were replaced."""
     plain = re.sub(r"[^\w.-]", "_", link)
     mark = "" if plain == link else f"_{zlib.crc32(link.encode()):08x}"
     return f"meshes/{plain}{mark}_hull_{index}.obj"

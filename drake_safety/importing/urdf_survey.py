@@ -26,7 +26,7 @@ _GUESSED_RADIUS_M = 0.02
 _STOP_RAD = 0.05  # Distance from a stop of a joint that cannot be at zero.
 _FLAT_M = 1e-3  # Height over a sole's lowest part within which other parts touch as well.
 _LEVEL_M = 0.005  # Height over the lowest sphere within which others count as contacts.
-_LEAST_INERTIA = 1e-10  # Of what a joint moves [kg·m², kg].
+_LEAST_INERTIA = 1e-10  # Inertia or mass that a joint moves [kg·m², kg].
 _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("L", "R"), ("l", "r"))
 
 
@@ -150,7 +150,7 @@ class Survey:
         return [group for group in groups if not carriers & set(group)]
 
     def _groups(self, named: list[str] | None) -> list[list[str]]:
-        """The ends of the tree, or those with the links that a user named."""
+        """The ends of the tree, or the groups with the links that a user named."""
         groups = self.leaves()
         ends = [name for group in groups for name in group]
         if unknown := [name for name in named or () if name not in ends]:
@@ -163,7 +163,7 @@ class Survey:
         return [other.name() for other in welded]
 
     def legs(self, feet: list[str] | None = None) -> list[Limb]:
-        """Returns the limbs that reach lowest, or those that end in the given links."""
+        """Returns the limbs that reach lowest, or the limbs that end in the given links."""
         groups = self._groups(feet)
         if feet is None:
             floor = min(map(self.lowest, groups), default=0.0)
@@ -186,7 +186,7 @@ class Survey:
     def arms(self, legs: list[Limb], named: list[str] | None = None) -> list[Limb]:
         """Returns other limbs that end in named links, by default limbs of four joints or more."""
         feet = {limb.body for limb in legs}
-        # Ends of limbs by their first four joints: chains and bodies. Fingers are no limbs.
+        # Ends of limbs by their first four joints: chains and bodies. Fingers are not limbs.
         hands: dict[tuple[str, ...], list[tuple[list[str], str]]] = {}
         for group in self._groups(named):
             chain = self.chain(group[0])
@@ -321,7 +321,7 @@ def require_feet(survey: Survey, copy: UrdfCopy) -> None:
         for name in group
         if name in copy.bare_links
         and z < 0.4 * floor
-        # What is left reaches lower than the link that was lost, such as a foot's cover.
+        # The remaining links reach lower than the lost link, such as a foot's cover.
         and (survey.pose(name).translation()[2] < z - 0.25 * floor or not shaped & set(group))
     ]
     if lost:

@@ -72,7 +72,7 @@ class DiscrepancyFunction:
             raise ValueError("DiscrepancyFunction: none of the feedback's points is finite")
         kernel = _fitted_kernel(points, difference)
         scale, noise = float(kernel.k1.k2.length_scale), float(kernel.k2.noise_level)
-        # As `alpha`, the noise of the observations is no part of sigma.
+        # As `alpha`, the noise of the observations does not enter sigma.
         process = GaussianProcessRegressor(RBF(scale), alpha=noise, optimizer=None)
         self._process: Any = process.fit(points, difference)
 

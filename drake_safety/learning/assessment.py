@@ -67,25 +67,25 @@ class SafetyAssessment:
 
     `fit` learns it from nominal episodes. Learned attributes end in an underscore.
 
-    Departure ("sharpened" only): x gains the safe set's signed margins along the plan (`features`),
-    the maps learn safety and future margins beside t-SNE's points from every start row, Γ is
-    interpolated bilinearly between cell centres, and it is the mean of an ensemble of maps, each
-    with its own grid. The "paper" mode is the literal reading, for comparison.
+    Departure ("sharpened" only): x gains the safe set's signed margins along the plan (`features`).
+    The maps learn safety and future margins beside t-SNE's points, from every start row. Γ is
+    interpolated bilinearly between cell centres, and averaged over maps, each with its own grid.
+    The "paper" mode is the literal reading, for comparison.
 
     Example: ``belief = assessment.predict_one(*inputs_at(legged_loop, start)).belief``
     """
 
-    info_: EpisodesInfo  # Of the training episodes.
+    info_: EpisodesInfo  # Metadata of the training episodes.
     grid_: Grid
     columns_: InputColumns
     embedding_: Embedding
     detector_: ChangeDetector
-    beliefs_: np.ndarray  # Of every map's cells, (K, R*R, 3 + n_c).
-    training_: TrainingScores  # Of training segments, from which adaptation starts.
+    beliefs_: np.ndarray  # Beliefs of every map's cells, (K, R*R, 3 + n_c).
+    training_: TrainingScores  # Adaptation starts from these.
     novelty_: Novelty
     base_logit_: BaseLogit | None  # None in the paper's mode.
     trees_: Trees | None
-    fall_logit_: FallLogit | None  # Of `fit_falls`.
+    fall_logit_: FallLogit | None  # Learned by `fit_falls`.
     correction_: Correction  # A term that feedback adds to the base logit.
     adaptation_: Adaptation | None
     used_: list[UsedEpisodes]  # Evaluation needs other episodes.
@@ -97,7 +97,7 @@ class SafetyAssessment:
 
     @property
     def settings(self) -> ModeSettings:
-        """What the stages of learning read of the parameters in this mode."""
+        """Parameters of the stages of learning in this mode."""
         return mode_settings(self.parameters)
 
     @property
@@ -218,7 +218,7 @@ class SafetyAssessment:
         if model.base_logit is None:
             raise ValueError(f"{self._who}: the probability of a fall needs maps with heads")
         if unknown := sorted(set(features) - set(names)):
-            raise ValueError(f"{self._who}: there are no features {unknown} among {names}")
+            raise ValueError(f"{self._who}: unknown features {unknown}; the features are {names}")
         self.check_unused(episodes.info.seed, purpose="falls")
         columns = [names.index(name) for name in features]
         labelled = [episode for episode in episodes if episode.cause != DIVERGED]
@@ -246,8 +246,8 @@ class SafetyAssessment:
         sharpened, base logit and training scores are recalibrated. Every adaptation starts from the
         nominal episodes, as F is not associative: pass all feedback, not only the new pairs.
 
-        `motions` of the actual robot, which the monitor is to know as well, may be rows (state,
-        desired preview, features), (K, n) each, as far apart as in its training.
+        The monitor learns `motions` of the actual robot as well. They may be rows (state, desired
+        preview, features), (K, n) each, as far apart as in its training.
         """
         require_extra("train", "SafetyAssessment.adapt", "sklearn")
         model, columns, parameters = self.model, self.columns_, self.parameters
@@ -327,7 +327,7 @@ class SafetyAssessment:
     def inputs_of(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
-        """Returns x, (..., n_x); the arguments are those of `predict`."""
+        """Returns x, (..., n_x), from the arguments of `predict`."""
         self._check_fitted()
         return self.columns_.of(state, desired_preview, features)
 

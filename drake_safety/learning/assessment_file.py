@@ -51,7 +51,7 @@ _MADE_OF_JSON: dict[str, type] = {
     "used": UsedEpisodes,
 }
 _T = TypeVar("_T")
-_ROUNDING = 1e-6  # Of a sum of masses.
+_ROUNDING = 1e-6  # Rounding of a sum of masses.
 _SIZES = dict(
     entry.split(":")
     for entry in """beliefs:krb input_range:2x correction.change:g correction.guard:kr
@@ -140,7 +140,7 @@ def read(path: Path) -> tuple[AssessmentParameters, dict[str, Any]]:
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
-        raise FileNotFoundError(f"there is no safety assessment at '{path}'")
+        raise FileNotFoundError(f"no safety assessment at '{path}'")
     try:
         with safe_open(path, framework="numpy") as file:
             opened: Any = file
@@ -193,7 +193,7 @@ def _known(made: Any, value: Any) -> Any:
 def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: dict[str, int]) -> None:
     """Raises ValueError if an array does not fit the sizes by letter, or has impossible values."""
     for name, values in sorted(arrays.items()):
-        kind = name.replace(".nominal.", ".")  # Of an adapted detector.
+        kind = name.replace(".nominal.", ".")  # An adapted detector's.
         letters = _SIZES.get(kind, "*" * values.ndim)
         fits = len(letters) == values.ndim and all(
             letter == "*" or sizes.setdefault(letter, size) == size

@@ -37,7 +37,7 @@ class AdaptationParameters:
 
 @schema(kw_only=True)
 class PaperReading:
-    """What the paper leaves open about its segments, its input x and its map Psi.
+    """Choices that the paper leaves open, about its segments, its input x and its map Psi.
 
     The defaults have the highest held-out accuracy on the robots, see docs/paper.md.
     """
@@ -82,7 +82,7 @@ class AssessmentParameters:
     # Largest distance of a known input's column from the centre of its range in training [half
     # widths]; larger for a robot that sags more than training's rows do.
     novelty_range: Annotated[float, Field(ge=1)] = 1.25
-    seed: int = 0  # Of t-SNE and of the maps.
+    seed: int = 0  # Seed of t-SNE and of the maps.
     learning_rate: Positive = 2e-3  # At its peak.
     batch_size: Count = 512
     epochs: Count = 18
@@ -94,8 +94,8 @@ class AssessmentParameters:
     margin_unit: Positive = 0.02  # Margin that counts as one in the Huber loss [m].
     # Range to which margins are clipped, [lowest, highest] [m].
     margin_range: Interval = field(default_factory=lambda: [-0.03, 0.10])
-    first_row_weight: Positive = 6.0  # Of an episode's first segment, for verdicts on plans.
-    # Least samples of a safe episode's segment, for episodes that end at rest; 0 means H.
+    first_row_weight: Positive = 6.0  # Weight of an episode's first segment, for verdicts on plans.
+    # Least samples of a safe episode's segment, if episodes end at rest; 0 means H.
     shortest_segment: Annotated[int, Field(ge=0)] = 0
     # Spread of state and preview as inputs, where features have spread one; a small one prevents
     # overfitting to them if the features suffice.

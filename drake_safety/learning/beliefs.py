@@ -60,9 +60,8 @@ def from_scores(
 def fuse(beliefs: np.ndarray) -> np.ndarray:
     """Applies F, the joint fusion of a set of beliefs (N, 3 + n_c), to one, (3 + n_c,).
 
-    Certain beliefs (mu = 0) outweigh all others and are averaged; vacuous ones (mu = 1) have no
-    weight. F accumulates no evidence (equal mu stays mu) and is not associative: fuse a set at
-    once.
+    Certain beliefs (mu = 0) outweigh all others and are averaged; vacuous beliefs (mu = 1) have no
+    weight. F accumulates no evidence (equal mu stays mu) and is not associative: fuse all at once.
 
     Departure: the printed products of uncertainties underflow from about 600 beliefs on. Divided
     by their common product they become the weights w = (1 - mu) / mu, which give the same value.

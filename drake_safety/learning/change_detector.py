@@ -1,4 +1,4 @@
-"""Detection of a changed plant or sensor: how the measured state follows from the last ones."""
+"""Detection of a changed plant or sensor, by errors in predicting the next measured state."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ LEAST_JUDGED = 0.5  # Share of inputs that can be judged, below which there is a
 RECOVERED_LEVEL, RECOVERY_S = 0.7, 5.0  # Levels are below it for this time before an alarm ends.
 SETTLING_S = 0.5  # Time for which the charts wait on after a disturbance that is known.
 NUM_PREVIEWED = 2  # Samples of the desired preview that the predictor sees.
-MOST_INNOVATION = 6.0  # In standard deviations, so that one impact is no lasting change.
+MOST_INNOVATION = 6.0  # In standard deviations, so that one impact is not a lasting change.
 _BEFORE_LEAVING_S = 0.5  # Left out of a motion that leaves the safe set.
 _BLOCK_S = 2.0  # Blocks whose maxima give the tail of a chart.
-_TAIL_SHARE = 0.1  # Of the blocks.
-_NUM_FOLDS = 12  # Of motions, whose levels are those by limits of the others.
-_LEAST_LIMIT = 0.3  # Of a chart, in standard deviations of its value for white innovations.
+_TAIL_SHARE = 0.1  # Share of the blocks.
+_NUM_FOLDS = 12  # Folds of motions; limits of the others give their levels.
+_LEAST_LIMIT = 0.3  # Limit of a chart, in its standard deviations for white innovations.
 _MOST_ALARMS = 0.1  # Share of safe episodes, above which the monitor does not know their motion.
 _FREE_REPEATS = 3  # Beyond the longest run of repeated inputs in training.
 _SETTINGS = ("alarm_level", "longest_repeat", "step_s", "motion_s")
@@ -60,14 +60,14 @@ class ChangeDetector:
     """
 
     predictor: StatePredictor
-    columns: np.ndarray  # Of (state, desired preview, features): the inputs, (n_u,).
+    columns: np.ndarray  # Inputs among (state, desired preview, features), (n_u,).
     watched: np.ndarray  # States that it predicts, (n_w,).
     deviation: np.ndarray  # Standard deviations of the innovations, (n_w,).
-    limits: np.ndarray  # Of the charts of the means, then of the squares, (6, n_w).
+    limits: np.ndarray  # Limits of the charts of the means, then of the squares, (6, n_w).
     alarm_level: float  # 1, or infinite where there was too little motion for limits.
     longest_repeat: int  # Longest known run of repeated inputs.
     step_s: float
-    motion_s: float  # Of the motion for the limits; of an actual robot's, if adapted to it.
+    motion_s: float  # Motion for the limits; an actual robot's, if adapted to it.
     nominal: ChangeDetector | None = None  # Before it was adapted to an actual robot.
 
     def __deepcopy__(self, memo: object) -> ChangeDetector:
@@ -84,7 +84,7 @@ class ChangeDetector:
         return [every[i] for i in self.columns]
 
     def describe(self) -> str:
-        """What the limits were learned from, and what they promise."""
+        """Describes the motion behind the limits, and their promise."""
         needed = f"{LEAST_MOTION_S / 60.0:.0f} are needed"
         minutes, own_minutes = (int(d.motion_s / 60.0) for d in (self.nominal or self, self))
         learned = f"monitor: {minutes} min of motion for its limits"
@@ -110,7 +110,7 @@ class ChangeDetector:
 
         Args:
             progress: Called with the share done.
-            episodes: Further motion, less calm than the undisturbed motions; safe ones are used.
+            episodes: Further, disturbed motion; only safe episodes are used.
         """
         require_extra("train", "ChangeDetector.fit", "torch")
         info = motions.info
@@ -259,14 +259,14 @@ class ChangeDetector:
             alarms.append(Alarm(first, places[end], cause))
         return levels, alarms
 
-    def next_alarm(self, alarm: float, calm_s: float, level: float) -> tuple[float, float]:
+    def next_alarm(self, alarm: float, below_s: float, level: float) -> tuple[float, float]:
         """Alarm (0 or 1), and time for which all levels have been low [s], after one more level."""
         if not level <= self.alarm_level:  # Also for NaN.
             return 1.0, 0.0
-        calm_s = calm_s + self.step_s if level < RECOVERED_LEVEL else 0.0
-        if alarm == 0.0 or calm_s > RECOVERY_S - 0.5 * self.step_s:
+        below_s = below_s + self.step_s if level < RECOVERED_LEVEL else 0.0
+        if alarm == 0.0 or below_s > RECOVERY_S - 0.5 * self.step_s:
             return 0.0, 0.0
-        return 1.0, calm_s
+        return 1.0, below_s
 
     def with_motions(self, motions: Sequence[np.ndarray]) -> ChangeDetector:
         """Returns the nominal detector for which an actual robot's motions (K, n) are known too.
@@ -429,5 +429,5 @@ def _repeats(x: np.ndarray) -> np.ndarray:
 
 
 def _free_repeats(inputs: Sequence[np.ndarray]) -> int:
-    """Length of a run of repeated inputs that is no alarm after motions (K, n_u)."""
+    """Length of a run of repeated inputs below an alarm, after motions (K, n_u)."""
     return int(max(_repeats(x).max(initial=0.0) for x in inputs)) + _FREE_REPEATS

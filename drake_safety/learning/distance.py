@@ -86,7 +86,7 @@ def neighbour_graph(
     distances = np.empty((num_segments, num_neighbours))
     indices = np.empty((num_segments, num_neighbours), dtype=int)
     for start in range(0, num_segments, _ROWS):
-        # Successive indices of the tree are those of a leaf.
+        # Successive indices of the tree belong to one leaf.
         rows = tree.indices[start : start + _ROWS]
         if num_candidates is not None and num_candidates < num_segments - 1:
             columns = np.unique(tree.query(places[rows], num_candidates + 1)[1])
@@ -167,7 +167,7 @@ def _max_dtw(held: np.ndarray, dtw: Callable[..., np.ndarray]) -> float:
     held, size = held[by_size], size[by_size]
     largest = float(dtw(by_size[:64], by_size[:64]).max())
     for start in range(0, len(held), _BLOCK):
-        # Two segments are no further apart than their distances from the mean together.
+        # The distance of two segments is at most the sum of their distances from the mean.
         reach = largest * (1.0 - _SLACK) - size[start]
         end = int(np.searchsorted(-size, -reach, side="right"))
         if end <= start:

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from pydantic import FiniteFloat, NonNegativeInt
 
-_LIMIT = 20.0  # Of the logit, which keeps exp from overflowing.
-_INVERSE_PENALTY = 0.01  # Of inputs with unit variance.
+_LIMIT = 20.0  # Limit of the logit, which keeps exp from overflowing.
+_INVERSE_PENALTY = 0.01  # For inputs with unit variance.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class FallLogit:
     def fit(
         cls, inputs: Sequence[np.ndarray], has_fallen: Sequence[bool], columns: Sequence[int]
     ) -> FallLogit:
-        """Fits it to the rows of episodes, of which those that are not finite are left out."""
+        """Fits it to the finite rows of episodes."""
         from sklearn.linear_model import LogisticRegression
         from sklearn.preprocessing import StandardScaler
 

@@ -24,7 +24,7 @@ from drake_safety.learning.segments import (
     unsafety_score,
 )
 
-START_TOLERANCE = 1e-2  # Of a twin's first true state: logged positions are not exact.
+START_TOLERANCE = 1e-2  # Error of a twin's first true state: logged positions are not exact.
 _SAME_TASK = (
     *("scenario", "step_s", "horizon", "preview_stride"),
     *("state_names", "output_names", "feature_names"),
@@ -49,7 +49,7 @@ class EpisodePair:
 
     @cached_property
     def rows(self) -> Segments:
-        """Segments from every row of the actual episode but those at its end."""
+        """Segments from every row of the actual episode except rows at its end."""
         return split(Episodes(self.info, [self.actual]), stride=1, discount=1.0, shortest=1)
 
 

@@ -21,7 +21,7 @@ class Graph:
     def node(
         self, operator: str, *inputs: Any, output: str | None = None, **attributes: Any
     ) -> Value:
-        """Adds a node and returns its output; inputs that are no values become constants."""
+        """Adds a node and returns its output; inputs other than a `Value` become constants."""
         from onnx import helper, numpy_helper
 
         names = []

@@ -19,7 +19,7 @@ class Grid:
     """A grid of R x R square cells, R the resolution, centred at the origin.
 
     Cell (i, j) has the index i * R + j, where i counts along the first coordinate. A cell contains
-    its lower edges but not its upper ones.
+    its lower edges but not its upper edges.
 
     Departure ("sharpened" only): `read` interpolates between the cells' centres; the paper reads
     the cell that contains Psi(x).
@@ -85,9 +85,9 @@ class Grid:
     def interpolate(self, points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Interpolates values of the cells bilinearly between the cells' centres.
 
-        Of points (K, N, 2) and values of every cell of K grids, (K, R*R, C), it gives the values
-        (K, N, C), zero outside the grid, and whether points are inside, (K, N). A point has the
-        same bits whatever the others are.
+        Points are (K, N, 2), values of all cells of K grids (K, R*R, C). Returns values (K, N, C),
+        zero outside the grid, and whether points are inside, (K, N). The bits of a point do not
+        depend on the others.
         """
         last = self.resolution - 1.0
         position = points / self.cell_length

@@ -50,10 +50,7 @@ class InputColumns:
     def of(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
-        """Returns x, (..., n_x), of inputs (..., n_s), (..., H*n_z) and (..., n_f).
-
-        Features are ignored in the paper's mode.
-        """
+        """Returns x (..., n_x) of (..., n_s), (..., H*n_z) and, outside paper mode, (..., n_f)."""
         parts: list[np.ndarray] = []
         given = (state, desired_preview, features)
         for (name, width), values in zip(self._widths.items(), given, strict=False):
@@ -71,10 +68,7 @@ class InputColumns:
         return np.concatenate(parts, axis=-1)
 
     def of_rows(self, rows: Episode | Segments, variation: str = "nominal") -> np.ndarray:
-        """Returns x of recorded rows of a plant, (N, n_x).
-
-        In the paper's mode, the states of the nominal plant are without noise.
-        """
+        """Returns x of a plant's recorded rows, (N, n_x); paper mode: nominal states lack noise."""
         is_plain = self._uses_true_state and variation == "nominal"
         state = rows.true_state if is_plain else rows.state
         return self.of(state, rows.desired_preview, rows.features)

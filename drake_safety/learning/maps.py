@@ -20,7 +20,7 @@ from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 from drake_safety.learning.trees import Trees
 
 _INSIDE_SHARE = 0.995  # Quantile of the outputs that are scaled to the extent of t-SNE's points.
-_CLIPPED_SHARE = 1e-3  # Of the training inputs, at either end of a column of x.
+_CLIPPED_SHARE = 1e-3  # Share of the training inputs at either end of a column of x.
 _SMALLEST_SPREAD = 1e-3
 _SAFETY_HIDDEN = 32
 _TARGET_WEIGHT, _SAFETY_WEIGHT = 0.1, 5.0

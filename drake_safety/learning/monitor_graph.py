@@ -33,7 +33,7 @@ _NUM_CHARTS = 2 * len(TIME_CONSTANTS_S)
 
 
 def cause_names(detector: ChangeDetector, state_names: list[str]) -> list[str]:
-    """What each index of the port `cause` means."""
+    """Meaning of each index of the port `cause`."""
     charts = itertools.product(("mean", "irregularity"), TIME_CONSTANTS_S, detector.watched)
     names = [f"{state_names[i]}, {kind} over {2.0 * t:g} s" for kind, t, i in charts]
     return [*names, "inputs frozen", "blind"]
@@ -48,7 +48,7 @@ def memory_sizes(detector: ChangeDetector) -> dict[str, int]:
 
 
 def add_monitor(graph: Graph, detector: ChangeDetector, ports: list[str]) -> None:
-    """Adds one step of a `ChangeMonitor`; `ports` are those of (state, preview, features)."""
+    """Adds one step of a `ChangeMonitor`; `ports` name state, preview and features."""
     n_w, sizes = len(detector.watched), memory_sizes(detector)
     ends = [0, *itertools.accumulate(sizes.values())]
     memory = Value(graph, "memory")

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 
 NUM_QUADRATIC = 3  # Distances that are quadratic forms.
-_NUM_FOLDS = 5  # Of the episodes, so that every distance is from the inputs of other episodes.
-_SMALLEST_SPREAD = 1e-2  # Of a column [unit of the column]; constant ones would be divided by zero.
+_NUM_FOLDS = 5  # Folds of the episodes: every distance is from inputs of other episodes.
+_SMALLEST_SPREAD = 1e-2  # Least scale of a column [its unit]: a column may be constant.
 # Variances of the standardised inputs along an axis:
 _REDUNDANT_VARIANCE = 1e-7  # Below this, the axis is a redundancy of the inputs.
 _LEAST_REDUNDANT_VARIANCE = 1e-8  # Lower bound along redundancies.
 _LEAST_VARIANCE = 1e-2  # Lower bound for the range: an actual robot differs that much.
 _LEAST_PLAN_VARIANCE = 1e-4  # The same for the plan alone, which no robot's reality changes.
-_LEAST_LIMIT = 3.0  # Of the root mean square distance along the redundancies; against rounding.
-_LEAST_HALF_WIDTH = 5e-2  # Of a column's range [unit of the column].
+_LEAST_LIMIT = 3.0  # Least root mean square along the redundancies; against rounding.
+_LEAST_HALF_WIDTH = 5e-2  # Half-width of a column's range [its unit].
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,9 +99,9 @@ class Distances:
             start += part.shape[1]
 
     def squared(self, x: np.ndarray, terms: np.ndarray) -> np.ndarray:
-        """Squares of all of x (N, n_x), along redundancies, of the plan, (N, 3), by their `terms`.
+        """Squared distances (N, 3) of x (N, n_x): all axes, redundancies, plan; by `terms`.
 
-        One product for each row: those of many rows at once would round differently.
+        One product for each row: a product of many rows would round differently.
         """
         num_inputs = len(self.mean)
         entries = np.empty((len(x), 1, len(self.terms)))
@@ -122,15 +122,14 @@ def _above(variance: np.ndarray, axes: np.ndarray, least: float) -> np.ndarray:
 
 
 class Novelty:
-    """Says which inputs are beyond those of training, by three Mahalanobis distances and the range.
+    """Flags inputs unlike the training inputs, by three Mahalanobis distances and the range.
 
-    The first is along all axes of the training inputs, with a tolerance. The second is along their
-    redundancies alone: an input that contradicts itself, such as the features of another plan, is
-    novel though every entry is within its range. (In process monitoring they are T^2 and SPE.) The
-    third is that of the plan alone. The range is that of every column, in half widths from its
-    centre: one entry far from all that training had is novel even where the sum over many others
-    hides it. `limits` are the largest of the four for a known input, in this order; the moments of
-    `feedback`, an actual robot's inputs, are known as well.
+    The first distance is along all axes of the training inputs, with a tolerance. The second is
+    along their redundancies: an input that contradicts itself, such as features of another plan,
+    is novel though every entry is within its range. (Process monitoring: T^2 and SPE.) The third
+    is the plan's. The range of each column, in half widths from its centre, exposes one extreme
+    entry that the sum over many others would hide. `limits` are the largest of the four for a known
+    input, in this order; the moments of `feedback`, an actual robot's inputs, are known as well.
     """
 
     def __init__(
@@ -164,10 +163,9 @@ class Novelty:
     ) -> Novelty:
         """Computes the moments of training inputs x (N, n_x) and chooses the limits.
 
-        Each limit is exceeded by at most a share of `rate` of the episodes' first inputs, and
-        somewhere in at most that share of the safe episodes, each judged by the moments of other
-        episodes. The range of a column is as much wider than that of the inputs as one fold of the
-        episodes exceeds that of the others.
+        At most a share `rate` of the episodes' first inputs, and of the safe episodes anywhere,
+        exceeds a limit, judged by the moments of other episodes. The range of a column is widened
+        by as much as one fold of the episodes exceeds the others.
         """
         fold = np.unique(episode, return_inverse=True)[1] % _NUM_FOLDS
         distances, growth = np.full((len(x), NUM_QUADRATIC), np.inf), np.ones(x.shape[1])
@@ -198,7 +196,7 @@ class Novelty:
     def with_feedback(self, x: np.ndarray, rate: float) -> Novelty:
         """Returns the novelty for which an actual robot's inputs are known as well.
 
-        They replace those of earlier feedback. If at most a share of `rate` of them is beyond the
+        They replace earlier feedback. If at most a share of `rate` of them is beyond the
         training inputs, as of a robot without a reality gap, these alone describe the robot.
         """
         own: dict[str, Any] = dict(training=self.training, limits=self.limits, plan=self.plan)
@@ -219,10 +217,7 @@ class Novelty:
         return np.abs((x - self.centre) * self.inverse_half_width)
 
     def of(self, x: np.ndarray) -> np.ndarray:
-        """Returns the largest distance of inputs (N, n_x) in units of its limit, (N,).
-
-        An input is novel above 1, and one that is not finite infinitely far.
-        """
+        """Largest distance of inputs (N, n_x) by its limit, (N,); novel above 1, inf for NaN."""
         with np.errstate(invalid="ignore", over="ignore"):
             largest = np.maximum.reduce(self.quadratic.squared(x, self._shares), axis=1)
             offset = (x - self.centre) * self._range_share

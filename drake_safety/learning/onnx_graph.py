@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     import onnx
 
 
-SCHEMA_VERSION = 1  # Of the graph's ports and of its metadata.
+SCHEMA_VERSION = 1  # Version of the graph's ports and metadata.
 OPSET = 17
-_IR_VERSION = 8  # That of the opset's time, so that old runtimes read the file.
+_IR_VERSION = 8  # As old as the opset, so that old runtimes read the file.
 _DESCRIPTIONS = {
     "state": "Measured state.",
     "desired_preview": "Desired outputs over the horizon, row-major in time.",
@@ -58,7 +58,7 @@ _DESCRIPTIONS |= _OF_MONITOR | {
     "probability_without_alarm": "The probability if there were no alarm.",
 }
 _CHECKED = ("belief", "safety_probability", "cause_probability")
-"""What margins and alarm change."""
+"""Outputs that margins and alarm change."""
 PARTS = {
     "gamma": ([], _OUTPUTS),
     "assessor": (
@@ -67,11 +67,11 @@ PARTS = {
     ),
     "monitor": (["hold", "memory"], list(_OF_MONITOR)[2:]),
 }
-"""Parts that are graphs, and their inputs beside those of Γ, and their outputs.
+"""Inputs beside Γ's, and outputs, by part.
 
-Γ alone; what a `SafetyAssessor` makes of it by margins and alarm; one step of a `ChangeMonitor`.
+Parts: Γ alone; Γ with margins and alarm as in `SafetyAssessor`; one step of a `ChangeMonitor`.
 """
-_UNITS = "those of the recorded ports: SI and radians (m, m/s, rad, rad/s, N, N·m) in the tasks of "
+_UNITS = "as in the recorded ports: SI and radians (m, m/s, rad, rad/s, N, N·m) in the tasks of "
 _UNITS += "drake_safety"
 
 
@@ -140,7 +140,7 @@ def make_model(assessment: Any, part: str, rows: int | str = "N") -> onnx.ModelP
 
 
 def _contract(assessment: Any, ports: Iterable[str]) -> dict[str, Any]:
-    """What the file is, by the name of the entry of its metadata."""
+    """Metadata of the file, by entry."""
     info, parameters = assessment.info_, assessment.parameters
     adaptation, calibrations = assessment.adaptation_, assessment.calibrations_.values()
     preview = [f"{name} [{k}]" for k in range(info.horizon) for name in info.output_names]
@@ -170,7 +170,7 @@ def _contract(assessment: Any, ports: Iterable[str]) -> dict[str, Any]:
 def _add_prediction(
     graph: Graph, model: Model, ports: Iterable[str], feature_unit: float, inner: str
 ) -> None:
-    """Adds `Model.predict`; the outputs have the names of the ports, `_CHECKED` ones a suffix."""
+    """Adds `Model.predict`; outputs are named like ports, `_CHECKED` outputs with a suffix."""
     base_logit, correction, embedding = model.base_logit, model.correction, model.embedding
     num_causes = model.num_causes
     parts = [Value(graph, name) for name in ports]
@@ -243,10 +243,10 @@ def _add_checks(graph: Graph, inner: str, num_causes: int) -> None:
     belief = is_inside.Where(belief, outside, output="belief_without_alarm")
     probability = is_inside.Where(probability.Unsqueeze([1]), 0.0)
     probability.Squeeze([1], output="probability_without_alarm")
-    is_calm = alarm.Greater(-np.inf).And(alarm.LessOrEqual(0.5))
-    is_calm.Where(belief, EMPTY, output="belief")
-    is_calm.Where(probability, 0.0).Squeeze([1], output="safety_probability")
-    is_calm.Where(cause, 0.0, output="cause_probability")
+    is_silent = alarm.Greater(-np.inf).And(alarm.LessOrEqual(0.5))
+    is_silent.Where(belief, EMPTY, output="belief")
+    is_silent.Where(probability, 0.0).Squeeze([1], output="safety_probability")
+    is_silent.Where(cause, 0.0, output="cause_probability")
 
 
 def _maps(x: Value, embedding: Embedding) -> tuple[Value, tuple[Value, Value] | None, Value]:
@@ -284,7 +284,7 @@ def _novelty(x: Value, novelty: Novelty) -> Value:
         outside = (x - novelty.centre) * (novelty.inverse_half_width * np.sqrt(inverse[-1]))
         shares = shares.Concat(outside * outside, axis=1)
     largest = shares.ReduceMax(axes=[1], keepdims=1)
-    # Of inputs that are not finite, some entries are NaN.
+    # Inputs that are not finite make some entries NaN.
     return largest.Less(np.inf).Where(largest.Max(0.0), np.inf).Sqrt()
 
 

@@ -23,7 +23,7 @@ SHIFT_LIMIT = 100.0  # Largest shift of the base logit, which keeps exp from ove
 
 @dataclass(kw_only=True, eq=False)
 class Prediction:
-    """What an assessment says of N inputs, or of one, for which the axis N is missing.
+    """Assessment of N inputs, or of one input without the axis N.
 
     Attributes:
         belief: (b_safe, b_unsafe, mu), (N, 3); empty for novel inputs. b_safe is the paper's Γ.
@@ -76,9 +76,9 @@ class Prediction:
 class BaseLogit:
     """The base logit: a logit of an unsafe end from the maps' heads and the trees.
 
-    ``offset + safety_slope z - margin_slope m / margin_unit + trees_slope t``, where z is the mean
-    logit of the safety heads, m the smallest predicted margin, clipped to `margin_range`, and t the
-    logit of the trees.
+    It is ``offset + safety_slope z - margin_slope m / margin_unit + trees_slope t``. Here z is the
+    mean logit of the safety heads, m the smallest predicted margin, clipped to `margin_range`, and
+    t the logit of the trees.
 
     Departure: the paper judges by the map alone. Boosted trees, taught by the ends of the motions,
     and maps, taught by margins too, err on different inputs.
@@ -123,7 +123,7 @@ class BaseLogit:
 class Correction:
     """Correction of the base logit by feedback."""
 
-    change: np.ndarray  # Of the offset and of the slopes of the heads, (3,), or (4,) with trees.
+    change: np.ndarray  # Change of offset and slopes of the heads, (3,), or (4,) with trees.
     hidden: np.ndarray  # Weights of the last hidden layer, and a constant, (K, n + 1).
     hidden_range: np.ndarray  # To which the sum of their terms is clipped: that in feedback, (2,).
     guard: np.ndarray  # 1 in cells where the base logit must not fall, else 0, (K, R*R).
@@ -161,7 +161,7 @@ class Evaluation(NamedTuple):
 
     maps: EmbeddingOutput
     margins: np.ndarray  # Mean of the maps' predicted margins, (N, n_c); NaN without heads.
-    heads: np.ndarray | None  # Of `BaseLogit.heads`.
+    heads: np.ndarray | None  # By `BaseLogit.heads`.
     logit: np.ndarray | None  # Before its correction, (N,).
 
 
@@ -201,7 +201,7 @@ class Model:
         return Evaluation(maps, margins, heads, self.base_logit.of_heads(heads))
 
     def predict(self, x: np.ndarray) -> Prediction:
-        """Assesses inputs; novel ones and those that are not finite get the empty belief."""
+        """Assesses inputs; the belief is empty for an input that is novel or not finite."""
         maps, margins, heads, logit = self.evaluate(x)
         num_members, _, num_columns = self.beliefs.shape
         has_correction = logit is not None and self.correction.is_any

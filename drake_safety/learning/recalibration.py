@@ -111,7 +111,7 @@ def fitted_change(
 
 
 def _cell_means(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
-    """Averages values (M,) at points (K, M, 2) in each map's cells, (K, R*R); 0 in empty ones."""
+    """Averages values (M,) at points (K, M, 2) in each map's cells, (K, R*R); 0 in empty cells."""
     means = []
     for member_points in points:
         cells = grid.locate(member_points)

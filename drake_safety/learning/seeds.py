@@ -1,8 +1,8 @@
 """Default seeds of each purpose, and the seeds that an assessment has used.
 
 Episode i of a set draws from `SeedSequence(seed, spawn_key=(i,))`: sets with one seed start in the
-same states for every plant. Choices are made on the default seeds; the figures of a release are of
-other ones, `RELEASE` above them, which nothing looks at before.
+same states for every plant. Choices are made on the default seeds. A release is measured on other
+seeds, `RELEASE` above them, which no choice has used.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from drake_safety.learning.segments import EpisodesInfo
 NOT_DRAWN = -1  # Seed of recorded episodes, whose starts no other set shares.
 _SPAN = 20_000_000  # More than the seeds of development.
 _RELEASES = {"0.1.0": _SPAN}  # Added for a version's figures; a span a version.
-RELEASE = max(_RELEASES.values())  # Of the newest version.
+RELEASE = max(_RELEASES.values())  # The newest version's.
 
 
 class SeedBlock(NamedTuple):
@@ -36,7 +36,7 @@ class SeedBlock(NamedTuple):
 
 
 TRAINING = SeedBlock(0, ("training", "training on the family"))
-# Thresholds are chosen on other episodes, throws and pushes than the evaluated ones.
+# Thresholds are chosen on other episodes, throws and pushes than the evaluation's.
 EVALUATION = SeedBlock(
     1_000_000, ("evaluation", "disturbances", "disturbance thresholds", "thresholds")
 )
@@ -46,12 +46,12 @@ ADAPTATION = SeedBlock(4_000_000, ("adaptation", "evaluation of the adaptation")
 WALKING = SeedBlock(6_000_000, ("calibration", "tour", "push", "command"))
 DEMONSTRATION = SeedBlock(7_000_000, ("demonstration",))  # For `run`, `play` and `check`.
 SHIFTS = SeedBlock(8_000_000, ("shifts",))  # Conditions that training does not have.
-# Undisturbed motion, from which a monitor learns; fresh one shows how often it alarms.
+# Undisturbed motion, from which a monitor learns; fresh motion shows how often it alarms.
 MOTION = SeedBlock(9_000_000, ("motion", "motion of the actual robot"))
 FRESH_MOTION = SeedBlock(9_100_000, ("fresh motion",))
 GATE = SeedBlock(11_000_000, ("pairs of two loops",))
 RATE = SeedBlock(12_000_000, ("failure rate",))
-PUSHES = SeedBlock(14_000_000, ("pushes",))  # Of the card.
+PUSHES = SeedBlock(14_000_000, ("pushes",))  # For the push card.
 FALLS = SeedBlock(13_000_000, ("falls",))  # Episodes that go on outside the safe set.
 
 

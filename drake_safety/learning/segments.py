@@ -30,11 +30,11 @@ class DivergenceError(RuntimeError):
 
 
 class EpisodeError(RuntimeError):
-    """An error during a motion: of a system, or a divergence where that is no result."""
+    """An error during a motion: of a system, or a divergence that may not be a result."""
 
 
 def installed_versions(*packages: str) -> dict[str, str]:
-    """Versions of this package and of the installed ones of some others, by name."""
+    """Versions of this package and of others, as far as installed, by name."""
     versions = {"drake_safety": "0+uninstalled"}
     for name in ("drake_safety", *packages):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -77,7 +77,7 @@ class EpisodesInfo:
         return self.preview_stride * self.step_s
 
     def plant_of(self, index: int) -> int:
-        """Number of the plant of an episode, from 1 on; 0 where there is no family."""
+        """Number of the plant of an episode, from 1 on; 0 without a family."""
         return 1 + index % self.plants if self.plants else 0
 
     @property
@@ -127,7 +127,7 @@ class Episode:
     margins: np.ndarray  # Distance to each constraint, negative where violated, (K+1, n_c).
     is_safe: bool  # Whether the whole rollout stayed in the safe set.
     cause: str  # "" when safe, else the name of the violated constraint, or "diverged".
-    first_step: int = 0  # First row with an undisturbed future; earlier ones are not learned.
+    first_step: int = 0  # First row with an undisturbed future; earlier rows are not learned.
     num_controller_failures: int = 0
     plant: int = 0  # Number of the plant in its family; 0 for the only plant of a set.
 
@@ -246,7 +246,7 @@ def unsafety_score(
 class Segments:
     """N segments of episodes, each at most H samples long, as training data of an assessment.
 
-    State, preview and features are those of the row at which a segment starts.
+    State, preview and features belong to the row at which a segment starts.
     """
 
     episode: np.ndarray  # Position of the episode in its set.

@@ -12,7 +12,7 @@ from drake_safety.files.progress import ignore
 from drake_safety.learning.maps import one_torch_thread
 
 HIDDEN_SIZES = (256, 256)
-_SMALLEST_SPREAD = 1e-4  # Of a column [unit of the column]; constant ones would be divided by zero.
+_SMALLEST_SPREAD = 1e-4  # Least scale of a column [its unit]: a column may be constant.
 LARGEST_INPUT = 10.0  # In standard deviations.
 _OUTSIDE = 0.005  # Share of training below and above the usual range of an input.
 _VECTORS = ("mean", "scale", "low", "high", "unit")
@@ -83,7 +83,7 @@ class StatePredictor:
         return np.clip((inputs - self.mean) / self.scale, -LARGEST_INPUT, LARGEST_INPUT)
 
     def _pairs(self, inputs: np.ndarray) -> np.ndarray:
-        """Standardised inputs (K, n_u) beside the ones before them, (K - 2, 2 n_u)."""
+        """Standardised inputs (K, n_u) beside their predecessors, (K - 2, 2 n_u)."""
         z = self._standardised(inputs)
         return np.concatenate([z[1:-1], z[:-2]], axis=1).astype(np.float32)
 
@@ -110,7 +110,7 @@ class StatePredictor:
         return np.diff(states, axis=0)[1:] - predicted
 
     def error(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """The error (n_w,) of a change (n_w,) after an input and the one before, (n_u,) each."""
+        """The error (n_w,) of a change (n_w,) after an input and its predecessor, (n_u,) each."""
         z = np.array((x, previous))
         z -= self.mean
         z /= self.scale

@@ -20,7 +20,7 @@ def are_usable(x: np.ndarray) -> bool:
 
 
 class EmbeddingOutput(NamedTuple):
-    """Outputs of a stack of K maps; without heads, the logit is NaN, and there are no margins."""
+    """Outputs of a stack of K maps; without heads the logit is NaN, and n_c is 0."""
 
     embedding: np.ndarray  # y, (K, N, 2)
     unsafe_logit: np.ndarray  # (K, N)
@@ -37,7 +37,7 @@ class Embedding:
 
     Attributes:
         input_range: Range to which each column of inputs is clipped, (2, n_x); may be infinite.
-        centre: What is subtracted from inputs before they are multiplied, (n_x,).
+        centre: Offset that is subtracted from inputs before the first product, (n_x,).
         centred_bias: Bias of the first layer for these inputs, (K, out).
     """
 
@@ -108,10 +108,7 @@ class Embedding:
         return Embedding(weights, self.input_range)
 
     def evaluate(self, x: np.ndarray) -> EmbeddingOutput:
-        """Evaluates all members at inputs (N, n_x); rows that are not finite give NaN.
-
-        A row has the same bits whatever the others are.
-        """
+        """Evaluates all members at inputs (N, n_x), each row by itself; NaN if not finite."""
         if np.ndim(x) != 2 or np.shape(x)[1] != self.num_inputs:
             expected = f"expected (N, {self.num_inputs})"
             raise ValueError(f"Embedding: inputs have shape {np.shape(x)}, {expected}")
@@ -186,7 +183,7 @@ class Embedding:
     def _hidden(self, x: np.ndarray) -> np.ndarray:
         """The last hidden layers, (K, N, 1, num_activations), at inputs of `_clipped`.
 
-        One product for each row: those of many rows at once would round differently.
+        One product for each row: a product of many rows would round differently.
         """
         z = x[None, :, None]
         for weight, bias in self._trunk:

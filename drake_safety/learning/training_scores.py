@@ -22,10 +22,10 @@ class TrainingScores:
     points: np.ndarray  # Psi(x), (K, N, 2).
     score: np.ndarray  # lambda
     cause: np.ndarray  # Column of the constraint that ended the episode, -1 when safe.
-    heads: np.ndarray | None = None  # Of `BaseLogit.heads`.
+    heads: np.ndarray | None = None  # By `BaseLogit.heads`.
     nearest: np.ndarray | None = None  # Column of the smallest predicted margin.
-    multiplicity: np.ndarray | None = None  # Segments that each stands for; None for one each.
-    count: np.ndarray | None = None  # Of all segments in the cells, if some were left out.
+    multiplicity: np.ndarray | None = None  # Segments that each stands for; None: 1.
+    count: np.ndarray | None = None  # All segments in the cells, if some were left out.
 
     @classmethod
     def of(cls, segments: Segments, evaluation: Evaluation) -> TrainingScores:

@@ -25,9 +25,9 @@ class Trees:
 
     Args:
         feature: Columns of x that the nodes compare, (M, T), M < 32.
-        threshold: Thresholds of the nodes, (M, T); infinite for nodes that a tree has not.
+        threshold: Thresholds of the nodes, (M, T); infinite for absent nodes.
         left: Leaves to the left of the nodes as bits, the lowest for the first leaf, (M, T).
-        value: What the leaves add to the logit, (T, M + 1).
+        value: Terms of the logit by leaf, (T, M + 1).
     """
 
     def __init__(

@@ -17,7 +17,7 @@ WORLD = "/drake"
 _GROUND = f"{WORLD}/visualizer/ground"
 _DISTANCE = 1.55  # From the camera to the robot, by the robot's size.
 _TICK_S, _FOLLOWED = 0.04, 0.2  # The camera goes this share of the way to the robot in a tick.
-_CELL_M = 0.5  # Of Meshcat's grid.
+_CELL_M = 0.5  # Cell of Meshcat's grid.
 
 
 class FollowingCamera:

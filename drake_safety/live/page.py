@@ -24,7 +24,7 @@ _PERIOD_S = 0.1  # Between updates of a page.
 _SCENE = "/scene"  # Path of the scene on the page's server.
 _FAREWELL_S = 1.0  # From the end of a session to that of its page, so that the page shows it.
 _WITHIN_S = 20.0  # For the server to start, and to stop.
-_Message = MutableMapping[str, Any]  # Of ASGI, the interface of servers and applications.
+_Message = MutableMapping[str, Any]  # ASGI, the interface of servers and applications.
 _Application = Callable[[_Message, Any, Any], Awaitable[None]]
 _BELIEF = {"safe": "safe", "unsafe": "unsafe", "unknown": "don't know"}
 _KEYS = {"Escape": "Esc", "ArrowUp": "↑", "ArrowDown": "↓", "ArrowLeft": "←", "ArrowRight": "→"}
@@ -162,7 +162,7 @@ def _build_readings(panel: LivePanel) -> Callable[[], None]:
     body = ui.query("body")  # Now: when the session ends, a browser may be too late to load it.
 
     def update() -> None:
-        # What does not differ is not sent.
+        # Only differences are sent.
         status = panel.status
         state.set_text(status.state)
         is_known = math.isfinite(panel.probability) and not panel.is_stopped

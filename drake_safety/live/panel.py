@@ -1,4 +1,4 @@
-"""What a live page shows, and what its controls were set to; no library for pages is needed."""
+"""Contents of a live page, and values of its controls; needs no library for pages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _UNKNOWN = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Status:
-    """What the robot does, a cause in words, a remark, and a key of `COLOURS`."""
+    """The robot's state and a cause in words, a remark, and a key of `COLOURS`."""
 
     state: str = ""
     cause: str = ""
@@ -44,9 +44,9 @@ class Slider:
 
 
 class LivePanel:
-    """What every viewer of a session sees and controls.
+    """Values that every viewer of a session sees and controls.
 
-    The session and a page share it. They run in two threads, of which each replaces whole values.
+    The session and a page share it. Each runs in its own thread and replaces whole values.
     """
 
     def __init__(self, *, title: str, threshold: float):
@@ -73,7 +73,7 @@ class LivePanel:
         return True
 
     def set_value(self, name: str, value: Any) -> None:
-        """Sets a slider, within its range, to what a page sent; what is no number is ignored."""
+        """Sets a slider, within its range, to a page's value; ignores other things than numbers."""
         slider = self.sliders[name]
         if isinstance(value, int | float) and math.isfinite(value):
             slider.value = float(min(max(value, slider.low), slider.high))

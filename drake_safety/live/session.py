@@ -40,7 +40,7 @@ from drake_safety.simulation.legged_loop import LeggedLoop
 from drake_safety.simulation.rollouts import episode_rng
 
 TICK_S = 0.04  # Simulated per tick.
-BREAK_S = 0.02  # Of real time between ticks while nothing is simulated.
+BREAK_S = 0.02  # Real time between ticks while nothing is simulated.
 STOP, START = "Stop", "Start again"
 THROW, PUSH = "Throw", "Push"
 ASK, GO, FORCE = "Ask", "Go", "Go all the same"
@@ -85,7 +85,7 @@ class LiveSession:
         monitor: Callable[[Context], object] | None = None,
     ):
         require_ports(loop, _PORTS)
-        self.loop: Any = loop  # What it can do is asked below.
+        self.loop: Any = loop  # Its capabilities are checked below.
         self.assessment: Any = loop.assessment
         self.meshcat = meshcat
         self.threshold, self.unsafe_below = threshold, unsafe_below
@@ -94,12 +94,12 @@ class LiveSession:
             self._simulator.set_monitor(monitor)
         self.cause = ""  # The constraint that was violated first since the start.
         self.command, self.is_guarded = np.zeros(3), True
-        # On the present goal, and the nearest accepted one.
+        # Verdicts on the present goal, and on the nearest accepted goal.
         self.verdict: GoalVerdict | None = None
         self.nearest: GoalVerdict | None = None
         self._goal = np.full(3, np.nan)
         self._seed, self._rngs = seed, map(episode_rng, repeat(seed), count())
-        self._end_s = math.inf  # Of the motion.
+        self._end_s = math.inf  # End of the motion.
         self._num_waits = 0  # Ticks for which a failure is still shown.
         self._is_ended, self._said, self._said_until_s = False, "", -math.inf
         self._camera = FollowingCamera(loop, meshcat) if isinstance(loop, LeggedLoop) else None
@@ -226,7 +226,7 @@ class LiveSession:
         """Shows why a simulation failed, and lets the next one begin a while later."""
         try:
             yield
-        except RuntimeError as error:  # Of Drake's solvers, or a simulation that diverges.
+        except RuntimeError as error:  # From Drake's solvers, or a simulation that diverges.
             note = textwrap.shorten(str(error), 160)
             self.panel.status = Status("the simulation failed", note=note, tone="unsafe")
             self._num_waits = round(_SHOWN_S / BREAK_S)

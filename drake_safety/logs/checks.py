@@ -29,14 +29,14 @@ _REACH_SHARE = 3.0  # Largest distance of z* from the base, relative to the stan
 _WINDOW_S, _MANY_WINDOWS = 0.1, 400
 # Least change in a window, and difference, that tells motion from noise [m, rad].
 _LEAST = {"base_linear_velocity": 0.01, "base_angular_velocity": 0.05, "joint_velocities": 0.1}
-_DISAGREES, _AGREES = 0.4, 0.25  # Of the motion, if another reading agrees.
-_WRONG, _FAR = 0.9, 3.0  # Of the motion, and of the least change, if none does.
+_DISAGREES, _AGREES = 0.4, 0.25  # Shares of the motion, if another reading agrees.
+_WRONG, _FAR = 0.9, 3.0  # Share of the motion, and of the least change, if no reading agrees.
 _FACTOR, _TURN_RAD = 1.6, math.radians(30.0)  # Least factor of a unit or rate, and turn of axes.
-_FASTEST_M_S, _FASTEST_RAD_S = 15.0, 40.0  # Of the base; gyroscopes measure less.
+_FASTEST_M_S, _FASTEST_RAD_S = 15.0, 40.0  # Speeds of the base; gyroscopes measure less.
 _FASTEST_JOINT = (20.0, 100.0)  # Range of the limit [rad/s].
 _JUMP_S = 0.005
-_STEP_S, _NUM_STEPS = 0.05, 80  # In which a foot on the ground does not move.
-_SHORTEST_S = 0.5  # Of a log that says how feet move.
+_STEP_S, _NUM_STEPS = 0.05, 80  # Windows in which a foot on the ground does not move.
+_SHORTEST_S = 0.5  # Shortest log that shows how feet move.
 _SLIP_M, _SLIP_FACTOR, _HIGH_M = 0.004, 3.0, 0.01
 _LONGEST_LEG = 7
 _MEASURES = ("from their means", "while the lowest one stands", "or rest at several heights")
@@ -53,7 +53,7 @@ class _Pose(NamedTuple):
     what: str
     stands: bool
     slips: list[float]  # By every measure [m].
-    height: float  # Of all feet [m].
+    height: float  # Height of all feet [m].
     rest: np.ndarray  # Motion and distance from that height of each foot in its best fifth [m].
 
 
@@ -226,7 +226,7 @@ def _stillest(poses: list[_Pose], i: int) -> _Pose | None:
 
 
 def _poses(source: Source, kinematics: RobotKinematics) -> Iterator[_Pose]:
-    """What the readings of pose and joints say of the feet, the map's reading first."""
+    """The feet by each reading of pose and joints, the map's reading first."""
     at_s = source.at_s
     step = max(_STEP_S, float(np.diff(at_s).max(initial=0.0)))
     begins = np.linspace(at_s[0], max(at_s[-1] - step, at_s[0]), _NUM_STEPS)

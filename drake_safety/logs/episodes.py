@@ -117,24 +117,24 @@ class _Cutter:
         if log.desired_output is None:
             raise ValueError(f"log '{log.path}' has no desired output: the preview needs it")
         context = self.loop.CreateDefaultContext()
-        found: list[tuple[Episode, EpisodeStart]] = []
+        kept: list[tuple[Episode, EpisodeStart]] = []
         begin_s = 0.0
         while log.duration_s - begin_s > self.step_s:
             start = self._start(log, log.desired_output, begin_s)
             self.loop.reset_to(context, None, start)
             episode = self._episode(log, context, begin_s)
-            if not episode.is_safe and episode.num_steps == 0 and not found:
+            if not episode.is_safe and episode.num_steps == 0 and not kept:
                 if log.piece:
                     return [], True
                 where = f"the safe set of scenario '{self.loop.scenario.name}'"
                 what = f"the margin '{episode.cause}' is {episode.margins[0].min():.3g}"
                 raise ValueError(f"log '{log.path}' begins outside {where}: {what}")
             if not episode.is_safe or episode.num_steps >= self.shortest:
-                found.append((episode, start))
+                kept.append((episode, start))
             if not episode.is_safe:
-                return found, True
+                return kept, True
             begin_s += float(episode.time_s[-1])
-        return found, False
+        return kept, False
 
     def _start(self, log: RobotLog, desired: np.ndarray, begin_s: float) -> EpisodeStart:
         """The logged state at a time, with the later z* (N, n_z) [m] as a plan."""
@@ -176,7 +176,7 @@ class _Cutter:
         recorder = Recorder(loop)
         context.SetTime(0.0)
         for time_s, state in zip(times, log.states_at(begin_s + times), strict=True):
-            # What the robot was commanded is not logged: the loop's own controller says it.
+            # The log lacks the robot's commands: the loop's own controller replaces them.
             loop.advance_control(context, float(time_s))
             self._set_state(context, time_s, state)
             recorder.record(context)

@@ -44,7 +44,7 @@ class _Quantity:
     topic: str = ""  # Topic of the messages; empty for a table.
     sign: dict[str, Literal[1, -1]] = field(default_factory=dict)  # Factor by column; 1 by default.
     offset: dict[str, float] = field(default_factory=dict)
-    """What is added then by column, in its unit; 0 by default."""
+    """Added then, by column, in its unit; 0 by default."""
 
 
 @schema(kw_only=True)
@@ -53,10 +53,10 @@ class _Columns(_Quantity):
 
     columns: list[str] = field(default_factory=list)
     """Columns, or fields of the messages such as ``pose.pose.position.x``."""
-    multiple: ClassVar[int] = 3  # Of a value's columns.
+    multiple: ClassVar[int] = 3  # Number of a value's columns.
 
     def names(self, joints: Sequence[str]) -> list[str]:
-        """Returns the columns; those of a quantity of joints are in their order."""
+        """Returns the columns; a quantity of joints has them in the order of the joints."""
         return self.columns
 
     def __post_init__(self) -> None:
@@ -86,7 +86,7 @@ class LinearVelocity(_Columns):
     """Velocity of the base's origin relative to the world: x, y, z per second."""
 
     unit: LengthUnit = "m"
-    frame: Frame = "world"  # Of x, y, z; ``body``: the base's own (as in ROS odometry).
+    frame: Frame = "world"  # Frame of x, y, z; ``body``: the base's own (as in ROS odometry).
 
 
 @schema(kw_only=True)
@@ -138,8 +138,8 @@ class LogMap:
     desired_output: Position = field(default_factory=Position)
     """z*, the desired position of the base or the hand. Required for episodes."""
     foot_positions: Position = field(default_factory=Position)
-    """Desired centres of the contact spheres, in the order of the ``robot.yaml``; by default those
-    of the joint positions."""
+    """Desired centres of the contact spheres, in the order of the ``robot.yaml``; by default from
+    the joint positions."""
     max_gap_s: Positive = 0.1  # Largest time between two rows [s].
 
     def __post_init__(self) -> None:

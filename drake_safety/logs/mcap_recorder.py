@@ -19,7 +19,7 @@ from drake_safety.logs.log_map import ATTACHED_MAP
 from drake_safety.simulation.closed_loop import ClosedLoop
 from drake_safety.simulation.legged_loop import LeggedLoop
 
-_PERIOD_S = 0.02  # Of a diagram without a scenario.
+_PERIOD_S = 0.02  # For a diagram without a scenario.
 _ROUNDING_S = 1e-6
 _BREAK_NS = 1_000_000_000  # Before a motion that begins anew.
 _STATE, _GOAL, _FEET = "measured_plant_state", "desired_output", "desired_foot_positions"
@@ -36,9 +36,9 @@ class McapRecorder:
     It is a monitor of Drake's Simulator (``set_monitor``) and of `simulate`, and writes a row every
     step of the scenario's change monitor, or 0.02 s. Each port is a topic, each entry of a vector a
     number with a name. A `LeggedLoop` adds ``/tf``, the true poses of all bodies, and the map by
-    which `read_pieces` reads the measured state; with the engine ``drake`` also ``/actuation``,
-    torques [N·m] or forces [N] by joint, and ``/contact_forces``, those on each foot in the world
-    [N]. Stamps are times of the Context; a motion that begins anew follows after a second.
+    which `read_pieces` reads the measured state. With the engine ``drake`` it adds ``/actuation``,
+    torques [N·m] or forces [N] by joint, and ``/contact_forces`` on each foot in the world [N].
+    Stamps are times of the Context; a motion that begins anew follows after a second.
 
     Args:
         monitor: Called with each Context as well; it may end the simulation.
@@ -94,7 +94,7 @@ class McapRecorder:
         self._due_s = self._period_s + (now_s if is_late else self._due_s)
         self._stamp_ns = round(1e9 * now_s) + self._shift_ns
         row = [(channel, make(context)) for channel, make in self._topics.values()]
-        for channel, data in row:  # Of complete rows, wherever Ctrl-C stops it.
+        for channel, data in row:  # The row is complete, wherever Ctrl-C stops it.
             self._writer.add_message(channel, self._stamp_ns, data, self._stamp_ns)
 
     def _of(self, kind: str, *values: Any) -> Any:

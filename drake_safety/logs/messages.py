@@ -102,7 +102,7 @@ def recorded_topics(path: Path) -> set[str]:
 
 
 def attached_map(path: Path) -> LogMap:
-    """The map that an MCAP file has as an attachment, as those of `McapRecorder` do."""
+    """The map attached to an MCAP file, as `McapRecorder` attaches it."""
     if path.suffix.lower() == ".mcap":
         require_extra("logs", f"log '{path}'", "mcap")
         from mcap.reader import make_reader
@@ -124,7 +124,7 @@ def field_of(path: str) -> Callable[[Any], Any]:
     def field(owner: Any, name: str) -> Any:
         if not hasattr(owner, name):
             existing = [key for key in getattr(owner, "__dict__", ()) if key[0] != "_"]
-            raise LookupError(f"there is no field '{name}'; the fields are {listed(existing)}")
+            raise LookupError(f"no field '{name}'; the fields are {listed(existing)}")
         return getattr(owner, name)
 
     def read(message: Any) -> Any:

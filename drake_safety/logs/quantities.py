@@ -16,7 +16,7 @@ MIN_ROWS = 3  # For derivatives.
 _INTERVALS_S = (1e-4, 0.5)  # Range of the median time between two rows.
 _SPARSE = 0.9  # Share of complete rows below which every quantity has rows of its own.
 _MANY_HELD, _REGULAR = 6, 0.9  # Least rows of whole holds of a value, and share of equal holds.
-_MANY_SAME, _MANY_RESTARTS = 0.4, 0.1  # Of the rows.
+_MANY_SAME, _MANY_RESTARTS = 0.4, 0.1  # Shares of the rows.
 
 
 def continued(channel: Channel, max_gap_s: float) -> tuple[Channel, dict[str, float]]:
@@ -32,7 +32,7 @@ def continued(channel: Channel, max_gap_s: float) -> tuple[Channel, dict[str, fl
 
 
 def in_order(channel: Channel, max_gap_s: float) -> tuple[Channel, list[str]]:
-    """Sorts rows that are a little out of order, joins those of one time, and says what is lost."""
+    """Sorts rows that are a little out of order, joins rows of one time, and describes losses."""
     time, clock = channel.time, channel.time_name
     if (is_bad := ~np.isfinite(time)).any():
         row = int(np.argmax(is_bad))
@@ -97,7 +97,7 @@ def quantities(
         if number > 1:
             what = f"changes only at every {number:.3g}th row: the others are left out"
             notes.append(f"{_start_of(name, channel)} {what}")
-        if name == "base_orientation":  # Zero quaternions are those before an estimator starts.
+        if name == "base_orientation":  # Before an estimator starts, quaternions are zero.
             frame = own[name].frame
             own[name] = replace(own[name], frame=frame.where(frame.any(axis=1)))
     return own, log_map, notes
@@ -153,8 +153,8 @@ def cut(
     pieces: list[tuple[float, float, dict[str, Channel]]] = [(-math.inf, math.inf, {})]
     reasons: dict[str, None] = {}
     for name, channel in channels.items():
-        stretches, found = _unbroken(channel, max_gap_s)
-        reasons |= dict.fromkeys(found)
+        stretches, breaks = _unbroken(channel, max_gap_s)
+        reasons |= dict.fromkeys(breaks)
         joined, i, k = [], 0, 0
         while i < len(pieces) and k < len(stretches):
             (begin, end, piece), part = pieces[i], stretches[k]
@@ -195,5 +195,5 @@ def _unbroken(channel: Channel, max_gap_s: float) -> tuple[list[Channel], list[s
         for row in np.flatnonzero(is_after_gap)[1:].tolist()
     ]
     rows = np.flatnonzero(~is_bad)
-    found = np.split(rows, np.flatnonzero((is_bad_before | is_after_gap)[rows]))
-    return [channel.select(one) for one in found if len(one) >= MIN_ROWS], reasons
+    parts = np.split(rows, np.flatnonzero((is_bad_before | is_after_gap)[rows]))
+    return [channel.select(part) for part in parts if len(part) >= MIN_ROWS], reasons

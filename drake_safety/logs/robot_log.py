@@ -33,7 +33,7 @@ class RobotLog:
     robot: str
     time_s: np.ndarray  # Since the first row, increasing, (N,) [s].
     q: np.ndarray  # Base quaternion (w, x, y, z), base position, joints, (N, n_q).
-    v: np.ndarray  # Of the base in the world, angular first, then of the joints, (N, n_v).
+    v: np.ndarray  # Base velocity in the world, angular first, then joints, (N, n_v).
     desired_output: np.ndarray | None = None  # z* in the world, (N, n_z) [m].
     foot_positions: np.ndarray | None = None  # Desired, (N, 3 n_c) [m].
     piece: int = 0  # Number of this piece of a cut log, from 0, again where time begins anew.
@@ -54,16 +54,16 @@ class RobotLog:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LogPieces:
-    """What is left of a log that was cut at missing values and gaps."""
+    """Pieces of a log, cut at missing values and gaps."""
 
     pieces: list[RobotLog]
-    duration_s: float  # Of the whole log.
-    lost: list[str]  # What was cut or left out, and where.
-    notes: list[str]  # What was resampled, or is a derivative.
+    duration_s: float  # Duration of the whole log.
+    lost: list[str]  # Each cut or omission, and its place.
+    notes: list[str]  # Each resampled or differentiated quantity.
 
     @property
     def cuts(self) -> list[str]:
-        """What was cut, left out or resampled, and where."""
+        """Each cut, omission and resampling, and its place."""
         return self.lost + self.notes
 
     @property

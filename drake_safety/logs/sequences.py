@@ -31,7 +31,7 @@ class SequenceMap:
     """Observation that is an input of the detector, where its name differs."""
     scale: dict[str, float] = field(default_factory=dict)  # Factor by input; 1 by default.
     offset: dict[str, float] = field(default_factory=dict)
-    """What is added then, such as a joint's default position; 0 by default."""
+    """Added then, such as a joint's default position; 0 by default."""
 
 
 def read_sequences(
@@ -75,17 +75,18 @@ def read_recording(
         return None
     names = detector.input_names(info), info.constraint_names
     wanted = dict(zip((inputs, margins), map(field_names, names), strict=True))
-    found = read_messages(path, wanted, LogTime())
+    channels = read_messages(path, wanted, LogTime())
     leave_s, cause = math.inf, ""
-    for time_s, row in zip(found[margins].time_s, found[margins].frame.to_numpy(), strict=True):
+    own = channels[margins]
+    for time_s, row in zip(own.time_s, own.frame.to_numpy(), strict=True):
         if is_outside(row):
             leave_s, cause = time_s, info.constraint_names[violated(row)]
             break
     # A row shows what the monitor took in the step before; while it waits there is none.
-    time_s = (found[inputs].time_s - detector.step_s).round(6)
+    time_s = (channels[inputs].time_s - detector.step_s).round(6)
     time_s = time_s[time_s <= leave_s]
     rows = np.zeros((len(time_s), _num_entries(info)))
-    rows[:, detector.columns] = found[inputs].frame.to_numpy()[: len(time_s)]
+    rows[:, detector.columns] = channels[inputs].frame.to_numpy()[: len(time_s)]
     begins = np.flatnonzero(np.diff(time_s) > 1.5 * detector.step_s) + 1
     parts = np.split(np.arange(len(time_s)), begins)
     return [(time_s[part], rows[part]) for part in parts if len(part) > 2], cause

@@ -69,7 +69,7 @@ def read_parquet(path: Path, wanted: Wanted, time: LogTime) -> dict[str, Channel
 
 
 def _columns(path: Path, wanted: Wanted, time: LogTime, existing: list[str]) -> list[str]:
-    """The column of the time and the wanted ones, which a table must have once."""
+    """The columns of time and of wanted values; a table must have each once."""
     if topics := [topic for topic in wanted if topic]:
         raise ValueError(f"log '{path}' is a table and has no topics; the map names {topics}")
     if not time.column:

@@ -25,7 +25,7 @@ class GoalVerdict:
     goal: np.ndarray  # In the world, (3,) [m].
     belief: np.ndarray = field(default_factory=lambda: np.array(EMPTY, dtype=float))
     """(safe, unsafe, don't know), (3,); its first entry is the paper's Γ."""
-    probability: float = math.nan  # Of staying safe; NaN outside the region sampled in training.
+    probability: float = math.nan  # To stay safe; NaN outside the region sampled in training.
     threshold: float
     constraint_names: tuple[str, ...]
     cause_probability: np.ndarray
@@ -47,7 +47,7 @@ class GoalVerdict:
 
     @property
     def cause(self) -> str:
-        """The constraint most likely to be violated; "" if there is no evidence for any."""
+        """The constraint most likely to be violated; "" without evidence."""
         return likely_cause(
             self.constraint_names, self.cause_probability, self.predicted_margins, self.margin_unit
         )
@@ -59,7 +59,7 @@ class GoalVerdict:
         return float(self.predicted_margins[names.index(cause)]) if cause else math.nan
 
     def cause_words(self, angular_constraints: Collection[str]) -> tuple[str, str]:
-        """What the cause is to the motion, and text of its margin; see the function."""
+        """Words for the cause and for its margin; see the function."""
         is_known = self.verdict != UNKNOWN
         return cause_words(self.cause, self.cause_margin, angular_constraints, is_known=is_known)
 
@@ -122,7 +122,7 @@ def assess_goals(
         if prediction.novelty[i] > 1.0:
             name, deviation = assessment.strangest_input(*(part[i] for part in inputs))
             by = f"{abs(deviation):.0f} standard deviations from what the other entries say"
-            return f"the input is unlike those of training: '{name}' differs by {by}"
+            return f"the input is unlike the training inputs: '{name}' differs by {by}"
         if has_no_data[i]:
             return f"too little training data near this {noun}'s embedding"
         if unsafe_below <= probability < threshold:

@@ -17,13 +17,13 @@ from drake_safety.simulation.closed_loop import ClosedLoop
 _DIFFERENCE_M = 1e-3  # Step of the finite differences of the inputs by the goal.
 _MAX_STEPS = 12  # Along the gradient.
 _LONGEST_STEP_M = 0.15  # The logit is nearly linear over that distance.
-_MARGIN = 0.5  # By how much the aimed-at logit falls where Γ does not follow it.
+_MARGIN = 0.5  # Decrease of the aimed-at logit where Γ does not follow it.
 _LARGEST_LOGIT = 8.0
 _FIRST_RADIUS_M = 0.05
 _GROWTH = 1.6  # From one ball of candidates to the next.
 _LAST_CHANCE = 16  # Times as many candidates in the whole region if no ball had an accepted one.
 _SPREAD = 0.25  # Radius of the candidates about the best goal, by its distance to the goal.
-_NUM_ROUNDS, _ROUNDS_FROM_KNOWN = 6, 4  # Of candidates about the best goal.
+_NUM_ROUNDS, _ROUNDS_FROM_KNOWN = 6, 4  # Rounds of candidates about the best goal.
 
 
 @one_blas_thread
@@ -46,7 +46,7 @@ def nearest_accepted_goal(
     Args:
         reserve: Share r of p - threshold in the least probability, threshold + r (p - threshold);
             p is 1, or 1 - mu_ini without heads, as in the paper's mode.
-        resolution_m: Of the grid of goals, so that rounding does not change a verdict.
+        resolution_m: Spacing of the grid of goals; rounding then does not change a verdict.
     """
     unknown = assessment.parameters.initial_uncertainty if assessment.base_logit_ is None else 0.0
     stricter = threshold + reserve * max(1.0 - unknown - threshold, 0.0)
@@ -95,7 +95,7 @@ class _Search:
         aim = math.log((1.0 - share) / share)
         point = np.clip(goal, *box)
         for _ in range(_MAX_STEPS):
-            # Differences point inwards: there is no training data beyond the region.
+            # Differences point inwards: training data end at the region's edge.
             inwards = np.where(point + _DIFFERENCE_M > box[1], -_DIFFERENCE_M, _DIFFERENCE_M)
             inputs = goal_inputs(self.loop, point + np.vstack([np.zeros(3), np.diag(inwards)]))
             x, logit, gradient = self.assessment.unsafe_logits(*inputs)

@@ -60,9 +60,9 @@ def build_model(
 ) -> tuple[mujoco.MjModel, list[int]]:
     """Compiles a robot and its scene; returns the model, and each control's place in the command.
 
-    MuJoCo reads masses, inertias, joint frames, axes and stops from the URDF. Actuators, effort
-    limits, collision shapes, friction coefficients and collision filters are those of the Drake
-    plant. Other contact parameters are MuJoCo's defaults, with an elliptic friction cone.
+    MuJoCo reads masses, inertias, joint frames, axes and stops from the URDF. The Drake plant gives
+    actuators, effort limits, collision shapes, friction coefficients and collision filters. Other
+    contact parameters are MuJoCo's defaults, with an elliptic friction cone.
     """
     mujoco = import_mujoco()
     path = model_file(robot.urdf, robot.source_dir, robot.requires)

@@ -78,7 +78,7 @@ def filter_collisions(
     robot: RobotModel,
     obstacles: list[ModelInstanceIndex],
 ) -> None:
-    """Filters all contacts but those of arms with obstacles and of other bodies with the ground."""
+    """Filters all contacts except of arms with obstacles and of other bodies with the ground."""
     arms = arm_geometries(plant, robot)
     everything = collision_geometries(plant, [plant.GetModelInstanceByName(robot.name)])
     rest = [geometry for geometry in everything if geometry not in set(arms)]
@@ -92,7 +92,7 @@ def filter_collisions(
 
 
 def remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph, context: Context) -> None:
-    """Removes all geometries but those of collision from a root Context.
+    """Removes all geometries except collision geometries from a root Context.
 
     Every query moves all geometries, and a robot's meshes are many times its collision shapes.
     """

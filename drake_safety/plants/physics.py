@@ -49,8 +49,8 @@ class Scene:
     """The surroundings of a robot besides the ground."""
 
     obstacles: Sequence[Obstacle] | None = None
-    """With a list, even an empty one, only contacts of arms with obstacles and of other bodies with
-    the ground are simulated; with None, those of the model file."""
+    """With a list, even an empty list, only contacts of arms with obstacles and of other bodies
+    with the ground are simulated; with None, the contacts of the model file."""
     decorations: Sequence[Obstacle] = ()  # Models without collision geometry.
     has_ball: bool = False
 

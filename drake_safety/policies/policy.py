@@ -29,17 +29,17 @@ from drake_safety.robots.robot_model import JointGains, RobotModel, as_pattern, 
 
 @dataclass(kw_only=True, eq=False)
 class PolicyInput:
-    """What observation terms are functions of."""
+    """Arguments of observation terms."""
 
     R_WB: np.ndarray  # Orientation of the base, (3, 3).
     w_WB: np.ndarray  # Its velocities in the world, (3,) [rad/s, m/s].
     v_WB: np.ndarray
-    positions: np.ndarray  # Of joints, less those of zero action, in its order, (n_a,) [rad].
+    positions: np.ndarray  # Joint positions less the positions of zero action, (n_a,) [rad].
     rates: np.ndarray
     command: np.ndarray  # (v_x, v_y, ω_z), (3,) [m/s, rad/s].
-    action: np.ndarray  # The last one, (n_a,).
-    phases: np.ndarray  # Of the gait clock, in [-π, π], (n_p,) [rad].
-    all_positions: np.ndarray  # Of all joints of the robot in its order, (n_j,) [rad].
+    action: np.ndarray  # The last action, (n_a,).
+    phases: np.ndarray  # Phases of the gait clock, in [-π, π], (n_p,) [rad].
+    all_positions: np.ndarray  # All joints of the robot in its order, (n_j,) [rad].
     all_rates: np.ndarray
 
 
@@ -80,7 +80,7 @@ class ObservationTerm:
     scale: list[float] = field(default_factory=lambda: [1.0])  # Factor, one or one per entry.
     clip: Annotated[float, Field(gt=0)] = 100.0  # Largest absolute value after scaling.
     history: Count = 1  # Number of samples, the oldest first.
-    # Joints whose positions or rates it has, in its order; by default those that are moved.
+    # Joints whose positions or rates it has, in its order; by default the moved joints.
     joints: list[str] = field(default_factory=list)
 
 
@@ -115,7 +115,7 @@ class WholeHistory:
 
     # Age of each sample in periods, 0 for the newest, in the network's order.
     ages: list[int] = field(default_factory=list)
-    # What is kept together: all terms of a ``time``, or all samples of a ``term``.
+    # Outer order: all terms of a ``time`` together, or all samples of a ``term``.
     by: Literal["time", "term"] = "time"
 
     def __post_init__(self) -> None:
@@ -129,8 +129,8 @@ class PolicyParameters:
     """The schema of ``policy.yaml``."""
 
     network: str = ""  # ONNX or TorchScript file: ``package://…`` or relative to the YAML file.
-    requires: Requirement = ""  # What pip installs for ``network``, without dependencies.
-    # Joints in the network's order; by default those of the network's metadata.
+    requires: Requirement = ""  # Package of ``network``, installed without dependencies.
+    # Joints in the network's order; by default from the network's metadata.
     joints: list[str] = field(default_factory=list)
     # Joint positions at zero action [rad], by regular expression; 0 for others. The default of
     # this, ``action_scale`` and ``gains`` is in the network's metadata.
@@ -185,7 +185,7 @@ class Policy:
         self.joints = np.array([joint_names.index(name) for name in names], dtype=int)
 
         def by_joint(key: str, joints: list[str]) -> dict[str, Any]:
-            """Values that are stated, else those of the network's metadata."""
+            """Stated values, else values of the network's metadata."""
             values: dict[str, Any] = {}
             for name in joints:
                 value = by_pattern(getattr(parameters, key, {}), name, key, robot)
@@ -344,13 +344,13 @@ def _wrapped(phases: np.ndarray) -> np.ndarray:
 
 
 def read_policy_file(path: Path, network: str = "") -> PolicyParameters:
-    """Reads a ``policy.yaml``; a network replaces the one that it names."""
+    """Reads a ``policy.yaml``; ``network`` replaces the file's network."""
     read = load_typed_file(PolicyParameters, path, f"policy file '{path}'")
     return replace(read, network=network, requires="") if network else read
 
 
 def load_policy(path: Path, kinematics: RobotKinematics, network: str = "") -> Policy:
-    """Loads a policy for a robot; a network replaces the one that the file names."""
+    """Loads a policy for a robot; ``network`` replaces the file's network."""
     parameters, robot = read_policy_file(path, network), kinematics.robot.name
     return Policy(parameters, kinematics.joint_names, robot=robot, folder=str(path.parent))
 

@@ -21,17 +21,17 @@ from drake_safety.extras import require_extra
 from drake_safety.files.schema import Pattern, load_typed
 
 _SUPPORTED = (
-    "supported are one observation, an action, and as memory further inputs and outputs of ONNX in "
+    "expected one observation, one action, and as memory further inputs and outputs of ONNX in "
     "pairs of one shape, such as h_in and h_out, or buffers of TorchScript"
 )
 _SCRIPT = "TorchScript: code of its author, which runs here"
-_KINDS = {".onnx": "ONNX, which is no code", ".pt": _SCRIPT, ".jit": _SCRIPT}
+_KINDS = {".onnx": "ONNX, which is not code", ".pt": _SCRIPT, ".jit": _SCRIPT}
 _Memory = Mapping[str, np.ndarray]
 
 
 @dataclass(kw_only=True)
 class PolicyMetadata:
-    """What an ONNX file says of its policy as in ``policy.yaml``; empty where it says nothing."""
+    """Entries of ``policy.yaml`` in an ONNX file's metadata; empty if absent."""
 
     joints: list[str] = field(default_factory=list)
     stiffness: dict[str, float] = field(default_factory=dict)
@@ -132,11 +132,11 @@ class PolicyNetwork:
     path: Path
     # Maps a batch and parts of the memory by name to the action and the new parts.
     evaluate: Callable[[np.ndarray, _Memory], tuple[np.ndarray, _Memory]]
-    widths: tuple[int | None, int | None]  # Of observation and action; None if it is not said.
+    widths: tuple[int | None, int | None]  # Observation and action; None if unknown.
     metadata: PolicyMetadata = field(default_factory=PolicyMetadata)
     # The memory at the start by name; all that may be memory until it is checked.
     start: _Memory = field(default_factory=dict)
-    shape: tuple[int, ...] = (1, -1)  # Of a batch of one observation.
+    shape: tuple[int, ...] = (1, -1)  # A batch of one observation.
     dtype: Any = np.float32
     outputs: list[str] = field(default_factory=list)  # Names and shapes, the action first.
 
@@ -171,7 +171,7 @@ class PolicyNetwork:
         probe = np.linspace(-1.0, 1.0, num_inputs, dtype=np.float32)
         try:
             _, after = self.evaluate(probe.astype(self.dtype).reshape(self.shape), self.start)
-            # What does not change is no memory, and what grows has no place in a Context.
+            # A constant part is not memory, and a growing part does not fit into a Context.
             self.start = {
                 name: part
                 for name, part in self.start.items()
@@ -272,7 +272,7 @@ def _load_onnx(path: Path) -> PolicyNetwork:
     require_extra("walking", f"ONNX network {path}", "onnxruntime")
     import onnxruntime
 
-    network_files(path)  # Names those that are missing.
+    network_files(path)  # Raises for missing files.
     options = onnxruntime.SessionOptions()
     # A thread pool costs more than the network, and would make sums depend on its size.
     options.intra_op_num_threads = options.inter_op_num_threads = 1

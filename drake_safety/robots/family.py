@@ -12,7 +12,7 @@ from drake_safety.robots.robot import PlantVariation
 
 FAMILY = "family"
 """Name of the variation whose episodes belong to the plants of a family."""
-_SHARE = "share"  # Of the plants that have an entry.
+_SHARE = "share"  # Share of the plants that have an entry.
 _DRAWS = ("uniform", "log_uniform", "one_of")
 _TRIED = 32  # Plants that a scenario's check draws.
 
@@ -26,7 +26,7 @@ class PlantFamily:
     share of the plants. Entries that are left out are the nominal plant's.
     """
 
-    plants: Count = 64  # Of training.
+    plants: Count = 64  # Number of plants in training.
     share: Share = 0.5  # Training episodes on these plants for each nominal one.
     ranges: dict[str, Any] = field(default_factory=dict)
 

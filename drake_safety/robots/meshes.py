@@ -42,7 +42,7 @@ def cache_folder() -> Path:
 
 
 def check_meshes(model: Path) -> None:
-    """Checks the meshes that a model file names, or is, as damaged ones crash Drake."""
+    """Checks the meshes of a model file, or the mesh that it is: damaged meshes crash Drake."""
     text = "" if model.suffix in SHOWN_FORMATS else model.read_text("utf-8", "replace")
     for url in {str(model), *_MESH.findall(text)}:
         try:
@@ -92,7 +92,7 @@ def _vtk_fault(content: bytes) -> str:
     cells = re.search(rb"^CELLS\s+\d+\s+\d+\s+([\d\s]+)", content, re.M)
     if points is None or cells is None:
         return ""  # It is binary.
-    corners = np.array(cells[1].split(), dtype=int).reshape(-1, 5)[:, 1:]  # Of tetrahedra.
+    corners = np.array(cells[1].split(), dtype=int).reshape(-1, 5)[:, 1:]  # Tetrahedra.
     is_beyond = corners.max(initial=0) >= int(points[1])
     return f"has {int(points[1])} points and a cell of point {corners.max()}" if is_beyond else ""
 
@@ -130,7 +130,7 @@ def mesh_points(path: Path) -> np.ndarray:
 
 
 def convex_hull(points: np.ndarray) -> trimesh.Trimesh:
-    """Returns a hull of points (n, 3) [m], of those extreme in 42 directions; a box if flat."""
+    """Returns a hull of the points (n, 3) [m] that are extreme in 42 directions; a box if flat."""
     from trimesh import convex, creation
 
     if np.linalg.matrix_rank(points - points.mean(axis=0), tol=_FLAT_M) < 3:

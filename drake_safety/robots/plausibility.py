@@ -12,7 +12,7 @@ from drake_safety.robots.robot_size import GRAVITY_M_S2
 
 _MATTERS = 1e-4  # Moment of inertia that matters, by the robot's mass times extent squared.
 _POINT = 0.005  # Least radius of gyration, by the robot's extent.
-_MOST_TORQUE, _MOST_FORCE = 1.5, 8.0  # Of motors, by weight times extent (known: 0.4); by weight.
+_MOST_TORQUE, _MOST_FORCE = 1.5, 8.0  # Motors: by weight times extent (known: 0.4); by weight.
 _AIR_KG_M3, _LEAD_KG_M3 = 1.2, 11_300.0  # Density of the cube that is as large as the robot.
 _NUM_LISTED = 4
 

@@ -65,7 +65,7 @@ class PlantVariation:
     mass_scale: Positive = 1.0  # Factor on every body's spatial inertia.
     joint_friction_nm: NotNegative = 0.0  # Dry (Coulomb) friction of every actuated joint [N·m].
     joint_damping: NotNegative = 0.0  # Viscous damping added to every actuated joint [N·m·s/rad].
-    foot_friction: Positive | None = None  # Of the feet; the robot's own by default.
+    foot_friction: Positive | None = None  # Friction of the feet; the robot's own by default.
     # Noise on the measurements of controllers and assessor.
     observation_noise: ObservationNoise = field(default_factory=ObservationNoise)
     # Noise on the assessor's inputs alone; the motion does not depend on it.
@@ -77,8 +77,8 @@ class PlantVariation:
 
 
 PAYLOAD_RADIUS_M = 0.05
-_SHAPE_FRICTION = 0.2  # Of all shapes but the feet.
-_SPRING_LENGTH_M = 1e4  # Of the spring that exerts a steady force.
+_SHAPE_FRICTION = 0.2  # Friction of all shapes but the feet.
+_SPRING_LENGTH_M = 1e4  # Length of the spring that exerts a steady force.
 _LOCKED_DAMPING = 1e5  # [N·m·s/rad]. Drake 1.51 crashes when a joint with a servo is locked.
 _FRICTION_SUFFIX = "_friction"  # Suffix of actuators that model dry friction.
 _FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
@@ -301,7 +301,7 @@ def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, flo
 def actuation_matrix(
     plant: MultibodyPlant, robot: RobotModel, joint_names: list[str]
 ) -> np.ndarray:
-    """The map (n_u, n_j) from joint values to actuators; those of friction get zero."""
+    """The map (n_u, n_j) from joint values to actuators; friction actuators get zero."""
     instance = plant.GetModelInstanceByName(robot.name)
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]
     matrix = np.zeros((len(actuators), len(joint_names)))
@@ -315,7 +315,7 @@ def actuation_matrix(
 def apply_masses(
     plant: MultibodyPlant, context: Context, robot: RobotModel, variation: PlantVariation
 ) -> None:
-    """Sets a robot's masses in a plant's Context to those of a variation, with its payload."""
+    """Sets a robot's masses in a plant's Context by a variation, with its payload."""
     instance = plant.GetModelInstanceByName(robot.name)
     bodies = [plant.get_body(i) for i in plant.GetBodyIndices(instance)]
     for body in bodies:

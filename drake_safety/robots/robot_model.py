@@ -29,7 +29,7 @@ class Foot:
     # Centres of the contact spheres in the body's frame, each (3,) [m].
     contact_points: Annotated[list[Triple], Field(min_length=1)]
     radius_m: float = 0.0
-    joints: list[str] = field(default_factory=list)  # Of the leg, from base to foot.
+    joints: list[str] = field(default_factory=list)  # Joints of the leg, from base to foot.
 
 
 @schema(kw_only=True)
@@ -57,7 +57,7 @@ class ReachingFrame:
     # Reaching point and centre of the collision sphere in the body's frame, (3,) [m].
     point: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
     radius_m: NotNegative = 0.0
-    joints: list[str] = field(default_factory=list)  # Of the arm, from torso to hand.
+    joints: list[str] = field(default_factory=list)  # Joints of the arm, from torso to hand.
 
 
 @schema(kw_only=True)
@@ -81,7 +81,7 @@ class CollisionShape:
     # Centre of a box or sphere, centre of a capsule's first end, in the body's frame, (3,).
     position_m: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
     box_m: Triple | None = None  # Edges of a box along the body's axes, (3,).
-    radius_m: NotNegative = 0.0  # Of a sphere or capsule.
+    radius_m: NotNegative = 0.0  # Radius of a sphere or capsule.
     to_m: Triple | None = None  # Centre of a capsule's other end, (3,).
 
     def __post_init__(self) -> None:
@@ -96,7 +96,7 @@ class RobotModel:
 
     name: str = ""
     urdf: str = ""  # ``package://…`` (ours, Drake's, pip's) or a path from the YAML file.
-    requires: Requirement = ""  # What pip installs for ``urdf``, without dependencies, if no extra.
+    requires: Requirement = ""  # Package of ``urdf`` for pip, without dependencies, if no extra.
     base: str = ""  # Floating base body.
     # Standing joint positions [rad], by regular expression over joint names.
     posture: dict[Pattern, float] = field(default_factory=dict)

@@ -1,7 +1,7 @@
 """Scaling of parameters from one robot to another of the same build.
 
 Lengths scale with the standing height or the foot spacing, durations with √height (equal Froude
-numbers), speeds with length over duration, and the masses of balls with the robot's mass.
+numbers). Speeds scale with length over duration, and the masses of balls with the robot's mass.
 """
 
 import math

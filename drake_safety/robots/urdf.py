@@ -25,7 +25,7 @@ def read_urdf(path: Path) -> ET.Element:
         raise ValueError(f"URDF '{path}' does not exist")
     content = path.read_bytes()
     try:
-        # Drake knows its elements by their prefix, whatever address the file gives.
+        # Drake knows its elements by their prefix, for any address in the file.
         root = ET.fromstring(_PREFIX.sub(rf'\1"{DRAKE}"'.encode(), content))
     except ET.ParseError as error:
         raise ValueError(f"'{path}' is not XML: {error}") from error
@@ -43,7 +43,7 @@ def read_urdf(path: Path) -> ET.Element:
 
 
 def _faults(root: ET.Element) -> Iterator[str]:
-    """What Drake reads as something else, or refuses without the name of its link or joint."""
+    """Faults that Drake misreads, or refuses without the name of the link or joint."""
     links, joints = root.findall("link"), joint_elements(root)
     for link in links:
         mass = number(element := link.find("inertial/mass"), "value")
@@ -144,7 +144,7 @@ def empty_shapes(root: ET.Element) -> list[tuple[ET.Element, ET.Element, str]]:
 
 
 def joint_elements(root: ET.Element) -> list[ET.Element]:
-    """Returns the joints of a URDF, with those that only Drake knows."""
+    """Returns the joints of a URDF, including joints that only Drake knows."""
     return [element for element in root if element.tag in ("joint", f"{{{DRAKE}}}joint")]
 
 

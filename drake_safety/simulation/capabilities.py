@@ -43,7 +43,7 @@ class HasGoals(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class GoalWords:
-    """What goals are called in messages and figures."""
+    """Words for goals in messages and figures."""
 
     goal: str = "target"
     axes: tuple[str, str, str] = ("x", "y", "z")
@@ -135,6 +135,6 @@ def require(loop: object, capability: type[_Capability], who: str = "") -> _Capa
 
 
 def goal_words(loop: HasGoals) -> GoalWords:
-    """What the goals of a loop are called: its ``goal_words``, if it has some."""
+    """Words for the goals of a loop: its ``goal_words``, if any."""
     words = GoalWords() if loop.hand is None else GoalWords(subject=f"the {loop.hand} hand")
     return getattr(loop, "goal_words", words)

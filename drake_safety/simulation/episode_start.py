@@ -9,7 +9,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.control.kinematics import RobotKinematics, fit_stance
 
-_DRIFT, _ROUNDING = 0.2, 1e-6  # Of a quaternion's norm.
+_DRIFT, _ROUNDING = 0.2, 1e-6  # Errors of a quaternion's norm.
 
 
 @dataclass(kw_only=True, eq=False)
@@ -17,9 +17,9 @@ class EpisodeStart:
     """A plant state and a plan, from which an episode or its nominal twin starts.
 
     ``q`` and ``v`` are in Drake's order, base first; the plan is of the output since the start, in
-    the stance frame, (n_z, 1) [m]. ``foot_positions`` (n_c, 3) [m] are the centres of the contact
-    spheres as the controller assumes them, by default those of ``q``, put on the ground.
-    ``controller_state`` is the controller's memory, such as the phase of a gait.
+    the stance frame, (n_z, 1) [m]. ``foot_positions`` (n_c, 3) [m] are the controller's centres of
+    the contact spheres, by default the feet of ``q``, put on the ground. ``controller_state`` is
+    the controller's memory, such as the phase of a gait.
 
     Example: ``moving = EpisodeStart(q=start.q, v=start.v + 0.1, plan=start.plan)``
     """

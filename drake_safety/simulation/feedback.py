@@ -36,7 +36,7 @@ class EpisodePairs:
     nominal_hash: str
 
     def feedback(self) -> list[EpisodePair]:
-        """The pairs in the order of the episodes, without diverged ones."""
+        """The pairs in the order of the episodes, without diverged episodes."""
         return pair_episodes(self.actual, self.nominal, nominal_hash=self.nominal_hash)
 
 
@@ -111,7 +111,7 @@ def _memory_size(loop: ClosedLoop) -> int:
     # A window begins at a row, so a row must be a time at which the controller updates.
     period_s, step_s = getattr(loop, "memory_period_s", loop.scenario.step_s), loop.scenario.step_s
     if abs(step_s / period_s - round(step_s / period_s)) > 1e-6:
-        text = f"step_s {step_s:g} is no multiple of the controller's period {period_s:g} s"
+        text = f"step_s {step_s:g} is not a multiple of the controller's period {period_s:g} s"
         raise ValueError(f"feedback of '{loop.scenario.name}': {text}")
     return size
 

@@ -36,8 +36,8 @@ _MOTORS_REMEDY = (
 )
 _START_REMEDY = "move the joints to the policy's first targets before it takes over, or blend"
 _RANDOM_REMEDY = "train the policy with random latency, friction and mass beyond the robot's"
-_COMMAND_REMEDY = "send the policy no smaller commands but zero, or train it with small ones"
-_CHANGE_M = 0.02  # Of the base's height: of the crouch, and of the drop.
+_COMMAND_REMEDY = "send the policy no smaller commands but zero, or train it with small commands"
+_CHANGE_M = 0.02  # Height of the crouch and of the drop of the base.
 _STAND_S, _WALK_S, _STOP_S = 1.0, 3.0, 2.0
 _SETTLED_S = 1.0  # From a command to its steady motion.
 _NEAR = 0.95  # Share of a limit that is near it.
@@ -45,9 +45,9 @@ _LIFTED_M, _TOUCHING_M = 0.01, 0.005  # Heights of a foot between which a step e
 _STOPPED_M_S = 0.1
 _AXES = (("forward", "m/s"), ("left", "m/s"), ("yaw", "rad/s"))
 _LEVELS = (0.05, 0.1, 0.2, 0.4)  # Commands, by the largest of their axis.
-_LEVEL_S = 1.5  # For which each is held.
-_FEW = 0.2  # Smallest command that is no dead zone, by the largest.
-_MARGIN_S = 3.0  # Of walking on a changed plant.
+_LEVEL_S = 1.5  # Time for which each is held.
+_FEW = 0.2  # Smallest command outside a dead zone, by the largest.
+_MARGIN_S = 3.0  # Walking on a changed plant.
 _CHANGES: dict[str, tuple[float, ...]] = {
     "latency": (0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12),  # [s]
     "friction": (0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05),  # Factor, as of masses.
@@ -81,7 +81,7 @@ class MotorLoads:
         self._controller = loop.GetSubsystemByName("policy_controller")
         self._num_q = kinematics.num_positions
         self._before_s = 0.0
-        self.peaks = np.zeros((3, len(self.names)))  # Of torque, speed and power.
+        self.peaks = np.zeros((3, len(self.names)))  # Torque, speed and power.
         self.hit_s = self.total_s = 0.0
 
     def targets(self, context: Context) -> np.ndarray:
@@ -121,12 +121,12 @@ def check_hand_over(
 ) -> Generator[Finding, None, str]:
     """Checks that a policy takes over, walks and stops, and how far that is from failing.
 
-    The policy takes over from standing, from a crouch and from a drop of 2 cm, stands for a second,
-    walks at half the largest command forward, and stops. With ``has_margins`` the smallest command
-    that moves the robot follows, and by how much latency, friction and mass may differ.
+    The policy takes over from standing, from a crouch and from a drop of 2 cm. It stands for a
+    second, walks at half the largest command forward, and stops. With ``has_margins`` the smallest
+    command that moves the robot follows, and limits of latency, friction and mass.
 
     Returns:
-        What to correct first, "" if the policy walks.
+        The first correction, "" if the policy walks.
     """
     highest = np.array(loop.policy.parameters.command.highest)
     axis = int(np.argmax(highest > 0.0))
@@ -197,7 +197,7 @@ def _taken_over(
     jump, period_s = np.zeros(len(loads.names)), loop.policy.parameters.period_s
 
     def watch(context: Context) -> None:
-        if context.get_time() < 0.5 * period_s:  # Of its first action.
+        if context.get_time() < 0.5 * period_s:  # Within its first action.
             jump[:] = np.abs(loads.targets(context) - start.q[-len(jump) :])
         loads.read(context)
 

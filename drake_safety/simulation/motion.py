@@ -45,7 +45,7 @@ class End:
 class Motion:
     """Log of a simulated motion; ``motion[name]`` is a logged port, (N, size)."""
 
-    time_s: np.ndarray  # Of the rows, since the start, (N,).
+    time_s: np.ndarray  # Times of the rows, since the start, (N,).
     ports: dict[str, np.ndarray]
     leave_time_s: float = math.inf  # When it left the safe set, if it did.
     cause: str = ""  # The constraint that was violated then.
@@ -160,11 +160,11 @@ def simulate(
     Args:
         start: Sets state, plan and perhaps time of the default root Context. It may return the
             first row whose future is undisturbed, if that is not 0.
-        ports: Ports to log; a mapping from logged names to those of ports renames them, also
-            ``margins`` and ``safe``. Without a port ``safe`` a negative margin is unsafe.
+        ports: Ports to log; a mapping of logged names to port names renames them, also ``margins``
+            and ``safe``. Without a port ``safe`` a negative margin is unsafe.
         step_s: Time between two rows [s].
         watch_period_s: Sampling period of the safe set [s]; by default it is sampled at rows.
-        events: Times [s] and what is done then with the Context.
+        events: Times [s] and functions that change the Context then.
         monitor: Called with the Context after each step of the simulator; it may end it.
         may_fail: Whether a failure of the simulation is a result, ``Motion.failure``, with the rows
             that are finite; otherwise it raises ``EpisodeError``, as an error of a system does.

@@ -11,7 +11,7 @@ _KEPT = 0.8  # Share of discrete draws that a move leaves as they are.
 
 
 class NormalPoint:
-    """Standard normal numbers z (n,) that an episode reads; a generator draws further ones."""
+    """Standard normal numbers z (n,) that an episode reads; a generator draws the rest."""
 
     def __init__(self, rng: np.random.Generator, z: np.ndarray | None = None):
         self._rng, self._z = rng, [] if z is None else z.tolist()

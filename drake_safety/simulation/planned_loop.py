@@ -76,7 +76,7 @@ class PlannedLoop(ClosedLoop):
         self, context: Context, rng: np.random.Generator | None, start: EpisodeStart
     ) -> None:
         """Sets plant state and plan; see `CanStartAnywhere`."""
-        del rng  # There is no noise.
+        del rng  # The plant has no noise.
         start.check(f"start of task '{type(self).__name__}'", *self.plant_state_sizes)
         self._enter(context, start)
 

@@ -63,14 +63,13 @@ def record_episodes(
 ) -> Episodes:
     """Simulates a set of episodes of any diagram, in worker processes.
 
-    The diagram exports, under these names or those of ``ports``, the ports ``state`` (n_s),
-    ``output`` (n_z), ``desired_preview`` (H n_z; its size determines H) and ``margins`` (n_c), as a
-    :class:`ClosedLoop` does. Optional are ``true_state``, by default ``state``, ``desired_output``,
-    by default the first sample of the preview, ``features`` of the assessor, by default none, and
+    The diagram exports the ports of a :class:`ClosedLoop`: ``state`` (n_s), ``output`` (n_z),
+    ``desired_preview`` (H n_z; its size determines H) and ``margins`` (n_c). Optional ports are
+    ``true_state``; ``desired_output``, by default the preview's first sample; ``features``; and
     ``safe``, below 1 once the state is unsafe, by default where a margin is negative.
 
-    Episode i depends on the diagram, the seed and i alone; the first one is simulated again after
-    the second, and must be the same.
+    Episode i depends on the diagram, the seed and i alone; the first is simulated again after the
+    second, and must be the same.
 
     Args:
         make_diagram: Builds the diagram in each worker; called with ``parameters``, after the plant
@@ -82,7 +81,7 @@ def record_episodes(
         draw_plant: Draws a random plant by a generator; the set is of a family then, for the
             argument ``family`` of `SafetyAssessment.fit`.
         plants: Number of the family's plants; the episodes take turns on them.
-        ports: The diagram's port names, by those above.
+        ports: Port names of the diagram by the names above, where they differ.
         state_names: Names of the n_s entries of ``state``; numbered by default.
         monitor_period_s: Sampling period of ``safe`` [s]; a tenth of ``step_s`` by default.
         num_workers, path, progress: As of `run_episodes`.
@@ -136,7 +135,7 @@ def prepare_recording(
     monitor_period_s: float | None = None,
     seed: int = 0,
 ) -> tuple[EpisodesInfo, MadeOnce[Any], Callable[..., Episode]]:
-    """What `record_episodes` simulates by: metadata, the diagram, and its run of an episode.
+    """Prepares `record_episodes`: metadata, the diagram, and its run of an episode.
 
     The run is called with the diagram, an index and perhaps ``draws``; see `run_episode`.
     """

@@ -182,11 +182,11 @@ def run_episode(
     of a system raises ``EpisodeError``.
 
     Args:
-        goal, start: Goal of the plan, or initial state and plan, in place of random ones.
+        goal, start: Goal of the plan, or initial state and plan; random by default.
         at_start: Called with the root Context at the start.
         until_fall: Whether it goes on for a second outside, and only a fall is an unsafe end.
         monitor: Called with the Context after each step of the simulator.
-        draws: Generator of all random numbers, in place of those of seed and index.
+        draws: Generator of all random numbers; by default of seed and index.
         **end: Fields of :class:`~drake_safety.simulation.motion.End`.
 
     Example: ``cause = run_episode(loop, seed=1).cause``
@@ -285,7 +285,7 @@ def run_motions(
     """Simulates undisturbed motion for a `ChangeDetector`; rows are `monitor_step_s` apart.
 
     Args:
-        duration_s: Of all motions [s]; a task that `MovesUndisturbed` moves a minute at a time.
+        duration_s: Sum of all motions [s]; a task that `MovesUndisturbed` moves for minutes.
         are_episodes: Whether the motions are episodes, as of other tasks.
         variation, plants, seed, num_workers, path, progress, extra: As of `run_episodes`.
 
@@ -371,13 +371,13 @@ def run_episodes(
     """Simulates a set of episodes, in worker processes.
 
     Episode i depends on the scenario, the variation, the seed and i alone. With the variation
-    ``family`` its plant is number i modulo ``plants`` of those that the seed draws.
+    ``family`` its plant is number i modulo ``plants`` of the seed's random plants.
 
     Args:
-        plants: Number of the family's plants; that of the scenario by default.
-        num_workers: Number of processes; that of cores by default. 1 runs in this process.
-        path: Folder for the episodes. Those that it holds are kept, if one of them, simulated
-            again, is the same to the last bit; another set is refused.
+        plants: Number of the family's plants; by default the scenario's.
+        num_workers: Number of processes; by default one a core. 1 runs in this process.
+        path: Folder for the episodes. Existing episodes are kept, if one of them, simulated again,
+            is the same to the last bit; another set is refused.
         progress: Called with the number done and in all; True shows it.
         extra: Further content of the folder's ``info.json``.
         until_fall: As of `run_episode`.
@@ -456,7 +456,7 @@ def collect_episodes(
     failed = [episode.index for episode in collected if episode.num_controller_failures]
     for problem, numbers in (
         ("diverged and have no safety label", diverged),
-        ("held the last action, where the controller found none", failed),
+        ("held the last action, where the controller had none", failed),
     ):
         if numbers:
             counts = (len(numbers), len(indices), info.scenario)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _FOLDER = Path(str(files("drake_safety.diagrams")))
 _LEAST_MONITOR_STEP_S = 0.02
-_MOST_STEPS = 10_000_000  # Of an episode, of any kind.
+_MOST_STEPS = 10_000_000  # Steps of an episode, of any kind.
 # A folder in a text file: the value of an XML attribute, or of a key or an item in YAML.
 _FOLDER_IN_TEXT = re.compile(rb"""(["']|[:,{\[-]\s+|\[)(?:file://)?/[^"'<>\n,}\]]*/""")
 _TEXT_FORMATS = (".yaml", ".yml", ".urdf", ".sdf", ".xml")
@@ -44,7 +44,7 @@ _TEXT_FORMATS = (".yaml", ".yml", ".urdf", ".sdf", ".xml")
 
 @schema(kw_only=True)
 class Scenario:
-    """Schema of a scenario file; the fields under ``parameters`` are those of the task.
+    """Schema of a scenario file; the task defines the fields under ``parameters``.
 
     Example: ``actual = scenario.make_loop("actual")``
     """
@@ -58,10 +58,10 @@ class Scenario:
     """Time between two rows of an episode [s]; the assessment's ``preview_stride`` rows are the
     paper's step, the unit of H."""
     time_step_s: Positive = 0.0025  # Step of the discrete plant.
-    control_period_s: Positive = 0.01  # Of the controller and of the safety monitor.
+    control_period_s: Positive = 0.01  # Period of controller and safety monitor.
     on_alarm: OnAlarm = "unknown"
-    """What an alarm of the monitor does: ``unknown`` makes every belief "don't know", so that
-    plans are refused; ``report`` only reports it. Recovery heeds no alarm."""
+    """Effect of the monitor's alarm: ``unknown`` makes every belief "don't know", so that plans are
+    refused; ``report`` only reports it. Recovery ignores alarms."""
     without_features: list[str] = field(default_factory=list)
     """Patterns such as ``foot_height_*`` of a legged robot's features that Γ does not read."""
     variations: dict[str, PlantVariation] = field(default_factory=dict)
@@ -160,7 +160,7 @@ class Scenario:
         Args:
             variation: The plant, a key of ``variations``, or ``family``.
             assessment: Γ that is added; without it the diagram has no ports of Γ.
-            **options: Of the task, such as ``recovery=False``.
+            **options: Options of the task, such as ``recovery=False``.
         """
         task: Any = self.task_class()  # Its constructor has options of its own.
         known = inspect.signature(task).parameters
@@ -204,9 +204,9 @@ class Scenario:
     def simulation_hash(self, variation: str = "nominal", *, name: str = "") -> str:
         """SHA-256 of all parameters that determine a rollout, and of the robot's files.
 
-        It covers defaults and, as the controllers' model, the nominal plant; not source code, the
-        assessment's parameters but the preview's, the task's online ones and other variations, and
-        the family only as its own variation. A ``name`` replaces that of the file.
+        It covers defaults and, as the controllers' model, the nominal plant. It omits source code,
+        the task's online parameters, other variations, and the assessment's parameters except the
+        preview's. The family counts only as its own variation. ``name`` replaces the file's name.
         """
         if variation != "nominal":
             self.variation(variation)

@@ -53,11 +53,11 @@ def check_scenario(
     check_robot: Callable[[RobotKinematics], Iterator[Finding]] | None = None,
     progress: StageProgress = ignore,
 ) -> Iterator[Finding]:
-    """Checks a scenario item by item, the cheap ones first; no error in its files is raised.
+    """Checks a scenario item by item, cheap items first; errors in its files become findings.
 
     Args:
-        num_episodes: Episodes by which the share of unsafe ones is estimated; with none the margins
-            of a policy are left out too.
+        num_episodes: Episodes that estimate the share of unsafe episodes; 0 skips also the margins
+            of a policy.
         is_imported: Whether the task is imported, which runs its code; else files are checked.
         check_robot: Further checks of the robot.
     """
@@ -137,7 +137,7 @@ def _robot(scenario: Scenario) -> Generator[Finding, None, RobotKinematics | Non
     yield passed("files", "found")
     text = robot_files(scenario.robot)[0].read_text(encoding="utf-8")
     if asked := [line.strip() for line in text.splitlines() if "# ASK the motor's" in line]:
-        message = f"those of {len(asked)} joints are estimates, such as {asked[0]}"
+        message = f"the limits of {len(asked)} joints are estimates, such as {asked[0]}"
         yield passed("effort limits", message, f"{_EFFORT_REMEDY}, and delete the remark")
     kinematics = RobotKinematics(robot)
     parts = f"{len(kinematics.foot_names)} feet, {kinematics.num_joints} joints"

@@ -32,15 +32,15 @@ class AssessorInputs(LeafSystem):
           controller_memory: n_m (with ``memory``)]
         output_ports: [state: n_s, features: n_f, margins: n_c]
 
-    The features are those of the safe set. Where they are asked for, three others follow: gravity
-    in the plane of the feet, which shows the slope of the ground; with ``servo_loads``, commanded
-    minus measured joint positions, (n_j,) [rad]; and the controller's memory.
+    Features of the safe set come first. On request three others follow: gravity in the plane of
+    the feet, which shows the slope of the ground; with ``servo_loads``, commanded minus measured
+    joint positions, (n_j,) [rad]; and the controller's memory.
 
     Args:
         num_outlook: M, samples of the outlook.
-        gravity: In the world of ``plant_state``, (3,) [m/s²].
+        gravity: Gravity in the world of ``plant_state``, (3,) [m/s²].
         memory: Names of the entries of ``controller_memory``.
-        mirror: If given, state and gravity are those of the robot's mirror image.
+        mirror: If given, state and gravity are mirrored.
         without: Patterns such as ``foot_height_*`` of features that are left out.
         is_walking: See :class:`~drake_safety.systems.state_observer.StateObserver`.
     """

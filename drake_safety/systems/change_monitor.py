@@ -30,8 +30,8 @@ class ChangeMonitor(LeafSystem):
     five seconds. Inputs that are not finite, and the two after each, cannot be judged.
     ``judged_share`` is the share of the others over two seconds; below a half every level is above
     1. The charts wait while a known disturbance acts, by ``hold`` or :meth:`expect_disturbance`,
-    and `SETTLING_S` longer. ``watched_inputs`` are the last ones, named `input_names`, NaN while
-    the charts wait. The detector is a parameter of the Context.
+    and `SETTLING_S` longer. ``watched_inputs`` are the newest inputs, named `input_names`, NaN
+    while the charts wait. The detector is a parameter of the Context.
 
     Example: ``monitor = builder.AddSystem(ChangeMonitor(assessment))``
     """

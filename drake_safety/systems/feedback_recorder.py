@@ -52,12 +52,15 @@ class FeedbackRecorder(LeafSystem):
           controller_memory: n (with ``controller_memory_size``), recovery_active: 1 (optional)]
         output_ports: [num_finished: 1]
 
-    A row is recorded every ``info.step_s``. A window ends safe after ``num_steps`` steps, and the
-    next one begins with its last row. It ends unsafe as soon as ``safe``, sampled every
-    ``watch_period_s`` [s], is below one, and the next one begins when it is one again. The open
-    window is dropped when time jumps, and while ``recovery_active`` is not zero, since its twin has
-    no recovery. The newest 400 finished windows are state of the Context. ``true_state`` defaults
-    to ``state``. ``plant_state`` and ``controller_memory`` are where a window's twin begins.
+    A window ends safe after ``num_steps`` steps, and the next begins with its last row. It ends
+    unsafe as soon as ``safe`` is below one, and the next begins when ``safe`` is one again. The
+    open window is dropped when time jumps, and during recovery, which its twin lacks. The newest
+    400 windows are state of the Context. ``true_state`` defaults to ``state``. A window's twin
+    begins at ``plant_state`` and ``controller_memory``.
+
+    Args:
+        info: Names of the ports' entries, and the time between two rows, ``step_s``.
+        watch_period_s: Sampling period of ``safe`` [s].
     """
 
     def __init__(

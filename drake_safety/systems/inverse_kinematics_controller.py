@@ -11,7 +11,7 @@ from drake_safety.control.inverse_kinematics import solve_from
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, RobotKinematics, fit_stance
 from drake_safety.systems.periodic_update import declare_update
 
-_RATE_SHARE = 0.7  # Of a joint's speed limit; the rest is left for the servo's overshoot.
+_RATE_SHARE = 0.7  # Share of a joint's speed limit; the rest is for the servo's overshoot.
 _LIFTED_M = 0.005  # Height of a foot's set point above which the foot carries no weight.
 
 
@@ -25,14 +25,16 @@ class InverseKinematicsController(LeafSystem):
           desired_foot_positions: 3 n_p (optional), desired_yaw: 1 (optional)]
         output_ports: [desired_joint_state: 2 n_j]
 
-    The command is a discrete state, for the plant's implicit joint servos; its rates are those of
-    the set points. The set points have the static offset τ/k_p, with τ from the weight distributed
-    over the feet on the ground, which removes the sag of a servo of finite stiffness. They respect
-    the joint limits, and move at most at 0.7 of the joints' speed limits.
+    The command, set points and their rates, is a discrete state for the plant's implicit joint
+    servos. A static offset τ/k_p removes the sag of the servos; τ is from the weight, distributed
+    over the feet on the ground. Set points respect the joint limits and 0.7 of the speed limits.
 
-    Without ``desired_foot_positions`` the feet are those of the first state of a simulation, put on
-    level ground. Without ``desired_yaw`` the base's yaw is that of the planar fit of the feet.
-    ``offset_s`` [s] is after the updates of the inputs.
+    Without ``desired_foot_positions`` the feet stay as in a simulation's first state, put on level
+    ground. Without ``desired_yaw`` the planar fit of the feet gives the base's yaw.
+
+    Args:
+        stiffness: k_p of the servos, (n_j,) [N·m/rad]; by default the robot's.
+        offset_s: Time of the first update, after the inputs' updates [s].
     """
 
     def __init__(
@@ -58,13 +60,13 @@ class InverseKinematicsController(LeafSystem):
         self._feet_port = self.DeclareVectorInputPort("desired_foot_positions", n_p)
         self._yaw_port = self.DeclareVectorInputPort("desired_yaw", 1)
         self._feet = self.DeclareDiscreteState(np.full(n_p, np.nan))
-        self._set_point = self.DeclareDiscreteState(n_j)  # Of the joints, without the offset.
+        self._set_point = self.DeclareDiscreteState(n_j)  # Joint positions without the offset.
         self._command = self.DeclareDiscreteState(2 * n_j)  # Positions with it, and rates.
         declare_update(self, self._update, self._initialize, period_s, offset_s)
         self.DeclareStateOutputPort("desired_joint_state", self._command)
 
     def set_foot_positions(self, context: Context, p_WC: np.ndarray) -> None:
-        """Sets the feet, (n_c, 3) [m], in place of those of the first state."""
+        """Sets the feet, (n_c, 3) [m], in place of the first state's feet."""
         context.SetDiscreteState(self._feet, np.ravel(p_WC))
 
     def foot_positions(self, context: Context) -> np.ndarray:

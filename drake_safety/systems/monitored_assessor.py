@@ -104,11 +104,11 @@ def AddSafetyAssessor(
 ) -> MonitoredSafetyAssessor:
     """Adds a :class:`MonitoredSafetyAssessor` named ``safety_assessor``, and connects it.
 
-    Plants with sampled output ports, and a monitor that never alarms, are warned of.
+    It warns of plants with sampled output ports, and of a monitor that never alarms.
 
     Args:
         state, desired_preview, features: Γ's inputs, (n_s,), (H n_z,) and (n_f,).
-        margins: Of the measured state, (n_c,) [m, rad]; None: a state outside is not detected.
+        margins: Margins of the measured state, (n_c,) [m, rad]; None: it may lie outside unnoticed.
         hold: 1 while a known disturbance acts, for which the monitor waits.
         period_s, on_alarm: As of `MonitoredSafetyAssessor`.
 

@@ -17,10 +17,9 @@ class MotorCurves(LeafSystem):
         input_ports: [desired_joint_state: 2 n_j, joint_state: 2 n_j]
         output_ports: [desired_joint_state: 2 n_j]
 
-    A motor's largest torque in the direction of its motion is its effort limit at rest and falls
-    linearly to zero at the joint's largest speed; against it it is the effort limit (``DCMotor`` of
-    Isaac Lab, whose saturation effort is the effort limit here). While the servo's torque is below
-    it, the desired state is unchanged.
+    A motor's largest torque along its motion falls linearly from the effort limit at rest to zero
+    at the joint's largest speed. Against its motion it is the effort limit (``DCMotor`` of Isaac
+    Lab with that saturation effort). Below it the desired state is unchanged.
     """
 
     def __init__(self, plant: MultibodyPlant, instance: ModelInstanceIndex, names: list[str]):

@@ -24,10 +24,10 @@ class PolicyController(LeafSystem):
           memory: n]
 
     ``command`` is (v_x, v_y, ω_z) in the base's heading frame [m/s, rad/s]. ``memory`` has all that
-    a clone needs. ``action_state`` is the last action (n_a,), its largest change in the last period
-    (1,), sine and cosine of the phases (2 n_p,), and the command that the policy followed (3,),
-    whose change it may limit. An action that is not finite is replaced by the last one; ``status``
-    is then ``HELD``, and ``num_failures`` counts it.
+    a clone needs. ``action_state`` has the last action (n_a,), its largest change in a period (1,),
+    sine and cosine of the phases (2 n_p,), and the applied command (3,); the policy may limit its
+    change. The last action replaces an action that is not finite; ``status`` is then ``HELD``,
+    and ``num_failures`` counts it.
     """
 
     def __init__(self, kinematics: RobotKinematics, policy: Policy, *, offset_s: float = 0.0):

@@ -25,8 +25,8 @@ class PushSource(LeafSystem):
         name: PushSource
         output_ports: [applied_spatial_force: abstract]
 
-    A push begins and ends with the plant's first step after the first multiple of ``period_s`` that
-    is not before its time.
+    A push begins and ends with the plant's first step after a multiple of ``period_s`` [s], the
+    first that is not before its time.
     """
 
     def __init__(self, plant: MultibodyPlant, instance: ModelInstanceIndex, *, period_s: float):

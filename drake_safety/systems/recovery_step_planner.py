@@ -37,16 +37,20 @@ class RecoveryStepPlanner(LeafSystem):
         output_ports: [desired_output: n_z, desired_foot_positions: 3 n_p, desired_yaw: 1,
           desired_preview: H n_z, desired_outlook: M n_z, stance_pose: 3, recovery_done: 1]
 
-    While idle, the feet keep the positions of the first state that the planner sees, put on level
-    ground, or those of :meth:`set_stance`. When ``recovery_active`` rises, groups of feet swing by
-    turns to Raibert footholds. The base set point follows the measured base at the standing height,
-    so that the stance legs do not pull it back, and the legs twist it towards the first heading.
+    While idle, the feet stay as in the planner's first state, put on level ground, or where
+    :meth:`set_stance` puts them. When ``recovery_active`` rises, groups of feet swing by turns to
+    Raibert footholds. The base set point follows the measured base at the standing height:
+    otherwise the stance legs would pull it back. The legs twist it towards the first heading.
 
     Groups alternate until the capture point is well inside the support polygon and the heading
     error is small. The base then comes to rest like an inverted pendulum over its capture point,
     and moves to the nominal set point in the new stance frame. If the capture point comes near the
     polygon's edge meanwhile, the robot steps again. After that ``recovery_done`` is 1 until
     ``recovery_active`` has fallen. Preview and outlook repeat the set point, in the stance frame.
+
+    Args:
+        offset_s: Time of the first update, after the trigger's [s].
+        horizon, num_outlook: H and M, samples of preview and outlook.
     """
 
     def __init__(
@@ -70,9 +74,9 @@ class RecoveryStepPlanner(LeafSystem):
         unset = np.full(3 * kinematics.num_contacts, np.nan)
         initial = {
             "mode": np.zeros(1),
-            "group": np.zeros(1),  # That swings.
+            "group": np.zeros(1),  # The swinging group.
             "num_steps": np.zeros(1),
-            "start_s": np.zeros(1),  # Of the swing, or of the return.
+            "start_s": np.zeros(1),  # Start of the swing, or of the return.
             "heading": np.zeros(1),  # Desired.
             "return_start": np.zeros(6),  # Position and velocity of the base.
             "planted": unset,  # Last contact positions.

@@ -28,9 +28,9 @@ class RecoverySwitch(Diagram):
 
     Args:
         threshold: Probability below which, for ``persistence_s`` [s], recovery starts.
-        initial_uncertainty: Of the assessment, to recognise "don't know".
-        period_s, offset_s: Of the trigger [s]; after the assessor, and the planner after it, as
-            updates of one time would see the state before all of them.
+        initial_uncertainty: The assessment's μ_ini, which marks "don't know".
+        period_s, offset_s: Timing of the trigger [s], after the assessor and before the planner:
+            updates at one time do not see each other.
         horizon, num_outlook: H and M, samples of preview and outlook.
 
     Example: ``switch = RecoverySwitch(legged_loop.kinematics, steps, threshold=0.2, **timing)``

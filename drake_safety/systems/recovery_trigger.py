@@ -21,11 +21,13 @@ class RecoveryTrigger(LeafSystem):
         input_ports: [safety_probability: 1, belief: 3 (optional), recovery_done: 1 (optional)]
         output_ports: [port_selector: abstract, recovery_active: 1]
 
-    The trigger latches: once active it stays active until ``recovery_done`` is 1. A probability
-    that is not finite activates it. Where ``belief`` is "don't know" by the assessment's μ_ini,
-    ``initial_uncertainty``, as for an instant after an impact, the probability must have been below
-    Γ_thre for ``persistence_s``. ``port_selector`` drives a PortSwitch whose ports were declared
-    ``nominal`` first, ``recovery`` second.
+    Once active it stays active until ``recovery_done`` is 1. A probability that is not finite
+    activates it. ``port_selector`` drives a PortSwitch with the ports ``nominal``, ``recovery``.
+
+    Args:
+        threshold: Γ_thre.
+        persistence_s: Time below Γ_thre [s] that activates it during a "don't know".
+        initial_uncertainty: The assessment's μ_ini, which marks "don't know".
     """
 
     def __init__(

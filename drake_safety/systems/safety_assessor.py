@@ -29,9 +29,9 @@ class SafetyAssessor(LeafSystem):
           predicted_margins: n_c, novelty: 1, probability_without_alarm: 1, belief_without_alarm: 3,
           fall_probability: 1, learned: abstract]
 
-    - ``belief``, whose first entry is the paper's Γ, is (0, 0, 1) for inputs that are novel or not
-      finite, before the first evaluation, and during an alarm.
-    - ``safety_probability`` is that of the maps' heads with the correction from feedback, or the
+    - ``belief`` has the paper's Γ first. It is (0, 0, 1) for inputs that are novel or not finite,
+      before the first evaluation, and during an alarm.
+    - ``safety_probability`` is from the maps' heads with the correction from feedback, or the
       belief's first entry in the paper's mode.
     - ``fall_probability`` is 1 for inputs that are not finite, and NaN if no falls were learned.
     - ``learned``, the only output with direct feedthrough, is for a `CommandGuard`.

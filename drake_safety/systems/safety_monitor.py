@@ -26,7 +26,7 @@ class SafeSet(Protocol):
 
 
 def finite_margins(safe_set: SafeSet, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Margins (n_c,) of a state; minus infinity for one that is not finite."""
+    """Margins (n_c,) of a state; minus infinity if it is not finite."""
     if q.dot(q) + v.dot(v) < math.inf:
         return floats(safe_set.margins(q, v))
     return np.full(len(safe_set.names), -np.inf)

@@ -28,8 +28,8 @@ class SensorFaults(LeafSystem):
     ``rest``, by default to zero.
 
     Args:
-        names: Of the n entries, which `Fault.entries` match.
-        period_s, offset_s: Between the samples of delays and ``freeze``, and before the first [s].
+        names: Names of the n entries, which `Fault.entries` match.
+        period_s, offset_s: Time between samples of delays and ``freeze``, and of the first [s].
 
     Example: ``sensor = SensorFaults(loop.state_names, [Fault(kind="freeze")], period_s=0.01)``
     """
@@ -49,7 +49,7 @@ class SensorFaults(LeafSystem):
         if any(fault.kind == "fade" for fault in faults):
             self._rest = self.DeclareVectorInputPort("rest", len(names))
         self._faults = [(fault, _indices(fault, list(names))) for fault in faults]
-        # Of each fault the samples that it holds, the latest first; NaN before the first one.
+        # Samples held by each fault, the latest first; NaN before the first sample.
         self._shapes = [(self._num_held(fault), len(entries)) for fault, entries in self._faults]
         for shape in self._shapes:
             self.DeclareDiscreteState(np.full(shape, np.nan).ravel())

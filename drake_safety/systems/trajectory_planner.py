@@ -65,9 +65,13 @@ class TrajectoryPlanner(LeafSystem):
 
     The plan is a trajectory of 3-D positions in the stance frame S, and a parameter of the Context
     (:meth:`set_plan`). Before its start and after its end it is constant. ``desired_output`` and
-    its rate are in the world; ``desired_preview``, H samples ``step_s`` apart, and
-    ``desired_outlook``, M samples from now to ``outlook_s`` ahead, are in S, row-major in time. The
-    stance pose [x, y, yaw] is the input if it is connected, else a parameter.
+    its rate are in the world, preview and outlook in S, row-major in time. The stance pose
+    [x, y, yaw] is the input if it is connected, else a parameter.
+
+    Args:
+        horizon, step_s: H, and the time between two samples of the preview [s].
+        outlook_s, num_outlook: Time until the last sample of the outlook [s], and M.
+        plan: The default, (n_z, 1) [m].
     """
 
     def __init__(

@@ -28,8 +28,8 @@ class WholeBodyController(LeafSystem):
           desired_output_rate: n_z]
         output_ports: [actuation: n_j, solver_status: 1, num_failures: 1]
 
-    ``desired_output`` is the set point of the hand in the world [m]; the other references are those
-    of :meth:`set_reference`. ``solver_status`` is 0 if the last program was solved, negative if it
+    ``desired_output`` is the set point of the hand in the world [m]; :meth:`set_reference` sets the
+    other references. ``solver_status`` is 0 if the last program was solved, negative if it
     was not (daqp's exit flag), and ``NOT_FINITE`` if its inputs were not finite. The last command
     is then held, initially zero torque. ``num_failures`` counts these updates.
 
@@ -37,7 +37,7 @@ class WholeBodyController(LeafSystem):
         hand: Name of the reaching frame that follows ``desired_output``.
         actuation_matrix: See :func:`~drake_safety.robots.robot.actuation_matrix`, (n_u, n_j); the
             identity by default.
-        offset_s: Time of the first update, after those of its inputs [s].
+        offset_s: Time of the first update, after the inputs' updates [s].
     """
 
     def __init__(
