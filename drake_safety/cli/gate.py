@@ -61,7 +61,8 @@ def gate(
         list[str] | None,
         Option(
             metavar="KEY=VALUE",
-            help="What a candidate changes: policy=FILE, variation=NAME, or a scenario's key.",
+            help="What a candidate changes: policy=FILE, variation=NAME, or a scenario's key; "
+            "repeatable.",
         ),
     ] = None,
     baseline: Annotated[str, Option(metavar="KEY=VALUE", help="The same for all loops.")] = "",

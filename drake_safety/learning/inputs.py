@@ -14,7 +14,7 @@ def preview_names(info: EpisodesInfo) -> list[str]:
 
 
 class InputColumns:
-    """The columns of x: [s; z*] in the paper's mode, [s; z*; features] when sharpened.
+    """The columns of x: ``[s; z*]`` in the paper's mode, ``[s; z*; features]`` when sharpened.
 
     A feature unit u appends asinh(features / u). `plan` are the columns of z*.
     """
