@@ -47,8 +47,12 @@ class PlainMarkdown(griffe.Extension):
                 call.function = griffe.ExprName("dataclass", parent=_DATACLASSES)
 
     def on_attribute_instance(self, *, attr: griffe.Attribute, **kwargs: Any) -> None:
-        """Shows the list that a ``default_factory`` returns as the default."""
+        """Shows a type without its limits, and the list that a ``default_factory`` returns."""
         del kwargs
+        note = attr.annotation
+        if isinstance(note, griffe.ExprSubscript) and str(note.left) == "Annotated":
+            assert isinstance(note.slice, griffe.ExprTuple)
+            attr.annotation = note.slice.elements[0]
         if isinstance(attr.value, griffe.ExprCall) and len(attr.value.arguments) == 1:
             (argument,) = attr.value.arguments
             factory = argument.value if isinstance(argument, griffe.ExprKeyword) else None

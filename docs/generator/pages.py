@@ -1,4 +1,4 @@
-"""A hook of MkDocs: a page for every system and every module, from the source; links to the source.
+"""A hook of MkDocs: a page for every system and every module, from the source; links; line breaks.
 
 Nothing is imported from the package: the pages are built where Drake is not installed, too.
 """
@@ -32,6 +32,12 @@ ROOMS = (
     "live",
 )
 _OUTWARD = re.compile(r"\[([^\]]*)\]\(\.\./([^)]+)\)")
+_PICTURE = re.compile(r"^!\[[^\]]*\]\((pictures/[^)]+)\)(?:\{[^}]*\})?", re.MULTILINE)
+_INTERVAL = re.compile(r"(?<=\d)–(?=\d)| (?=%)")
+_NAMES = re.compile(
+    r'(?<=class="doc doc-heading">).*?(?=</h\d>)|(?<=<code>)[\w./-]+(?=</code>)', re.DOTALL
+)
+_UP = "[Reference](../index.md) › {}"
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -41,8 +47,10 @@ def on_files(files: Files, config: Any) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Any, **kwargs: Any) -> str:
-    """Links that lead out of ``docs/`` into the checkout become the file's name.
+def on_page_markdown(markdown: str, page: Any, files: Files, **kwargs: Any) -> str:
+    """A link out of ``docs/`` leads to a module's or tutorial's page, or becomes the file's name.
+
+    A picture leads to its file. Intervals and percentages are not broken.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -50,14 +58,29 @@ def on_page_markdown(markdown: str, page: Any, **kwargs: Any) -> str:
     del kwargs
     if page.file.generated_by is not None:
         return markdown
+    markdown = _PICTURE.sub(r"[\g<0>](\1)", markdown)
+    parts = markdown.split("```")  # Every second part is code.
+    parts[::2] = [_INTERVAL.sub(_unbroken, part) for part in parts[::2]]
+    markdown = "```".join(parts)
 
     def name(found: re.Match[str]) -> str:
         path = ROOT / found.group(2).split("#")[0]
         if not path.exists():
             raise FileNotFoundError(f"{page.file.src_uri}: a link leads to {path}, which is not")
-        return f"{found.group(1)} (`{found.group(2)}`)"
+        text, target = found.groups()
+        generated = re.sub(r"^drake_safety/(.+)\.py$", r"reference/\1.md", target)
+        generated = re.sub(r"ipynb$", "md", generated)
+        if generated in files.src_uris:
+            return f"[{text}]({generated})"
+        return text if text.strip("`") == target else f"{text} (`{target}`)"
 
     return _OUTWARD.sub(name, markdown)
+
+
+def on_page_content(html: str, **kwargs: Any) -> str:
+    """Names may be broken at a point, a slash or an underscore."""
+    del kwargs
+    return _NAMES.sub(lambda one: re.sub(r"(?<=\w)([._/])(?=\w)", r"\1<wbr>", one[0]), html)
 
 
 def reference_pages() -> dict[str, str]:
@@ -71,7 +94,7 @@ def reference_pages() -> dict[str, str]:
                 continue
             module = f"drake_safety.systems.{path.stem}"
             pages[f"reference/systems/{path.stem}.md"] = "\n\n".join(
-                [f"# {block.name}", block.svg, block.table, f"::: {module}"]
+                [_UP.format("systems"), f"# {block.name}", block.svg, block.table, f"::: {module}"]
             )
             summary = to_markdown((ast.get_docstring(node) or "").splitlines()[0])
             systems.append(f"| [{block.name}](systems/{path.stem}.md) | {summary} |")
@@ -81,9 +104,9 @@ def reference_pages() -> dict[str, str]:
         "",
         "[Public names](public.md) has what most users need, with examples.",
     ]
-    lines += ["", "## Systems", "", "| system | |", "|---|---|", *sorted(systems)]
+    lines += ["", "## Systems", "", "| system | purpose |", "|---|---|", *sorted(systems)]
     for room in ROOMS:
-        lines += ["", f"## {room}", "", "| module | |", "|---|---|"]
+        lines += ["", f"## {room}", "", "| module | purpose |", "|---|---|"]
         for path in _modules(room):
             module = f"drake_safety.{room}.{path.stem}"
             page = f"reference/{room}/{path.stem}.md"
@@ -92,11 +115,17 @@ def reference_pages() -> dict[str, str]:
             )
             blocks = [block for block in map(parse_block, docstrings) if block]
             ports = [f"Ports of {block.name}:\n\n{block.table}" for block in blocks]
-            pages[page] = "\n\n".join([f"# {path.stem}", *ports, f"::: {module}\n"])
+            pages[page] = "\n\n".join(
+                [_UP.format(room), f"# {path.stem}", *ports, f"::: {module}\n"]
+            )
             summary = (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or "").splitlines()[0]
             lines.append(f"| [{path.stem}]({room}/{path.stem}.md) | {to_markdown(summary)} |")
     pages["reference/index.md"] = "\n".join(lines) + "\n"
     return pages
+
+
+def _unbroken(found: re.Match[str]) -> str:
+    return "\N{NO-BREAK SPACE}" if found[0] == " " else "–\N{WORD JOINER}"
 
 
 def _modules(room: str) -> list[Path]:

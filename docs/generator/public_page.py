@@ -39,7 +39,7 @@ The examples begin with:
 ```python
 {preamble}```
 
-| | |
+| name | purpose |
 |---|---|
 {table}
 """

@@ -31,7 +31,7 @@ COMMANDS = {
     "scenarios": ("prepare", "", "List the scenarios that come with the package."),
     "new": ("prepare", "", "Write a robot's folder and a first scenario from a URDF or an MJCF."),
     "check": ("prepare", "", "Check a scenario and its robot, and print problems with remedies."),
-    "train": ("train", "train", "Simulate the nominal closed loop and train Γ."),
+    "train": ("train", "train", "Simulate the nominal and random plants, and train Γ."),
     "calibrate": ("calibrate", "train", "Choose thresholds with a promised miss rate."),
     "ask": ("ask", "", "Print the verdict on a target, or on a command of a walking robot."),
     "run": ("run", "", "Simulate once with Γ in the loop; write a recording and a timeline."),

@@ -38,7 +38,8 @@ def adapt(
     feedback: Annotated[int, Option(help="Actual episodes, with nominal twins.", min=1)] = 160,
     variation: Annotated[str, Option(help="Variation of the actual plant.")] = "actual",
     log: Annotated[
-        list[Path] | None, Option(help="Logs of a robot, in place of a variation.", exists=True)
+        list[Path] | None,
+        Option(help="Log of a robot, in place of a variation; repeatable.", exists=True),
     ] = None,
     log_map: console.MapOption = None,
     out: Annotated[

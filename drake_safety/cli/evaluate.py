@@ -99,7 +99,10 @@ def evaluate(
     hours: Annotated[
         float, Option(help="Hours of undisturbed motion for false alarms, with --shifts.", min=0.0)
     ] = 0.2,
-    seed: Annotated[int | None, Option(help="First seed; another with --shifts.")] = None,
+    seed: Annotated[
+        int | None,
+        Option(help=f"First seed; by default {EVALUATION.first}, with --shifts {SHIFTS.first}."),
+    ] = None,
     out: Annotated[Path | None, Option(help="Folder of results; by default ASSESSMENT.")] = None,
     workers: console.WorkersOption = None,
     cluster: console.ClusterOption = None,

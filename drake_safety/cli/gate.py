@@ -61,7 +61,8 @@ def gate(
         list[str] | None,
         Option(
             metavar="KEY=VALUE",
-            help="Change of a candidate: policy=FILE, variation=NAME, or a scenario's key.",
+            help="Change of a candidate: policy=FILE, variation=NAME, or a scenario's key; "
+            "repeatable.",
         ),
     ] = None,
     baseline: Annotated[str, Option(metavar="KEY=VALUE", help="The same for all loops.")] = "",

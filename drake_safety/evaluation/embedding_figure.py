@@ -52,7 +52,7 @@ def embedding_figure(assessment: SafetyAssessment, episodes: Episodes) -> Figure
 def show_beliefs(
     fig: Figure, panels: Sequence[Axes], grid: Grid, is_empty: np.ndarray, *, room: float
 ) -> None:
-    """Limits panels side by side to the cells that are not empty, (R*R,), and a cell around them.
+    """Limits panels side by side to the cells that are not empty, (R * R,), and a cell around them.
 
     The figure becomes as high as the panels, with room [inches] for all else.
     """
@@ -70,7 +70,7 @@ def show_beliefs(
 def draw_values(
     axes: Axes, grid: Grid, value: np.ndarray, is_empty: np.ndarray, most: float = 1.0
 ) -> None:
-    """Draws cells coloured by a value (R*R,); empty cells, (R*R,), are hatched."""
+    """Draws cells coloured by a value (R * R,); empty cells, (R * R,), are hatched."""
     colours = ScalarMappable(Normalize(0.0, most), _SAFETY).to_rgba(value)
     _draw_cells(axes, grid, colours, is_empty)
 
@@ -122,7 +122,7 @@ def _draw_grid(axes: Axes, grid: Grid) -> None:
 
 
 def _draw_cells(axes: Axes, grid: Grid, colours: np.ndarray, is_empty: np.ndarray) -> None:
-    """Draws squares of given colours, RGBA (R*R, 4); empty cells, (R*R,), are hatched."""
+    """Draws squares of given colours, RGBA (R * R, 4); empty cells, (R * R,), are hatched."""
     corners = grid.centres - 0.5 * grid.cell_length
     squares = np.array([Rectangle(xy, grid.cell_length, grid.cell_length) for xy in corners])
     hollow, filled = squares[is_empty], squares[~is_empty]

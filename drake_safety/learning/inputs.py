@@ -26,7 +26,7 @@ def kept_features(names: Sequence[str], without: Sequence[str]) -> list[int]:
 
 
 class InputColumns:
-    """The columns of x: [s; z*] in the paper's mode, [s; z*; features] when sharpened.
+    """The columns of x: ``[s; z*]`` in the paper's mode, ``[s; z*; features]`` when sharpened.
 
     A feature unit u appends asinh(features / u). `plan` are the columns of z*.
     """
