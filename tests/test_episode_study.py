@@ -1,10 +1,14 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from drake_safety.evaluation.episode_study import (
     PROMISED_UNSAFE_RECALL,
+    evaluate_causes,
     evaluate_episodes,
     evaluate_plans,
+    first_segments,
     promised_miss_rate,
 )
 from drake_safety.evaluation.metrics import auc
@@ -64,6 +68,24 @@ def test_plans_are_judged_once_by_a_stored_threshold_or_one_of_the_calibration_s
     shares = [one.value for key, one in found.items() if key[1] == "outcomes"]
     assert sum(shares) == pytest.approx(1.0)
     assert found["plans", "outcomes", "safe"].value == fresh.num_safe / len(fresh)
+
+
+def test_the_likely_cause_of_refused_plans_is_compared_with_the_violated_constraint(fresh):
+    first, names = first_segments(fresh), fresh.info.constraint_names
+    margins = np.ones((len(first), len(names)))
+    for row, episode in zip(margins, fresh, strict=True):
+        row[names.index(episode.cause) if episode.cause else 0] = -0.01
+    unsafe = np.flatnonzero(first.is_unsafe)
+    wrong, accepted = unsafe[0], unsafe[1]
+    margins[wrong] = np.roll(margins[wrong], 1)
+    probability = np.where(np.arange(len(first)) == accepted, 0.9, 0.2)
+    predicted = SimpleNamespace(
+        probability=probability, predicted_margins=margins, cause_probability=np.zeros_like(margins)
+    )
+    found = evaluate_causes(predicted, fresh, margin_unit=0.02, threshold=0.6)
+    refused = fresh.num_unsafe - 1
+    right = found["plans", "causes", "right_cause"]
+    assert (right.value, right.n) == ((refused - 1) / refused, refused)
 
 
 def test_a_promise_needs_unsafe_plans_and_is_what_their_number_allows():

@@ -25,7 +25,12 @@ from drake_safety.diagrams.balancing.throw_study import (
 from drake_safety.diagrams.balancing.throws import HasBall
 from drake_safety.evaluation import shift_study
 from drake_safety.evaluation.embedding_figure import embedding_figure
-from drake_safety.evaluation.episode_study import evaluate_episodes, evaluate_plans
+from drake_safety.evaluation.episode_study import (
+    evaluate_causes,
+    evaluate_episodes,
+    evaluate_plans,
+    first_segments,
+)
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.reliability import reliability, reliability_figure, verdict_shares
@@ -183,6 +188,10 @@ def add_verdicts(
         stored = {m: g.calibrations_.get(PLAN) for m, g in evaluation.assessments.items()}
         thresholds = {mode: 1.0 - one.threshold for mode, one in stored.items() if one}
         estimates = evaluate_plans(scorers, calibration, test, thresholds)
+        if (gamma := evaluation.assessments.get(MODES[0])) and (plan := stored[MODES[0]]):
+            predicted = gamma.predict_rows(first_segments(test))
+            limits = {"margin_unit": gamma.parameters.margin_unit, "threshold": plan.threshold}
+            estimates |= evaluate_causes(predicted, test, **limits)
     else:
         estimates = evaluate_episodes(scorers, calibration, test)
     maps = {f"embedding_{m}": embedding_figure(g, test) for m, g in evaluation.assessments.items()}

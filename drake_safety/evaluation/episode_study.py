@@ -9,7 +9,9 @@ import numpy as np
 from drake_safety.evaluation.metrics import Estimate, proportion, segment_estimates, threshold_at
 from drake_safety.evaluation.results import Key
 from drake_safety.evaluation.scorers import Scorer
+from drake_safety.learning.assessment import Prediction
 from drake_safety.learning.calibration import episodes_needed, score_threshold
+from drake_safety.learning.causes import likely_cause
 from drake_safety.learning.seeds import check_unused
 from drake_safety.learning.segments import DIVERGED, Episodes, Segments, split
 
@@ -55,7 +57,7 @@ def evaluate_plans(
     most while a future unsafe plan is refused with probability `PROMISED_UNSAFE_RECALL`, or what
     the number of unsafe calibration plans allows. Estimates give thresholds as Γ_thre.
     """
-    first, others = _first_segments(test), _first_segments(calibration)
+    first, others = first_segments(test), first_segments(calibration)
     miss_rate = promised_miss_rate(others.is_unsafe)
     promised = Estimate.exact(1.0 - miss_rate, int(others.is_unsafe.sum()))
     estimates = {("plans", "", "promised_unsafe_recall"): promised}
@@ -74,7 +76,26 @@ def evaluate_plans(
     return estimates
 
 
-def _first_segments(episodes: Episodes) -> Segments:
+def evaluate_causes(
+    predicted: Prediction, test: Episodes, *, margin_unit: float, threshold: float
+) -> dict[Key, Estimate]:
+    """Share of the correctly refused plans whose likely cause is the violated constraint.
+
+    Args:
+        predicted: Of the first row of each episode that has not diverged.
+    """
+    causes = [episode.cause for episode in test if episode.cause != DIVERGED]
+    parts = predicted.cause_probability, predicted.predicted_margins
+    every = test.info.constraint_names
+    names = [likely_cause(every, *one, margin_unit) for one in zip(*parts, strict=True)]
+    refused = [
+        i for i, cause in enumerate(causes) if cause and predicted.probability[i] < threshold
+    ]
+    right = sum(names[i] == causes[i] for i in refused)
+    return {("plans", "causes", "right_cause"): proportion(right, len(refused))}
+
+
+def first_segments(episodes: Episodes) -> Segments:
     """The first segment of each episode that has not diverged, even if it ends early."""
     segments = split(episodes, stride=episodes.info.horizon, discount=1.0, shortest=1)
     return segments.take(segments.is_first)
