@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import importlib
 import inspect
 import json
 import re
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -131,6 +133,31 @@ def test_hosted_pages_are_built_with_what_the_extra_docs_installs_alone():
     assert printed.stdout.split() == project["optional-dependencies"]["docs"]
 
 
+def test_links_out_of_docs_lead_to_generated_pages_and_figures_stay_in_one_piece():
+    pytest.importorskip("mkdocs", reason="extra 'docs' not installed")
+    pages = importlib.import_module("pages")
+    page = SimpleNamespace(file=SimpleNamespace(generated_by=None, src_uri="page.md"))
+    files = SimpleNamespace(src_uris={"reference/robots/robot.md", "tutorials/6_compose.md"})
+
+    def shown(text):
+        return pages.on_page_markdown(text, page, files)
+
+    assert shown("[`A`](../drake_safety/robots/robot.py)") == "[`A`](reference/robots/robot.md)"
+    assert shown("[6](../tutorials/6_compose.ipynb)") == "[6](tutorials/6_compose.md)"
+    assert shown("[`Makefile`](../Makefile) [us](../LICENSE)") == "`Makefile` us (`LICENSE`)"
+    assert shown("![p](pictures/path.png)") == "[![p](pictures/path.png)](pictures/path.png)"
+    # No-break space and word joiner; code stays as it is.
+    assert shown("90 % (80–95)\n```\n9 %\n```") == "90\u00a0% (80–\u206095)\n```\n9 %\n```"
+    with pytest.raises(
+        FileNotFoundError, match=r"page\.md: a link leads to .*/nowhere, which is not"
+    ):
+        shown("[a](../nowhere)")
+    cell = pages.on_page_content("<td><code>safety_probability</code></td>")
+    assert cell == "<td><code>safety_<wbr>probability</code></td>"
+    short = "<p><code>policy.yaml</code> <code>run_episodes</code></p>"
+    assert pages.on_page_content(short) == short
+
+
 @pytest.mark.slow
 def test_the_reference_builds_without_a_warning(tmp_path):
     commands = pytest.importorskip("mkdocs.commands.build", reason="extra 'docs' not installed")
@@ -149,7 +176,7 @@ def test_the_reference_builds_without_a_warning(tmp_path):
         assert f"drake_safety.{name}" in shown
     assert shown.count("Examples:") == len(public_page.public_homes())
     assert "initial_uncertainty: Share = 0.3" in shown and "dropout: ShareBelowOne" in shown
-    assert "hidden_sizes: Widths = [128, 128]" in shown
+    assert "hidden_sizes: Widths = [128, 128]" in shown and "horizon: int = 10" in shown
     for page in tmp_path.rglob("*.html"):
         shown = re.sub(r"<[^>]+>", "", page.read_text(encoding="utf-8"))
         assert not re.search(r":(class|meth|func|attr|mod):|={6}|\.\. \w+::", shown), page

@@ -35,8 +35,11 @@ _OUTWARD = re.compile(r"\[([^\]]*)\]\(\.\./([^)]+)\)")
 _PICTURE = re.compile(r"^!\[[^\]]*\]\((pictures/[^)]+)\)(?:\{[^}]*\})?", re.MULTILINE)
 _INTERVAL = re.compile(r"(?<=\d)–(?=\d)| (?=%)")
 _NAMES = re.compile(
-    r'(?<=class="doc doc-heading">).*?(?=</h\d>)|(?<=<code>)[\w./-]+(?=</code>)', re.DOTALL
+    r'(?<=class="doc doc-heading">).*?(?=</h\d>)|'
+    r"(?:(?<=<td><code>)[\w./-]{12,}|(?<=<code>)[\w./-]{24,})(?=</code>)",
+    re.DOTALL,
 )
+_BREAK = re.compile(r"(?<=\w)(?:\.(?=\w{6})|[_/](?=\w))")  # Not before a file's suffix.
 _UP = "[Reference](../index.md) › {}"
 
 
@@ -78,9 +81,9 @@ def on_page_markdown(markdown: str, page: Any, files: Files, **kwargs: Any) -> s
 
 
 def on_page_content(html: str, **kwargs: Any) -> str:
-    """Names may be broken at a point, a slash or an underscore."""
+    """Long names may be broken at a point, a slash or an underscore."""
     del kwargs
-    return _NAMES.sub(lambda one: re.sub(r"(?<=\w)([._/])(?=\w)", r"\1<wbr>", one[0]), html)
+    return _NAMES.sub(lambda one: _BREAK.sub(r"\g<0><wbr>", one[0]), html)
 
 
 def reference_pages() -> dict[str, str]:
