@@ -150,14 +150,6 @@ def _pushes(name: str, folder: Path) -> Figure:
     return push_figure(cards_of(name, Results.read(_ROOT / f"docs/results/{name}.json")))
 
 
-def _adaptation_study(folder: Path) -> Figure:
-    results = Results.read(_ROOT / "docs/results/adaptation/laikago-payload-pools.json")
-    kinds = "sharpened.calibrated", "paper.grid"
-    metrics = "brier", "auc", "unsafe_recall"
-    rows = {k: one for k, one in results.items() if k[0] in kinds and k[2] in metrics}
-    return interval_figure(rows)
-
-
 PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
     "glance": glance,
     "blocks": blocks,
@@ -168,7 +160,6 @@ PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
     "walking_timeline": partial(_of_run, "timeline.png", "g1_walking", **_WALKING),
     "embedding": _embedding,
     "adaptation": _adaptation,
-    "adaptation_study": _adaptation_study,
     "shifts_laikago": partial(_shifts, "laikago"),
     "shifts_atlas": partial(_shifts, "atlas"),
     "shifts_go2_walking": partial(_shifts, "go2_walking"),

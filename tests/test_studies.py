@@ -142,8 +142,8 @@ def test_saved_episodes_are_of_the_error_about_the_share_of_random_episodes():
 
 def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypatch, tmp_path):
     monkeypatch.chdir(ROOT)
-    assert study(monkeypatch, "figures", "adaptation_study", "--out", tmp_path) == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["adaptation_study.png"]
+    assert study(monkeypatch, "figures", "pushes_go2", "--out", tmp_path) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["pushes_go2.png"]
     assert study(monkeypatch, "figures", "nothing", "--out", tmp_path) == 2
     there = {path.stem for path in (ROOT / "docs/pictures").iterdir()}
     assert there == {*PICTURES, "compose", "alarms_go2_walking"}
