@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -36,6 +36,7 @@ def features(
     ],
     assessment: AssessmentOption = None,
     episodes: Annotated[int, typer.Option(help="Fresh nominal episodes.", min=1)] = 600,
+    seed: Annotated[int, typer.Option(help="First of the seeds.")] = EVALUATION.first,
     release: ReleaseOption = False,
     workers: WorkersOption = None,
 ) -> None:
@@ -44,7 +45,8 @@ def features(
     features.json is written to the run's folder.
     """
     folder = assessment_folder(load_scenario(scenario), assessment).path
-    with open_study("features", scenario, folder, release=release, workers=workers) as study:
+    options: dict[str, Any] = {"seed": seed, "release": release, "workers": workers}
+    with open_study("features", scenario, folder, **options) as study:
         seed = EVALUATION.seeds(study.seed)["evaluation"]
         gamma, report = study.load("sharpened", [seed]), partial(study.stages, "fresh episodes")
         fresh = run_fresh_episodes(study.scenario, folder, episodes, seed, report, workers)

@@ -36,7 +36,7 @@ def test_full_disk_leaves_the_earlier_files(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "no space left")
 
     monkeypatch.setattr(Path, "write_bytes", full_disk)
-    said = r"cannot be written: No space left on device; what had"
+    said = r"cannot be written: No space left on device; its earlier content"
     with pytest.raises(OSError, match=said):
         save(new_figure(1.0, 1.0), files[0])
     with pytest.raises(OSError, match=said):

@@ -88,7 +88,9 @@ def test_a_failed_write_leaves_no_file_and_the_episodes_pending(tmp_path, monkey
     writer.append(make_episode(0))
     with monkeypatch.context() as patch:
         patch.setattr(pq, "write_table", fill_the_disk)
-        with pytest.raises(OSError, match=r"00000.parquet cannot be written: no space left; what"):
+        with pytest.raises(
+            OSError, match=r"00000.parquet cannot be written: no space left; its earlier content"
+        ):
             writer.flush()
     assert names_in(tmp_path / "here") == ["info.json"]
     shutil.move(tmp_path / "here", tmp_path / "there")

@@ -62,7 +62,7 @@ def test_row_alone_and_file_have_the_same_bits(fitted, tmp_path):
 def test_what_cannot_be_learned_from_is_refused(fitted):
     before = copy.copy(fitted)
     episodes, _ = until_falls(14, num=40)
-    with pytest.raises(ValueError, match=r"no features \['nowhere'\]"):
+    with pytest.raises(ValueError, match=r"unknown features \['nowhere'\]"):
         before.fit_falls(episodes, ["nowhere"])
     with pytest.raises(ValueError, match="seed 0 gives episodes that start as"):
         before.fit_falls(until_falls(0, num=40)[0], [])

@@ -152,7 +152,7 @@ def test_what_a_deploy_yaml_cannot_say_here_is_refused(tmp_path, old, new, messa
         ({"rl_kp": [1, 2, 3]}, "'rl_kp' must have 2 entries; got 3"),
         ({"clip_actions_upper": [8, 9]}, "must be the same for all joints"),
         ({"observations_history": [0, 2]}, "newest 2 samples once"),
-        ({"model_name": "gone.pt"}, "no network .* beside it"),
+        ({"model_name": "gone.pt"}, "expected a network beside it, one of .*gone.pt"),
     ],
 )
 def test_what_a_file_cannot_say_here_is_refused(tmp_path, changes, message):
