@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from pydantic import FiniteFloat, NonNegativeInt
 
-_LIMIT = 20.0  # Limit of the logit, which keeps exp from overflowing.
+_LIMIT = 20.0  # Bounds the logit, so that exp does not overflow.
 _INVERSE_PENALTY = 0.01  # For inputs with unit variance.
 
 

@@ -18,7 +18,7 @@ from drake_safety.learning.trained_maps import Embedding, EmbeddingOutput
 from drake_safety.learning.trees import Trees
 
 LOGIT_LIMIT = 8.0  # Largest magnitude of the heads' logits.
-SHIFT_LIMIT = 100.0  # Largest shift of the base logit, which keeps exp from overflowing.
+SHIFT_LIMIT = 100.0  # Bounds the shift of the base logit, so that exp does not overflow.
 
 
 @dataclass(kw_only=True, eq=False)

@@ -28,7 +28,7 @@ class SensorFaults(LeafSystem):
     ``rest``, by default to zero.
 
     Args:
-        names: Names of the n entries, which `Fault.entries` match.
+        names: Names of the n entries; `Fault.entries` are patterns of these.
         period_s, offset_s: Time between samples of delays and ``freeze``, and of the first [s].
 
     Example: ``sensor = SensorFaults(loop.state_names, [Fault(kind="freeze")], period_s=0.01)``
