@@ -1,7 +1,5 @@
 """The package's extras, and the error for one that is not installed."""
 
-from __future__ import annotations
-
 import shlex
 from importlib.util import find_spec
 

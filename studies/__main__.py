@@ -1,7 +1,5 @@
 """The studies' commands: ``python -m studies --help``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import typer

@@ -1,7 +1,5 @@
 """``python -m studies adaptation``: adaptation by feedback, beside training from scratch."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The map of an assessment before and after feedback of an actual robot."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

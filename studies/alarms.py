@@ -5,8 +5,6 @@ motion that stays in the safe set every alarm is false, and so is any before the
 is an alarm between the push and the instant at which the robot leaves the safe set.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

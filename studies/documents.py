@@ -5,8 +5,6 @@ The text between ``<!-- KIND: NAME -->`` and ``<!-- end -->`` is made by ``templ
 and ``<!-- end -->``: EXPRESSION formats ``r(NAME, SET, METHOD, METRIC)`` or what ships.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence

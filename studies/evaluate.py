@@ -4,8 +4,6 @@ Its ``evaluation.json`` has what `drake-safety evaluate` writes and, besides, ba
 and alarms on throws.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

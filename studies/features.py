@@ -1,7 +1,5 @@
 """``python -m studies features``: Γ without some of its features, beside Γ with all of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any

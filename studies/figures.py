@@ -1,7 +1,5 @@
 """``python -m studies figures``: the pictures of README and docs, from what ships."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 import time

@@ -4,8 +4,6 @@ Real pairs of episodes are drawn again, a thousand times, so that errors can be 
 candidates are the same robot with weaker motors.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The method in one picture, and its block diagram."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ A study gives rows of the table of results: set, method, metric and an estimate.
 long is kept in the folder of the training as it finishes: a stopped study continues.
 """
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The moving picture of README and docs: a ball without and with recovery, and Γ."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The path of a motion through the embedding space, beside the probability over time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from itertools import pairwise

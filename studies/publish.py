@@ -5,8 +5,6 @@ commands, seeds and versions of the evaluation, and the SHA-256 of every evaluat
 has verdicts on the first fresh episodes of its seed, to compare with a new simulation.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil

@@ -5,8 +5,6 @@ of `calibration` exceed it. RAPT takes its limit from the nominal episodes of `t
 table has both rates. Their intervals take the limit as given.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple

@@ -1,7 +1,5 @@
 """``python -m studies rare``: rates of rare failures beside the shares of random episodes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial

@@ -1,7 +1,5 @@
 """Thresholds of triggers, chosen on other throws, and the trigger rules of baselines."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

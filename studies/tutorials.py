@@ -1,7 +1,5 @@
 """``python -m studies tutorials``: runs the tutorials and keeps the outputs that the site shows."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """``python -m studies walking``: tours, alarms, guard and recovery of a walking robot."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Sequence

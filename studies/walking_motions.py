@@ -1,7 +1,5 @@
 """Motions of walking robots: tours of commands, and pushes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Balls thrown at the actual plant: when each rule triggers recovery, and the outcome."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Throws: balls thrown at a balancing robot, and logs of them."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence

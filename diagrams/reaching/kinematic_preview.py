@@ -1,7 +1,5 @@
 """Kinematic preview of the whole body while the hand follows a plan."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

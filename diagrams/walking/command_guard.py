@@ -1,7 +1,5 @@
 """CommandGuard: passes on the accepted velocity command nearest to the asked one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

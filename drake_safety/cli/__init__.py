@@ -5,8 +5,6 @@ docstring the help), an entry of `COMMANDS` and an example in `commands.txt`. On
 command that is called is imported.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import signal

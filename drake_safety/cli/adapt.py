@@ -1,7 +1,5 @@
 """``drake-safety adapt``: adapts Γ to an actual robot, and evaluates it before and after."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """``drake-safety ask``: the verdict on a target, without motion; and targets of other commands."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import numpy as np

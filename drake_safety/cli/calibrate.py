@@ -1,7 +1,5 @@
 """``drake-safety calibrate``: thresholds of Γ with a promised miss rate, stored with Γ."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """``drake-safety evaluate``: evaluates Γ on fresh episodes, on throws, and under shifts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

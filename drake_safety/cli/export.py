@@ -1,7 +1,5 @@
 """``drake-safety export`` and ``report``: files for readers without this package."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """``drake-safety gate``: whether a loop fails more often than another one."""
 
-from __future__ import annotations
-
 import contextlib
 import html
 import math

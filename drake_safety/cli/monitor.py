@@ -1,7 +1,5 @@
 """``drake-safety monitor``: the change detector over logs of a robot."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any

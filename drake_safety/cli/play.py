@@ -1,7 +1,5 @@
 """``drake-safety play``: throw balls, move targets, walk or watch, with Γ beside the scene."""
 
-from __future__ import annotations
-
 import contextlib
 import secrets
 import signal

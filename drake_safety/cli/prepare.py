@@ -1,7 +1,5 @@
 """Commands before training: ``drake-safety scenarios``, ``new`` and ``check``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """``drake-safety pushes``: how hard a push a robot survives, by direction and phase."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import shlex

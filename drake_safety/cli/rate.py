@@ -1,7 +1,5 @@
 """``drake-safety rate``: how often a loop fails, in as few episodes as it takes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict
 from functools import partial

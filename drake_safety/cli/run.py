@@ -1,7 +1,5 @@
 """``drake-safety run``: simulates once with Γ in the loop, and shows the events."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from dataclasses import fields

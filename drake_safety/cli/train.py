@@ -1,7 +1,5 @@
 """``drake-safety train``: simulates the closed loop of nominal and random plants, trains Γ."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The folder written by ``train``, with episodes and an assessment for each mode."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path

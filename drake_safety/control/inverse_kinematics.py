@@ -1,7 +1,5 @@
 """Inverse kinematics: from a base pose and foot positions to joint positions."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.math import RigidTransform
 

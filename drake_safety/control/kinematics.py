@@ -1,7 +1,5 @@
 """Kinematics of a legged robot from its own model: contact points, the stance frame, statics."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

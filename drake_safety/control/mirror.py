@@ -1,7 +1,5 @@
 """Mirror: the reflection of a robot's state through the sagittal plane of its stance."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix

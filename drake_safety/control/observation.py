@@ -1,7 +1,5 @@
 """The assessor's state of a robot, in the stance frame and independent of world position."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tasks, feet and limits of a robot's whole-body programs."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

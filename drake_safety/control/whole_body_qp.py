@@ -1,7 +1,5 @@
 """Whole-body control as a quadratic program in accelerations and contact forces."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The map of an assessment: embedded segments, beliefs of the cells, and causes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

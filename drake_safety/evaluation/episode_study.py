@@ -1,7 +1,5 @@
 """Evaluation of scorers on fresh nominal episodes: every segment, and the first row alone."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

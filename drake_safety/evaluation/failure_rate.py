@@ -1,7 +1,5 @@
 """The failure rate of a closed loop by fewer simulations, as Γ says where they tell most."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

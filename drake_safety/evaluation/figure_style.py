@@ -1,7 +1,5 @@
 """Common style of all figures: colours distinct for colour-blind readers, fonts, and saving."""
 
-from __future__ import annotations
-
 import io
 import os
 from contextlib import AbstractContextManager

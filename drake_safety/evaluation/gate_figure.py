@@ -1,7 +1,5 @@
 """The difference of two loops over the number of pairs, with its confidence sequence."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Two closed loops in the same episodes, pair by pair, until a verdict is known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing

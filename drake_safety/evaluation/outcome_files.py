@@ -1,7 +1,5 @@
 """Outcomes of episodes in files, which any simulator may have written, and verdicts on them."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Failure of an episode: metrics, and the record that is kept."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ reaches 1/α under its null hypothesis with a probability of at most α. Source:
 Vovk and Shafer, Game-theoretic statistics and safe anytime-valid inference, Stat. Science 2023.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The pushes that robots survive, around the robot."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

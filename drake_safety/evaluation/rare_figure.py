@@ -1,7 +1,5 @@
 """Rare failures beside random episodes, in one picture."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 

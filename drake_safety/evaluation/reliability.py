@@ -1,7 +1,5 @@
 """Reliability: predicted probabilities beside outcomes, and stored thresholds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 

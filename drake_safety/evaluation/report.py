@@ -1,7 +1,5 @@
 """The report of a run: its tables and pictures as one self-contained HTML page."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 from importlib.resources import files

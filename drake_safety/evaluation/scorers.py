@@ -1,7 +1,5 @@
 """Scorers: safety probabilities of assessments, and of others, behind one interface."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Γ and its monitor under shifts: "don't know", rows sure and wrong (confident errors), alarms."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial

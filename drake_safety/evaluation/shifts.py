@@ -1,7 +1,5 @@
 """Catalogue of shifts: plants and faulty sensors absent from training, scaled to the robot."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

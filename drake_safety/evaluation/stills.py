@@ -1,7 +1,5 @@
 """Stills of the plant of a closed loop by a camera that follows the robot, rendered offscreen."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Iterable, Mapping

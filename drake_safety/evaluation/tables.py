@@ -1,7 +1,5 @@
 """Tables of results: a row a method or set, a column a metric."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Γ over the time of a run, with stills of the robot; the monitor's levels over that of a log."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

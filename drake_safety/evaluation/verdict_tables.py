@@ -1,7 +1,5 @@
 """The tables of an evaluation: which metrics each judged set shows, under which heading."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from drake_safety.evaluation.figure_style import label_of

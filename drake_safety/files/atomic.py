@@ -1,7 +1,5 @@
 """Files that are complete or not there, and folders with one writer."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Iterator

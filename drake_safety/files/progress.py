@@ -1,7 +1,5 @@
 """Progress of long computations: bars on a terminal, elsewhere a plain line every few seconds."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext

@@ -1,7 +1,5 @@
 """The boundary at which the errors of file formats become errors that name the file and the key."""
 
-from __future__ import annotations
-
 import difflib
 import json
 import re

@@ -1,7 +1,5 @@
 """Dataclasses that check themselves, and strict YAML that is read into them."""
 
-from __future__ import annotations
-
 import functools
 import json
 import math

@@ -1,7 +1,5 @@
 """Writes the robot of an MJCF, MuJoCo's format, as a URDF, and keeps what a URDF cannot hold."""
 
-from __future__ import annotations
-
 import math
 import re
 import xml.etree.ElementTree as ET

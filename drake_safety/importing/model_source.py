@@ -1,7 +1,5 @@
 """Model files to be made first: xacro is expanded, a named description downloaded."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from difflib import get_close_matches
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Writes the first ``policy.yaml`` of a new robot, as far as the files of a policy tell."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

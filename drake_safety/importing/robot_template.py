@@ -1,7 +1,5 @@
 """Writes a robot's folder and its first scenario from a URDF, xacro or an MJCF."""
 
-from __future__ import annotations
-
 import math
 import re
 import shutil

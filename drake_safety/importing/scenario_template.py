@@ -1,7 +1,5 @@
 """First scenarios for a new robot: the tasks' defaults, scaled to its size."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

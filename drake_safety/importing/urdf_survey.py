@@ -1,7 +1,5 @@
 """Identifies a robot's base, legs, arms and contact points from its URDF, or refuses it."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Collection, Iterator, Mapping

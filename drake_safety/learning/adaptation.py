@@ -1,7 +1,5 @@
 """The paper's update of beliefs from feedback; see `recalibration` for the sharpened mode's."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from typing import Any

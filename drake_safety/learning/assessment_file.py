@@ -1,7 +1,5 @@
 """Reading and writing assessments as safetensors files."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -4,8 +4,6 @@ A belief is an array (..., 3 + n_c): the masses of safe, unsafe and uncertainty,
 then optionally n_c columns that split the unsafe mass by cause and sum to it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 SAFE, UNSAFE, UNCERTAINTY = 0, 1, 2  # Columns; columns from 3 on split `UNSAFE` by cause.

@@ -1,7 +1,5 @@
 """Which constraint a motion is most likely to violate: one rule for all who name a cause."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Sequence
 

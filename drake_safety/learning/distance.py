@@ -6,8 +6,6 @@ one held at its last value, bounds DTW from above. A tree finds the candidates w
 bounds; DTW is computed for these alone, together for segments that are close in the tree.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Feedback from an actual robot: its episodes paired with nominal twins, split into segments."""
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The maps' input x: state, desired preview and, in the sharpened mode, features."""
 
-from __future__ import annotations
-
 import fnmatch
 from collections.abc import Sequence
 

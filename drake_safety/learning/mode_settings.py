@@ -1,7 +1,5 @@
 """The settings that the stages of learning read, resolved by the mode."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """One step of a `ChangeDetector` as nodes of a graph, with its memory as input and output."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The points of segments in the plane: t-SNE under the safety distance Omega."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Recalibration: the sharpened mode's update of base logit and beliefs from feedback."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """FollowingCamera: Meshcat's camera and ground around a robot on legs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The page of a live session: Meshcat's scene, and beside it Γ, belief, state and controls."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math

@@ -1,7 +1,5 @@
 """Contents of a live page, and values of its controls; needs no library for pages."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass

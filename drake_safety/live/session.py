@@ -1,7 +1,5 @@
 """LiveSession: a simulation in Meshcat, in real time, with controls."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import textwrap

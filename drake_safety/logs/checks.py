@@ -3,8 +3,6 @@
 Velocities and positions are compared by their changes in short windows; standing feet do not slide.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import warnings

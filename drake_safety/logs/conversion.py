@@ -1,7 +1,5 @@
 """Conversion of a log's columns to positions and velocities in Drake's order and SI units."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Conversion of logs to episodes, by evaluating a loop's ports at the logged states."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

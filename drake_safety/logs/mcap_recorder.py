@@ -1,7 +1,5 @@
 """McapRecorder: writes a simulation as ROS 2 messages into an MCAP file."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

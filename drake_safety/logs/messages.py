@@ -1,7 +1,5 @@
 """Reader of message logs: MCAP files, ROS 1 bags and ROS 2 bags."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Quantities of a log, such as the base's position, each at the rows where it is measured."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """RobotLog: a robot's motion in Drake's order and SI units, read from a log of any format."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

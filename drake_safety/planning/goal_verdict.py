@@ -1,7 +1,5 @@
 """Verdicts on goals before the robot moves."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Search for the accepted goal nearest to a refused one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """MujocoPlant: a robot simulated by MuJoCo, in place of a MultibodyPlant."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 

@@ -3,8 +3,6 @@
 With MuJoCo, a Drake plant still describes bodies, joints and shapes, for rendering.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Networks of locomotion policies: ONNX and TorchScript files, and what they say of policies."""
 
-from __future__ import annotations
-
 import ast
 import json
 import math

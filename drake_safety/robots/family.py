@@ -1,7 +1,5 @@
 """Plant families: random plants around the nominal one, on which Γ learns beside it."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Model files: in this package, in one installed by pip, or beside a YAML file."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import importlib.util
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """URDFs as Drake reads them: faults that it does not name, and what it rejects or cannot show."""
 
-from __future__ import annotations
-
 import math
 import re
 import xml.etree.ElementTree as ET

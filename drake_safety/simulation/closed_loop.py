@@ -1,7 +1,5 @@
 """ClosedLoop: the contract of a task's diagram."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """A cluster of workers: dask's scheduler as joblib's backend."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Check of a closed loop's contract: its ports, their sizes, and finite values."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Feedback by simulation: actual episodes and their nominal twins."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike

@@ -1,7 +1,5 @@
 """Check of a hand-over: a policy takes over a robot, walks at a command, and stops."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect
 from collections.abc import Callable, Generator, Sequence

@@ -1,7 +1,5 @@
 """Simulation of a diagram from a start to an end, and its log."""
 
-from __future__ import annotations
-
 import logging
 import math
 import re

@@ -1,7 +1,5 @@
 """The random draws of an episode as a point of a space of standard normal numbers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

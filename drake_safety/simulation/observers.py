@@ -1,7 +1,5 @@
 """Observers of one robot in a diagram, one for each noise level."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Adaptation during a simulation: an update of Γ after every k_u pairs of episodes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import deque

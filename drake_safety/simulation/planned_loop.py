@@ -1,7 +1,5 @@
 """PlannedLoop: base of tasks that follow a plan of points within a safe set."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """Episodes of any diagram with the contract's output ports."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import uuid

@@ -1,7 +1,5 @@
 """Rollouts: episodes of closed loops, simulated in worker processes."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import math

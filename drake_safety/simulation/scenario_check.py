@@ -1,7 +1,5 @@
 """Check of a scenario before rollouts: what is wrong, and how to correct it."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator

@@ -1,7 +1,5 @@
 """Worker processes: one place that maps work over them."""
 
-from __future__ import annotations
-
 import importlib
 import io
 import os

@@ -1,7 +1,5 @@
 """AssessorInputs: what an assessor reads of a legged robot besides its plan."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

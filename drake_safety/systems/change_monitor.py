@@ -1,7 +1,5 @@
 """ChangeMonitor: an alarm when plant or sensors no longer behave as in training."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

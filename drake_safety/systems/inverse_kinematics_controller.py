@@ -1,7 +1,5 @@
 """InverseKinematicsController: joint position commands from a desired base position."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

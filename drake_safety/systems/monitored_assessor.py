@@ -1,7 +1,5 @@
 """MonitoredSafetyAssessor: a fitted assessment with its monitor, as a diagram."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """MotorCurves: desired joint states whose servos ask for no more torque than DC motors have."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex

@@ -1,7 +1,5 @@
 """Periodic updates of a state that begins once: a copied Context goes on as its original."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """PolicyController: joint set points from a trained locomotion policy."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 

@@ -1,7 +1,5 @@
 """PushSource: a force on a body of the robot during an interval."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.multibody.math import SpatialForce

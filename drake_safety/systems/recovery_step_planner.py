@@ -1,7 +1,5 @@
 """RecoveryStepPlanner: capture steps, replanned at every update."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """RecoverySwitch: a diagram of recovery trigger, step planner and PortSwitches."""
 
-from __future__ import annotations
-
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import PortSwitch
 

@@ -1,7 +1,5 @@
 """RecoveryTrigger: a latch that is set when the probability falls below its threshold."""
 
-from __future__ import annotations
-
 import math
 
 from pydrake.common.value import Value

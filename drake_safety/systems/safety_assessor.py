@@ -1,7 +1,5 @@
 """SafetyAssessor: a fitted assessment as a system."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

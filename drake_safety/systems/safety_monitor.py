@@ -1,7 +1,5 @@
 """SafetyMonitor: the signed margins of the safe set."""
 
-from __future__ import annotations
-
 import math
 from typing import Protocol
 

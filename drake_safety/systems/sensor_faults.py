@@ -1,7 +1,5 @@
 """SensorFaults: faults of a vector signal, between what measures it and what reads it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

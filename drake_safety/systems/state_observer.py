@@ -1,7 +1,5 @@
 """StateObserver: the measured plant state, and the assessor's state derived from it."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 

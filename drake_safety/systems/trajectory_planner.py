@@ -1,7 +1,5 @@
 """TrajectoryPlanner: a desired trajectory with a preview."""
 
-from __future__ import annotations
-
 import copy
 import math
 from functools import partial

@@ -1,7 +1,5 @@
 """WholeBodyController: joint torques from set points of the hand and the body."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 
