@@ -23,10 +23,6 @@ def episode_of(robot=PACKAGED, variation="nominal"):
     return run_episode(standing_loop(robot, variation))
 
 
-def contact_velocities(kinematics, start):
-    return kinematics.contact_jacobian(start.q) @ start.v
-
-
 @pytest.mark.parametrize("name", ROBOTS)
 def test_any_robot_with_feet_stands_for_two_seconds_within_five_millimetres(name):
     episode = episode_of(name)
@@ -131,7 +127,7 @@ def test_a_calm_start_is_a_point_of_its_motion_with_the_motions_velocity(elapsed
     start = throw_start(kinematics, np.random.default_rng(1), elapsed_s=elapsed_s, **options)
     assert start.plan.start_time() == -elapsed_s
     np.testing.assert_allclose(start.q[4:7], start.plan.value(0.0).ravel())
-    np.testing.assert_allclose(contact_velocities(kinematics, start), 0.0, atol=1e-6)
+    np.testing.assert_allclose(kinematics.contact_jacobian(start.q) @ start.v, 0.0, atol=1e-6)
     is_moving = np.linalg.norm(start.v[3:6]) > 1e-3
     assert is_moving == (0.0 < elapsed_s < 1.0)
 

@@ -7,7 +7,6 @@ from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.learning.beliefs import UNCERTAINTY, from_scores, fuse_cells
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.segments import split
-from drake_safety.learning.training_scores import TrainingScores
 from lip_episodes import make_episodes
 
 
@@ -21,12 +20,8 @@ class StandIn:
         )
         self.grid_ = Grid(resolution=6, cell_length=0.1)
         segments = split(episodes, stride=1, discount=0.99)
-        points = segments.state[None, :, :2]
         masses = from_scores(segments.score, 0.3, segments.cause, 2)
-        cells = self.grid_.locate(points[0])
-        count = np.bincount(cells[cells >= 0], minlength=36)[None]
-        scores = {"score": segments.score, "cause": segments.cause, "count": count}
-        self.training_ = TrainingScores(points=points, **scores)
+        cells = self.grid_.locate(segments.state[:, :2])
         self.beliefs_ = fuse_cells(masses, cells, num_cells=36, min_count=5)[None]
 
     def predict(self, state, desired_preview, features):

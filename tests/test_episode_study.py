@@ -75,8 +75,7 @@ def test_the_likely_cause_of_refused_plans_is_compared_with_the_violated_constra
     margins = np.ones((len(first), len(names)))
     for row, episode in zip(margins, fresh, strict=True):
         row[names.index(episode.cause) if episode.cause else 0] = -0.01
-    unsafe = np.flatnonzero(first.is_unsafe)
-    wrong, accepted = unsafe[0], unsafe[1]
+    wrong, accepted = np.flatnonzero(first.is_unsafe)[:2]
     margins[wrong] = np.roll(margins[wrong], 1)
     probability = np.where(np.arange(len(first)) == accepted, 0.9, 0.2)
     predicted = SimpleNamespace(

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import time
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
@@ -43,48 +44,28 @@ def meshcat():
     return Meshcat()
 
 
-@pytest.fixture(scope="module")
-def throws_loop(meshcat):
-    scenario = quick(load_scenario("laikago_balancing"))
-    return scenario.make_loop(assessment=learned(scenario, 8), meshcat=meshcat, ball=True)
+def learned_quickly(scenario):
+    return learned(quick(scenario), 8)
 
 
-@pytest.fixture(scope="module")
-def goals_loop(meshcat):
-    return load_scenario(SCENARIO).make_loop(assessment=learned_targets(), meshcat=meshcat)
+def session_of(name, threshold, learn=learned_quickly, changes=None, **options):
+    @cache
+    def loop(meshcat):
+        scenario = load_scenario(name, changes)
+        return scenario.make_loop(assessment=learn(scenario), meshcat=meshcat, **options)
+
+    @pytest.fixture
+    def session(meshcat):
+        return LiveSession(loop(meshcat), meshcat, threshold=threshold)
+
+    return session
 
 
-@pytest.fixture(scope="module")
-def commands_loop(meshcat):
-    scenario = quick(load_scenario("go2_walking"))
-    return scenario.make_loop(assessment=learned(scenario, 8), meshcat=meshcat, guard=True)
-
-
-@pytest.fixture(scope="module")
-def pendulum_loop(meshcat):
-    scenario = load_scenario("pendulum")
-    scenario.assessment.ensemble_size = 1
-    return scenario.make_loop(assessment=learned(scenario, 200), meshcat=meshcat)
-
-
-@pytest.fixture
-def throws(throws_loop, meshcat):
-    return LiveSession(throws_loop, meshcat, threshold=0.4)
-
-
-@pytest.fixture
-def goals(goals_loop, meshcat):
-    return LiveSession(goals_loop, meshcat, threshold=0.4)
-
-
-@pytest.fixture
-def commands(commands_loop, meshcat):
-    return LiveSession(commands_loop, meshcat, threshold=0.5)
-
-
-@pytest.fixture
-def pendulum(pendulum_loop, meshcat):
-    return LiveSession(pendulum_loop, meshcat, threshold=0.5)
+throws = session_of("laikago_balancing", 0.4, ball=True)
+goals = session_of(SCENARIO, 0.4, lambda _: learned_targets())
+commands = session_of("go2_walking", 0.5, guard=True)
+ONE_MAP = {"assessment.ensemble_size": 1}
+pendulum = session_of("pendulum", 0.5, lambda scenario: learned(scenario, 200), ONE_MAP)
 
 
 def value_of(session, port):

@@ -1,5 +1,3 @@
-import ast
-import builtins
 import os
 import re
 import shlex
@@ -72,16 +70,6 @@ def test_the_python_of_the_readme_runs_as_one_script_and_prints_a_belief(tmp_pat
     assert belief.shape == (3,)
     assert np.all(belief >= 0)
     assert belief.sum() == pytest.approx(1.0, abs=1e-4)
-
-
-def test_every_name_in_the_python_of_the_readme_is_defined_in_it():
-    for block in blocks("python"):
-        tree = ast.parse(block)
-        names = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
-        imported = [one.name for node in ast.walk(tree) for one in getattr(node, "names", [])]
-        known = {one.id for one in names if isinstance(one.ctx, ast.Store)}
-        known |= {"np", *imported, *dir(builtins)}
-        assert {one.id for one in names} - known == set()
 
 
 def test_the_refusal_of_the_readme_and_of_start_is_what_the_command_prints(monkeypatch, capsys):

@@ -314,13 +314,10 @@ def make_between_walls(wall_m=1.0):
     return make_glider(wall_m=wall_m)
 
 
-def draw_wall(rng):
-    return rng.uniform(1.0, 3.0)
-
-
 @pytest.mark.train
 def test_a_sampler_draws_plants_for_episodes_in_turn(tmp_path):
-    drawn = {"make": make_between_walls, "draw_plant": draw_wall, "plants": 3, "seed": 5}
+    drawn = {"make": make_between_walls, "plants": 3, "seed": 5}
+    drawn["draw_plant"] = lambda rng: rng.uniform(1.0, 3.0)
     family, nominal = record(9, **drawn), record(9, make=make_between_walls, seed=4)
     assert (family.info.variation, nominal.info.variation) == ("family", "nominal")
     assert [one.plant for one in family] == [1, 2, 3] * 3 and {one.plant for one in nominal} == {0}

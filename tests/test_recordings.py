@@ -53,15 +53,11 @@ def test_a_date_as_the_index_of_a_parquet_file_is_a_column_without_a_unit(tmp_pa
 SOURCES = {"base": 1, "quat": 1, "gyro": 2, "velo": 2, "goal": 4, "feet": 4}
 
 
-def by_topic(name):
-    return 3 if name in ANGLES + RATES else SOURCES[name[:4]]
-
-
 def sparse(frame):
     """Each source's values in rows of its own, at times of its own, as exporters join topics."""
-    parts = []
+    parts, topics = [], dict.fromkeys(ANGLES + RATES, 3)
     for shift in range(1, 5):
-        names = [name for name in frame.columns[1:] if by_topic(name) == shift]
+        names = [n for n in frame.columns[1:] if (topics.get(n) or SOURCES[n[:4]]) == shift]
         rows = frame[["stamp", *names]] if shift < 4 else frame[["stamp", *names]][::2]
         parts.append(rows.assign(stamp=rows.stamp + 500_000 * shift))
     return pd.concat(parts).sort_values("stamp")

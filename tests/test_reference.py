@@ -2,7 +2,6 @@
 
 import ast
 import dataclasses
-import importlib
 import inspect
 import json
 import re
@@ -134,28 +133,23 @@ def test_hosted_pages_are_built_with_what_the_extra_docs_installs_alone():
 
 
 def test_links_out_of_docs_lead_to_generated_pages_and_figures_stay_in_one_piece():
-    pytest.importorskip("mkdocs", reason="extra 'docs' not installed")
-    pages = importlib.import_module("pages")
+    pages = pytest.importorskip("pages", reason="extra 'docs' not installed", exc_type=ImportError)
     page = SimpleNamespace(file=SimpleNamespace(generated_by=None, src_uri="page.md"))
     files = SimpleNamespace(src_uris={"reference/robots/robot.md", "tutorials/6_compose.md"})
-
-    def shown(text):
-        return pages.on_page_markdown(text, page, files)
-
-    assert shown("[`A`](../drake_safety/robots/robot.py)") == "[`A`](reference/robots/robot.md)"
-    assert shown("[6](../tutorials/6_compose.ipynb)") == "[6](tutorials/6_compose.md)"
-    assert shown("[`Makefile`](../Makefile) [us](../LICENSE)") == "`Makefile` us (`LICENSE`)"
-    assert shown("![p](pictures/path.png)") == "[![p](pictures/path.png)](pictures/path.png)"
-    # No-break space and word joiner; code stays as it is.
-    assert shown("90 % (80–95)\n```\n9 %\n```") == "90\u00a0% (80–\u206095)\n```\n9 %\n```"
-    with pytest.raises(
-        FileNotFoundError, match=r"page\.md: a link leads to .*/nowhere, which is not"
-    ):
-        shown("[a](../nowhere)")
-    cell = pages.on_page_content("<td><code>safety_probability</code></td>")
-    assert cell == "<td><code>safety_<wbr>probability</code></td>"
-    short = "<p><code>policy.yaml</code> <code>run_episodes</code></p>"
-    assert pages.on_page_content(short) == short
+    for text, shown in {
+        "[`A`](../drake_safety/robots/robot.py)": "[`A`](reference/robots/robot.md)",
+        "[6](../tutorials/6_compose.ipynb)": "[6](tutorials/6_compose.md)",
+        "[`Makefile`](../Makefile) [us](../LICENSE)": "`Makefile` us (`LICENSE`)",
+        "![p](pictures/path.png)": "[![p](pictures/path.png)](pictures/path.png)",
+        # No-break space and word joiner; code stays as it is.
+        "90 % (80–95)\n```\n9 %\n```": "90\u00a0% (80–\u206095)\n```\n9 %\n```",
+    }.items():
+        assert pages.on_page_markdown(text, page, files) == shown
+    with pytest.raises(FileNotFoundError, match=r"page\.md: a link leads to .*/nowhere, which"):
+        pages.on_page_markdown("[a](../nowhere)", page, files)
+    short = "<p><code>policy.yaml</code> <code>run_episodes</code></p><td><code>safety_"
+    long = f"{short}probability</code></td>"
+    assert pages.on_page_content(long) == f"{short}<wbr>probability</code></td>"
 
 
 @pytest.mark.slow

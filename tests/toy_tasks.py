@@ -220,10 +220,6 @@ class Shuttling(Toy):
         context.SetTime(0.0)
         self.set_state(context, start, (goal - start) / self.scenario.episode_duration_s)
 
-    def goal_of(self, episode):
-        position, velocity = np.split(episode.state[0], 2)
-        return self.mass.reflect * (position + self.scenario.episode_duration_s * velocity)
-
 
 SHUTTLING = """
 task: toy_tasks:Shuttling

@@ -283,7 +283,7 @@ def run_motions(
     """Simulates undisturbed motion for a `ChangeDetector`; rows are `monitor_step_s` apart.
 
     Args:
-        duration_s: Sum of all motions [s]; a task that `MovesUndisturbed` moves for minutes.
+        duration_s: Sum of all motions [s]; pieces of a task that `MovesUndisturbed` last a minute.
         are_episodes: Whether the motions are episodes, as of other tasks.
         variation, plants, seed, num_workers, path, progress, extra: As of `run_episodes`.
 
