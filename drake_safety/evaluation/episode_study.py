@@ -80,7 +80,7 @@ def evaluate_causes(
     """Share of the correctly refused plans whose likely cause is the violated constraint.
 
     Args:
-        predicted: Of the first row of each episode that has not diverged.
+        predicted: Prediction of the first row of each episode that has not diverged.
     """
     causes = [episode.cause for episode in test if episode.cause != DIVERGED]
     parts = predicted.cause_probability, predicted.predicted_margins
