@@ -48,7 +48,7 @@ def pushes(
         bool, Option("--recovery", help="A second loop in which Γ triggers recovery.")
     ] = False,
     target: console.TargetOption = None,
-    body: Annotated[str, Option(help="Pushed body; that of the scenario by default.")] = "",
+    body: Annotated[str, Option(help="Pushed body; by default the scenario's.")] = "",
     duration: Annotated[float, Option(help="Seconds of a push.", min=0.001)] = 0.1,
     directions: Annotated[int, Option(help="Number of directions.", min=1)] = 16,
     phases: Annotated[int, Option(help="Number of phases of a gait.", min=1)] = 8,

@@ -160,7 +160,7 @@ def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
         flight = f"{throw.speed_m_s:g} m/s towards {np.degrees(throw.direction_rad):.0f}°"
         events.append((throw.time_s, f"ball of {throw.mass_kg:g} kg at {flight}"))
     events = _all_events(loop, motion, events, "standing", [], threshold)
-    text = f"recovery where the probability is below {threshold:g}, that of the scenario"
+    text = f"recovery where the probability is below {threshold:g}, as in the scenario"
     triggers = [start_s for start_s, _ in motion.recovery_intervals_s]
     timeline = {"throws": throws, "trigger_times_s": triggers, "trigger_label": "trigger"}
     return _Shown(motion, events, threshold, text, timeline)
