@@ -21,9 +21,10 @@ from drake_safety.robots.robot_model import ReachingFrame, RobotModel
 
 try:
     from scipy.linalg.lapack import dposv
-except ImportError:  # Online environments do not need scipy: see docs/start.md.
+except ImportError:  # Online environments do not need scipy: see docs/start.md. griffe cannot read
+    # annotations after a second definition, unless they are quoted.
 
-    def dposv(a: np.ndarray, b: np.ndarray) -> tuple[None, np.ndarray, int]:
+    def dposv(a: "np.ndarray", b: "np.ndarray") -> "tuple[None, np.ndarray, int]":
         """Replaces LAPACK's routine, a few microseconds slower."""
         return None, np.linalg.solve(a, b), 0
 
