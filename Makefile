@@ -25,7 +25,7 @@ help: ## Show these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(INSTALLED) ## Train on 120 episodes, evaluate, and throw balls at the robot
-	$(BIN)/drake-safety train laikago_balancing --motion 14 --episodes 120 --out runs/demo --resume
+	$(BIN)/drake-safety train laikago_balancing --motion 8 --episodes 120 --out runs/demo --resume
 	$(BIN)/drake-safety evaluate laikago_balancing --assessment runs/demo \
 		--episodes 80 --calibration-episodes 40 --throws 20
 	$(BIN)/drake-safety run laikago_balancing --assessment runs/demo --push ball

@@ -12,6 +12,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from matplotlib.figure import Figure
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from drake_safety.assessments import shipped_folder
 from drake_safety.cli.console import say
@@ -24,6 +26,7 @@ from drake_safety.evaluation.embedding_figure import embedding_figure
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.push_figure import push_figure
 from drake_safety.evaluation.results import Key, Results
+from drake_safety.learning.assessment_file import file_hash
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.simulation.feedback import run_pairs
@@ -41,6 +44,11 @@ _REACHING: dict[str, Any] = {"target": "blue_box", "push": ["torso"], "force": T
 _WALKING: dict[str, Any] = {"target": "0.5 0 0", "push": ["side"], "force": True}
 _WALKING |= {"variation": "nominal"}  # On another one the monitor may alarm before the push.
 _SHOWN, _PAIRS = 300, 160  # Episodes in the embedding, and pairs of feedback.
+_LAIKAGO, _ATLAS, _G1 = (
+    f"assessments/{name}/{MODES[0]}.safetensors"
+    for name in ("laikago_balancing", "atlas_reaching", "g1_walking")
+)
+_RESULTS, _CHANGED = "docs/results/{}.json", ("laikago", "atlas", "go2_walking")
 _ELSEWHERE = (
     "compose.svg, which "
     "`python docs/generator/diagram_picture.py` draws by GraphViz; alarms_*.png of "
@@ -148,22 +156,28 @@ def _pushes(name: str, folder: Path) -> Figure:
     return push_figure(cards_of(name, Results.read(_ROOT / f"docs/results/{name}.json")))
 
 
-PICTURES: dict[str, Callable[[Path], Figure | Path]] = {
-    "glance": glance,
-    "blocks": blocks,
-    "recovery": recovery,
-    "timeline": partial(_of_run, "timeline.png", "laikago_balancing", push=["ball"]),
-    "path": _path,
-    "reaching": partial(_of_run, "timeline.png", "atlas_reaching", **_REACHING),
-    "walking_timeline": partial(_of_run, "timeline.png", "g1_walking", **_WALKING),
-    "embedding": _embedding,
-    "adaptation": _adaptation,
-    "shifts_laikago": partial(_shifts, "laikago"),
-    "shifts_atlas": partial(_shifts, "atlas"),
-    "shifts_go2_walking": partial(_shifts, "go2_walking"),
-    **{name: partial(_pushes, name) for name in CARDS},
+PICTURES: dict[str, tuple[Callable[[Path], Figure | Path], str]] = {
+    "glance": (glance, _LAIKAGO),
+    "blocks": (blocks, ""),
+    "recovery": (recovery, ""),
+    "timeline": (partial(_of_run, "timeline.png", "laikago_balancing", push=["ball"]), _LAIKAGO),
+    "path": (_path, _LAIKAGO.replace(*MODES)),
+    "reaching": (partial(_of_run, "timeline.png", "atlas_reaching", **_REACHING), _ATLAS),
+    "walking_timeline": (partial(_of_run, "timeline.png", "g1_walking", **_WALKING), _G1),
+    "embedding": (_embedding, _ATLAS),
+    "adaptation": (_adaptation, _LAIKAGO.replace(*MODES)),
+    **{f"shifts_{name}": (partial(_shifts, name), _RESULTS.format(name)) for name in _CHANGED},
+    **{name: (partial(_pushes, name), _RESULTS.format(name)) for name in CARDS},
 }
-"""Draws a picture, or writes it into a folder, by name."""
+"""What draws a picture, or writes it into a folder, and the file that it shows, by name."""
+
+
+def _stamp(picture: Path, source: str) -> None:
+    """Writes into a PNG which file it shows: a test finds the pictures of another one."""
+    with Image.open(picture) as image:
+        text = PngInfo()
+        text.add_text("Source", f"{source} {file_hash(_ROOT / source)}")
+        image.save(picture, dpi=image.info["dpi"], pnginfo=text, optimize=True)
 
 
 def figures(
@@ -179,9 +193,12 @@ def figures(
     for name in names or PICTURES:
         begin_s = time.monotonic()
         with tempfile.TemporaryDirectory() as folder:
-            drawn = PICTURES[name](Path(folder))
+            draw, source = PICTURES[name]
+            drawn = draw(Path(folder))
             if isinstance(drawn, Figure):
                 drawn = style.save(drawn, Path(folder) / name)[0]
+            if source:
+                _stamp(drawn, source)
             picture = out / f"{name}{drawn.suffix}"
             shutil.copyfile(drawn, picture)
         say(f"{time.monotonic() - begin_s:4.0f} s ", picture)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from command_line import call, study
 from drake_safety.assessments import shipped_folder
@@ -15,6 +16,7 @@ from drake_safety.cli.training_folder import MODES, assessment_file
 from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.rare_failures import RareFailures
 from drake_safety.evaluation.results import Results
+from drake_safety.learning.assessment_file import file_hash
 from studies import rare
 from studies.figures import PICTURES
 from toy_tasks import SCENARIO, train_shuttle
@@ -138,6 +140,14 @@ def test_saved_episodes_are_of_the_error_about_the_share_of_random_episodes():
     error = (0.002**2 + 0.002**2 + 0.006**2) / 3
     assert rows["saved"].value == pytest.approx(0.01 * 0.99 / error / 100)
     assert rare.judged(found, failed[1:])["saved"].value > rows["saved"].value  # About the mean.
+
+
+@pytest.mark.parametrize("name", [name for name, (_, source) in PICTURES.items() if source])
+def test_pictures_of_the_documents_show_what_ships(name):
+    """A picture's thresholds and figures are of one file: `python -m studies figures` draws it."""
+    source = PICTURES[name][1]
+    with Image.open(ROOT / f"docs/pictures/{name}.png") as image:
+        assert image.text["Source"] == f"{source} {file_hash(ROOT / source)}"
 
 
 def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypatch, tmp_path):

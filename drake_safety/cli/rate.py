@@ -41,7 +41,7 @@ _MOST_SHOWN = 8  # Kinds of failures.
 def rate(
     scenario: console.ScenarioArgument,
     assessment: console.AssessmentOption = None,
-    variation: console.VariationOption = "actual",
+    variation: console.VariationOption = "nominal",
     metric: MetricOption = UNSAFE,
     starts: Annotated[int, Option(help="Starts of which Γ is asked.", min=10)] = 10_000,
     episodes: Annotated[int, Option(help="Starts that are simulated.", min=10)] = 500,
