@@ -246,12 +246,14 @@ def _commands(
     results: Results, assessments: Mapping[str, SafetyAssessment], family: PlantFamily | None
 ) -> list[str]:
     """The commands that make a shipped folder, as far as its files tell."""
-    plants = " --plants 0" if family and not assessments["sharpened"].knows_family else ""
     entries = results.entries
+    more = re.findall(r" --(?:motion|falls) \S+", entries["train_command"])
+    if family and not assessments["sharpened"].knows_family:
+        more.append(" --plants 0")
     name, evaluate = entries["scenario"], entries["command"]
     (folder,) = re.findall(r"--assessment[ =](\S+)", evaluate)
     training = {
-        mode: f"--episodes {one.num_episodes} --seed {one.seed}{plants} --out {folder}"
+        mode: f"--episodes {one.num_episodes} --seed {one.seed}{''.join(more)} --out {folder}"
         for mode, assessment in assessments.items()
         for one in assessment.used_
         if one.purpose == "training"
