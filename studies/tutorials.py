@@ -5,6 +5,8 @@ import hashlib
 import io
 import json
 import os
+import re
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -85,7 +87,7 @@ def run(path: Path) -> dict[str, Any]:
         "source_sha256": source_hash(notebook),
         "core_s": round(core_s, 1),
         "cells": [
-            [kept for one in cell.outputs if (kept := _kept(one, [folder, str(Path.cwd())]))]
+            [kept for one in cell.outputs if (kept := _kept(one, [folder, sys.prefix, paths[0]]))]
             for cell in notebook.cells
             if cell.cell_type == "code"
         ],
@@ -100,6 +102,7 @@ def _kept(output: Mapping[str, Any], folders: Sequence[str]) -> dict[str, str] |
     text = output.get("text", data.get("text/plain", ""))
     if output.get("name") == "stderr" or not text.strip() or text.startswith("<"):
         return None
+    text = re.sub(r"\x1b\[[\d;]*m", "", text)  # Colours of a terminal.
     for one in folders:
         text = text.replace(f"{one}/", "")
     return {"text": text.rstrip()}
