@@ -24,10 +24,10 @@ BENCH ?= runs/bench.json
 help: ## Show these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: $(INSTALLED) ## Train on 120 episodes, evaluate, and throw balls at the robot
-	$(BIN)/drake-safety train laikago_balancing --motion 8 --episodes 120 --out runs/demo --resume
+demo: $(INSTALLED) ## Train on 100 episodes, evaluate, and throw balls at the robot
+	$(BIN)/drake-safety train laikago_balancing --motion 12.5 --episodes 100 --out runs/demo --resume
 	$(BIN)/drake-safety evaluate laikago_balancing --assessment runs/demo \
-		--episodes 80 --calibration-episodes 40 --throws 20
+		--episodes 64 --calibration-episodes 40 --throws 16
 	$(BIN)/drake-safety run laikago_balancing --assessment runs/demo --push ball
 
 walking: $(WALKING) ## Install what the walking scenarios need: robots, ONNX, policies
