@@ -1,8 +1,8 @@
-"""Falls that alarms announce, over all thresholds: at equal cost, and as curves.
+"""Falls that alarms announce at equal cost.
 
 An alarm announces a fall if its value falls below the threshold between the push and `EARLY_S`
-before the fall. The cost of a threshold is the share of other pushed motions that have an alarm, or
-the false alarms an hour on undisturbed motion. Methods are compared at the same cost.
+before the fall. The cost of a threshold is the share of the pushed motions inside the safe set that
+have an alarm. Methods are compared at the same cost.
 """
 
 from __future__ import annotations
@@ -12,10 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from drake_safety.evaluation import figure_style as style
 from drake_safety.evaluation.metrics import Bootstrap, Estimate, rate_per_hour
 from drake_safety.evaluation.results import Key
 from drake_safety.simulation.motion import Motion
@@ -25,16 +22,9 @@ EARLY_S = 0.2
 """Time before a fall that an alarm should leave [s]."""
 SHARES = (0.05, 0.1, 0.2, 0.34, 0.5)
 """Shares of other motions with an alarm, at which alarms are compared."""
-COSTS = {
-    "without_leaving": "never leave the safe set",
-    "without_fall": "do not fall",
-}
-"""Other motions by key, and their description."""
-_JUDGED = "without_leaving"  # Cost of the rows; the figure has all.
-_LABELS = {"sharpened": "Γ", "fall": "probability of a fall"}
+_SET = "alarm.without_leaving"
 _BOOTSTRAP = Bootstrap()
 _SLACK_S = 1e-9
-_MOST_SHARE, _MOST_RATE = 0.6, 100.0  # Ends of the figure's axes; the rate an hour.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +33,7 @@ class Watched:
 
     Attributes:
         is_fall: Pushed motions with a fall, (N,).
-        others: Pushed motions that should have no alarm, (N,), by key of `COSTS`.
+        others: Pushed motions that never leave the safe set, and should have no alarm, (N,).
         warning: Lowest value from the push until `EARLY_S` before the fall, (N,); infinite without
             a fall, and of one that comes earlier.
         lowest: Lowest value of each pushed motion, (N,).
@@ -54,7 +44,7 @@ class Watched:
     """
 
     is_fall: np.ndarray
-    others: Mapping[str, np.ndarray]
+    others: np.ndarray
     warning: np.ndarray
     lowest: np.ndarray
     rows: np.ndarray
@@ -78,10 +68,7 @@ class Watched:
         rows = np.concatenate([*quiet, np.zeros(0)])
         return cls(
             is_fall=np.array([motion.has_fallen for motion in pushed], dtype=bool),
-            others={
-                "without_leaving": np.array([not motion.has_left for motion in pushed], dtype=bool),
-                "without_fall": np.array([not motion.has_fallen for motion in pushed], dtype=bool),
-            },
+            others=np.array([not motion.has_left for motion in pushed], dtype=bool),
             warning=np.array(warning),
             lowest=np.array(lowest),
             rows=np.sort(rows),
@@ -90,13 +77,13 @@ class Watched:
             num_undisturbed=len(undisturbed),
         )
 
-    def announced(self, cost: str, share: float) -> Callable[[np.ndarray], float]:
+    def announced(self, share: float) -> Callable[[np.ndarray], float]:
         """The share of falls announced if at most a share of the others has an alarm.
 
         Returns:
             A function of the weights of the pushed motions, (N,); NaN without falls or others.
         """
-        falls, others = np.flatnonzero(self.is_fall), np.flatnonzero(self.others[cost])
+        falls, others = np.flatnonzero(self.is_fall), np.flatnonzero(self.others)
         others = others[np.argsort(self.lowest[others])]
         # The others with an alarm at the lowest threshold that announces a fall.
         count = np.searchsorted(self.lowest[others], self.warning[falls], side="right")
@@ -112,31 +99,17 @@ class Watched:
 
         return statistic
 
-    def threshold(self, cost: str, share: float) -> float:
+    def threshold(self, share: float) -> float:
         """The highest threshold with which at most a share of the others has an alarm."""
-        return equal_share_threshold(self.lowest[self.others[cost]], share)
+        return equal_share_threshold(self.lowest[self.others], share)
 
-    def num_false_alarms(self, threshold: np.ndarray | float, side: str = "left") -> np.ndarray:
+    def num_false_alarms(self, threshold: np.ndarray | float) -> np.ndarray:
         """Number of false alarms on undisturbed motion at thresholds, (...).
 
-        An alarm is a row below a threshold, with side "right" not above it, after one that is not.
+        An alarm is a row below a threshold, after one that is not.
         """
-        below, still = (np.searchsorted(one, threshold, side) for one in (self.rows, self.pairs))  # type: ignore[call-overload]
+        below, still = (np.searchsorted(one, threshold) for one in (self.rows, self.pairs))
         return np.asarray(below - still)
-
-    def share_costs(self, cost: str) -> np.ndarray:
-        """The least share of others with an alarm that announces 1, 2, … falls, (num_falls,)."""
-        warning, lowest = np.sort(self.warning[self.is_fall]), self.lowest[self.others[cost]]
-        share = np.searchsorted(np.sort(lowest), warning, side="right") / max(len(lowest), 1)
-        return np.where(warning < math.inf, share, math.inf)
-
-    def rate_costs(self) -> np.ndarray:
-        """The least false alarms an hour that announce 1, 2, … falls, (num_falls,)."""
-        warning = np.sort(self.warning[self.is_fall])
-        count = self.num_false_alarms(warning, "right")
-        # A threshold among most values has fewer, longer alarms.
-        rate = np.maximum.accumulate(count) / (self.undisturbed_s / 3600.0)
-        return np.where(warning < math.inf, rate, math.inf)
 
 
 def _values(alarm: Alarm, motion: Motion) -> np.ndarray:
@@ -155,19 +128,18 @@ def equal_cost_estimates(
     for share in SHARES:
         at = f"at_{100 * share:.0f}"
         statistics = {
-            name: [one.announced(_JUDGED, share) for one in seeds]
-            for name, seeds in watched.items()
+            name: [one.announced(share) for one in seeds] for name, seeds in watched.items()
         }
         for name, seeds in watched.items():
-            key = f"alarm.{_JUDGED}", name
+            key = _SET, name
             estimates[*key, f"announced_{at}"] = _over_motions(seeds[0], statistics[name])
-            counts = [one.num_false_alarms(one.threshold(_JUDGED, share)) for one in seeds]
+            counts = [one.num_false_alarms(one.threshold(share)) for one in seeds]
             estimates[*key, f"false_alarms_per_hour_{at}"] = rate_per_hour(
                 float(np.mean(counts)), seeds[0].undisturbed_s, seeds[0].num_undisturbed
             )
         if {own, rival} <= watched.keys():
-            estimates[f"alarm.{_JUDGED}", f"{own}_minus_{rival}", f"announced_{at}"] = (
-                _over_motions(watched[own][0], statistics[own], statistics[rival])
+            estimates[_SET, f"{own}_minus_{rival}", f"announced_{at}"] = _over_motions(
+                watched[own][0], statistics[own], statistics[rival]
             )
     return estimates
 
@@ -184,54 +156,3 @@ def _over_motions(
         return float(np.mean([one(weight) for one in plus]) - less)
 
     return _BOOTSTRAP.over_episodes(statistic, np.arange(len(watched.lowest)))
-
-
-def alarm_figure(watched: Mapping[str, Sequence[Watched]]) -> Figure:
-    """Plots falls announced over each cost: means over seeds, and each seed as a thin line."""
-    grid = np.linspace(0.0, _MOST_SHARE, 601)
-    any_one = next(iter(watched.values()))[0]
-    with style.drawing_style():
-        fig = style.new_figure(12.0, 4.6)
-        *panels, last = fig.subplots(1, len(COSTS) + 1, sharey=True)
-        for axes, (cost, what) in zip(panels, COSTS.items(), strict=True):
-            costs = {
-                name: [one.share_costs(cost) for one in seeds] for name, seeds in watched.items()
-            }
-            _draw(axes, costs, grid)
-            axes.set_title(f"{any_one.others[cost].sum()} pushes that {what}")
-            axes.set_xlabel("share of them with an alarm [%]")
-            axes.set_xticks(SHARES, [f"{100 * share:.0f}" for share in SHARES])
-            axes.set_xlim(0.0, _MOST_SHARE)
-        rates = np.concatenate([[0.0], np.geomspace(0.01, _MOST_RATE, 600)])
-        costs = {name: [one.rate_costs() for one in seeds] for name, seeds in watched.items()}
-        _draw(last, costs, rates)
-        last.set_xscale("symlog", linthresh=1.0)
-        last.set_xlim(0.0, _MOST_RATE)
-        last.set_xticks([0, 1, 10, 100], ["0", "1", "10", "100"])
-        last.set_title(f"{any_one.undisturbed_s / 3600.0:.1f} h undisturbed")
-        last.set_xlabel("false alarms an hour")
-        num_falls = any_one.is_fall.sum()
-        panels[0].set_ylabel(f"announced ≥ {EARLY_S} s ahead of {num_falls} falls [%]")
-        panels[0].set_ylim(0.0, 1.02)
-        panels[0].set_yticks(np.linspace(0, 1, 6), [f"{y:.0f}" for y in np.linspace(0, 100, 6)])
-        fig.legend(
-            *last.get_legend_handles_labels(), loc="outside lower center", ncols=len(watched)
-        )
-    return fig
-
-
-def _draw(axes: Axes, costs: Mapping[str, Sequence[np.ndarray]], grid: np.ndarray) -> None:
-    looks = zip(style.SERIES_COLOURS, style.SERIES_DASHES, strict=True)
-    for (name, seeds), (colour, dashes) in zip(costs.items(), looks, strict=False):
-        shares = [np.searchsorted(one, grid, side="right") / max(len(one), 1) for one in seeds]
-        if len(shares) > 1:
-            axes.plot(grid, np.transpose(shares), color=colour, linewidth=0.6, alpha=0.5)
-        axes.plot(
-            grid,
-            np.mean(shares, axis=0),
-            color=colour,
-            linestyle=dashes,
-            linewidth=2.4 if name == "sharpened" else 1.6,
-            label=_LABELS.get(name, style.label_of(name)),
-        )
-    axes.grid(color="#eceef0", linewidth=0.7)

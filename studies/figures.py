@@ -49,11 +49,7 @@ _LAIKAGO, _ATLAS, _G1 = (
     for name in ("laikago_balancing", "atlas_reaching", "g1_walking")
 )
 _RESULTS, _CHANGED = "docs/results/{}.json", ("laikago", "atlas", "go2_walking")
-_ELSEWHERE = (
-    "compose.svg, which "
-    "`python docs/generator/diagram_picture.py` draws by GraphViz; alarms_*.png of "
-    "`python -m studies walking`"
-)
+_ELSEWHERE = "compose.svg, which `python docs/generator/diagram_picture.py` draws by GraphViz"
 
 
 def _of_run(picture: str, scenario: str, folder: Path, **options: Any) -> Path:
@@ -169,11 +165,11 @@ PICTURES: dict[str, tuple[Callable[[Path], Figure | Path], str]] = {
     **{f"shifts_{name}": (partial(_shifts, name), _RESULTS.format(name)) for name in _CHANGED},
     **{name: (partial(_pushes, name), _RESULTS.format(name)) for name in CARDS},
 }
-"""What draws a picture, or writes it into a folder, and the file that it shows, by name."""
+"""By name, a function that draws a picture or writes it into a folder, and the file it shows."""
 
 
 def _stamp(picture: Path, source: str) -> None:
-    """Writes into a PNG which file it shows: a test finds the pictures of another one."""
+    """Writes into a PNG the file that it shows and its hash: a test finds stale pictures."""
     with Image.open(picture) as image:
         text = PngInfo()
         text.add_text("Source", f"{source} {file_hash(_ROOT / source)}")

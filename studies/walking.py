@@ -10,9 +10,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption, say
+from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption
 from drake_safety.cli.training_folder import MODES, assessment_file, training_episodes
-from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.metrics import Estimate, median, proportion
 from drake_safety.evaluation.results import Key
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
@@ -22,7 +21,7 @@ from drake_safety.learning.seeds import WALKING
 from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.scenario import Scenario
-from studies.alarm_curves import EARLY_S, Watched, alarm_figure, equal_cost_estimates
+from studies.alarm_curves import EARLY_S, Watched, equal_cost_estimates
 from studies.alarms import Alarm, scorer_alarm, threshold_alarms
 from studies.baselines import KINDS, classifier_scorers
 from studies.harness import ReleaseOption, open_study
@@ -136,8 +135,6 @@ def walking(
             for name, seeds in alarms.items()
         }
         study.rows |= equal_cost_estimates(watched, MODES[0], "gradient_boosting")
-        for picture in save(alarm_figure(watched), assessment / "walking_alarms"):
-            say("picture", picture)
 
 
 def walking_alarms(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drake_safety.simulation.motion import Motion
-from studies.alarm_curves import COSTS, SHARES, Watched, equal_cost_estimates
+from studies.alarm_curves import SHARES, Watched, equal_cost_estimates
 from studies.alarms import Alarm, first_alarm
 
 ALARM = Alarm(name="value", value=lambda motion: motion["value"])
@@ -40,8 +40,8 @@ def watched(pushed, tours=TOURS):
     return Watched.of(ALARM, pushed, tours)
 
 
-def announced(one, cost, share):
-    return one.announced(cost, share)(np.ones(len(one.lowest)))
+def announced(one, share):
+    return one.announced(share)(np.ones(len(one.lowest)))
 
 
 def test_a_fall_is_announced_by_a_row_between_the_push_and_0_2_s_before_the_fall():
@@ -55,27 +55,22 @@ def test_a_fall_is_announced_by_a_row_between_the_push_and_0_2_s_before_the_fall
     np.testing.assert_array_equal(found.warning, [0, 1, 1, math.inf, math.inf])
     np.testing.assert_array_equal(found.lowest, [0, 0, 0, 0, 0.5])
     # Only the first has a lower value than the survivor.
-    assert announced(found, "without_fall", 0.0) == 1 / 4
-    np.testing.assert_array_equal(found.share_costs("without_fall"), [0, 1, 1, math.inf])
+    assert announced(found, 0.0) == 1 / 4
 
 
-@pytest.mark.parametrize("cost", COSTS)
-def test_at_every_share_the_highest_allowed_threshold_is_applied(cost):
+def test_at_every_share_the_highest_allowed_threshold_is_applied():
     pushed = random_motions(np.random.default_rng(1))
     found = watched(pushed)
-    costs = found.share_costs(cost)
     for share in (0.0, *SHARES, 0.97):
-        threshold = found.threshold(cost, share)
-        others = found.lowest[found.others[cost]]
+        threshold = found.threshold(share)
+        others = found.lowest[found.others]
         assert np.mean(others < threshold) <= share < np.mean(others <= threshold)
         fallen = []
         for one in pushed[::3]:
             value = np.nan_to_num(one["value"], nan=-math.inf)
             alarm_s = first_alarm(one, value, threshold, since_s=0.2)
             fallen.append(one.fall_time_s - alarm_s >= 0.2 - 1e-9)
-        assert announced(found, cost, share) == pytest.approx(np.mean(fallen))
-        # The curve goes through it.
-        assert np.searchsorted(costs, share, side="right") == sum(fallen)
+        assert announced(found, share) == pytest.approx(np.mean(fallen))
 
 
 def test_a_false_alarm_is_a_row_below_the_threshold_after_one_that_is_not():
@@ -84,8 +79,6 @@ def test_a_false_alarm_is_a_row_below_the_threshold_after_one_that_is_not():
     np.testing.assert_array_equal(found.num_false_alarms(np.array([0, 0.5, 1.5, 3])), [0, 3, 2, 2])
     unknown = watched([], [motion([1, np.nan, 1])])
     assert unknown.num_false_alarms(-1e9) == 1
-    # The fall is announced by thresholds above 0.5.
-    np.testing.assert_allclose(found.rate_costs(), [3 * 3600 / 0.9])
 
 
 def test_differences_are_paired_and_seeds_averaged():
@@ -94,21 +87,19 @@ def test_differences_are_paired_and_seeds_averaged():
     methods = {"sharpened": sets[:1], "same": sets[:1], "other": sets[1:]}
     found = equal_cost_estimates(methods, "sharpened", "same")
     found |= equal_cost_estimates(methods, "sharpened", "other")
-    announced = {
+    shares = {
         method: one
         for (set, method, metric), one in found.items()
         if (set, metric) == ("alarm.without_leaving", "announced_at_20")
     }
-    same = announced["sharpened_minus_same"]
+    same = shares["sharpened_minus_same"]
     assert (same.value, same.low, same.high) == (0.0, 0.0, 0.0)
-    ours, *each = (
-        float(one.announced("without_leaving", 0.2)(np.ones(len(one.lowest)))) for one in sets
-    )
-    mean = announced["other"].value
-    assert (announced["sharpened"].value, mean) == pytest.approx((ours, np.mean(each)))
-    difference = announced["sharpened_minus_other"]
+    ours, *each = (announced(one, 0.2) for one in sets)
+    mean = shares["other"].value
+    assert (shares["sharpened"].value, mean) == pytest.approx((ours, np.mean(each)))
+    difference = shares["sharpened_minus_other"]
     assert difference.value == pytest.approx(ours - mean)
     assert difference.low < difference.value < difference.high
     rate = found["alarm.without_leaving", "sharpened", "false_alarms_per_hour_at_50"]
-    threshold = sets[0].threshold("without_leaving", 0.5)
+    threshold = sets[0].threshold(0.5)
     assert rate.value == pytest.approx(sets[0].num_false_alarms(threshold) * 3600 / 0.9)

@@ -103,7 +103,6 @@ def test_walking_is_judged_on_tours_pushes_commands_and_engines(monkeypatch, tmp
     rows += "guard.falls_with, guard.unchanged_inside, speed.difference_to_mujoco_m_s"
     assert study(monkeypatch, "walking", *arguments) == 0
     results_of(tmp_path / "walking.json", rows)
-    assert (tmp_path / "walking_alarms.png").is_file()
 
 
 @pytest.mark.train
@@ -156,6 +155,6 @@ def test_figures_draws_pictures_by_name_and_knows_all_of_the_documents(monkeypat
     assert [path.name for path in tmp_path.iterdir()] == ["pushes_go2.png"]
     assert study(monkeypatch, "figures", "nothing", "--out", tmp_path) == 2
     there = {path.stem for path in (ROOT / "docs/pictures").iterdir()}
-    assert there == {*PICTURES, "compose", "alarms_go2_walking"}
+    assert there == {*PICTURES, "compose"}
     text = "".join(path.read_text() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
     assert set(re.findall(r"pictures/(\w+)\.", text)) == there

@@ -21,8 +21,7 @@ from drake_safety.robots.robot_model import ReachingFrame, RobotModel
 
 try:
     from scipy.linalg.lapack import dposv
-except ImportError:  # Online environments do not need scipy: see docs/start.md. griffe cannot read
-    # annotations after a second definition, unless they are quoted.
+except ImportError:  # Online environments lack scipy (docs/start.md); griffe needs the quotes.
 
     def dposv(a: "np.ndarray", b: "np.ndarray") -> "tuple[None, np.ndarray, int]":
         """Replaces LAPACK's routine, a few microseconds slower."""
