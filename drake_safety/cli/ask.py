@@ -11,7 +11,7 @@ from drake_safety.cli.training_folder import MODES
 from drake_safety.files.reading import is_number
 from drake_safety.learning.calibration import UNSAFE
 from drake_safety.learning.causes import describe_margin
-from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal
+from drake_safety.planning.goal_verdict import GoalVerdict, assess_goal, goal_threshold
 from drake_safety.planning.nearest_goal import nearest_accepted_goal
 from drake_safety.simulation.capabilities import HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -42,8 +42,8 @@ def ask(
         )
     if target is None:
         raise ValueError("ask: pass --target, or for a walking robot --command")
-    goal, rule = parse_target(loop, target), folders.goal_threshold(gamma)
-    verdict, nearest = judge_target(loop, goal, rule)
+    goal, rule = parse_target(loop, target), goal_threshold(gamma)
+    verdict, nearest = judge_target(loop, goal)
     print_verdict(loop, verdict, nearest, rule.origin)
     console.say(origin.get().rstrip())
     if not verdict.is_accepted:
@@ -65,16 +65,14 @@ def parse_target(loop: ClosedLoop, text: str) -> np.ndarray:
     )
 
 
-def judge_target(
-    loop: Any, goal: np.ndarray, rule: folders.GoalThreshold
-) -> tuple[GoalVerdict, GoalVerdict | None]:
+def judge_target(loop: Any, goal: np.ndarray) -> tuple[GoalVerdict, GoalVerdict | None]:
     """The verdict on a target and, for a refusal, on the nearest one accepted with reserve."""
-    gamma, threshold = loop.assessment, rule.threshold
-    verdict = assess_goal(loop, gamma, goal, threshold=threshold, unsafe_below=rule.unsafe_below)
+    gamma = loop.assessment
+    verdict = assess_goal(loop, gamma, goal)
     if verdict.is_accepted:
         return verdict, None
     rng = np.random.default_rng(0)  # The same answer every time.
-    return verdict, nearest_accepted_goal(loop, gamma, goal, threshold=threshold, rng=rng)
+    return verdict, nearest_accepted_goal(loop, gamma, goal, threshold=verdict.threshold, rng=rng)
 
 
 def print_verdict(

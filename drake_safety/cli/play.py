@@ -15,6 +15,7 @@ from drake_safety.cli.training_folder import MODES
 from drake_safety.diagrams.balancing.throws import HasBall
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.live.session import LiveSession
+from drake_safety.planning.goal_verdict import goal_threshold
 from drake_safety.simulation.capabilities import FollowsCommands, HasGoals
 
 _FIRST_PORT = 7000
@@ -40,7 +41,7 @@ def play(
     loaded, _, gamma = folders.open_assessment(scenario, assessment, mode)
     options = console.given(hand=hand, recovery=recovery)
     task = loaded.make_loop(variation, assessment=gamma, **options)
-    rule = folders.goal_threshold(gamma)
+    rule = goal_threshold(gamma)
     threshold = rule.threshold
     if isinstance(task, FollowsCommands):
         options["guard"], threshold = True, loaded.parameters.guard.threshold

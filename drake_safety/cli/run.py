@@ -28,6 +28,7 @@ from drake_safety.learning.causes import cause_words, likely_cause
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.seeds import DEMONSTRATION
 from drake_safety.live.following_camera import follow
+from drake_safety.planning.goal_verdict import GoalThreshold, goal_threshold
 from drake_safety.plants.balls import Throw
 from drake_safety.plants.pushes import Push
 from drake_safety.simulation.capabilities import CanBePushed, HasGoals, goal_words, require
@@ -78,14 +79,14 @@ def run(
     loaded, learned, gamma = folders.open_assessment(scenario, assessment, mode)
     folder = (out or learned.out) / "run"
     folders.check_writable(folder)
-    rule = folders.goal_threshold(gamma)
+    rule = goal_threshold(gamma)
     options = console.given(hand=hand, recovery=recovery)
     # The verdict is on the asked goal, also if a guard would replace it.
     loop = loaded.make_loop(variation, assessment=gamma, **options)
     duration_s, simulated = loaded.episode_duration_s, partial(_move, rule=rule)
     if target is not None:
         goal, one_push = parse_target(loop, target), named_push(loop, push)
-        verdict, nearest = judge_target(loop, goal, rule)
+        verdict, nearest = judge_target(loop, goal)
         print_verdict(loop, verdict, nearest, rule.origin)
         if not (verdict.is_accepted or force or guard):
             console.say("refused: nothing moved; --force goes there")
@@ -124,7 +125,7 @@ class _Shown(NamedTuple):
 
 
 def _go(
-    loop: Any, goal: np.ndarray, push: Push | None, rule: folders.GoalThreshold, **options: Any
+    loop: Any, goal: np.ndarray, push: Push | None, rule: GoalThreshold, **options: Any
 ) -> _Shown:
     """Moves to a goal, pushed or not."""
     motion = run_to_goal(loop, goal, push=push, ports=_logged_ports(loop), **options)
@@ -167,7 +168,7 @@ def _throw(loop: Any, throws: list[Throw], **options: Any) -> _Shown:
 
 
 def _move(
-    loop: ClosedLoop, rule: folders.GoalThreshold, *, seed: int, duration_s: float, **options: Any
+    loop: ClosedLoop, rule: GoalThreshold, *, seed: int, duration_s: float, **options: Any
 ) -> _Shown:
     """Simulates an episode from a random start, and a little beyond the safe set."""
     motion = simulate(

@@ -16,7 +16,6 @@ from drake_safety.simulation.worker_processes import Progress
 
 MODES = ("sharpened", "paper")
 """Modes, the default first."""
-_DEFAULT_THRESHOLD = 0.5  # For goals, without a calibration.
 
 
 class AssessmentFolder(NamedTuple):
@@ -24,14 +23,6 @@ class AssessmentFolder(NamedTuple):
 
     path: Path
     out: Path
-
-
-class GoalThreshold(NamedTuple):
-    """Thresholds from which a goal is safe and below which it is unsafe, and their origin."""
-
-    threshold: float
-    unsafe_below: float
-    origin: str
 
 
 def episodes_folder(folder: Path, mode: str = MODES[0]) -> Path:
@@ -168,11 +159,3 @@ def check_writable(*folders: Path) -> None:
                 pass
         except OSError as error:
             raise ValueError(f"folder '{folder}' cannot be written: {error.strerror}") from error
-
-
-def goal_threshold(assessment: SafetyAssessment) -> GoalThreshold:
-    """The thresholds of verdicts on goals that `calibrate` has chosen; else the default."""
-    if (stored := assessment.calibrations_.get("plan")) is not None:
-        return GoalThreshold(stored.threshold, stored.unsafe_below, stored.origin)
-    origin = "the default, which promises nothing: `drake-safety calibrate` chooses one"
-    return GoalThreshold(_DEFAULT_THRESHOLD, _DEFAULT_THRESHOLD, origin)

@@ -86,7 +86,10 @@ class Calibration:
         return f"calibrated on {number} episodes for a promised miss rate: {self.promise}"
 
     def verdicts(self, safety_probability: np.ndarray) -> np.ndarray:
-        """Returns the verdicts for probabilities (N,) as strings; "don't know" for NaN."""
+        """Returns the verdicts for probabilities (N,) as strings; "don't know" for NaN.
+
+        Pass NaN where the belief is "don't know": its probability of 0 is "unsafe" here.
+        """
         probability = floats(safety_probability)
         verdicts = np.full(probability.shape, UNKNOWN, dtype=object)
         verdicts[probability >= self.threshold] = SAFE

@@ -3,17 +3,36 @@
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import EMPTY
-from drake_safety.learning.calibration import SAFE, UNKNOWN, UNSAFE
+from drake_safety.learning.calibration import PLAN, SAFE, UNKNOWN, UNSAFE
 from drake_safety.learning.causes import cause_words, likely_cause
 from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import floats
 from drake_safety.simulation.capabilities import HasGoals, goal_words, require
 from drake_safety.simulation.closed_loop import ClosedLoop
+
+_DEFAULT_THRESHOLD = 0.5  # Without a calibration.
+
+
+class GoalThreshold(NamedTuple):
+    """Thresholds from which a goal is safe and below which it is unsafe, and their origin."""
+
+    threshold: float
+    unsafe_below: float
+    origin: str
+
+
+def goal_threshold(assessment: SafetyAssessment) -> GoalThreshold:
+    """The thresholds of verdicts on goals that `calibrate` has chosen; else the default."""
+    if (stored := assessment.calibrations_.get(PLAN)) is not None:
+        return GoalThreshold(stored.threshold, stored.unsafe_below, stored.origin)
+    origin = "the default, which promises nothing: `drake-safety calibrate` chooses one"
+    return GoalThreshold(_DEFAULT_THRESHOLD, _DEFAULT_THRESHOLD, origin)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,17 +86,20 @@ def assess_goal(
     assessment: SafetyAssessment,
     goal: np.ndarray,
     *,
-    threshold: float,
+    threshold: float | None = None,
     unsafe_below: float | None = None,
 ) -> GoalVerdict:
     """Assesses the motion from standing to a goal, by state and plan at its start.
 
     Args:
         goal: (3,) [m], or a command; outside the region sampled in training it is "don't know".
-        threshold: Probability from which the goal is safe.
+        threshold: Probability from which the goal is safe; without it both thresholds are
+            the calibrated ones of `goal_threshold`.
         unsafe_below: Probability below which it is unsafe, the threshold by default; in between
             it is "don't know".
     """
+    if threshold is None:
+        threshold, unsafe_below, _ = goal_threshold(assessment)
     goal, with_goals = checked_goal(goal), require(loop, HasGoals)
     box, words = with_goals.target_box, goal_words(with_goals)
     if np.all((goal >= box[0]) & (goal <= box[1])):

@@ -34,6 +34,8 @@ from drake_safety.systems.monitored_assessor import warn_of_sampled_ports
 _LOGGER = logging.getLogger("drake_safety")
 _OPTIONAL_PORTS = ("true_state", "desired_output", "features", "safe")
 
+_MOST_ROWS = 50  # Rows between two samples of a preview, of which a wrong stride is searched for.
+
 Reset = Callable[[Diagram, Context, np.random.Generator], int | None]
 
 
@@ -44,6 +46,7 @@ def record_episodes(
     reset: Reset,
     duration_s: float,
     step_s: float,
+    preview_stride: int = 1,
     parameters: Mapping[str, Any] | None = None,
     draw_plant: Callable[[np.random.Generator], Any] | None = None,
     plants: int = 64,
@@ -75,7 +78,9 @@ def record_episodes(
         reset: Called with diagram, root Context and generator; samples a start into the Context,
             the diagram's default one with seeded random sources of Drake; rows count from its time.
             It may return the first row whose future is undisturbed, if that is not 0.
-        step_s: Time between two rows, the unit of H [s].
+        step_s: Time between two rows [s].
+        preview_stride: Rows between two of the preview's H samples; `AssessmentParameters` needs
+            the same ``horizon`` and ``preview_stride``.
         draw_plant: Draws a random plant by a generator; the set is of a family then, for the
             argument ``family`` of `SafetyAssessment.fit`.
         plants: Number of the family's plants; the episodes take turns on them.
@@ -92,6 +97,7 @@ def record_episodes(
         reset=reset,
         duration_s=duration_s,
         step_s=step_s,
+        preview_stride=preview_stride,
         parameters=parameters,
         draw_plant=draw_plant,
         plants=plants,
@@ -107,6 +113,12 @@ def record_episodes(
     call = run if draw_plant is None else partial(run_on_plant, run, info)
     episodes = collect_episodes(info, range(num_episodes), make, call, is_repeated=True, **options)
     episodes.warn()
+    if (stride := _seen_stride(episodes)) not in (None, preview_stride):
+        _LOGGER.warning(
+            "the preview's second sample of '%s' is the first one %d rows later: pass "
+            "preview_stride=%d; got %d",
+            *(info.scenario, stride, stride, preview_stride),
+        )
     if ended := [e.index for e in episodes if e.is_safe and e.num_steps < info.num_steps]:
         _LOGGER.warning(
             "a system of '%s' ended %d of %d episodes early, as episode %d, and they count as safe",
@@ -121,6 +133,7 @@ def prepare_recording(
     reset: Reset,
     duration_s: float,
     step_s: float,
+    preview_stride: int = 1,
     parameters: Mapping[str, Any] | None = None,
     draw_plant: Callable[[np.random.Generator], Any] | None = None,
     plants: int = 64,
@@ -156,6 +169,7 @@ def prepare_recording(
     # As the hash has always been made of it, so that kept sets stay valid.
     timing = f"EpisodeTiming({step_s=}, {num_steps=}, monitor_period_s={period_s!r})"
     identity = f"({name!r}, {timing}, {used}, {sorted((parameters or {}).items())})"
+    identity += f", {preview_stride=}" * (preview_stride != 1)
     horizon = sizes["desired_preview"] // sizes["output"]
     info = EpisodesInfo(
         scenario=name,
@@ -164,6 +178,7 @@ def prepare_recording(
         seed=seed,
         step_s=step_s,
         horizon=horizon,
+        preview_stride=preview_stride,
         state_names=_names("state", state_names, sizes["state"]),
         output_names=_names("output", output_names, sizes["output"]),
         feature_names=_names("feature", feature_names, sizes.get("features", 0)),
@@ -198,6 +213,27 @@ def prepare_recording(
         ).episode()
 
     return info, make, run
+
+
+def _seen_stride(episodes: Episodes) -> int | None:
+    """Rows after which the preview's second sample is its first one; None if no number fits.
+
+    The stated stride counts if it fits half of the rows on which the two samples differ.
+    """
+    n_z, stated = len(episodes.info.output_names), episodes.info.preview_stride
+
+    def agreement(stride: int) -> float:
+        fits: list[bool] = []
+        for preview in (episode.desired_preview for episode in episodes[:8]):
+            ahead, later = preview[:-stride, n_z : 2 * n_z], preview[stride:, :n_z]
+            moves = ~np.isclose(ahead, preview[:-stride, :n_z]).all(axis=1)
+            fits += np.isclose(ahead, later).all(axis=1)[moves].tolist()
+        return float(np.mean(fits)) if fits else 0.0
+
+    if episodes.info.horizon < 2 or agreement(stated) > 0.5:
+        return None
+    best = max(range(1, _MOST_ROWS), key=agreement)
+    return best if agreement(best) > 0.9 else None
 
 
 def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str], dict[str, int]]:
