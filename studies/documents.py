@@ -33,7 +33,7 @@ RESULTS_FOLDER = Path("docs/results")
 EVALUATION_FILE, CARD_FILE = "evaluation.json", "README.md"
 """Files of a shipped folder."""
 _TEMPLATES = Path(__file__).with_name("templates")
-_KINDS = "adaptation|anomalies|features|monitoring|pushes|rare|results|summary|shifts|walking"
+_KINDS = "adaptation|features|monitoring|pushes|rare|results|summary|shifts|walking"
 CARDS = {
     "pushes_go2": ["Drake", "MuJoCo"],
     "pushes_g1": ["fastsac", "ppo"],

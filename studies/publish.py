@@ -37,7 +37,7 @@ from studies.documents import CARD_FILE, EVALUATION_FILE, GENERATED, card_text, 
 NUM_EPISODES = 6
 """Number of fresh episodes whose verdicts are stored."""
 # Stored beside the evaluation.
-_STUDIES = ("shifts", "walking_results")
+_STUDIES = ("shifts", "walking")
 _PRINTED = re.compile(r"(<!-- printed: drake-safety (.*?) -->\n```text\n).*?(```\n)", re.DOTALL)
 _PRINTED_LINES = 5
 _HASHES, _VERDICTS = "assessment_sha256", "first_episodes"
