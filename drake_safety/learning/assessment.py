@@ -327,7 +327,11 @@ class SafetyAssessment:
     def inputs_of(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
-        """Returns x, (..., n_x), from the arguments of `predict`."""
+        """Returns x, (..., n_x), the input of the maps.
+
+        Args:
+            state, desired_preview, features: As of `predict`, (..., n).
+        """
         self._check_fitted()
         return self.columns_.of(state, desired_preview, features)
 
@@ -365,7 +369,14 @@ class SafetyAssessment:
         features: np.ndarray | None = None,
         **learned: Any,
     ) -> Prediction:
-        """Assesses one input, with the same bits; arguments as of `predict` without the axis N."""
+        """Assesses one input, with the same bits as `predict`.
+
+        Args:
+            state: Measured state, (n_s,).
+            desired_preview: Desired outputs over the horizon, row-major in time, (H*n_z,).
+            features: (n_f,); ignored in the paper's mode.
+            **learned: As of `predict`.
+        """
         x = self._checked_inputs(1, state, desired_preview, features)[None]
         return self._predict(x, **learned).one(0)
 
@@ -391,7 +402,11 @@ class SafetyAssessment:
     def strangest_input(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> tuple[str, float]:
-        """Returns the entry of x that contradicts the others most, and by how much [std dev]."""
+        """Returns the entry of x that contradicts the others most, and by how much [std dev].
+
+        Args:
+            state, desired_preview, features: One input, as of `predict_one`.
+        """
         difference = self.novelty_.contradictions(self.inputs_of(state, desired_preview, features))
         column = int(np.argmax(np.abs(difference)))
         return self.columns_.names[column], float(difference[column])
@@ -402,6 +417,9 @@ class SafetyAssessment:
         """Returns x, the maps' mean logit (N,) of an unsafe end and its gradient, (N, n_x) both.
 
         Unlike the belief, this logit has a slope everywhere.
+
+        Args:
+            state, desired_preview, features: N inputs, as of `predict`.
         """
         x = self.inputs_of(state, desired_preview, features)
         return x, *self.embedding_.logit_gradient(x)

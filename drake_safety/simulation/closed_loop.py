@@ -58,7 +58,13 @@ class ClosedLoop(Diagram):
 
     @classmethod
     def options_for(cls, purpose: Purpose, scenario: Any, variation: str) -> dict[str, Any]:
-        """Options of the diagram that differ from training's; in "pairs" twins start alike."""
+        """Options of the diagram that differ from training's.
+
+        Args:
+            purpose: Such as "evaluation", or "pairs", whose twins start alike.
+            scenario: The scenario of the task.
+            variation: Name of the plant.
+        """
         del purpose, scenario, variation
         return {}
 

@@ -79,7 +79,13 @@ class ChangeMonitor(LeafSystem):
             context.SetDiscreteState(self._groups[name], value)
 
     def expect_disturbance(self, context: Context, begin_s: float, end_s: float) -> None:
-        """Lets the charts wait in an interval [s]; one before the last has settled extends it."""
+        """Lets the charts wait in an interval, and half a second longer.
+
+        Args:
+            context: The monitor's Context.
+            begin_s, end_s: The interval, in the Context's time [s]; it extends an interval that has
+                not settled.
+        """
         begin, end = self._value(context, "expected_s")
         if context.get_time() < end + SETTLING_S:
             begin_s, end_s = min(begin_s, begin), max(end_s, end)
