@@ -35,8 +35,10 @@ EVALUATION_FILE, CARD_FILE = "evaluation.json", "README.md"
 _TEMPLATES = Path(__file__).with_name("templates")
 _KINDS = "adaptation|features|monitoring|pushes|rare|results|summary|shifts|walking"
 CARDS = {
+    "pushes_laikago": ["balancing alone", "balancing alone, MuJoCo", "recovery steps"],
     "pushes_go2": ["Drake", "MuJoCo"],
-    "pushes_g1": ["fastsac", "ppo"],
+    "pushes_g1": ["fastsac", "ppo", "fastsac, MuJoCo"],
+    "pushes_t1": ["Drake", "MuJoCo"],
 }
 """Loops of stored push cards, in their order."""
 _OPEN = rf"<!-- (?P<kind>{_KINDS}): (?P<name>[\w/-]+) -->\n"

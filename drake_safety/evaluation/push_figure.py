@@ -41,7 +41,8 @@ def push_figure(cards: Mapping[str, PushCard]) -> Figure:
         if np.isfinite(foreseen).any():
             middle = np.median(foreseen, axis=1)
             middle[~np.isfinite(middle)] = math.nan
-            text = "Γ: a failure is likelier than not (median phase)"
+            text = "Γ: a failure is likelier than not"
+            text += " (median phase)" * (foreseen.shape[1] > 1)
             _draw(axes, middle, style.INK, (0, (3, 2)), text, width=1.6)
         axes.set_ylim(0.0, None)
         axes.set_xticks(np.arange(8) * math.pi / 4)
