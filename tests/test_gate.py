@@ -260,6 +260,21 @@ def test_the_command_says_which_candidate_is_worse_and_replays_an_episode(
     assert "variation=actual: leaves the safe set: " in printed
 
 
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        (["policy=a/new.onnx", "variation=weak"], ["policy=new.onnx", "variation=weak"]),
+        (["policy=a/new.onnx metric=0.1"], ["policy=new.onnx metric=0.1"]),
+        (["policy=a/new.onnx", "policy=b/new.onnx"], ["policy=a/new.onnx", "policy=b/new.onnx"]),
+    ],
+)
+def test_a_candidate_is_named_without_the_folder_of_its_file_unless_two_names_are_alike(
+    changes, names
+):
+    assert list(gate.short_names(changes).values()) == names
+    assert list(gate.short_names(changes)) == changes
+
+
 @pytest.mark.train
 def test_a_scenario_file_is_a_candidate_and_ctrl_c_tells_what_is_known_so_far(
     monkeypatch, capsys, tmp_path

@@ -100,7 +100,8 @@ def gate(
         _end(found)
     metric = metric or UNSAFE
     given = {Path(one).stem: (one, baseline) for one in candidates or []}
-    given |= {text: (scenario, f"{baseline} {text}") for text in candidate or []}
+    names = short_names(candidate or [])
+    given |= {names[text]: (scenario, f"{baseline} {text}") for text in names}
     if len(given) < max(replay is None, len(candidates or []) + len(candidate or [])):
         raise ValueError("gate: name different candidates: YAML files, or --candidate KEY=VALUE")
     first = changed_plant(scenario, baseline)
@@ -164,6 +165,16 @@ def gate(
 def _end(verdicts: Mapping[str, Verdict]) -> NoReturn:
     known = {one.verdict for one in verdicts.values()}
     raise Exit(1 if WORSE in known else 2 if UNDECIDED in known else 0)
+
+
+def short_names(changes: Sequence[str]) -> dict[str, str]:
+    """Names of changes: a file without its folder, unless two changes would be named alike."""
+    split = {text: [one.partition("=") for one in shlex.split(text)] for text in changes}
+    names = {
+        text: " ".join(key + sign + Path(value).name for key, sign, value in pairs)
+        for text, pairs in split.items()
+    }
+    return names if len(set(names.values())) == len(names) else {text: text for text in changes}
 
 
 def changed_plant(scenario: str, changes: str) -> ComparedPlant:

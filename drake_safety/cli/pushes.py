@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
@@ -16,7 +15,13 @@ from typer import Option
 from drake_safety.cli import console
 from drake_safety.cli import training_folder as folders
 from drake_safety.cli.ask import parse_target
-from drake_safety.cli.gate import changed_plant, record_motions, show_rows, write_results
+from drake_safety.cli.gate import (
+    changed_plant,
+    record_motions,
+    short_names,
+    show_rows,
+    write_results,
+)
 from drake_safety.cli.training_folder import MODES
 from drake_safety.evaluation.figure_style import save
 from drake_safety.evaluation.loop_comparison import ComparedPlant
@@ -65,10 +70,7 @@ def pushes(
     """
     first = changed_plant(scenario, f"variation={variation}")
     loops: dict[str, tuple[ComparedPlant, dict[str, Any]]] = {_BASELINE: (first, {})}
-    for text in candidate or []:
-        # A file by its name alone.
-        pairs = [one.partition("=") for one in shlex.split(text)]
-        name = " ".join(key + sign + Path(value).name for key, sign, value in pairs)
+    for text, name in short_names(candidate or []).items():
         loops[name] = changed_plant(scenario, f"variation={variation} {text}"), {}
     gamma = None
     with contextlib.suppress(*([] if recovery or assessment else [ValueError])):
