@@ -9,7 +9,8 @@ import pytest
 from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, EventStatus, LeafSystem
-from pydrake.systems.primitives import ConstantVectorSource, RandomSource
+from pydrake.systems.primitives import ConstantVectorSource, RandomSource, TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
 
 import quadrotor
 from cart_episodes import assert_identical
@@ -63,40 +64,27 @@ def test_what_is_left_out_has_its_default():
         np.testing.assert_allclose(episode.state[:, 0], x + v * episode.time_s, atol=1e-9)
 
 
-class Ramp(LeafSystem):
+def make_ramp(sample_s):
     """A plan that moves at 1 m/s, and its preview of three samples ``sample_s`` apart."""
-
-    def __init__(self, sample_s):
-        super().__init__()
-        names = {"state": [0.0], "output": [0.0], "desired_preview": sample_s * np.arange(3.0)}
-        for name, ahead_s in names.items():
-            self.DeclareVectorOutputPort(
-                name,
-                len(ahead_s),
-                lambda context, out, ahead_s=ahead_s: out.SetFromVector(
-                    context.get_time() + np.array(ahead_s)
-                ),
-            )
-        self.DeclareVectorOutputPort("margins", 1, lambda context, out: out.SetAtIndex(0, 1.0))
+    builder = DiagramBuilder()
+    ahead_s = {"state": [0.0], "output": [0.0], "desired_preview": sample_s * np.arange(3.0)}
+    for name, values in ahead_s.items():
+        line = PiecewisePolynomial.FirstOrderHold([0.0, 9.0], np.add.outer(values, [0.0, 9.0]))
+        builder.ExportOutput(builder.AddSystem(TrajectorySource(line)).get_output_port(), name)
+    margins = builder.AddSystem(ConstantVectorSource([1.0]))
+    builder.ExportOutput(margins.get_output_port(), "margins")
+    return builder.Build()
 
 
 @pytest.mark.parametrize(("sample_s", "stride"), [(0.1, 1), (0.3, 3), (0.25, 1)])
 def test_a_preview_whose_samples_are_further_apart_than_said_is_named(sample_s, stride, caplog):
-    options = {"make": lambda: single(Ramp(sample_s)), "reset": lambda *start: 0, "ports": {}}
+    options = {"make": lambda: make_ramp(sample_s), "reset": lambda *start: 0, "ports": {}}
     assert record(2, **options).info.preview_step_s == pytest.approx(0.1)
     assert ("pass preview_stride=3; got 1" in caplog.text) == (stride == 3)
     caplog.clear()
     stated = record(2, preview_stride=stride, **options)
     assert stated.info.preview_step_s == pytest.approx(stride * STEP_S)
     assert "preview_stride" not in caplog.text
-
-
-def single(system):
-    builder = DiagramBuilder()
-    builder.AddSystem(system)
-    for i in range(system.num_output_ports()):
-        builder.ExportOutput(system.get_output_port(i), system.get_output_port(i).get_name())
-    return builder.Build()
 
 
 @pytest.mark.train

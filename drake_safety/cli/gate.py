@@ -100,8 +100,8 @@ def gate(
         _end(found)
     metric = metric or UNSAFE
     given = {Path(one).stem: (one, baseline) for one in candidates or []}
-    names = short_names(candidate or [])
-    given |= {names[text]: (scenario, f"{baseline} {text}") for text in names}
+    for text, name in short_names(candidate or []).items():
+        given[name] = scenario, f"{baseline} {text}"
     if len(given) < max(replay is None, len(candidates or []) + len(candidate or [])):
         raise ValueError("gate: name different candidates: YAML files, or --candidate KEY=VALUE")
     first = changed_plant(scenario, baseline)

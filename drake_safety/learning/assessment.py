@@ -327,11 +327,7 @@ class SafetyAssessment:
     def inputs_of(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
-        """Returns x, (..., n_x), the input of the maps.
-
-        Args:
-            state, desired_preview, features: As of `predict`, (..., n).
-        """
+        """Returns x, (..., n_x), from the arguments of `predict`."""
         self._check_fitted()
         return self.columns_.of(state, desired_preview, features)
 
@@ -402,11 +398,7 @@ class SafetyAssessment:
     def strangest_input(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> tuple[str, float]:
-        """Returns the entry of x that contradicts the others most, and by how much [std dev].
-
-        Args:
-            state, desired_preview, features: One input, as of `predict_one`.
-        """
+        """Returns the entry of x that contradicts the others most, and by how much [std dev]."""
         difference = self.novelty_.contradictions(self.inputs_of(state, desired_preview, features))
         column = int(np.argmax(np.abs(difference)))
         return self.columns_.names[column], float(difference[column])
@@ -417,9 +409,6 @@ class SafetyAssessment:
         """Returns x, the maps' mean logit (N,) of an unsafe end and its gradient, (N, n_x) both.
 
         Unlike the belief, this logit has a slope everywhere.
-
-        Args:
-            state, desired_preview, features: N inputs, as of `predict`.
         """
         x = self.inputs_of(state, desired_preview, features)
         return x, *self.embedding_.logit_gradient(x)

@@ -196,12 +196,7 @@ class ChangeDetector:
         return np.stack([_smoothed(v, rate) for v in both for rate in self.rates], axis=1)
 
     def innovation(self, x: np.ndarray, previous: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """The innovation of the watched states, clipped, (n_w,).
-
-        Args:
-            x, previous: The last two inputs, (n_u,).
-            change: Measured change of the watched states, (n_w,).
-        """
+        """The innovation (n_w,) of a change of the state after two inputs (n_u,), clipped."""
         error = self.predictor.error(x, previous, change)
         return np.minimum(np.maximum(error / self.deviation, -MOST_INNOVATION), MOST_INNOVATION)
 
@@ -217,12 +212,10 @@ class ChangeDetector:
         repeats: float | np.ndarray = 0.0,
         judged: float | np.ndarray = 1.0,
     ) -> np.ndarray:
-        """Largest chart of each state, in units of its limit, (..., n_w).
+        """Largest chart (..., 6, n_w) of each state, in units of its limit, (..., n_w).
 
-        Args:
-            charts: (..., 6, n_w).
-            repeats: Length of the run of repeated inputs, (..., 1); it concerns all states.
-            judged: Share of inputs that could be judged, (..., 1); likewise.
+        The length of the run of repeated inputs and the share of inputs that could be judged,
+        (..., 1), concern all states.
         """
         levels = (_sizes(charts) / self.limits).max(axis=-2)
         blind = (1.0 - judged) / (1.0 - LEAST_JUDGED)
@@ -267,12 +260,7 @@ class ChangeDetector:
         return levels, alarms
 
     def next_alarm(self, alarm: float, below_s: float, level: float) -> tuple[float, float]:
-        """Alarm (0 or 1), and time for which all levels have been low [s], after one more step.
-
-        Args:
-            alarm, below_s: What this function returned last.
-            level: The largest level of this step.
-        """
+        """Alarm (0 or 1), and time for which all levels have been low [s], after one more level."""
         if not level <= self.alarm_level:  # Also for NaN.
             return 1.0, 0.0
         below_s = below_s + self.step_s if level < RECOVERED_LEVEL else 0.0
@@ -304,14 +292,7 @@ class ChangeDetector:
     def cause(
         self, charts: np.ndarray, repeats: float, state_names: Sequence[str], judged: float = 1.0
     ) -> str:
-        """Says in which watched state charts show an alarm, and of what kind it is.
-
-        Args:
-            charts: (6, n_w).
-            repeats: Length of the run of repeated inputs.
-            state_names: Names of the n_w watched states.
-            judged: Share of inputs that could be judged.
-        """
+        """Says in which watched state charts (6, n_w) show an alarm, and of what kind it is."""
         if judged < LEAST_JUDGED:
             return "blind: most inputs are not finite, or follow one that is not"
         if repeats > self.longest_repeat:

@@ -113,7 +113,7 @@ def record_episodes(
     call = run if draw_plant is None else partial(run_on_plant, run, info)
     episodes = collect_episodes(info, range(num_episodes), make, call, is_repeated=True, **options)
     episodes.warn()
-    if (stride := _seen_stride(episodes)) not in (None, preview_stride):
+    if stride := _better_stride(episodes):
         _LOGGER.warning(
             "the preview's second sample of '%s' is the first one %d rows later: pass "
             "preview_stride=%d; got %d",
@@ -215,14 +215,12 @@ def prepare_recording(
     return info, make, run
 
 
-def _seen_stride(episodes: Episodes) -> int | None:
-    """Rows after which the preview's second sample is its first one; None if no number fits.
-
-    The stated stride counts if it fits half of the rows on which the two samples differ.
-    """
+def _better_stride(episodes: Episodes) -> int:
+    """Rows after which the preview's second sample is its first one; 0 if the stated ones fit."""
     n_z, stated = len(episodes.info.output_names), episodes.info.preview_stride
 
     def agreement(stride: int) -> float:
+        """Share of the rows with a moving plan on which it is so."""
         fits: list[bool] = []
         for preview in (episode.desired_preview for episode in episodes[:8]):
             ahead, later = preview[:-stride, n_z : 2 * n_z], preview[stride:, :n_z]
@@ -231,9 +229,9 @@ def _seen_stride(episodes: Episodes) -> int | None:
         return float(np.mean(fits)) if fits else 0.0
 
     if episodes.info.horizon < 2 or agreement(stated) > 0.5:
-        return None
+        return 0
     best = max(range(1, _MOST_ROWS), key=agreement)
-    return best if agreement(best) > 0.9 else None
+    return best if agreement(best) > 0.9 else 0
 
 
 def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str], dict[str, int]]:
