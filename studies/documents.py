@@ -73,7 +73,7 @@ def render(kind: str, results: Results, **more: Any) -> str:
     )
     environment.filters |= {name: _column("", "", name).text for name in _FORMATS}
     environment.filters |= {"markdown": markdown, "narrow": narrow}
-    environment.filters |= {"today": partial(today, results), "origin": origin}
+    environment.filters["origin"] = origin
     environment.globals |= {
         "r": results,
         "entries": results.entries,
@@ -99,16 +99,6 @@ def cards_of(name: str, results: Results) -> dict[str, PushCard]:
 def origin(seed: int) -> str:
     """A seed, and whether it is one of development or of a release's figures."""
     return f"{seed} ({use_of(seed)})"
-
-
-def today(results: Results, command: str) -> str:
-    """A stored command by its present name and options."""
-    command = re.sub(r" --other-hand \d+", "", command)
-    if " --shifts " in command:
-        return command.replace("python -m studies ", "drake-safety ")
-    is_beside = any(method == "gradient_boosting" for _, method, _ in results)
-    old = "drake-safety evaluate "
-    return command.replace(old, "python -m studies evaluate ") if is_beside else command
 
 
 def _column(key: str, title: str, format: str = "share") -> Column:
@@ -208,11 +198,9 @@ def _value(read: Callable[[str], Results], match: re.Match[str]) -> str:
 def _delays(results: Results) -> dict[str, float]:
     """Median delay of the monitor's alarm [s] by changed plant; infinite without an alarm."""
     return {
-        (name if set == "monitor" else set.removeprefix("shifts.")): (
-            math.inf if math.isnan(one.value) else one.value
-        )
-        for (set, name, metric), one in results.items()
-        if metric == "delay_s" and (set == "monitor" or (name == "monitor" and "shifts." in set))
+        set.removeprefix("shifts."): math.inf if math.isnan(one.value) else one.value
+        for (set, method, metric), one in results.items()
+        if (method, metric) == ("monitor", "delay_s")
     }
 
 
@@ -276,5 +264,4 @@ def _commands(
                 f"--episodes {one.num_unsafe + one.num_safe} --seed {one.seed}"
             )
     commands += [evaluate, *([entries["shifts"]["command"]] if "shifts" in entries else [])]
-    commands = [today(results, command) for command in dict.fromkeys(commands)]
-    return [*commands, f"python -m studies ship --assessment {folder}"]
+    return [*dict.fromkeys(commands), f"python -m studies ship --assessment {folder}"]

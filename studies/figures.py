@@ -48,7 +48,8 @@ _LAIKAGO, _ATLAS, _G1 = (
     f"assessments/{name}/{MODES[0]}.safetensors"
     for name in ("laikago_balancing", "atlas_reaching", "g1_walking")
 )
-_RESULTS, _CHANGED = "docs/results/{}.json", ("laikago", "atlas", "go2_walking")
+_RESULTS = "docs/results/{}.json"
+_CHANGED = ("laikago", "atlas", "go2_walking", "g1_walking")
 _ELSEWHERE = "compose.svg, which `python docs/generator/diagram_picture.py` draws by GraphViz"
 
 

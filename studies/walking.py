@@ -12,11 +12,13 @@ import typer
 
 from drake_safety.cli.console import ScenarioArgument, TrainingOption, WorkersOption
 from drake_safety.cli.training_folder import MODES, assessment_file, training_episodes
-from drake_safety.evaluation.metrics import Estimate, median, proportion
+from drake_safety.evaluation.metrics import Estimate, median, proportion, rate_per_hour
 from drake_safety.evaluation.results import Key
 from drake_safety.evaluation.scorers import Scorer, assessment_scorer
+from drake_safety.evaluation.shift_study import SEEN
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.assessment_file import file_hash
+from drake_safety.learning.change_detector import ChangeDetector
 from drake_safety.learning.seeds import WALKING
 from drake_safety.simulation.capabilities import CanFall, require
 from drake_safety.simulation.motion import Motion
@@ -126,7 +128,7 @@ def walking(
             )
             study.rows |= speed_estimates(ours, theirs)
         toured = run("tour", range(tours))
-        study.rows |= tour_estimates(toured)
+        study.rows |= tour_estimates(toured, gamma.detector_)
         # A motion that leaves the safe set before the push is not judged.
         pushed = [motion for motion in pushed if not motion.leave_time_s < motion.push_time_s]
         safe = [motion for motion in toured if not motion.has_left]
@@ -189,13 +191,17 @@ def push_estimates(pushed: Sequence[Motion], push_s: float) -> dict[Key, Estimat
     }
 
 
-def tour_estimates(tours: Sequence[Motion]) -> dict[Key, Estimate]:
-    """Share of undisturbed tours without a fall, and the hours of tours that stay safe."""
+def tour_estimates(tours: Sequence[Motion], detector: ChangeDetector) -> dict[Key, Estimate]:
+    """Share of undisturbed tours without a fall, safe hours, and the monitor's false alarms."""
     safe = [motion for motion in tours if not motion.has_left]
-    hours = sum(float(motion.time_s[-1]) for motion in safe) / 3600.0
+    rows = [np.concatenate([motion[name] for name in SEEN], axis=1) for motion in safe]
+    alarms = sum(len(detector.watch([one])[1]) for one in rows)
+    duration_s = sum(float(motion.time_s[-1]) for motion in safe)
+    false_alarms = rate_per_hour(alarms, duration_s, len(safe))
     return {
         ("tours", "", "without_fall"): proportion(sum(not m.has_fallen for m in tours), len(tours)),
-        ("tours", "", "hours"): Estimate.exact(hours, len(safe)),
+        ("tours", "", "hours"): Estimate.exact(duration_s / 3600.0, len(safe)),
+        ("tours", "monitor", "false_alarms_per_hour"): false_alarms,
     }
 
 

@@ -98,7 +98,7 @@ def test_walking_is_judged_on_tours_pushes_commands_and_engines(monkeypatch, tmp
     counts = ("tours", "pushes", "commands", "guarded-tours", "speeds")
     options = itertools.chain.from_iterable((f"--{name}", 1) for name in counts)
     arguments = ("go2_walking", "--assessment", tmp_path, "--workers", 1, *options)
-    rows = "tours.without_fall, tours.hours, pushes.fallen, "
+    rows = "tours.without_fall, tours.monitor.false_alarms_per_hour, pushes.fallen, "
     rows += "alarm.without_leaving.sharpened.false_alarms_per_hour_at_5, "
     rows += "guard.falls_with, guard.unchanged_inside, speed.difference_to_mujoco_m_s"
     assert study(monkeypatch, "walking", *arguments) == 0
