@@ -73,7 +73,7 @@ if __name__ == "__main__":
     simulator, plant = Simulator(diagram), diagram.GetSubsystemByName("plant")
     own = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     plant.SetVelocities(own, np.eye(18)[4])  # The base begins at 1 m/s to the left.
-    for time_s in np.arange(0.0, 3.1, 0.25):
+    for time_s in np.arange(0.0, 3.1, 0.2):
         simulator.AdvanceTo(time_s)
         (gamma,) = diagram.GetOutputPort("safety_probability").Eval(simulator.get_context())
         margin = diagram.GetOutputPort("margins").Eval(simulator.get_context()).min()

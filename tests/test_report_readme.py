@@ -90,7 +90,7 @@ def test_what_is_stored_is_read_again_but_for_folders_of_ones_own(tmp_path):
 
 def test_the_text_between_the_markers_is_rewritten_and_no_other(tmp_path):
     text = filled(tmp_path, make_figures())
-    assert text.startswith("# Title\n\n<!-- results: lip -->\n```sh\npython -m studies evaluate")
+    assert text.startswith("# Title\n\n<!-- results: lip -->\n```sh\ndrake-safety evaluate lip ")
     assert text.endswith("<!-- end -->\n\nThe end.\n")
     assert "stale words" not in text
     assert "Γ learned from 64 episodes of seed 7. The evaluation has 60 fresh episodes" in text
