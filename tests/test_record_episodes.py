@@ -67,12 +67,10 @@ def test_what_is_left_out_has_its_default():
 def make_ramp(sample_s):
     """A plan that moves at 1 m/s, and its preview of three samples ``sample_s`` apart."""
     builder = DiagramBuilder()
-    ahead_s = {"state": [0.0], "output": [0.0], "desired_preview": sample_s * np.arange(3.0)}
-    for name, values in ahead_s.items():
+    first = {"state": [0.0], "output": [0.0], "margins": [1.0]}
+    for name, values in (first | {"desired_preview": sample_s * np.arange(3.0)}).items():
         line = PiecewisePolynomial.FirstOrderHold([0.0, 9.0], np.add.outer(values, [0.0, 9.0]))
         builder.ExportOutput(builder.AddSystem(TrajectorySource(line)).get_output_port(), name)
-    margins = builder.AddSystem(ConstantVectorSource([1.0]))
-    builder.ExportOutput(margins.get_output_port(), "margins")
     return builder.Build()
 
 
