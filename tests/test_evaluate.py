@@ -60,7 +60,8 @@ def test_fresh_targets_are_judged_kept_and_not_simulated_again(monkeypatch, caps
     assert "all targets" in printed and "paper uses its next H steps" in printed
     first = Results.read(folder / "evaluation.json")
     judged = {method for _, method, metric in first if metric == "brier"}
-    assert judged == {"sharpened", "paper"}
+    assert judged == {"sharpened", "paper", "paper_at_06"}
+    assert first["plans", "paper_at_06", "threshold"].value == 0.6
     assert first["plans", "outcomes", "safe"].n == 30
     assert first["plans", "sharpened", "threshold"].n == first.entries["calibration_episodes"] == 20
     for place in ("calibration", "calibration.rows"):

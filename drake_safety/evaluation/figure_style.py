@@ -54,6 +54,7 @@ _STYLE: dict[Any, Any] = {
 _LABELS = {
     "auc": "AUC",
     "mlp": "MLP",
+    "paper_at_06": "paper, unsafe if b_safe < 0.6",
     "reachability": "inverse kinematics",
     "reachability_free": "inverse kinematics, free base",
     "support_margin": "support-polygon margin",
