@@ -313,8 +313,9 @@ def _stands(loop: LeggedLoop) -> _Check:
     )
     touching = int(np.sum(kinematics.contact_positions(q)[:, 2] - kinematics.foot_radii < 5e-3))
     message = (
-        f"after 1 s it has sunk {100 * sunk:.1f} cm, {touching} of {kinematics.num_contacts} "
-        f"contact points touch, the fastest joint turns at {speed:.2f} rad/s"
+        f"after 1 s it has {'sunk' if sunk >= 0.0 else 'risen'} {100 * abs(sunk):.1f} cm, "
+        f"{touching} of {kinematics.num_contacts} contact points touch, "
+        f"the fastest joint turns at {speed:.2f} rad/s"
     )
     standing = kinematics.contact_positions(kinematics.standing_positions())
     remedy = _GAINS_REMEDY
