@@ -1,4 +1,4 @@
-"""``python -m studies adaptation``: adaptation by feedback, beside training from scratch."""
+"""``python -m studies adaptation``: adaptation by feedback, beside boosting."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,11 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drake_safety.cli.console import (
-    AssessmentOption,
-    ScenarioArgument,
-    WorkersOption,
-)
+from drake_safety.cli.console import AssessmentOption, ScenarioArgument, WorkersOption
 from drake_safety.cli.training_folder import (
     MODES,
     assessment_folder,
@@ -24,7 +20,6 @@ from drake_safety.evaluation.metrics import Estimate, area_under_curve
 from drake_safety.evaluation.results import Key
 from drake_safety.files.progress import StageProgress, ignore
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.assessment_parameters import AssessmentParameters
 from drake_safety.learning.beliefs import safe_share
 from drake_safety.learning.feedback import EpisodePair
 from drake_safety.learning.seeds import ADAPTATION
@@ -33,13 +28,11 @@ from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.feedback import run_pairs
 from drake_safety.simulation.rollouts import run_episodes
 from drake_safety.simulation.scenario import load_scenario
-from drake_safety.simulation.worker_processes import map_items
 from studies.baselines import DirectClassifier
 from studies.harness import ReleaseOption, open_study
 
 SIZES = (40, 80, 120, 160, 400)
 """Numbers of pairs of episodes after which an assessment is evaluated."""
-_SCRATCH_SIZES = (40, 160, 400)
 _BOOSTED_SIZES = (40, 160)
 _POOL_STRIDE = 10  # Between the first seeds of two pools.
 Pool = tuple[Sequence[EpisodePair], Episodes]  # Feedback, and the test set that judges it.
@@ -58,9 +51,8 @@ def adaptation(
     pools: Annotated[
         int, typer.Option(help="Independent pools of feedback and test episodes.", min=1)
     ] = 3,
-    scratch: Annotated[
-        bool,
-        typer.Option("--scratch", help="Also train from scratch, and boosting, on the feedback."),
+    boosting: Annotated[
+        bool, typer.Option("--boosting", help="Also train boosting on the feedback.")
     ] = False,
     seed: Annotated[
         int, typer.Option(help="First of the seeds of fresh simulations.")
@@ -76,13 +68,7 @@ def adaptation(
     learned = assessment_folder(load_scenario(scenario), assessment)
     folder = learned.out / f"adapted-{variation}"
     with open_study(
-        "study",
-        scenario,
-        learned.path,
-        seed=seed,
-        release=release,
-        workers=workers,
-        out=folder,
+        "study", scenario, learned.path, seed=seed, release=release, workers=workers, out=folder
     ) as study:
         loaded, stages = study.scenario, study.stages
         seeds = [ADAPTATION.seeds(study.seed + _POOL_STRIDE * i) for i in range(pools)]
@@ -101,18 +87,9 @@ def adaptation(
             fresh.append(run_episodes(loaded, evaluate, seed=fresh_seed, progress=report, **kept))
         sets = [pairs.feedback() for pairs in drawn]
         judged = list(zip(sets, fresh, strict=True))
-        sizes = [size for size in _SCRATCH_SIZES if scratch and size <= feedback]
         for mode, prior in priors.items():
-            learned_anew = map_items(
-                partial(_learned, prior.parameters),
-                [drawn[0].actual[:size] for size in reversed(sizes)],  # The longest first.
-                num_workers=workers,
-                batch_size=1,
-                progress=partial(stages, "learning from scratch"),
-            )
-            baselines = {f"scratch {one.used_[0].num_episodes}": one for one in learned_anew}
-            study.rows |= pool_estimates(prior, judged, baselines=baselines, progress=stages)
-            if mode == MODES[0] and scratch:
+            study.rows |= pool_estimates(prior, judged, progress=stages)
+            if mode == MODES[0] and boosting:
                 nominal = load_episodes(episodes_folder(learned.path))
                 study.rows |= boosting_estimates(nominal, judged, prior.settings.shortest, stages)
         study.entries |= {
@@ -149,7 +126,6 @@ def pool_estimates(
     pools: Sequence[Pool],
     *,
     sizes: Sequence[int] = SIZES,
-    baselines: Mapping[str, SafetyAssessment] | None = None,
     progress: StageProgress = ignore,
 ) -> dict[Key, Estimate]:
     """Evaluates an assessment before and after feedback, on independent pools.
@@ -157,9 +133,9 @@ def pool_estimates(
     Orders of one pool would vary less than other feedback of the same robot does.
 
     Returns:
-        By "FORM.ASSESSMENT.METRIC", where ASSESSMENT is "prior", "adapted N" or the name of a
-        baseline, the mean over pools, with minimum and maximum as interval. FORM is the probability
-        of the sharpened mode, and the safe share of the grid's belief in the paper's.
+        By "FORM.ASSESSMENT.METRIC", where ASSESSMENT is "prior" or "adapted N", the mean over
+        pools, with minimum and maximum as interval. FORM is the probability of the sharpened mode,
+        and the safe share of the grid's belief in the paper's.
     """
     least = min(len(feedback) for feedback, _ in pools)
     sizes = [size for size in sizes if size <= least]
@@ -168,8 +144,7 @@ def pool_estimates(
     found: dict[str, list[dict[str, float]]] = {}
     mode = assessment.parameters.mode
     for i, (feedback, test) in enumerate(pools):
-        for name, one in {"prior": assessment, **(baselines or {})}.items():
-            found.setdefault(name, []).append(scores(one, test))
+        found.setdefault("prior", []).append(scores(assessment, test))
         for k, size in enumerate(sizes):
             adapted = assessment.adapt(feedback[:size])
             found.setdefault(f"adapted {size}", []).append(scores(adapted, test))
@@ -192,10 +167,7 @@ def _over_pools(
 
 
 def boosting_estimates(
-    nominal: Episodes,
-    pools: Sequence[Pool],
-    shortest: int,
-    progress: StageProgress,
+    nominal: Episodes, pools: Sequence[Pool], shortest: int, progress: StageProgress
 ) -> dict[Key, Estimate]:
     """Gradient boosting before feedback ("prior"), and on it and the training ("refitted N")."""
     least = min(len(feedback) for feedback, _ in pools)
@@ -216,7 +188,3 @@ def boosting_estimates(
             unsafe = one.predict_unsafe(*rows)
             found.setdefault(who, []).append(_metrics(unsafe, segments.is_unsafe))
     return _over_pools("boosting", found, pools)
-
-
-def _learned(parameters: AssessmentParameters, episodes: Episodes) -> SafetyAssessment:
-    return SafetyAssessment(parameters).fit(episodes)

@@ -37,20 +37,16 @@ class Watched:
         warning: Lowest value from the push until `EARLY_S` before the fall, (N,); infinite without
             a fall, and of one that comes earlier.
         lowest: Lowest value of each pushed motion, (N,).
-        rows: Values of the rows of all undisturbed motions, sorted, (M,).
-        pairs: The larger of each value and its predecessor, sorted, (M,).
+        undisturbed: Values of the rows of each undisturbed motion.
         undisturbed_s: Duration of these motions [s].
-        num_undisturbed: Their number.
     """
 
     is_fall: np.ndarray
     others: np.ndarray
     warning: np.ndarray
     lowest: np.ndarray
-    rows: np.ndarray
-    pairs: np.ndarray
+    undisturbed: list[np.ndarray]
     undisturbed_s: float
-    num_undisturbed: int
 
     @classmethod
     def of(cls, alarm: Alarm, pushed: Sequence[Motion], undisturbed: Sequence[Motion]) -> Watched:
@@ -63,18 +59,13 @@ class Watched:
             is_in_time &= motion.has_fallen
             warning.append(value[is_in_time].min(initial=math.inf))
             lowest.append(value.min())
-        quiet = [_values(alarm, motion) for motion in undisturbed]
-        before = [np.concatenate([[math.inf], value[:-1]]) for value in quiet]
-        rows = np.concatenate([*quiet, np.zeros(0)])
         return cls(
             is_fall=np.array([motion.has_fallen for motion in pushed], dtype=bool),
             others=np.array([not motion.has_left for motion in pushed], dtype=bool),
             warning=np.array(warning),
             lowest=np.array(lowest),
-            rows=np.sort(rows),
-            pairs=np.sort(np.maximum(rows, np.concatenate([*before, np.zeros(0)]))),
+            undisturbed=[_values(alarm, motion) for motion in undisturbed],
             undisturbed_s=sum(float(motion.time_s[-1]) for motion in undisturbed),
-            num_undisturbed=len(undisturbed),
         )
 
     def announced(self, share: float) -> Callable[[np.ndarray], float]:
@@ -103,13 +94,10 @@ class Watched:
         """The highest threshold with which at most a share of the others has an alarm."""
         return equal_share_threshold(self.lowest[self.others], share)
 
-    def num_false_alarms(self, threshold: np.ndarray | float) -> np.ndarray:
-        """Number of false alarms on undisturbed motion at thresholds, (...).
-
-        An alarm is a row below a threshold, after one that is not.
-        """
-        below, still = (np.searchsorted(one, threshold) for one in (self.rows, self.pairs))
-        return np.asarray(below - still)
+    def num_false_alarms(self, threshold: float) -> int:
+        """Number of rows of undisturbed motion below a threshold, each after one that is not."""
+        is_below = [np.concatenate([[False], one < threshold]) for one in self.undisturbed]
+        return sum(int(np.sum(one[1:] & ~one[:-1])) for one in is_below)
 
 
 def _values(alarm: Alarm, motion: Motion) -> np.ndarray:
@@ -135,7 +123,7 @@ def equal_cost_estimates(
             estimates[*key, f"announced_{at}"] = _over_motions(seeds[0], statistics[name])
             counts = [one.num_false_alarms(one.threshold(share)) for one in seeds]
             estimates[*key, f"false_alarms_per_hour_{at}"] = rate_per_hour(
-                float(np.mean(counts)), seeds[0].undisturbed_s, seeds[0].num_undisturbed
+                float(np.mean(counts)), seeds[0].undisturbed_s, len(seeds[0].undisturbed)
             )
         if {own, rival} <= watched.keys():
             estimates[_SET, f"{own}_minus_{rival}", f"announced_{at}"] = _over_motions(

@@ -7,9 +7,10 @@ is an alarm between the push and the instant at which the robot leaves the safe 
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from drake_safety.evaluation.metrics import Estimate, auc, median, proportion, rate_per_hour
 from drake_safety.evaluation.results import Key
@@ -27,25 +28,16 @@ TRACKING = "tracking_error_"
 _SLACK_S = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True)
-class Alarm:
-    """A monitored value.
+class Alarm(NamedTuple):
+    """A monitored value."""
 
-    Attributes:
-        name: Its key in tables.
-        value: Maps a motion to the value of each row, (N,); NaN means "don't know", an alarm.
-    """
-
-    name: str
-    value: Callable[[Motion], np.ndarray]
+    name: str  # Its key in tables.
+    value: Callable[[Motion], np.ndarray]  # Of each row, (N,); NaN, "don't know", is an alarm.
 
 
 def scorer_alarm(scorer: Scorer) -> Alarm:
     """An alarm on the safety probability of a scorer."""
-    return Alarm(
-        name=scorer.name,
-        value=lambda one: scorer.probability(*(one[port] for port in SEEN)),
-    )
+    return Alarm(scorer.name, lambda one: scorer.probability(*(one[port] for port in SEEN)))
 
 
 def threshold_alarms(
@@ -62,34 +54,19 @@ def threshold_alarms(
     def of_feature(column: int) -> Callable[[Motion], np.ndarray]:
         return lambda motion: motion["features"][:, column]
 
-    alarms = [
-        Alarm(name=name, value=of_feature(features.index(feature)))
-        for name, feature in watched.items()
-    ]
-    tracking = [i for i, name in enumerate(features) if name.startswith(TRACKING)]
-    if tracking:
-        alarms.append(
-            Alarm(
-                name="tracking_error",
-                value=lambda motion: -np.linalg.norm(motion["features"][:, tracking], axis=1),
-            )
-        )
+    values = {name: of_feature(features.index(feature)) for name, feature in watched.items()}
+    if tracking := [i for i, name in enumerate(features) if name.startswith(TRACKING)]:
+        values["tracking_error"] = lambda one: -np.linalg.norm(one["features"][:, tracking], axis=1)
     if set(_ROTATION) <= set(states):
         rotation = [states.index(name) for name in _ROTATION]
-        alarms.append(Alarm(name="tilt", value=lambda motion: -tilt(motion["state"][:, rotation])))
-    alarms.append(Alarm(name="smallest_margin", value=lambda motion: motion["margins"].min(axis=1)))
-    return alarms
+        values["tilt"] = lambda one: -tilt(one["state"][:, rotation])
+    values["smallest_margin"] = lambda one: one["margins"].min(axis=1)
+    return [*map(Alarm, values, values.values())]
 
 
 def tilt(rotation: np.ndarray) -> np.ndarray:
     """Angle between a body's z axis and the vertical [rad], (N,), of rotation vectors (N, 3)."""
-    angle = np.linalg.norm(rotation, axis=1)
-    share = np.divide(
-        rotation[:, 2], angle, out=np.ones_like(angle), where=(angle > 0) | np.isnan(angle)
-    )
-    # R_zz of Rodrigues' formula.
-    cosine = np.cos(angle)
-    return np.arccos(np.clip(cosine + share**2 * (1.0 - cosine), -1.0, 1.0))
+    return np.arccos(np.clip(Rotation.from_rotvec(rotation).as_matrix()[:, 2, 2], -1.0, 1.0))
 
 
 def first_alarm(

@@ -31,13 +31,8 @@ class DirectClassifier:
     the same seed gives the same bits.
     """
 
-    def __init__(
-        self, kind: str, *, uses_features: bool = True, seed: int = 0, shortest: int | None = None
-    ):
-        self.kind = kind
-        self.uses_features = uses_features
-        self.seed = seed
-        self.shortest = shortest
+    def __init__(self, kind: str, *, seed: int = 0, shortest: int | None = None):
+        self.kind, self.seed, self.shortest = kind, seed, shortest
 
     def fit(self, episodes: Episodes) -> DirectClassifier:
         """Fits the classifier to episodes, at least two of either kind, and returns it."""
@@ -59,11 +54,7 @@ class DirectClassifier:
     def predict_unsafe(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None = None
     ) -> np.ndarray:
-        """Probability of an unsafe end.
-
-        Returns:
-            The probabilities, (N,); NaN for an input that is not finite.
-        """
+        """Probability of an unsafe end, (N,); NaN for an input that is not finite."""
         from threadpoolctl import threadpool_limits
 
         x = self._inputs(state, desired_preview, features)
@@ -80,9 +71,7 @@ class DirectClassifier:
     def _inputs(
         self, state: np.ndarray, desired_preview: np.ndarray, features: np.ndarray | None
     ) -> np.ndarray:
-        parts = [state, desired_preview]
-        if self.uses_features and features is not None:
-            parts.append(features)
+        parts = [state, desired_preview, *([] if features is None else [features])]
         return np.concatenate([np.asarray(part, dtype=np.float32) for part in parts], axis=1)
 
     def _held_out(self, segments: Segments) -> np.ndarray:

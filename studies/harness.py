@@ -5,10 +5,9 @@ long is kept in the folder of the training as it finishes: a stopped study conti
 """
 
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -106,33 +105,22 @@ def open_study(
 
 def kept(
     folder: Path,
-    work: Mapping[str, tuple],
-    function: Callable[..., Arrays],
+    indices: Sequence[int],
+    function: Callable[[int], tuple[int, Any]],
     *,
     workers: int | None = None,
     progress: Progress | None = None,
-) -> dict[str, Arrays]:
-    """Calls a function of arrays for every part in worker processes, and keeps what it returns."""
+) -> list[Arrays]:
+    """Calls a function in worker processes, and keeps the arrays that it returns with the index."""
     folder.mkdir(parents=True, exist_ok=True)
-    files = {name: folder / f"{name}.npz" for name in work}
-    missing = [name for name, file in files.items() if not file.is_file()]
-    found = map_items(
-        partial(_called, function),
-        [(name, work[name]) for name in missing],
-        num_workers=workers,
-        batch_size=1,
-        progress=progress,
-        num_done=len(work) - len(missing),
-    )
-    for name, arrays in found:
-        with replacing(files[name]) as temporary, temporary.open("wb") as file:
+    files = {index: folder / f"{index:05d}.npz" for index in indices}
+    missing = [index for index, file in files.items() if not file.is_file()]
+    options: dict[str, Any] = {"num_workers": workers, "batch_size": 1, "progress": progress}
+    found = map_items(function, missing, num_done=len(files) - len(missing), **options)
+    for index, arrays in found:
+        with replacing(files[index]) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
-    return {name: _loaded(file) for name, file in files.items()}
-
-
-def _called(function: Callable[..., Arrays], item: tuple[str, tuple]) -> tuple[str, Any]:
-    name, arguments = item
-    return name, function(*arguments)
+    return [_loaded(file) for file in files.values()]
 
 
 def _loaded(file: Path) -> Arrays:

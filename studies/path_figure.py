@@ -8,17 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from drake_safety.evaluation import figure_style as style
 from drake_safety.evaluation.embedding_figure import draw_bar, draw_values, show_beliefs
-from drake_safety.evaluation.figure_style import (
-    INK,
-    PAGE_WIDTH,
-    SAFE_COLOUR,
-    UNKNOWN_COLOUR,
-    UNSAFE_COLOUR,
-    draw_threshold,
-    drawing_style,
-    new_figure,
-)
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.beliefs import UNCERTAINTY, safe_share
 
@@ -41,31 +32,36 @@ def path_figure(
     grid, cells = assessment.grid_, assessment.beliefs_[0]
     is_empty = cells[:, UNCERTAINTY] >= 1.0
     known = np.flatnonzero(is_known)
-    with drawing_style():
-        fig = new_figure(PAGE_WIDTH, PAGE_WIDTH)
+    with style.drawing_style():
+        fig = style.new_figure(style.PAGE_WIDTH, style.PAGE_WIDTH)
         upper, lower = fig.subplots(2, 1, height_ratios=(2.0, 1.0))
         show_beliefs(fig, [upper], grid, is_empty, room=3.4)
         draw_values(upper, grid, safe_share(cells), is_empty)
         draw_bar(fig, upper, "safe share of a cell's belief")
-        upper.plot(*points[known].T, "o", color="white", mec=INK, mew=0.5, markersize=3.5)
+        upper.plot(*points[known].T, "o", color="white", mec=style.INK, mew=0.5, markersize=3.5)
         for a, b in pairwise(known.tolist()):
             if math.dist(points[a], points[b]) > grid.cell_length:
-                style: dict[str, Any] = {"linestyle": "-" if b == a + 1 else (0, (1, 1.5))}
-                style |= {"arrowstyle": "-|>", "color": INK, "linewidth": 1.3, "mutation_scale": 12}
-                style["connectionstyle"] = "arc3,rad=0.15"
-                upper.annotate("", points[b], points[a], arrowprops=style)
+                look: dict[str, Any] = {"linestyle": "-" if b == a + 1 else (0, (1, 1.5))}
+                look |= {
+                    "arrowstyle": "-|>",
+                    "color": style.INK,
+                    "linewidth": 1.3,
+                    "mutation_scale": 12,
+                }
+                look["connectionstyle"] = "arc3,rad=0.15"
+                upper.annotate("", points[b], points[a], arrowprops=look)
         upper.set_title("Path through the embedding")
         upper.set_xlabel("hatched, and dotted arrows: don't know")
-        wait: dict[str, Any] = {"step": "post", "color": UNKNOWN_COLOUR, "linewidth": 0}
+        wait: dict[str, Any] = {"step": "post", "color": style.UNKNOWN_COLOUR, "linewidth": 0}
         lower.fill_between(time_s, -0.04, 1.0, where=~np.asarray(is_known), **wait)
-        lower.step(time_s, probability, where="post", color=SAFE_COLOUR, linewidth=2.0)
-        draw_threshold(lower, threshold, UNSAFE_COLOUR)
+        lower.step(time_s, probability, where="post", color=style.SAFE_COLOUR, linewidth=2.0)
+        style.draw_threshold(lower, threshold, style.UNSAFE_COLOUR)
         lower.set(title="Probability over time, grey: don't know", ylim=(-0.04, 1.22))
         lower.set_yticks([0.0, 0.5, 1.0])
         ordered = sorted(events.items(), key=lambda event: event[1])
-        box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": INK, "lw": 0.8}
+        box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": style.INK, "lw": 0.8}
         number_style: dict[str, Any] = {"fontsize": 9, "ha": "center", "va": "center", "bbox": box}
-        line = {"arrowstyle": "-", "color": INK, "linewidth": 0.8}
+        line = {"arrowstyle": "-", "color": style.INK, "linewidth": 0.8}
         for number, (_, at_s) in enumerate(ordered, start=1):
             # Around the path, as events may be close together.
             angle = math.radians(150.0 - 75.0 * (number - 1))
@@ -74,8 +70,8 @@ def path_figure(
             after = known[time_s[known] >= at_s - 1e-9]
             if len(after):
                 upper.annotate(f"{number}", points[after[0]], **beside, **number_style)
-                upper.plot(*points[after[0]], "o", color=INK, markersize=5)
-            lower.axvline(at_s, color=INK, linewidth=0.6, alpha=0.5)
+                upper.plot(*points[after[0]], "o", color=style.INK, markersize=5)
+            lower.axvline(at_s, color=style.INK, linewidth=0.6, alpha=0.5)
             # Alternating heights, as events may be close together.
             lower.annotate(f"{number}", (at_s, 1.07 + 0.09 * (number % 2)), **number_style)
         words = [f"{number} {name}" for number, (name, _) in enumerate(ordered, start=1)]

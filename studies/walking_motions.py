@@ -100,14 +100,9 @@ def run_motions(
     # The folder is named after all that a loop depends on.
     loop = partial(scenario.make_loop, variation, assessment=assessment, **(options or {}))
     make = MadeOnce(str(folder), loop)
-    found = kept(
-        folder,
-        {f"{i:05d}": (make, kind, seed, duration_s, i) for i in indices},
-        _run_motion,
-        workers=num_workers,
-        progress=progress,
-    )
-    return [_motion(arrays) for arrays in found.values()]
+    run = partial(_run_motion, make, kind, seed, duration_s)
+    found = kept(folder, indices, run, workers=num_workers, progress=progress)
+    return [_motion(arrays) for arrays in found]
 
 
 def _motion(arrays: Arrays) -> Motion:
@@ -118,7 +113,8 @@ def _motion(arrays: Arrays) -> Motion:
 
 def _run_motion(
     make: Callable[[], Any], kind: str, seed: int, duration_s: float, index: int
-) -> Arrays:
+) -> tuple[int, Arrays]:
     motion = KINDS[kind](make(), index, seed=seed, duration_s=duration_s)
     arrays = {name: np.asarray(one) for name, one in vars(motion).items() if name != "ports"}
-    return arrays | {name: rows.astype(np.float32) for name, rows in motion.ports.items()}
+    rows = {name: one.astype(np.float32) for name, one in motion.ports.items()}
+    return index, arrays | rows

@@ -10,12 +10,12 @@ CALLS = []
 
 def squared(number):
     CALLS.append(number)
-    return {"square": np.array(number**2), "text": np.array("why")}
+    return number, {"square": np.array(number**2), "text": np.array("why")}
 
 
 def test_what_is_kept_is_not_called_again_and_a_stopped_study_goes_on(tmp_path):
     CALLS.clear()
-    work = {f"{i}": (i,) for i in range(4)}
+    work = range(4)
 
     def stop(done, total):
         assert total == 4
@@ -31,12 +31,12 @@ def test_what_is_kept_is_not_called_again_and_a_stopped_study_goes_on(tmp_path):
     )
     assert CALLS == [0, 1, 2, 3]
     assert reports == [(2, 4), (3, 4), (4, 4)]
-    assert [int(found[name]["square"]) for name in work] == [0, 1, 4, 9]
-    assert str(found["3"]["text"]) == "why"
+    assert [int(one["square"]) for one in found] == [0, 1, 4, 9]
+    assert str(found[3]["text"]) == "why"
     # No half-written file, and a damaged one is told of.
-    assert sorted(file.name for file in tmp_path.iterdir()) == [f"{i}.npz" for i in range(4)]
-    (tmp_path / "0.npz").write_bytes(b"nothing")
-    with pytest.raises(ValueError, match=r"0\.npz is damaged .*: remove it"):
+    assert sorted(file.name for file in tmp_path.iterdir()) == [f"{i:05d}.npz" for i in range(4)]
+    (tmp_path / "00000.npz").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match=r"00000\.npz is damaged .*: remove it"):
         kept(tmp_path, work, squared, workers=1)
 
 

@@ -84,50 +84,29 @@ def train(
             f"train: --motion {motion_s / 60.0:g} is too little: give 2 or more, or 0 for none"
         )
     with console.open_stages() as stages:
+
+        def work(folder: Path, stage: str) -> dict[str, Any]:
+            return {"num_workers": workers, "path": folder, "progress": partial(stages, stage)}
+
+        extra = {"command": console.command_line(), "scenario_yaml": loaded.to_yaml()}
         for folder, (number, options) in sets.items():
-            run_episodes(
-                loaded,
-                number,
-                seed=seeds["training on the family" if folder == drawn else "training"],
-                num_workers=workers,
-                path=folder,
-                progress=partial(stages, folder.name),
-                extra={"command": console.command_line(), "scenario_yaml": loaded.to_yaml()},
-                **options,
-            )
+            options |= work(folder, folder.name) | {"extra": extra}
+            its_seed = seeds["training on the family" if folder == drawn else "training"]
+            run_episodes(loaded, number, seed=its_seed, **options)
         detector = None
         if motion_s:
-            motions = run_motions(
-                loaded,
-                motion_s,
-                num_workers=workers,
-                path=out / "motion",
-                progress=partial(stages, "undisturbed motion"),
-            )
-            watched = run_motions(
-                loaded,
-                min(episodes, _WATCHED) * loaded.episode_duration_s,
-                seed=seed,
-                are_episodes=True,
-                num_workers=workers,
-                path=out / "watched",
-                progress=partial(stages, "episodes for the monitor"),
-            )
+            motions = run_motions(loaded, motion_s, **work(out / "motion", "undisturbed motion"))
+            options = work(out / "watched", "episodes for the monitor") | {"are_episodes": True}
+            watched_s = min(episodes, _WATCHED) * loaded.episode_duration_s
+            watched = run_motions(loaded, watched_s, seed=seed, **options)
             # The half of which nothing is learned says what the monitor knows.
             known, fresh = (Episodes(watched.info, list(watched)[i::2]) for i in range(2))
             detector = ChangeDetector.fit(motions, stage_of(stages, "monitor"), episodes=known)
         num_falls = episodes // 4 if falls is None else falls
         fallen = None
         if num_falls and MODES[0] in modes and isinstance(loop, CanFall):
-            fallen = run_episodes(
-                loaded,
-                num_falls,
-                seed=FALLS.first,
-                until_fall=True,
-                num_workers=workers,
-                path=out / "falls",
-                progress=partial(stages, "episodes until a fall"),
-            )
+            options = work(out / "falls", "episodes until a fall") | {"until_fall": True}
+            fallen = run_episodes(loaded, num_falls, seed=FALLS.first, **options)
         rows = []
         for name in modes:
             started = time.process_time()

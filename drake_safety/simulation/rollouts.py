@@ -296,18 +296,10 @@ def run_motions(
     info = episodes_info(loop, seed, options)
     info = replace(info, step_s=step_s, num_steps=round(piece_s / step_s))
     run: Callable[..., Episode] = partial(run_motion, seed=seed, is_episode=are_episodes)
-    run = _with_plants(info, scenario, plants, run)
-    return collect_episodes(
-        info,
-        range(math.ceil(duration_s / piece_s - 1e-6)),
-        make,
-        run,
-        num_workers=num_workers,
-        path=path,
-        progress=progress,
-        extra=extra,
-        batch_size=1 if piece_s > scenario.episode_duration_s else BATCH_SIZE,
-    )
+    run, number = _with_plants(info, scenario, plants, run), math.ceil(duration_s / piece_s - 1e-6)
+    kept = dict[str, Any](num_workers=num_workers, path=path, progress=progress, extra=extra)
+    size = 1 if piece_s > scenario.episode_duration_s else BATCH_SIZE
+    return collect_episodes(info, range(number), make, run, batch_size=size, **kept)
 
 
 def motion_piece_s(loop: ClosedLoop, is_episode: bool = False) -> float:
@@ -388,18 +380,9 @@ def run_episodes(
     run: Callable[..., Episode] = partial(run_episode, seed=seed, until_fall=until_fall)
     if until_fall:
         info.until = require(loop, CanFall).fall_name
-    run = _with_plants(info, scenario, plants, run)
-    return collect_episodes(
-        info,
-        range(num_episodes),
-        make,
-        run,
-        num_workers=num_workers,
-        path=path,
-        progress=progress,
-        extra=extra,
-        is_repeated=num_episodes >= _MANY,
-    )
+    run, is_many = _with_plants(info, scenario, plants, run), num_episodes >= _MANY
+    kept = dict[str, Any](num_workers=num_workers, path=path, progress=progress, extra=extra)
+    return collect_episodes(info, range(num_episodes), make, run, is_repeated=is_many, **kept)
 
 
 def collect_episodes(
