@@ -62,8 +62,13 @@ def test_order_does_not_matter_and_other_episodes_are_drawn_into_pairs():
     other = {f"other {name}": value for name, value in turned.items()}
     drawn = compare_outcomes(one, other)
     assert (drawn.verdict, drawn.is_paired, drawn.pairs) == ("undecided", False, 600)
-    fewer = compare_outcomes(one, {name: two[name] for name in names[:500]})
+    fewer = compare_outcomes(one, dict([*other.items()][:500]))
     assert (fewer.is_paired, fewer.pairs) == (False, 500)
+    # Episodes that a file lacks may have crashed.
+    with pytest.raises(
+        ValueError, match="599 episodes are in both sets, and 1 in one, such as '7'"
+    ):
+        compare_outcomes(one, {name: value for name, value in two.items() if name != "7"})
 
 
 def test_verdicts_on_equal_unpaired_sets_are_seldom_wrong():
@@ -135,6 +140,8 @@ def test_lerobots_evaluations_are_read(tmp_path):
         ("a.csv", "episode,m\n1,-1\n", "m", "line 2: 'm' must be 0 to 1; got '-1'"),
         ("a.csv", "episode,m\n1,nan\n", "m=3", "line 2: 'm' must be a number; got 'nan'"),
         ("a.csv", "episode,m\n1,1\n", "m=x", "expected a column, or COLUMN=BOUND"),
+        ("a.csv", "episode,m\n1,1\n", "m=nan", "expected a column, or COLUMN=BOUND"),
+        ("a.csv", "episode,m\n1,0,35\n", "m=1", r"line 2: expected 2 cells; the rest is \['35'\]"),
         ("a.json", "{}", "failed", "it is not an eval_info.json of LeRobot: expected 'per_task'"),
         ("a.json", "5", "failed", "it is not an eval_info.json of LeRobot"),
         ("a.json", "[1", "failed", "a.json': Expecting ',' delimiter"),
@@ -164,8 +171,10 @@ def test_the_command_says_whether_it_pairs_and_ends_as_the_simulated_gate(
     assert call(monkeypatch, "gate", "--outcomes", base, same, "--worse-by", 0.05) == 0
     other = write(tmp_path / "other.csv", failed, names=[f"x{k}" for k in range(200)])
     assert call(monkeypatch, "gate", "--outcomes", base, other) == 2
-    assert "other.csv: not the baseline's episodes" in capsys.readouterr().out
-    for words in ([base], [base, same, "--candidate", "a=1"], [base, tmp_path / "gone.csv"]):
+    _, note, end = capsys.readouterr().out.partition("other.csv: no episode is the baseline's")
+    assert note and "looks" not in end
+    wrong = ([base], [base, same, "--candidate", "a=1"], [base, tmp_path / "gone.csv"])
+    for words in (*wrong, [base, base], [base, same, same]):
         assert call(monkeypatch, "gate", "--outcomes", *words) == 3
 
 

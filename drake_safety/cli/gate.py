@@ -91,11 +91,18 @@ def gate(
         if not candidates or candidate or baseline or out or replay is not None:
             without = "without --candidate, --baseline, --out and --replay"
             raise ValueError(f"gate: --outcomes takes files, the baseline's first, {without}")
+        if len({Path(one).resolve() for one in (scenario, *candidates)}) <= len(candidates):
+            raise ValueError(f"gate: expected different files; got {[scenario, *candidates]}")
         metric, alpha = metric or FAILED, alpha / len(candidates)
         reference = read_outcomes(Path(scenario), metric)
         levels: dict[str, Any] = {"worse_by": worse_by, "alpha": alpha, "seed": seed}
-        read = {name: read_outcomes(Path(name), metric) for name in candidates}
-        found = {name: compare_outcomes(reference, one, **levels) for name, one in read.items()}
+        found = {}
+        for name in candidates:
+            try:
+                read = read_outcomes(Path(name), metric)
+                found[name] = compare_outcomes(reference, read, **levels)
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from error
         _report(scenario, found, metric, alpha, worse_by)
         _end(found)
     metric = metric or UNSAFE
@@ -246,7 +253,7 @@ def _report(
     show_rows(f"{title}: {metric}", columns, rows)
     for name, one in verdicts.items():
         if not one.is_paired:
-            console.say(f"{name}: not the baseline's episodes; pairs are drawn, for one look")
+            console.say(f"{name}: no episode is the baseline's; pairs are drawn, for one look")
             continue
         new, old = one.newly_failing, one.no_longer_failing
         show_episodes(f"{name}: episodes that newly fail", new, metric)
@@ -254,9 +261,10 @@ def _report(
         for each in [*new, *old][:is_replayed]:
             replay = f"--replay={each.episode}"
             console.say("to see one:", console.command_line("drake-safety", replay))
+    ever = ", whenever one looks" * all(one.is_paired for one in verdicts.values())
     console.say(
         f"a verdict or end of an interval is wrong with a probability of at most {100 * alpha:.3g} "
-        f"% a candidate, whenever one looks; 'not worse': by {100 * worse_by:g} points"
+        f"% a candidate{ever}; 'not worse': by {100 * worse_by:g} points"
     )
 
 

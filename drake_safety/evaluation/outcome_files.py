@@ -60,7 +60,7 @@ def read_outcomes(path: Path, metric: str = FAILED) -> dict[str, float]:
 def _rows(text: str, metric: str) -> Iterator[tuple[str, str, float]]:
     """Place, episode and outcome of each row of a CSV file."""
     column, has_bound, bound = metric.partition("=")
-    if has_bound and not is_number(bound):
+    if has_bound and not (is_number(bound) and math.isfinite(float(bound))):
         raise ValueError(f"metric '{metric}': expected a column, or COLUMN=BOUND with a number")
     rows = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
     columns = rows.fieldnames or []
@@ -69,6 +69,8 @@ def _rows(text: str, metric: str) -> Iterator[tuple[str, str, float]]:
     wanted = "0 or 1" if column == FAILED else "a number" if has_bound else "0 to 1"
     for row in rows:
         where, cell = f"line {rows.line_num}", (row[column] or "").strip()
+        if more := row.get(None):  # DictReader puts them there.
+            raise ValueError(f"{where}: expected {len(columns)} cells; the rest is {more}")
         value = _WORDS.get(cell.lower(), float(cell) if is_number(cell) else math.nan)
         is_right = value in (0.0, 1.0) if column == FAILED else 0.0 <= value <= 1.0
         if math.isnan(value) or not (is_right or has_bound):
@@ -106,10 +108,15 @@ def compare_outcomes(
 ) -> Verdict:
     """Compares outcomes by episode, as `compare_loops` does at its last look.
 
-    A single look at all episodes does not depend on their order. If the episodes differ, pairs are
+    A single look at all episodes does not depend on their order. If all episodes differ, pairs are
     drawn by ``seed``, as many as the smaller set has: bets on independent pairs are valid too.
     """
     check_levels(worse_by, alpha)
+    if (common := baseline.keys() & candidate.keys()) and (apart := baseline.keys() ^ candidate):
+        raise ValueError(
+            f"{len(common)} episodes are in both sets, and {len(apart)} in one, such as "
+            f"'{min(apart)}': give a crashed episode the outcome 1, and other episodes other names"
+        )
     names = [sorted(one, key=lambda name: (len(name), name)) for one in (baseline, candidate)]
     if not (is_paired := names[0] == names[1]):
         rng = np.random.default_rng(seed)
@@ -118,8 +125,8 @@ def compare_outcomes(
         (_outcome(one, baseline[one]), _outcome(two, candidate[two]))
         for one, two in zip(*names, strict=False)
     ]
-    apart = [two.value - one.value for one, two in pairs]
-    verdict = verdict_of(pairs, [interim_estimate(apart, [], alpha)], worse_by)
+    differences = [two.value - one.value for one, two in pairs]
+    verdict = verdict_of(pairs, [interim_estimate(differences, [], alpha)], worse_by)
     return replace(verdict, is_paired=is_paired)
 
 
