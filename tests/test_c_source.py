@@ -204,6 +204,7 @@ def test_example_prints_the_verdict_of_every_row(
     rows = frozen(cases["locked joint"][0])
     table = generated / "rows.csv"
     np.savetxt(table, rows, delimiter=",", fmt="%.17g", header=names.stdout.strip(), comments="")
+    table.write_bytes(table.read_bytes().replace(b"\n", b"\r\n").rstrip())
     columns = names.stdout.strip().split(",")
     assert columns[0] == "state base_x" and columns[-1] == "hold" and len(columns) == rows.shape[1]
     done = subprocess.run([generated / "example", table], capture_output=True, text=True)
@@ -220,9 +221,15 @@ def test_example_prints_the_verdict_of_every_row(
             assert one["verdict"] == calibration.verdicts(np.array([probability]))[0]
         else:
             assert one["verdict"] == "don't know" and probability == 0.0
-    table.write_text(f"{names.stdout}1.0,2.0\n")
-    done = subprocess.run([generated / "example", table], capture_output=True, text=True)
-    assert done.returncode == 1 and f"row 0 needs {len(columns)} numbers" in done.stderr
+    wrong = {
+        f"{names.stdout}1.0,2.0\n": f"row 0 needs {len(columns)} numbers",
+        names.stdout.replace(*columns[:2]): "column 0 must be 'state base_x'",
+        names.stdout.strip() + ",more\n": f"column {len(columns) - 1} must be 'hold'",
+    }
+    for text, message in wrong.items():
+        table.write_text(text)
+        done = subprocess.run([generated / "example", table], capture_output=True, text=True)
+        assert done.returncode == 1 and message in done.stderr
 
 
 @pytest.mark.slow
@@ -231,13 +238,13 @@ def test_command_writes_the_promise_and_sources_that_link_with_others(
     generated, monkeypatch, capsys, tmp_path
 ):
     file = tmp_path / "robot" / "safety.c"
-    assert call(monkeypatch, "export", SCENARIO, "--out", file, "--prefix", "robot_2") == 0
+    assert call(monkeypatch, "export", SCENARIO, "--out", file, "--prefix", "node1") == 0
     printed = capsys.readouterr().out
     calibration = load_assessment(SCENARIO).calibrations_["motion"]
     header = file.with_suffix(".h").read_text()
     assert calibration.promise in printed and calibration.promise in header
-    assert f"ROBOT_2_MOTION_THRESHOLD {calibration.threshold}" in header
-    assert "ROBOT_2_STATE_BASE_Z = 2," in header and "#define ROBOT_2_STEP_S 0.04 " in header
+    assert f"NODE1_MOTION_THRESHOLD {calibration.threshold}" in header
+    assert "NODE1_STATE_BASE_Z = 2," in header and "#define NODE1_STEP_S 0.04 " in header
     assert {one.name for one in file.parent.iterdir()} == {"safety.c", "safety.h", "example.c"}
     # No memory is allocated, and nothing but C's own headers is included.
     source = file.read_text()
@@ -246,8 +253,8 @@ def test_command_writes_the_promise_and_sources_that_link_with_others(
     standard = ("stdint", "stdbool", "math", "float", "limits", "string")
     assert included == {*(f"#include <{one}.h>" for one in standard), '#include "safety.h"'}
     main = f'#include "safety.h"\n#include "{generated}/gamma.h"\nint main(void) {{\n'
-    main += "    static robot_2_monitor a;\n    static robot_2_inputs in;\n"
-    main += "    robot_2_watch(&in, &a);\n    return (int)a.alarm;\n}\n"
+    main += "    static node1_monitor a;\n    static node1_inputs in;\n"
+    main += "    node1_watch(&in, &a);\n    return (int)a.alarm;\n}\n"
     (file.parent / "main.c").write_text(main)
     options = ["-std=c99", "-O0", "main.c", "safety.c", str(generated / "gamma.c"), "-lm"]
     build("gcc", *options, "-o", "main", folder=file.parent)
@@ -259,6 +266,15 @@ def test_errors_name_what_was_given(monkeypatch, assessment, tmp_path):
         assessment.to_onnx(tmp_path / "gamma.onnx", "gama")
     with pytest.raises(ValueError, match=r"prefix must be a name in C, .* got '2legs'"):
         assessment.to_c(tmp_path / "2legs.c")
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "example.c").write_text("int main() {}")
+    for file in (tmp_path / "example.c", own / "gamma.c"):
+        with pytest.raises(ValueError, match=r"it also writes 'example\.c' there, which would be"):
+            assessment.to_c(file)
+    for words in (["gamma.cpp"], ["gamma.c", "--part", "monitor"], ["a.onnx", "--prefix", "b"]):
+        assert call(monkeypatch, "export", SCENARIO, "--out", tmp_path / words[0], *words[1:]) == 2
+    shutil.rmtree(own)
     monkeypatch.setitem(sys.modules, "emx_onnx_cgen", None)
     with pytest.raises(ValueError, match=r"'emx_onnx_cgen' is not installed: pip .*\[c\]"):
         assessment.to_c(tmp_path / "gamma.c")

@@ -25,10 +25,15 @@ def export(
     ] = None,
 ) -> None:
     """Write Γ as one ONNX or C file, which runs without this package and without Drake."""
+    if out.suffix not in (".onnx", ".c"):
+        raise ValueError(f"export: --out must end in .onnx or .c; got '{out}'")
+    is_c = out.suffix == ".c"
+    if (is_c and part != "gamma") or (prefix is not None and not is_c):
+        raise ValueError("export: --part belongs to an ONNX file, --prefix to C")
     *_, gamma = folders.open_assessment(scenario, assessment, mode)
     folders.check_writable(out.parent)
     written = [out]
-    if out.suffix == ".c":
+    if is_c:
         written = gamma.to_c(out, prefix)
     else:
         gamma.to_onnx(out, part)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import onnx
 
 PARTS = ("assessor", "monitor")
+_EXAMPLE = "Verdicts on the rows of a CSV file"  # What begins an example of before.
 
 
 def write(path: Path, assessment: Any, prefix: str | None = None) -> list[Path]:
@@ -23,6 +24,10 @@ def write(path: Path, assessment: Any, prefix: str | None = None) -> list[Path]:
     if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):
         what = f"prefix must be a name in C, of letters, digits and '_'; got '{prefix}'"
         raise ValueError(f"export to '{path}': {what}")
+    example = path.with_name("example.c")
+    if path == example or (example.exists() and _EXAMPLE not in example.read_text()):
+        what = f"it also writes '{example.name}' there, which would be lost"
+        raise ValueError(f"export to '{path}': {what}; choose another name or folder")
     require_extra("c", f"export to '{path}'")
     import jinja2
 
@@ -55,7 +60,7 @@ def write(path: Path, assessment: Any, prefix: str | None = None) -> list[Path]:
         "threshold": next((key for key in ("motion", "plan") if key in calibrations), None),
         "sources": [_source(model, prefix, part) for part, model in models.items()],
     }
-    files = {path: "source.c", header: "header.h", path.with_name("example.c"): "example.c"}
+    files = {path: "source.c", header: "header.h", example: "example.c"}
     for file, template in files.items():
         text = environment.get_template(f"{template}.j2").render(known)
         write_file(file, f"{text}\n")
@@ -83,7 +88,8 @@ def _source(model: onnx.ModelProto, prefix: str, part: str) -> str:
     source = re.sub(r"^extern const .*\n", "", source, flags=re.M)
     source = re.sub(r"^_Bool \w+_load\(.*?^}\n", "", source, flags=re.M | re.S)
     source = re.sub(r"^(const EMX_UNUSED|void) ", r"static \1 ", source, flags=re.M)
-    return re.sub(r"\b(ref_scalar|node\d+|weight\d+)_", rf"{part}_\1_", source)
+    its_own = rf"\b(?!{prefix}_{part}_graph)(ref_scalar|node\d+|weight\d+)_"
+    return re.sub(its_own, rf"{part}_\1_", source)
 
 
 def _c_name(text: str) -> str:
