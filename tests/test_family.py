@@ -84,6 +84,16 @@ def test_a_plant_depends_on_seed_and_number_alone_and_not_on_the_shares_of_other
         ({"mass_scal": {"uniform": [0.5, 1]}}, "unknown key 'mass_scal' (did you mean"),
         ({"mass_scale": {"uniform": [-1.0, -0.5]}}, "'mass_scale'"),
         ({"shift": {"joints": {"one_of": 3}}}, "one_of must be a list; got 3"),
+        ({}, "ranges must have an entry of a plant variation; got {}"),
+        ({"share": 0.5, "mass_scale": 1.1}, "ranges cannot have a share"),
+        (
+            {"payload": {"position_m": [{"share": 0.5, "uniform": [0, 1]}]}},
+            "position_m cannot have",
+        ),
+        ({"shift": {"one_of": [{"share": 0.1}]}}, "one_of cannot have a share"),
+        ({"payload": {"share": 0.001, "mas_kg": 1.0}}, "unknown key 'payload.mas_kg'"),
+        ({"mass_scale": {"uniform": [-1e-6, 1.0]}}, "'mass_scale'"),
+        ({"shift": {"joints": {"*_hip": {}}}}, "must be a regular expression: nothing to repeat"),
     ],
 )
 def test_ranges_that_no_plant_can_have_are_refused(ranges, message):

@@ -38,7 +38,7 @@ def inputs(episodes):
 
 
 def added(assessment, inputs, **options):
-    """An assessor in a diagram, connected by one call, and a simulator."""
+    """An assessor in a diagram beside another one, each connected by one call, and a simulator."""
     builder = DiagramBuilder()
     ports = {
         name: None
@@ -47,6 +47,9 @@ def added(assessment, inputs, **options):
         for name, numbers in inputs.items()
     }
     assessor = AddSafetyAssessor(builder, assessment, **ports, **options)
+    with pytest.raises(ValueError, match="has a 'safety_assessor'; pass another name"):
+        AddSafetyAssessor(builder, assessment, **ports, **options)
+    AddSafetyAssessor(builder, assessment, **ports, **options, name="second")
     simulator = Simulator(builder.Build())
     return assessor, simulator, assessor.GetMyContextFromRoot(simulator.get_context())
 

@@ -17,6 +17,7 @@ from cart_episodes import assert_identical
 from drake_safety import record_episodes
 from drake_safety.learning.segments import DIVERGED, EpisodeError
 from drake_safety.simulation.dataset import completed, load_episodes
+from drake_safety.simulation.rollouts import episode_rng
 from toy_tasks import GlidingParameters, Mass
 
 STEP_S = 0.1
@@ -161,6 +162,24 @@ def test_a_diverged_simulation_is_counted_and_a_mistake_is_an_error(caplog):
         record(parameters={"failure": "bug"})
     with pytest.raises(EpisodeError, match=r"episode 0 of 'make_glider' \(seed 0\), reset: Type"):
         record(reset=lambda diagram, context, rng: context + 1)
+    with pytest.raises(EpisodeError, match=r"reset: .* expected the first row, 0 to 10; got 99"):
+        record(reset=lambda diagram, context, rng: 99)
+
+
+def reset_outside(diagram, context, rng):
+    """A start of which the first one is outside the safe set."""
+    if rng.random() == episode_rng(0, 0).random():
+        return context.SetDiscreteState([2.0, 0.0])
+    return reset_glider(diagram, context, rng)
+
+
+def test_an_episode_that_ends_at_its_start_vouches_for_no_diagram(tmp_path):
+    options = {"reset": reset_outside, "path": tmp_path, "name": "glider"}
+    assert record(3, **options)[0].num_steps == 0
+    with pytest.raises(ValueError, match=r"not the same any more: episode [12], sim"):
+        record(3, **options, make=lambda: make_glider(wall_m=0.1))
+    with pytest.raises(ValueError, match=r"1 of '<lambda>', .* keeps state outside its Context"):
+        record(reset=reset_outside, make=lambda: make_glider(mass=Keeper("memory")))
 
 
 @pytest.mark.parametrize(
@@ -169,6 +188,14 @@ def test_a_diverged_simulation_is_counted_and_a_mistake_is_an_error(caplog):
         ({"ports": {}}, r"exports no port \['state'\] for \['state'\]; it exports .*'margins'"),
         ({"ports": {"state": "output", "output": "margins"}}, "size 15 of .* is not H \\* 2"),
         ({"constraint_names": ["wall"]}, "constraint_names has 1 names; expected 2"),
+        (
+            {"ports": NAMES | {"safe": "margins"}},
+            "state and margins need entries, and safe has one",
+        ),
+        ({"make": lambda: None}, "make_diagram must return a Diagram; got NoneType"),
+        ({"preview_stride": 1.5}, "preview_stride must be an integer from 1 on; got 1.5"),
+        ({"plants": 0}, "plants must be an integer from 1 on; got 0"),
+        ({"duration_s": 1.05}, "duration_s must be a multiple of step_s; got 1.05 and 0.1"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_what_there_is(options, message):

@@ -12,7 +12,7 @@ FAMILY = "family"
 """Name of the variation whose episodes belong to the plants of a family."""
 _SHARE = "share"  # Share of the plants that have an entry.
 _DRAWS = ("uniform", "log_uniform", "one_of")
-_TRIED = 32  # Plants that a scenario's check draws.
+_TRIED = 32  # Choices of each list that are tried.
 
 
 @schema(kw_only=True)
@@ -29,13 +29,38 @@ class PlantFamily:
     ranges: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not self.ranges:
+            raise ValueError("family: ranges must have an entry of a plant variation; got {}")
         for number in range(_TRIED):
-            self.plant(PlantVariation(), 0, number)
+            self.extreme(PlantVariation(), number)
+
+    def extreme(self, nominal: PlantVariation, number: int) -> PlantVariation:
+        """The plant with every entry, at one end of each range, the odd numbers at the highest."""
+        return _plant(nominal, _drawn(self.ranges, _Extreme(number), "ranges"))
 
     def plant(self, nominal: PlantVariation, seed: int, number: int) -> PlantVariation:
         """Draws the plant of a number, the same for a seed."""
-        drawn = _drawn(self.ranges, plant_rng(seed, number), "ranges")
-        return load_typed(PlantVariation, asdict(nominal) | drawn, "family")
+        return _plant(nominal, _drawn(self.ranges, plant_rng(seed, number), "ranges"))
+
+
+class _Extreme:
+    """Stands for a generator, and draws the ends of ranges and the items of lists in turn."""
+
+    def __init__(self, number: int):
+        self._number = number
+
+    def random(self) -> float:
+        return 0.0
+
+    def uniform(self, *bounds: float) -> float:
+        return bounds[self._number % 2]
+
+    def integers(self, number: int) -> int:
+        return self._number % number
+
+
+def _plant(nominal: PlantVariation, drawn: dict[str, Any]) -> PlantVariation:
+    return load_typed(PlantVariation, asdict(nominal) | drawn, "family")
 
 
 def plant_rng(seed: int, number: int) -> np.random.Generator:
@@ -43,8 +68,10 @@ def plant_rng(seed: int, number: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, 1)))
 
 
-def _drawn(value: Any, rng: np.random.Generator, place: str) -> Any:
+def _drawn(value: Any, rng: Any, place: str, *, has_share: bool = False) -> Any:
     """The value with numbers in place of ranges; absent mappings are left out."""
+    if isinstance(value, dict) and _SHARE in value and not has_share:
+        raise ValueError(f"family: {place} cannot have a share; only entries of a mapping have one")
     if isinstance(value, list):
         return [_drawn(one, rng, place) for one in value]
     if not isinstance(value, dict):
@@ -62,13 +89,13 @@ def _drawn(value: Any, rng: np.random.Generator, place: str) -> Any:
         if isinstance(share, bool) or not (isinstance(share, int | float) and 0 < share <= 1):
             raise ValueError(f"family: {place}.{key}.share must be in (0, 1]; got {share!r}")
         # Drawn in either case, so that a share changes no other entry.
-        is_there, inner = rng.random() < share, _drawn(part, rng, f"{place}.{key}")
+        is_there, inner = rng.random() < share, _drawn(part, rng, f"{place}.{key}", has_share=True)
         if is_there:
             drawn[key] = inner
     return drawn
 
 
-def _of_range(kind: str, bounds: Any, rng: np.random.Generator, place: str) -> Any:
+def _of_range(kind: str, bounds: Any, rng: Any, place: str) -> Any:
     if not isinstance(bounds, list) or not bounds:
         raise ValueError(f"family: {place} must be a list; got {bounds!r}")
     if kind == "one_of":

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat
 
-from drake_safety.files.schema import NotNegative, Positive, Triple, schema
+from drake_safety.files.schema import NotNegative, Pattern, Positive, Triple, schema
 
 FAULTS = {one: True for one in ("bias", "drift", "scale", "delay", "fade")}
 FAULTS |= {"zero": False, "freeze": False}
@@ -55,7 +55,7 @@ class Shift:
     gravity_scale: Positive = 1.0  # Factor on gravity.
     # Steady force on the base's origin, in the world, (3,) [N].
     base_force_n: Triple = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    joints: dict[str, JointShift] = field(default_factory=dict)  # By name or pattern.
+    joints: dict[Pattern, JointShift] = field(default_factory=dict)  # By name or pattern.
     command_delay_s: NotNegative = 0.0  # Age of the command that the joints get [s].
     # Faults of the command that the joints get. Entries are joints, their velocities end in
     # ``_rate``; where the command is torques, they are actuators.

@@ -9,7 +9,7 @@ from os import PathLike
 from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Context, Diagram, PortDataType
 
 from drake_safety.files.schema import check_times
 from drake_safety.learning.segments import (
@@ -154,8 +154,12 @@ def prepare_recording(
     period_s = step_s / 10 if monitor_period_s is None else monitor_period_s
     check_times("record_episodes", duration_s=duration_s, step_s=step_s, monitor_period_s=period_s)
     num_steps = round(duration_s / step_s)
-    if num_steps < 1:
-        raise ValueError("record_episodes: duration_s must be at least step_s")
+    if num_steps < 1 or abs(duration_s / step_s - num_steps) > 0.01:
+        times = f"got {duration_s} and {step_s}"
+        raise ValueError(f"record_episodes: duration_s must be a multiple of step_s; {times}")
+    for what, count in {"preview_stride": preview_stride, "plants": plants}.items():
+        if count < 1 or int(count) != count:
+            raise ValueError(f"record_episodes: {what} must be an integer from 1 on; got {count}")
     # The diagram is built anew for each call: a function does not tell whether its result changed.
     key = uuid.uuid4().hex
     build = partial(make_diagram, **dict(parameters or {}))
@@ -164,6 +168,9 @@ def prepare_recording(
         sampler = draw_plant
         make = loops_by_plant(key, lambda number: build(sampler(plant_rng(seed, number))))
     first = make() if draw_plant is None else make()(1)
+    if not isinstance(first, Diagram):
+        got = type(first).__name__
+        raise ValueError(f"record_episodes: make_diagram must return a Diagram; got {got}")
     warn_of_sampled_ports("record_episodes", [first])
     used, sizes = _used_ports(first, dict(ports or {}))
     # As the hash has always been made of it, so that kept sets stay valid.
@@ -195,7 +202,10 @@ def prepare_recording(
         def begin(context: Context) -> int | None:
             rng = seed_random_sources(diagram, context, seed, index, draws)
             try:
-                return start(diagram, context, rng)
+                row = start(diagram, context, rng)
+                if row is not None and not (int(row) == row and 0 <= row <= num_steps):
+                    raise ValueError(f"expected the first row, 0 to {num_steps}; got {row!r}")
+                return row
             except Exception as error:
                 raise EpisodeError(f"{who}, reset: {type(error).__name__}: {error}") from error
 
@@ -248,6 +258,12 @@ def _used_ports(diagram: Diagram, given: dict[str, str]) -> tuple[dict[str, str]
         text = f"no port {ports} for {named}; it exports {sorted(there)}"
         raise ValueError(f"record_episodes: the diagram exports {text}")
     sizes = {name: there[port] for name, port in used.items()}
+    types = {port: diagram.GetOutputPort(port).get_data_type() for port in used.values()}
+    if abstract := [port for port, one in types.items() if one == PortDataType.kAbstractValued]:
+        raise ValueError(f"record_episodes: ports {abstract} must have vectors")
+    if min(sizes["state"], sizes["margins"]) < 1 or sizes.get("safe", 1) != 1:
+        text = f"state and margins need entries, and safe has one; got {sizes}"
+        raise ValueError(f"record_episodes: {text}")
     n_z, n_preview = sizes["output"], sizes["desired_preview"]
     if n_z < 1 or n_preview < 1 or n_preview % n_z:
         raise ValueError(f"record_episodes: size {n_preview} of desired_preview is not H * {n_z}")

@@ -400,8 +400,8 @@ def collect_episodes(
 ) -> Episodes:
     """Simulates the episodes of a set that a folder does not hold yet, in worker processes.
 
-    ``run`` returns the episode of a diagram and an index. If ``is_repeated``, the first episode,
-    simulated again after the next by a new diagram, must be the same.
+    ``run`` returns the episode of a diagram and an index. If ``is_repeated``, the first
+    episode with several rows, simulated again after the next by a new diagram, must be the same.
     """
     with nullcontext() if path is None else EpisodeWriter(path, info, extra) as writer:
         there = [] if writer is None else load_episodes(writer.path)
@@ -423,10 +423,14 @@ def collect_episodes(
             stage=f"episodes of '{info.scenario}'",
             batch_size=batch_size,
         )
+        judged = set(pending[:1] if is_repeated else ())
         with closing(results):
             for episode in results:
-                is_judged = is_repeated and episode.index == pending[0]
-                if is_judged and not is_repeatable(episode, make.make(), run):
+                if is_judged := episode.index in judged:
+                    judged = (
+                        set() if episode.num_steps else set(pending)
+                    )  # A single row says little.
+                if is_judged and not judged and not is_repeatable(episode, make.make(), run):
                     who = f"episode {episode.index} of '{info.scenario}'"
                     raise ValueError(f"{who}, simulated again after the next, {HIDDEN_STATE}")
                 episodes.append(episode)
@@ -454,7 +458,7 @@ def is_repeatable(episode: Episode, diagram: Diagram, run: Callable[..., Episode
 
 def check_kept(path: Path, kept: Sequence[Episode], run: Callable[[int], Episode]) -> None:
     """Simulates one of a folder's episodes again, a long unsafe one if there is one."""
-    chosen = min(kept, key=lambda episode: (episode.is_safe, -episode.num_steps, episode.index))
+    chosen = min(kept, key=lambda e: (e.num_steps == 0, e.is_safe, -e.num_steps, e.index))
     with ONE_BLAS_THREAD:
         again = run(chosen.index)
     if not is_same(chosen, again):

@@ -354,11 +354,12 @@ def _episodes(
     for index in range(num_episodes):
         episodes.append(run(loop, index))
         report("episodes", index + 1, num_episodes)
+    longest = max(episodes, key=lambda episode: episode.num_steps)
     yield _judged(
         "repeated episode",
-        is_repeatable(episodes[0], loop.scenario.make_loop(loop.variation), run),
+        is_repeatable(longest, loop.scenario.make_loop(loop.variation), run),
         "simulated again after others, it is the same to the last bit",
-        f"episode 0, simulated again after others, {HIDDEN_STATE}",
+        f"episode {longest.index}, simulated again after others, {HIDDEN_STATE}",
         "declare it as discrete, continuous or abstract state, or as a parameter",
     )
     causes = Counter(episode.cause for episode in episodes if not episode.is_safe)

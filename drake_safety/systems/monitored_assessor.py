@@ -99,8 +99,9 @@ def AddSafetyAssessor(
     hold: OutputPort | None = None,
     period_s: float | None = None,
     on_alarm: str | None = "unknown",
+    name: str = "safety_assessor",
 ) -> MonitoredSafetyAssessor:
-    """Adds a :class:`MonitoredSafetyAssessor` named ``safety_assessor``, and connects it.
+    """Adds a :class:`MonitoredSafetyAssessor`, and connects it.
 
     It warns of plants with sampled output ports, and of a monitor that never alarms.
 
@@ -109,20 +110,24 @@ def AddSafetyAssessor(
         margins: Margins of the measured state, (n_c,) [m, rad]; None: it may lie outside unnoticed.
         hold: 1 while a known disturbance acts, for which the monitor waits.
         period_s, on_alarm: As of `MonitoredSafetyAssessor`.
+        name: Name of the subsystem, another one for a second Γ.
 
     Example: ``assessor = AddSafetyAssessor(builder, assessment, margins=None, **ports)``
     """
+    if builder.HasSubsystemNamed(name):
+        raise ValueError(f"AddSafetyAssessor: the builder has a '{name}'; pass another name")
     assessor = MonitoredSafetyAssessor(
         assessment, period_s=period_s, checks_margins=margins is not None, on_alarm=on_alarm
     )
     warn_of_sampled_ports("AddSafetyAssessor", builder.GetSystems())
     if on_alarm is not None and math.isinf(assessment.detector_.alarm_level):
         _LOGGER.warning("AddSafetyAssessor: %s", assessment.detector_.describe())
-    builder.AddNamedSystem("safety_assessor", assessor)
-    ports = {"state": state, "desired_preview": desired_preview}
-    for name, port in {**ports, "features": features, "margins": margins, "hold": hold}.items():
+    builder.AddNamedSystem(name, assessor)
+    ports: dict[str, OutputPort | None] = {"state": state, "desired_preview": desired_preview}
+    ports |= {"features": features, "margins": margins, "hold": hold}
+    for input_port, port in ports.items():
         if port is not None:
-            builder.Connect(port, assessor.GetInputPort(name))
+            builder.Connect(port, assessor.GetInputPort(input_port))
     return assessor
 
 
