@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from command_line import call
 from drake_safety import (
     AssessmentParameters,
     SafetyAssessment,
@@ -190,6 +191,15 @@ def test_check_simulates_the_family(scenario, tmp_path):
     findings = {one.item: one for one in check_scenario(tmp_path / "one.yaml", num_episodes=4)}
     finding = findings["share of unsafe episodes in the family"]
     assert "of 4 episodes, each on a random plant" in finding.message
+
+
+def test_train_refuses_a_rare_entry_before_it_simulates(monkeypatch, capsys, tmp_path):
+    scenario = load_scenario(
+        "pendulum", {"family": {"ranges": {"foot_friction": {"share": 0.01, "one_of": [0.5]}}}}
+    )
+    (tmp_path / "one.yaml").write_text(scenario.to_yaml())
+    assert call(monkeypatch, "train", tmp_path / "one.yaml", "--out", tmp_path / "run") == 2
+    assert "foot_friction" in capsys.readouterr().out and not (tmp_path / "run").exists()
 
 
 def test_promises_over_the_family_are_judged_on_fresh_plants(scenario, sets, tmp_path):

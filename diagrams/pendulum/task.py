@@ -180,7 +180,9 @@ class Pendulum(PlannedLoop):
         varied = self._plant_variation
         plain = PlantVariation(mass_scale=varied.mass_scale, joint_damping=varied.joint_damping)
         if varied != plain:
-            raise ValueError("pendulum: variations may set mass_scale and joint_damping alone")
+            what = f"variation '{variation}' may set mass_scale and joint_damping alone"
+            got = [name for name, one in vars(varied).items() if one != getattr(plain, name)]
+            raise ValueError(f"pendulum: {what}; got {got}")
         parameters, period_s = scenario.parameters, scenario.control_period_s
         outlook_s, builder = scenario.episode_duration_s, DiagramBuilder()
         pendulum = self._pendulum = builder.AddNamedSystem("pendulum", PendulumPlant())

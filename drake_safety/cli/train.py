@@ -77,6 +77,9 @@ def train(
             raise ValueError(f"{folder} already holds {len(kept)} episodes: pass --resume")
     folders.check_writable(out)
     loop = loaded.make_loop()
+    if family is not None:  # What the task does not take is refused before the simulations.
+        whole = family.extreme(loaded.variation("nominal"), 0)
+        loaded.with_variation(FAMILY, whole).make_loop(FAMILY)
     piece_s = motion_piece_s(loop)
     motion_s = max(min(6.0 * episodes, 2880.0), 2.0 * piece_s) if motion is None else 60.0 * motion
     if 0.0 < motion_s <= piece_s:
