@@ -12,6 +12,7 @@ from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation import hand_over
 from drake_safety.simulation.hand_over import MotorLoads, check_hand_over
 from drake_safety.simulation.motion import Motion
+from legged_robots import edited
 from policy_networks import save_network, save_script, walker
 
 
@@ -50,6 +51,23 @@ def test_a_network_that_returns_nan_at_a_command_is_damaged(tmp_path):
     (finding,) = check_hand_over(loop)
     assert not finding.is_ok
     assert "returns actions that are not finite, and the last one is held" in finding.message
+
+
+@pytest.mark.train
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"period_s": 0.005}, "the joint targets jump by 0.13 rad (knee_5)"),
+        ({"gains": {".*": {}}}, "the joint targets jump by 0.13 rad (knee_5)"),  # No servos.
+        ({"command": {"highest": [0, 0, 0]}}, "no command is above zero"),
+    ],
+)
+def test_a_policy_that_does_not_walk_is_told_how_it_begins(tmp_path, changes, message):
+    # The first action is 0.36 to 0.53, by gravity.
+    scenario = walker(tmp_path, save_network(tmp_path / "walk.pt", 42, 18, scale=-0.01))
+    edited(scenario.with_name("policy.yaml"), **changes)
+    (finding,) = check_hand_over(load_scenario(scenario).make_loop())
+    assert not finding.is_ok and message in finding.message
 
 
 @pytest.mark.train

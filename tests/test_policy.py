@@ -136,6 +136,10 @@ def test_the_gait_clock_runs_once_a_period_and_commands_change_slowly(tmp_path):
         ({"observation": terms("lidar")}, r"unknown term 'lidar'; registered"),
         ({"observation": terms("last_action", scale=[1.0] * 3)}, "has 2 entries; got 3 scales"),
         ({"observation": terms("joint_pos_rel", joints=["ear"])}, r"has joints \['ear'\]"),
+        ({"default_positions": {"hip": 0.1, "ear": 0.1}}, "yaml's default_positions pattern 'ear'"),
+        ({"action_scale": {".*": 0.1, "ear": 0.1}}, "yaml's action_scale pattern 'ear'; it has"),
+        ({"gains": {".*": JointGains(), "ear": JointGains()}}, "yaml's gains pattern 'ear'; it"),
+        ({"rotor_inertia": {"ear": 0.01}}, r"yaml's rotor_inertia pattern 'ear'; it has \['hip'"),
     ],
 )
 def test_policy_that_does_not_fit_its_robot_is_refused(tmp_path, changed, message):
@@ -233,6 +237,9 @@ def test_what_the_metadata_say_is_used_where_nothing_is_stated(tmp_path):
     # An entry that does not fit is an error only where nothing else is stated.
     network = save_onnx(tmp_path / "q.onnx", 13, 2, metadata=said | {"action_scale": "1,2,3"})
     with pytest.raises(ValueError, match=r"'action_scale' \[rad\] of joints .* got \[1, 2, 3\]"):
+        policy(tmp_path, network=str(network), **unstated)
+    network = save_onnx(tmp_path / "r.onnx", 13, 2, metadata=said | {"joint_damping": "-1"})
+    with pytest.raises(ValueError, match=r"gains of joint 'knee' in its metadata: 'damping' must"):
         policy(tmp_path, network=str(network), **unstated)
 
 

@@ -33,6 +33,10 @@ def plant_of(robot, variation=None, **options):
         ({"joint_gains": {".*": {}, "left_knee": {}}}, "gains of joint 'left_knee' matches"),
         ({"mirror": {"left_(.*)": r"x_\1"}}, "pairs joints .*'left_hip_z': 'x_hip_z'.*; it has"),
         ({"mirror": {"left_(hip_x|knee)": "right_knee"}}, "'left_hip_x' and with 'left_knee'"),
+        ({"joint_gains": {".*": {}, "hip": {}}}, "no joint for joint_gains pattern 'hip'; it has"),
+        ({"effort_limits": {"hip": 4.0}}, "no joint for effort_limits pattern 'hip'; it has"),
+        ({"velocity_limits": {"hip": 4.0}}, "no joint for velocity_limits pattern 'hip'; it has"),
+        ({"rotor_inertia": {"hip": 4.0}}, "no joint for rotor_inertia pattern 'hip'; it has"),
     ],
 )
 def test_names_that_the_model_lacks_are_answered_with_those_it_has(tmp_path, change, message):

@@ -235,6 +235,8 @@ def test_a_strangers_scenario_is_checked_without_running_its_code(tmp_path, monk
     assert (scenario.task, scenario.parameters) == ("stranger:Task", {})
     with pytest.raises(SystemExit, match="code was run"):
         load_scenario(file)
+    (finding,) = check_scenario(file)  # A failed condition in Drake is SystemExit, too.
+    assert finding.message == "SystemExit: code was run"
 
 
 @pytest.mark.parametrize(

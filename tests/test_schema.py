@@ -54,6 +54,10 @@ CASES = {
     },
     RobotModel: {
         "joint_gains: {.*: {stiffnes: 3.0}}": r"s\.\.\*\.stiffnes'.*'stiffness'",
+        "joint_gains: {.*: {stiffness: -20.0}}": r"\.stiffness' must be greater .* to 0; got -20",
+        "effort_limits: {a: -1.0}": r"'effort_limits\.a' must be greater than 0; got -1",
+        "velocity_limits: {a: 0.0}": r"'velocity_limits\.a' must be greater than 0; got 0",
+        "rotor_inertia: {a: -1.0}": r"'rotor_inertia\.a' must be greater than or equal to 0",
         "mirror: {(: x}": r"'mirror\.\(' must be a regular expression: .*; got '\('",
         "shapes: {seat: [{}]}": r"'shapes\.seat\.0': expected box_m, or radius_m",
         "shapes: {a: [{radius_m: 1}]}": r"shapes \['a'\] need collision: stated",
@@ -62,6 +66,9 @@ CASES = {
         "history: {ages: [0, 2]}": r"newest 2 samples once; got \[0, 2\]",
         "history: {ages: [0, 1]}, observation: [{name: a, history: 2}]": r"got both, \['a'\]",
         "command: {lowest: [2, 0, 0]}": "'command': lowest must not exceed",
+        "command: {change: [0, -1, 0]}": r"'command\.change\.1' must be greater .*; got -1",
+        "gains: {a: {damping: .nan}}": r"'gains\.a\.damping' must be a finite number; got nan",
+        "action_scale: {a: .nan}": r"'action_scale\.a' must be a finite number; got nan",
     },
     Scenario: {
         "step_s: 1e-9": "an episode of 2.0 s has more than 10000000 steps of step_s",

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, FiniteFloat
 from pydrake.math import RotationMatrix
 
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES, RobotKinematics
@@ -19,12 +19,19 @@ from drake_safety.files.schema import (
     Positive,
     Requirement,
     Triple,
+    load_typed,
     load_typed_file,
     schema,
 )
 from drake_safety.policies.policy_network import PolicyNetwork, load_network
 from drake_safety.robots.model_files import model_file
-from drake_safety.robots.robot_model import JointGains, RobotModel, as_pattern, by_pattern
+from drake_safety.robots.robot_model import (
+    JointGains,
+    RobotModel,
+    as_pattern,
+    by_pattern,
+    require_known,
+)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -44,6 +51,7 @@ class PolicyInput:
 
 
 Term = Callable[[PolicyInput], np.ndarray]
+_Change = Annotated[float, Field(ge=0)]  # Of a command; it may be infinite.
 # Registered terms by the names of Isaac Lab; clocks and parts of the command are Holosoma's.
 TERMS: dict[str, Term] = {
     "base_lin_vel": lambda inputs: inputs.R_WB.T @ inputs.v_WB,
@@ -77,7 +85,7 @@ class ObservationTerm:
     """A part of the network's input."""
 
     name: str = ""  # One of the registered terms; see :func:`observation_term`.
-    scale: list[float] = field(default_factory=lambda: [1.0])  # Factor, one or one per entry.
+    scale: list[FiniteFloat] = field(default_factory=lambda: [1.0])  # Factor, one or one per entry.
     clip: Annotated[float, Field(gt=0)] = 100.0  # Largest absolute value after scaling.
     history: Count = 1  # Number of samples, the oldest first.
     # Joints whose positions or rates it has, in its order; by default the moved joints.
@@ -90,7 +98,7 @@ class GaitClock:
 
     period_s: NotNegative = 0.0  # Period of a cycle [s]; 0 for policies without a clock.
     # Phase of each foot at the start, as a share of the period.
-    offsets: list[float] = field(default_factory=lambda: [0.0, 0.5])
+    offsets: list[FiniteFloat] = field(default_factory=lambda: [0.0, 0.5])
     standing_below: float = 0.01  # Norm of the command below which every phase is half a period.
 
 
@@ -100,7 +108,7 @@ class CommandLimits:
 
     lowest: Triple = field(default_factory=lambda: [-1.0, -1.0, -1.0])
     highest: Triple = field(default_factory=lambda: [1.0, 1.0, 1.0])
-    change: Annotated[list[float], Field(min_length=3, max_length=3)] = field(
+    change: Annotated[list[_Change], Field(min_length=3, max_length=3)] = field(
         default_factory=lambda: 3 * [math.inf]  # Largest in one period.
     )
 
@@ -134,13 +142,13 @@ class PolicyParameters:
     joints: list[str] = field(default_factory=list)
     # Joint positions at zero action [rad], by regular expression; 0 for others. The default of
     # this, ``action_scale`` and ``gains`` is in the network's metadata.
-    default_positions: dict[Pattern, float] = field(default_factory=dict)
+    default_positions: dict[Pattern, FiniteFloat] = field(default_factory=dict)
     # Joint positions per unit of action [rad], by regular expression.
-    action_scale: dict[Pattern, float] = field(default_factory=dict)
+    action_scale: dict[Pattern, FiniteFloat] = field(default_factory=dict)
     action_clip: Annotated[float, Field(gt=0)] = 100.0  # Largest absolute action.
     gains: dict[Pattern, JointGains] = field(default_factory=dict)  # Servo gains, by pattern.
     # Rotor inertia as the joints feel it [kg·m²], by regular expression.
-    rotor_inertia: dict[Pattern, float] = field(default_factory=dict)
+    rotor_inertia: dict[Pattern, NotNegative] = field(default_factory=dict)
     period_s: Positive = 0.02  # Time between two actions [s].
     observation: list[ObservationTerm] = field(default_factory=list)  # In the network's order.
     history: WholeHistory = field(default_factory=WholeHistory)
@@ -181,6 +189,9 @@ class Policy:
         if unknown or len(set(names)) != len(names):
             what = f"got {names}, of which it lacks {unknown}; it has {joint_names}"
             raise ValueError(f"{who}: joints must be different joints of the robot; {what}")
+        for key in ("default_positions", "action_scale", "gains", "rotor_inertia"):
+            what = f"joint for policy.yaml's {key} pattern"
+            require_known(robot, what, getattr(parameters, key), joint_names)
         self.joint_names = list(names)
         self.joints = np.array([joint_names.index(name) for name in names], dtype=int)
 
@@ -201,7 +212,9 @@ class Policy:
         self.gains: dict[str, JointGains] = {}
         for name, stiffness in by_joint("stiffness", names).items():
             if name in damping:
-                self.gains[name] = JointGains(stiffness=stiffness, damping=damping[name])
+                both = {"stiffness": stiffness, "damping": damping[name]}
+                where = f"{who}: gains of joint '{name}' in its metadata"
+                self.gains[name] = load_typed(JointGains, both, where)
         self.gains |= by_joint("gains", names)
         missing = []
         if not names:

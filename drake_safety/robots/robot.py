@@ -1,9 +1,8 @@
 """Adds a robot to a MultibodyPlant, with plant variations that model a reality gap."""
 
 import logging
-import re
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import field
 from itertools import chain
 from typing import Generic, Literal, TypeVar
@@ -33,7 +32,7 @@ from pydrake.systems.framework import Context
 from drake_safety.files.schema import NotNegative, Positive, Triple, schema
 from drake_safety.robots.meshes import check_meshes
 from drake_safety.robots.model_files import model_file, package_parser
-from drake_safety.robots.robot_model import RobotModel, by_pattern
+from drake_safety.robots.robot_model import RobotModel, by_pattern, require_known
 from drake_safety.robots.shift import JointShift, Shift
 from drake_safety.robots.urdf import drake_urdf, empty_shapes, read_urdf
 
@@ -84,13 +83,6 @@ _FRICTION_SUFFIX = "_friction"  # Suffix of actuators that model dry friction.
 _FRICTION_DAMPING = 2000.0  # [N·m·s/rad]: a stuck joint creeps at no more than tau_c / 2000.
 
 
-def _require(robot: RobotModel, what: str, names: Iterable[str], known: list[str]) -> None:
-    """Checks that names, or patterns, are of what a robot has."""
-    for name in names:
-        if name not in known and not any(re.fullmatch(name, other) for other in known):
-            raise ValueError(f"robot '{robot.name}' has no {what} '{name}'; it has {known}")
-
-
 def servo_joints(plant: MultibodyPlant, robot: RobotModel) -> list[str]:
     """Returns the robot's one-degree-of-freedom joints, in the order of a finalised plant."""
     instance = plant.GetModelInstanceByName(robot.name)
@@ -106,7 +98,7 @@ def _set_friction(
 ) -> None:
     ground = variation.foot_friction or robot.foot_friction
     of_feet = variation.shift.foot_friction if variation.shift else {}
-    _require(robot, "foot for friction", of_feet, list(robot.feet))
+    require_known(robot.name, "foot for friction", of_feet, list(robot.feet))
     inspector = scene_graph.model_inspector()
     instance = plant.GetModelInstanceByName(robot.name)
     source = plant.get_source_id()
@@ -165,7 +157,7 @@ def _add_stated_shapes(
 ) -> None:
     """Adds the collision geometry of robot.yaml: contact points and shapes."""
     bodies = {body.name(): body for body in map(plant.get_body, plant.GetBodyIndices(instance))}
-    _require(robot, "body for shapes", robot.shapes, list(bodies))
+    require_known(robot.name, "body for shapes", robot.shapes, list(bodies))
     material = CoulombFriction(_SHAPE_FRICTION, _SHAPE_FRICTION)
     for name, body in bodies.items():
         shapes = by_pattern(robot.shapes, name, "shapes", robot.name, "body") or []
@@ -218,7 +210,7 @@ def add_robot(
     variation = variation or PlantVariation()
     instance = _add_description(plant, robot)
     shifts, joint_names = variation.shift or Shift(), servo_joints(plant, robot)
-    _require(robot, "joint for shift", shifts.joints, joint_names)
+    require_known(robot.name, "joint for shift", shifts.joints, joint_names)
     if force_n := np.linalg.norm(shifts.base_force_n):
         # A spring so long that motion hardly changes its force or direction.
         far = _SPRING_LENGTH_M * np.array(shifts.base_force_n) / force_n
@@ -229,8 +221,12 @@ def add_robot(
     bodies = [plant.get_body(i).name() for i in plant.GetBodyIndices(instance)]
     joints = [plant.get_joint(i).name() for i in plant.GetJointIndices(instance)]
     links = (limb.body for limb in robot.limbs())
-    _require(robot, "body", (robot.base, *links, *robot.whole_body.orientation), bodies)
-    _require(robot, "joint", (name for limb in robot.limbs() for name in limb.joints), joints)
+    require_known(robot.name, "body", (robot.base, *links, *robot.whole_body.orientation), bodies)
+    of_limbs = (name for limb in robot.limbs() for name in limb.joints)
+    require_known(robot.name, "joint", of_limbs, joints)
+    for key in ("joint_gains", "effort_limits", "velocity_limits", "rotor_inertia"):
+        what = f"joint for {key} pattern"
+        require_known(robot.name, what, getattr(robot, key), joint_names)
     robot.mirror_partners(joint_names)
     if robot.collision == "stated" and plant.geometry_source_is_registered():
         _add_stated_shapes(plant, robot, instance)
@@ -294,7 +290,7 @@ def require_motors(plant: MultibodyPlant, robot: RobotModel) -> None:
 def posture_positions(plant: MultibodyPlant, robot: RobotModel) -> dict[str, float]:
     """Returns the standing position [rad] of every servo joint; zero if robot.yaml has none."""
     names = servo_joints(plant, robot)
-    _require(robot, "joint for posture pattern", robot.posture, names)
+    require_known(robot.name, "joint for posture pattern", robot.posture, names)
     return {name: by_pattern(robot.posture, name, "posture", robot.name) or 0.0 for name in names}
 
 
@@ -328,7 +324,7 @@ def apply_masses(
     if payload is None:
         return
     name = payload.body or robot.base
-    _require(robot, "body", [name], [body.name() for body in bodies])
+    require_known(robot.name, "body", [name], [body.name() for body in bodies])
     body = plant.GetBodyByName(name, instance)
     M_PPo_P = SpatialInertia.SolidSphereWithMass(payload.mass_kg, PAYLOAD_RADIUS_M)
     M_BBo_B = body.CalcSpatialInertiaInBodyFrame(context)

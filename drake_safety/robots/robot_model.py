@@ -6,7 +6,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import Field
+from pydantic import Field, FiniteFloat
 
 from drake_safety.files.schema import (
     NotNegative,
@@ -36,8 +36,8 @@ class Foot:
 class JointGains:
     """Gains of a joint's position servo."""
 
-    stiffness: float = 0.0  # [N·m/rad]
-    damping: float = 0.0  # [N·m·s/rad]
+    stiffness: NotNegative = 0.0  # [N·m/rad]
+    damping: NotNegative = 0.0  # [N·m·s/rad]
 
 
 @schema(kw_only=True)
@@ -99,7 +99,7 @@ class RobotModel:
     requires: Requirement = ""  # Package of ``urdf`` for pip, without dependencies, if no extra.
     base: str = ""  # Floating base body.
     # Standing joint positions [rad], by regular expression over joint names.
-    posture: dict[Pattern, float] = field(default_factory=dict)
+    posture: dict[Pattern, FiniteFloat] = field(default_factory=dict)
     feet: dict[str, Foot] = field(default_factory=dict)
     reaching_frames: dict[str, ReachingFrame] = field(default_factory=dict)  # By hand.
     # Mirrored joints: regular expression over joint names -> name of the partner.
@@ -108,11 +108,11 @@ class RobotModel:
     # Position servo gains, by regular expression over joint names.
     joint_gains: dict[Pattern, JointGains] = field(default_factory=dict)
     # Effort limits [N·m] that the model file lacks, by regular expression.
-    effort_limits: dict[Pattern, float] = field(default_factory=dict)
+    effort_limits: dict[Pattern, Positive] = field(default_factory=dict)
     # Joint speed limits [rad/s] that replace the model file's, by regular expression.
-    velocity_limits: dict[Pattern, float] = field(default_factory=dict)
+    velocity_limits: dict[Pattern, Positive] = field(default_factory=dict)
     # Inertia of the motors' rotors as the joints feel it [kg·m²], by regular expression.
-    rotor_inertia: dict[Pattern, float] = field(default_factory=dict)
+    rotor_inertia: dict[Pattern, NotNegative] = field(default_factory=dict)
     # ``stated``: only the feet's contact points and ``shapes`` (URDF only).
     collision: Literal["model_file", "stated"] = "model_file"
     # Shapes for ``stated`` collisions, by regular expression over body names.
@@ -171,6 +171,13 @@ def load_robot_file(path: str | Path) -> RobotModel:
 def as_pattern(name: str) -> str:
     """Returns a regular expression that matches a name alone, and is the name where it can be."""
     return re.sub(r"[.^$*+?{}\[\]\\|()]", r"\\\g<0>", name)
+
+
+def require_known(robot_name: str, what: str, names: Iterable[str], known: list[str]) -> None:
+    """Checks that names, or patterns, are of what a robot has."""
+    for name in names:
+        if name not in known and not any(re.fullmatch(name, other) for other in known):
+            raise ValueError(f"robot '{robot_name}' has no {what} '{name}'; it has {known}")
 
 
 def by_pattern(

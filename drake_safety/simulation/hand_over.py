@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform
+from pydrake.multibody.tree import PdControllerGains
 from pydrake.systems.framework import Context
 
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
@@ -32,6 +33,7 @@ _MOTORS_REMEDY = (
     "speed and a penalty near them, and compare 'action_scale', 'action_clip' and 'gains' in "
     "policy.yaml with training"
 )
+_RANGES_REMEDY = "state the largest commands of training, 'command: {highest: ...}' in policy.yaml"
 _START_REMEDY = "move the joints to the policy's first targets before it takes over, or blend"
 _RANDOM_REMEDY = "train the policy with random latency, friction and mass beyond the robot's"
 _COMMAND_REMEDY = "send the policy no smaller commands but zero, or train it with small commands"
@@ -69,7 +71,8 @@ class MotorLoads:
         actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
         motors = {one.joint().name(): one for one in actuators}
         ordered = [motors[name] for name in kinematics.joint_names]
-        gains = [one.get_controller_gains() for one in ordered]
+        loose = PdControllerGains()  # Zero: of a joint without a servo.
+        gains = [one.get_controller_gains() if one.has_controller() else loose for one in ordered]
         self.names = kinematics.joint_names
         effort = np.array([one.effort_limit() for one in ordered])
         # By the limit of torque [1/rad, s/rad].
@@ -127,6 +130,10 @@ def check_hand_over(
         The first correction, "" if the policy walks.
     """
     highest = np.array(loop.policy.parameters.command.highest)
+    if not (highest > 0.0).any():
+        message = f"no command is above zero: 'command' has highest {highest.tolist()}"
+        yield failed(ITEM, message, _RANGES_REMEDY)
+        return _RANGES_REMEDY
     axis = int(np.argmax(highest > 0.0))
     command = 0.5 * highest * np.eye(3)[axis]
     starts, loads = _starts(loop), MotorLoads(loop)
@@ -195,7 +202,7 @@ def _taken_over(
     jump, period_s = np.zeros(len(loads.names)), loop.policy.parameters.period_s
 
     def watch(context: Context) -> None:
-        if context.get_time() < 0.5 * period_s:  # Within its first action.
+        if context.get_time() <= period_s:  # Before the second action; at time zero before any.
             jump[:] = np.abs(loads.targets(context) - start.q[-len(jump) :])
         loads.read(context)
 

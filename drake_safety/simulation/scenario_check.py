@@ -100,8 +100,8 @@ def _guarded(
     """A check's findings and result; an exception is a finding, and the result None."""
     try:
         return (yield from check(*arguments))
-    # A user's task may raise anything, and so may Drake's parser.
-    except Exception as error:
+    # A user's task may raise anything, and so may Drake; a failed condition of it is SystemExit.
+    except (Exception, SystemExit) as error:
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
         yield failed(item, f"{kind}{error}", "correct what the message names")
         return None
