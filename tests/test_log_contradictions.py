@@ -64,6 +64,11 @@ def with_signs(*parts):
     return times([*ANGLES, *RATES], *signs, *signs)
 
 
+def slowly(spoil):
+    """A spoilt log of a motion four times as slow."""
+    return lambda f: spoil(times([*LINEAR, *GYRO, *RATES], 0.25)(f.assign(stamp=4 * f.stamp)))
+
+
 UNMAPPED = [(line, "") for line in TABLE_MAP.splitlines() if "velocit" in line]
 CONTRADICTIONS = {
     "in the world": (lambda f: with_values(f, LINEAR, turns_of(f).apply(np.array(f[LINEAR]))), [],
@@ -93,6 +98,15 @@ CONTRADICTIONS = {
                               r"below the .* m higher: 'base_position.offset' of .base_z: 4"),
     "two frames in turn": (lambda f: f.assign(base_y=f.base_y + 250.0 * (f.index % 2)), [],
                            "line 3, column 'base_y': .* m/s since the row before"),
+    "slow, two exchanged": (
+        slowly(lambda f: f), [("velocity_x, velocity_y", "velocity_y, velocity_x")],
+        "if columns 'velocity_y' and 'velocity_x' are exchanged"),
+    "slow, a dead encoder": (slowly(times(ANGLES[:1], 0)), [], f"encoder of '{ANGLES[0]}' is dead"),
+    "slow, gyro in the world": (slowly(lambda f: f), [("deg, frame: body", "deg, frame: world")],
+                                "if 'base_angular_velocity.frame' is body"),
+    "slow, another rate": (slowly(times([*LINEAR, *RATES], 2)), [], r"by 0.5\d*: .*of time"),
+    "slow, left-handed": (slowly(times(["base_y", "goal_y"], -1)), [],
+                          r"slide by .* if 'base_position.sign' is {base_y: -1} .and of"),
     "a gyroscope's spike": (lambda f: f.assign(gyro_x=f.gyro_x + 9e3 * (f.index == 30)), [],
                             "line 32, column 'gyro_x': the value is 8947.84, .*rad/s; robots stay"),
 }  # fmt: skip
@@ -132,6 +146,20 @@ def test_a_noisy_log_is_read(every, tmp_path):
     frame = noisy(frame_of(walked()), np.random.default_rng(0))[::every]
     log = read(save(frame, tmp_path), ("ns}", "ns}\nmax_gap_s: 0.11"), reader=read_log)
     assert len(log.time_s) == len(frame)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_slow_log_with_biased_estimators_is_read(seed, tmp_path):
+    rng = np.random.default_rng(seed)
+    frame = slowly(lambda f: f)(frame_of(walked()))
+    bias = rng.normal(size=(3, 3))
+    bias /= np.linalg.norm(bias, axis=1, keepdims=True)
+    frame[BASE] += np.outer(frame.stamp - frame.stamp[0], 2e-8 * bias[0])  # mm
+    frame[LINEAR] += 0.05 * bias[1]
+    frame[GYRO] += np.rad2deg(0.02) * bias[2]
+    frame[RATES] += 0.5 * rng.normal(size=(len(frame), len(RATES)))
+    frame.stamp += (2e6 * rng.normal(size=len(frame))).astype(int)
+    read(save(frame, tmp_path), reader=read_log)
 
 
 @pytest.mark.parametrize("index", [SAFE, UNSAFE])

@@ -77,6 +77,11 @@ SPOILT = {
                      r"2.5 s apart, which is implausible: check 'time.unit'"),
     "goal in millimetres": (lambda f: f.assign(goal_z=1e3 * f.goal_z), [],
                             "desired output is .* m from the robot"),
+    "goal in metres as millimetres": (lambda f: f, [("goal_z]", "goal_z], unit: mm")],
+                                      r"at z = 0.0004.*expected .*'desired_output.unit' is m$"),
+    "a velocity as goal": (
+        lambda f: f.assign(**{f"goal_{a}": f[f"velocity_{a}"] for a in "xyz"}), [],
+        "expected a position, no velocity, within 1.27 m, at z = 0.212 to 0.849 m: check col"),
     "a joint beyond its stop": (
         lambda f: f.assign(**{f"{JOINTS[2]}_pos": f[f"{JOINTS[2]}_pos"] + 200.0 * (f.index == 9)}),
         [], rf"line 11, column '{JOINTS[2]}_pos': joint .* far beyond its stops"),

@@ -179,3 +179,10 @@ def test_a_log_with_too_few_values_is_not_judged(folder, kept, monkeypatch, caps
     assert "error: 1 of 2 logs have less than 1 s" in printed
     assert logs[0]["judged_s"] < 1.0 < logs[1]["judged_s"]
     assert logs[1]["judged_s"] == pytest.approx(logs[1]["duration_s"])
+
+
+def test_a_table_of_a_walking_robot_is_refused_before_it_is_read(monkeypatch, capsys, tmp_path):
+    (tmp_path / "walk.csv").write_text("t\n")
+    given = ("--log", tmp_path / "walk.csv", "--map", tmp_path / "walk.csv", "--out", tmp_path)
+    assert call(monkeypatch, "monitor", "go2_walking", *given) == 2
+    assert "'monitor' takes .npz files" in " ".join(capsys.readouterr().out.split())

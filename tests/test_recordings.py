@@ -96,13 +96,13 @@ def test_a_goal_that_is_logged_when_it_changes_holds_until_the_next(tmp_path):
 
 def test_rows_before_the_estimator_starts_are_cut(tmp_path):
     size = 5
-    for names, value in [(QUATERNION, 0.0), (QUATERNION, np.nan)]:
+    for value, what in [(0.0, "quaternion is 0"), (np.nan, "value is nan")]:
         frame = frame_of(PLAIN)
-        frame.loc[: size - 1, names] = value
+        frame.loc[: size - 1, QUATERNION] = value
         found = read(save(frame, tmp_path))
         assert_reads(found, part(PLAIN, size, 60))
         assert found.kept_share < 1
-        with pytest.raises(ValueError, match=r"line 2, column .*: the value is nan"):
+        with pytest.raises(ValueError, match=rf"line 2, column .*: the {what}"):
             read(tmp_path / "run.csv", reader=read_log)
 
 

@@ -98,6 +98,8 @@ CASES = {
     Calibration: {"kind: walk": "'kind' must be 'plan' or 'motion'; got 'walk'"},
     LogMap: {
         "base_position: {columns: [a, b]}": "'base_position': columns must be 3 names",
+        "base_position: {columns: [a, b, c]}, base_orientation: {columns: [a, b, c, d]}, "
+        "base_linear_velocity: {columns: [a, b, c, d, e, f]}": "linear.* 3 names; got 6: ",
         "joint_positions: {template: q_}": "'joint_positions': template must contain",
         "joint_positions: {template: 'q_{joint}'}": ".columns' is missing; a state estimator",
     },

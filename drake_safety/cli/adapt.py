@@ -20,7 +20,7 @@ from drake_safety.learning.change_detector import LEAST_MOTION_S
 from drake_safety.learning.feedback import EpisodePair
 from drake_safety.learning.seeds import ADAPTATION, MOTION
 from drake_safety.learning.segments import Episodes
-from drake_safety.logs.episodes import cut_log, motions_from_log
+from drake_safety.logs.episodes import cut_log, loggable_loop, motions_from_log
 from drake_safety.logs.robot_log import read_pieces
 from drake_safety.simulation.feedback import pair_starts, run_pairs
 from drake_safety.simulation.rollouts import run_motions
@@ -68,7 +68,7 @@ def adapt(
     folders.check_writable(folder)
     with console.open_stages() as stages:
         if logs:
-            loop = loaded.make_loop("actual")
+            loop = loggable_loop(loaded)
             pieces, cut = [], []
             for path in logs:
                 read = read_pieces(path, log_map, loop.robot)

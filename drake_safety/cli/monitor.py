@@ -15,7 +15,7 @@ from drake_safety.evaluation.timeline_figure import levels_figure
 from drake_safety.files.schema import load_typed_file
 from drake_safety.learning.assessment import SafetyAssessment
 from drake_safety.learning.change_detector import rows_of
-from drake_safety.logs.episodes import motions_from_log
+from drake_safety.logs.episodes import loggable_loop, motions_from_log
 from drake_safety.logs.robot_log import FORMATS, read_pieces
 from drake_safety.logs.sequences import Motion, SequenceMap, read_recording, read_sequences
 from drake_safety.simulation.rollouts import worker_loop
@@ -87,7 +87,7 @@ def _motions(
             motions, left = recorded
             yield entry | {"left_safe_set": left}, motions
             return
-    loop = worker_loop(scenario, "actual")()
+    loop = loggable_loop(worker_loop(scenario, "actual")())
     read = read_pieces(file, log_map, loop.robot)
     if summary := read.summary():
         console.say(summary, style="yellow")

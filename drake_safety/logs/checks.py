@@ -24,10 +24,13 @@ _MAX_TILT_RAD = math.radians(60.0)
 _FOOT_SHARE = 0.2  # Largest height of the lowest foot, relative to the standing height.
 _FAR_RAD = 0.3  # Largest excess over a joint stop by servo errors and encoder offsets.
 _REACH_SHARE = 3.0  # Largest distance of z* from the base, relative to the standing height.
-_WINDOW_S, _MANY_WINDOWS = 0.1, 400
+_LOW_BASE, _LOW_HAND = 0.5, 0.2  # Least height of z*, relative to it; the largest is the inverse.
+_WINDOWS_S, _MANY_WINDOWS = (0.1, 0.5), 400  # For fast and for slow motion.
+_LONG_S, _MANY_LONG, _MANY_ROWS = 0.45, 4, 10  # Long windows in a log, and rows in one, at least.
 # Least change in a window, and difference, that tells motion from noise [m, rad].
 _LEAST = {"base_linear_velocity": 0.01, "base_angular_velocity": 0.05, "joint_velocities": 0.1}
 _DISAGREES, _AGREES = 0.4, 0.25  # Shares of the motion, if another reading agrees.
+_DISAGREES_LONG, _CLEARLY = 0.2, 0.25  # In long windows, and the other reading's share of it.
 _WRONG, _FAR = 0.9, 3.0  # Share of the motion, and of the least change, if no reading agrees.
 _FACTOR, _TURN_RAD = 1.6, math.radians(30.0)  # Least factor of a unit or rate, and turn of axes.
 _FASTEST_M_S, _FASTEST_RAD_S = 15.0, 40.0  # Speeds of the base; gyroscopes measure less.
@@ -178,11 +181,24 @@ def _check_start(source: Source, kinematics: RobotKinematics) -> None:
 def _check_desired_output(source: Source, kinematics: RobotKinematics) -> None:
     if "desired_output" not in source.channels:
         return
-    desired, base = (source.at(n, source.at_s[:1]) for n in ("desired_output", "base_position"))
-    distance = float(np.linalg.norm(desired - base))
-    if distance > _REACH_SHARE * kinematics.standing_height:
-        what = f"the desired output is {distance:.3g} m from the robot's base"
-        raise ValueError(f"{source.where}: {what}; it is a position, no velocity: check its unit")
+    desired, base = (source.at(n, source.at_s[:1])[0] for n in ("desired_output", "base_position"))
+    low = _LOW_HAND if kinematics.robot.reaching_frames else _LOW_BASE
+    height, unit = kinematics.standing_height, si_units(source.log_map.desired_output)
+
+    def is_near(z: np.ndarray) -> bool:
+        is_far = np.linalg.norm(z - base) > _REACH_SHARE * height
+        return bool(low < z[2] / height < 1 / low and not is_far)
+
+    if is_near(desired):
+        return
+    units = [one for one, size in LENGTH_UNITS.items() if is_near(size / unit * desired)]
+    got = f"{np.linalg.norm(desired - base):.3g} m from the robot's base, at z = {desired[2]:.3g} m"
+    near = (
+        f"within {_REACH_SHARE * height:.3g} m, at z = {low * height:.3g} to {height / low:.3g} m"
+    )
+    what = f"the desired output is {got}; expected a position, no velocity, {near}"
+    hint = f"it fits if 'desired_output.unit' is {units[0]}" if units else "check columns and unit"
+    raise ValueError(f"{source.where}: {what}: {hint}")
 
 
 def _check_stance(source: Source, kinematics: RobotKinematics) -> list[str]:
@@ -212,8 +228,11 @@ def _offset_text(source: Source, height: float) -> str:
     """The map's offset that lowers the base by a height [m]."""
     part = source.log_map.base_position
     offset = part.offset.get(column := part.columns[2], 0.0) - height / si_units(part)
-    text = f"'base_position.offset' of {{{column}: {offset:.4g}}}"
-    return f"{text} (and of 'desired_output')" if "desired_output" in source.channels else text
+    return f"'base_position.offset' of {{{column}: {offset:.4g}}}{_also(source)}"
+
+
+def _also(source: Source) -> str:
+    return " (and of 'desired_output')" if "desired_output" in source.channels else ""
 
 
 def _stillest(poses: list[_Pose], i: int) -> _Pose | None:
@@ -252,6 +271,8 @@ def _poses(source: Source, kinematics: RobotKinematics) -> Iterator[_Pose]:
     p_BC = contacts(joints)
     for what, R, p in _readings(source.log_map.base_orientation.order, R_WB, p_WB):
         yield pose(what, R, p, joints, p_BC)
+    for what, p in _mirrored(source, "base_position", p_WB):
+        yield pose(what + _also(source), R_WB, p, joints, p_BC)
     feet = kinematics.robot.feet.values()
     legs = [np.array([source.joints.index(name) for name in foot.joints]) for foot in feet]
     if len(set(map(len, legs))) > 1 or len(legs[0]) > _LONGEST_LEG:
@@ -279,6 +300,16 @@ def _poses(source: Source, kinematics: RobotKinematics) -> Iterator[_Pose]:
     yield pose(f"'joint_positions.sign' is {named}", R_WB, p_WB, read, contacts(read))
 
 
+def _mirrored(source: Source, name: str, values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Readings of x, y, z (N, 3) with one of them reversed, or two exchanged."""
+    part = getattr(source.log_map, name)
+    for i, k in itertools.combinations_with_replacement(range(3), 2):
+        read, one = values.copy(), part.columns[i]
+        read[:, [i, k]] = values[:, [k, i]] * (-1 if i == k else 1)
+        sign = f"'{name}.sign' is {{{one}: {-part.sign.get(one, 1)}}}"
+        yield sign if i == k else f"columns '{one}' and '{part.columns[k]}' are exchanged", read
+
+
 def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rotation, np.ndarray]]:
     """Readings of the base's orientation (N,) and position (N, 3)."""
     swapped = R.as_quat(scalar_first=order == "wxyz")
@@ -299,14 +330,17 @@ def _readings(order: str, R: Rotation, p: np.ndarray) -> Iterator[tuple[str, Rot
 
 def _check_velocities(source: Source) -> None:
     """Checks that logged velocities are the derivatives of positions, in frame, sign and unit."""
-    for name, positions in VELOCITIES.items():
+    for window_s, (name, positions) in itertools.product(_WINDOWS_S, VELOCITIES.items()):
         if name not in source.channels:
             continue
         names = {positions, name} if "joint" in name else {positions, name, "base_orientation"}
         channels = [source.channels[other] for other in names]
         begin, end = common_span(channels)
         step = max(float(np.median(np.diff(channel.time_s))) for channel in channels)
-        width = min(max(_WINDOW_S, 2 * step), end - begin)
+        width = min(max(window_s, 2 * step), end - begin)
+        is_long = window_s > _LONG_S
+        if is_long and (end - begin < _MANY_LONG * width or width < _MANY_ROWS * step):
+            continue
         number = 1 + int(min((end - begin - width) / step + 1e-6, _MANY_WINDOWS))
         windows = np.linspace(begin, end - width, number) + np.array([[0.0], [width]])
         time_s = source.channels[name].time_s
@@ -316,12 +350,21 @@ def _check_velocities(source: Source) -> None:
         if name != "joint_velocities":
             _check_base(source, name, moved, logged, windows)
             continue
+        moved, logged = (_without_drift(one, width) for one in (moved, logged))
         for i, column in enumerate(source.log_map.joint_velocities.names(source.joints)):
             given = "", moved[:, [i]], logged[:, [i]]
             readings = _scaled(source, name, *given[1:])
             for k, joint in enumerate(source.joints):
                 readings.append((f"it is of joint '{joint}'", moved[:, [k]], given[2]))
+            if not moved[:, i].any():
+                angle = source.log_map.joint_positions.column(source.joints[i])
+                readings = [(f"the encoder of '{angle}' is dead", given[2], given[2])] * is_long
             _require(source, name, [column], width, given, readings)
+
+
+def _without_drift(change: np.ndarray, width_s: float) -> np.ndarray:
+    """Changes in windows without their mean if these are long, so that a bias is no motion."""
+    return change - change.mean(axis=0) if width_s > _LONG_S else change
 
 
 def _check_base(
@@ -329,15 +372,17 @@ def _check_base(
 ) -> None:
     def derived(begin: Rotation, end: Rotation, middle: Rotation) -> dict[str, np.ndarray]:
         change = moved if "linear" in name else (end * begin.inv()).as_rotvec()
-        return {"world": change, "body": middle.inv().apply(change)}
+        both = {"world": change, "body": middle.inv().apply(change)}
+        return {frame: _without_drift(one, width) for frame, one in both.items()}
 
-    part = getattr(source.log_map, name)
+    part, width = getattr(source.log_map, name), float(windows[1, 0] - windows[0, 0])
+    logged = _without_drift(logged, width)
     frame, other = part.frame, "body" if part.frame == "world" else "world"
     turns = [source.rotations_at(at_s) for at_s in (*windows, windows.mean(axis=0))]
     changes, inverse = derived(*turns), derived(*(one.inv() for one in turns))
     in_other = f"'{name}.frame' is {other}"
     simple = [(in_other, changes[other], logged), (_INVERSE, inverse[frame], logged)]
-    turned: list[_Reading] = []
+    turned = [(what, changes[frame], one) for what, one in _mirrored(source, name, logged)]
     for change, also in ((changes[frame], ""), (changes[other], f" and {in_other}")):
         simple += _scaled(source, name, change, logged, also)
         if len(logged) > 1 and logged.any() and change.any():
@@ -347,7 +392,6 @@ def _check_base(
             if turn.magnitude() > _TURN_RAD:
                 text = f"its axes, or the base's, are turned by {_turn_text(turn)} in the "
                 turned.append((text + (other if also else frame), change, turn.apply(logged)))
-    width = float(windows[1, 0] - windows[0, 0])
     _require(source, name, part.columns, width, ("", changes[frame], logged), simple, turned)
 
 
@@ -380,9 +424,11 @@ def _require(
         size = float(np.median(np.linalg.norm(derived - logged, axis=1)[moves]))
         return size / float(np.median(sizes(derived, logged)[moves])), size
 
-    moves, least = sizes(*given[1:]) > _LEAST[name], _LEAST[name]
+    changes, least, is_long = sizes(*given[1:]), _LEAST[name], width_s > _LONG_S
+    # All long windows count: noise would choose among them.
+    moves = np.full(len(changes), np.median(changes) > least / 2) if is_long else changes > least
     share, size = differs(*given[1:]) if moves.any() else (0.0, 0.0)
-    if share <= _DISAGREES or size < least:
+    if share <= (_DISAGREES_LONG if is_long else _DISAGREES) or (size < least and not is_long):
         return
     unit = "m/s" if "linear" in name else "rad/s"
     text = (
@@ -390,15 +436,15 @@ def _require(
         f"derivative of '{VELOCITIES[name]}' by {size / width_s:.2f} {unit}, median where it moves"
     )
     for tier in tiers:
-        shares = [(*differs(*changes), what) for what, *changes in tier]
+        shares = [(*differs(*both), what) for what, *both in tier]
         best = min((other[0] for other in shares), default=math.inf)
-        if best < min(_AGREES, share / 2):
+        if best < min(_AGREES, share * (_CLEARLY if is_long else 0.5)):
             close = [other for other in shares if other[0] < best + 0.05][:2]
             likely = " or ".join(what for _, _, what in close)
             raise ValueError(f"{text}, but by {close[0][1] / width_s:.2f} {unit} if {likely}")
     num_rows = 8 if "angular" in name else 4  # A gyroscope's vibrations need more to be averaged.
     is_still = any(not np.median(np.linalg.norm(part, axis=1)[moves]) for part in given[1:])
-    is_far = share > _WRONG and (size > _FAR * least or is_still)
+    is_far = not is_long and share > _WRONG and (size > _FAR * least or is_still)
     if is_far and width_s > num_rows * np.median(np.diff(source.channels[name].time_s)):
         remedy = f"leave '{name}' out of the map, unless '{VELOCITIES[name]}' stands still"
         raise ValueError(f"{text}; no other frame, sign or unit agrees: {remedy}")

@@ -25,7 +25,7 @@ from drake_safety.simulation.scenario import Scenario
 _ROUNDING_S = 1e-9
 
 
-def _loggable_loop(loop: LeggedLoop | Scenario) -> LeggedLoop:
+def loggable_loop(loop: LeggedLoop | Scenario) -> LeggedLoop:
     """The actual loop; one whose controller has a memory, which no log has, is refused."""
     if isinstance(loop, Scenario):
         loop = loop.make_loop("actual")
@@ -48,7 +48,7 @@ def cut_log(
     Args:
         loop: The loop without Γ that evaluates the states, or a scenario with an ``actual`` one.
     """
-    loop = _loggable_loop(loop)
+    loop = loggable_loop(loop)
     scenario, assessment = loop.scenario, loop.scenario.assessment
     shortest = assessment.preview_stride * mode_settings(assessment).shortest
     cutter = _Cutter(loop, scenario.step_s, scenario.episode_duration_s, shortest)
@@ -70,7 +70,7 @@ def motions_from_log(
     log: RobotLog | Sequence[RobotLog], loop: LeggedLoop | Scenario, *, step_s: float | None = None
 ) -> Episodes:
     """Converts logs to motions for a `ChangeDetector`, at the step of the monitor by default."""
-    loop = _loggable_loop(loop)
+    loop = loggable_loop(loop)
     step_s = step_s or loop.scenario.monitor_step_s
     cutter = _Cutter(loop, step_s, MOTION_PIECE_S, shortest=2)
     motions: list[Episode] = []

@@ -36,7 +36,7 @@ class LogTime:
     column: str = ""
     """The column, or the field of every message (``header.stamp``); empty for the recording time
     of messages."""
-    unit: TimeUnit = "s"  # Unit of a number; ignored for ROS stamps, recording times and dates.
+    unit: TimeUnit = "s"  # Of a number; ignored for ROS stamps, recording times and Parquet dates.
 
 
 @schema(kw_only=True)
@@ -61,7 +61,8 @@ class _Columns(_Quantity):
 
     def __post_init__(self) -> None:
         if len(self.columns) % self.multiple:
-            raise ValueError(f"columns must be {self.multiple} names; got {self.columns}")
+            what = f"got {len(self.columns)}: {self.columns}"
+            raise ValueError(f"columns must be {self.multiple} names; {what}")
         if len(set(self.columns)) != len(self.columns):
             raise ValueError(f"columns names a column twice: {self.columns}")
 
@@ -147,9 +148,11 @@ class LogMap:
             if not getattr(self, name).columns:
                 where = "(docs/logs.md, 'Logs without a base position')"
                 raise ValueError(f"'{name}.columns' is missing; a state estimator adds it {where}")
-        for name in ("base_position", "desired_output"):
-            if len(columns := getattr(self, name).columns) > 3:
-                raise ValueError(f"'{name}.columns' must be [x, y, z]; got {columns}")
+        for name in QUANTITIES:
+            part, is_one = getattr(self, name), name != "foot_positions"
+            if is_one and isinstance(part, _Columns) and len(part.columns) > part.multiple:
+                what = f"must be {part.multiple} names; got {len(part.columns)}: {part.columns}"
+                raise ValueError(f"'{name}.columns' {what}")
         if not (self.joint_positions.template or self.joint_positions.columns):
             raise ValueError("'joint_positions' needs a 'template', or 'columns' by joint")
 

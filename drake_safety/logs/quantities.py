@@ -95,9 +95,6 @@ def quantities(
         if number > 1:
             what = f"changes only at every {number:.3g}th row: the others are left out"
             notes.append(f"{_start_of(name, channel)} {what}")
-        if name == "base_orientation":  # Before an estimator starts, quaternions are zero.
-            frame = own[name].frame
-            own[name] = replace(own[name], frame=frame.where(frame.any(axis=1)))
     return own, log_map, notes
 
 
@@ -151,7 +148,7 @@ def cut(
     pieces: list[tuple[float, float, dict[str, Channel]]] = [(-math.inf, math.inf, {})]
     reasons: dict[str, None] = {}
     for name, channel in channels.items():
-        stretches, breaks = _unbroken(channel, max_gap_s)
+        stretches, breaks = _unbroken(name, channel, max_gap_s)
         reasons |= dict.fromkeys(breaks)
         joined, i, k = [], 0, 0
         while i < len(pieces) and k < len(stretches):
@@ -164,7 +161,7 @@ def cut(
     return [piece for _, _, piece in pieces], list(reasons)
 
 
-def _unbroken(channel: Channel, max_gap_s: float) -> tuple[list[Channel], list[str]]:
+def _unbroken(name: str, channel: Channel, max_gap_s: float) -> tuple[list[Channel], list[str]]:
     """Stretches of rows without a missing value and without a gap, and what lies between them."""
     steps_s, clock = np.diff(channel.time_s), channel.time_name
     if len(channel.time) < MIN_ROWS:
@@ -178,13 +175,16 @@ def _unbroken(channel: Channel, max_gap_s: float) -> tuple[list[Channel], list[s
         raise ValueError(f"{channel.where(0, clock)}: {what}")
     # A value that is missing, not finite or absurdly large is bad.
     bad = ~(channel.frame.abs() < LARGEST).to_numpy()
+    if name == "base_orientation":  # Before an estimator starts, quaternions are zero.
+        bad |= (channel.frame == 0).all(axis=1).to_numpy()[:, None]
     is_bad = bad.any(axis=1)
     is_bad_before = np.append(False, is_bad[:-1])
     reasons = []
     for row in np.flatnonzero(is_bad & ~is_bad_before).tolist():
         column = int(np.argmax(bad[row]))
         where = channel.where(row, channel.frame.columns[column])
-        reasons.append(f"{where}: the value is {channel.frame.iat[row, column]}")
+        value = channel.frame.iat[row, column]
+        reasons.append(f"{where}: {f'the value is {value}' if value else 'the quaternion is 0'}")
     # The tolerance covers rounding, so that a log of 10 Hz passes a limit of 0.1 s.
     is_after_gap = np.append(True, steps_s > max_gap_s * (1 + 1e-6))
     reasons += [
