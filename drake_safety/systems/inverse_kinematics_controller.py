@@ -31,14 +31,23 @@ class InverseKinematicsController(LeafSystem):
     ground. Without ``desired_yaw`` the planar fit of the feet gives the base's yaw.
 
     Args:
+        stiffness: k_p of the servos, (n_j,) [N·m/rad]; by default the robot's.
         offset_s: Time of the first update, after the inputs' updates [s].
     """
 
-    def __init__(self, kinematics: RobotKinematics, *, period_s: float, offset_s: float = 0.0):
+    def __init__(
+        self,
+        kinematics: RobotKinematics,
+        stiffness: np.ndarray | None = None,
+        *,
+        period_s: float,
+        offset_s: float = 0.0,
+    ):
         super().__init__()
         n_j, names = kinematics.num_joints, kinematics.joint_names
-        gains = map(kinematics.robot.gains_of, names)
-        stiffness = np.array([0.0 if gain is None else gain.stiffness for gain in gains])
+        if stiffness is None:
+            gains = map(kinematics.robot.gains_of, names)
+            stiffness = np.array([0.0 if gain is None else gain.stiffness for gain in gains])
         if not np.all(stiffness > 0):
             raise ValueError(f"inverse kinematics: stiffness of {names} must be positive")
         self._kinematics, self._stiffness, self._period_s = kinematics, stiffness, period_s
