@@ -48,7 +48,7 @@ from drake_safety.simulation.motion import Motion
 from drake_safety.simulation.rollouts import MOTION_PIECE_S, run_motions
 from drake_safety.simulation.scenario import Scenario, load_scenario
 
-AT_06 = "paper_at_06"  # The paper's mode, with the paper's threshold.
+_AS_PUBLISHED = "paper_at_06"  # The mode with the paper's threshold.
 _FAMILY_PLANTS = 20  # Fresh plants.
 _ON_FAMILY = "episodes on the family's plants"
 
@@ -187,9 +187,9 @@ def add_verdicts(
     if isinstance(evaluation.scenario.make_loop(), HasGoals):
         stored = {m: g.calibrations_.get(PLAN) for m, g in evaluation.assessments.items()}
         thresholds = {mode: 1.0 - one.threshold for mode, one in stored.items() if one}
-        as_published = [replace(one, name=AT_06) for one in scorers if one.name == MODES[1]]
-        thresholds[AT_06] = 1.0 - PAPER_THRESHOLD
-        scorers = [*scorers, *as_published]
+        thresholds[_AS_PUBLISHED] = 1.0 - PAPER_THRESHOLD
+        paper = [replace(one, name=_AS_PUBLISHED) for one in scorers if one.name == MODES[1]]
+        scorers = [*scorers, *paper]
         estimates = evaluate_plans(scorers, calibration, test, thresholds)
         if (gamma := evaluation.assessments.get(MODES[0])) and (plan := stored[MODES[0]]):
             predicted = gamma.predict_rows(first_segments(test))

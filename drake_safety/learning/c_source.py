@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import onnx
 
 PARTS = ("assessor", "monitor")
-_EXAMPLE = "Verdicts on the rows of a CSV file"  # What begins an example of before.
+_EXAMPLE = "Verdicts on the rows of a CSV file"  # In the first line of every example.
 
 
 def write(path: Path, assessment: Any, prefix: str | None = None) -> list[Path]:
