@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from pydrake.systems.analysis import Simulator
 
 from drake_safety.simulation.scenario import load_scenario, parse_scenario
 from legged_robots import robot_kinematics, robot_model
+from system_doubles import begun
 
 PACKAGED = "laikago"
 
@@ -57,8 +57,4 @@ def packaged_loop(variation="nominal", **options):
 
 def started(loop, seed=0):
     """A simulator at the start of an episode, and its context."""
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset(context, np.random.default_rng(seed))
-    simulator.Initialize()
-    return simulator, context
+    return begun(loop, loop.reset, np.random.default_rng(seed))

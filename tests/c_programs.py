@@ -4,12 +4,9 @@ import ctypes
 import subprocess
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import TrajectorySource
-from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety.systems.monitored_assessor import MonitoredSafetyAssessor
+from system_doubles import Played
 
 WARNINGS = ("-Wall", "-Wextra", "-Werror", "-pedantic", "-fmax-errors=3")
 PORTS = ("state", "desired_preview", "features", "margins", "hold")
@@ -78,19 +75,7 @@ def _pointer(values):
 
 def diagram_history(assessment, rows, widths):
     """The same of a `MonitoredSafetyAssessor`, and the text of the cause."""
-    builder, step_s = DiagramBuilder(), assessment.detector_.step_s
-    system = builder.AddSystem(MonitoredSafetyAssessor(assessment))
-    times = step_s * (np.arange(len(rows) + 1) - 0.5)
-    for name, part in zip(PORTS, np.split(rows, np.cumsum(widths)[:-1], axis=1), strict=True):
-        # A polynomial of values that are not finite has none.
-        held = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([part, part[-1:]]).T)
-        source = builder.AddSystem(TrajectorySource(held))
-        builder.Connect(source.get_output_port(), system.GetInputPort(name))
-    simulator = Simulator(builder.Build())
-    context = system.GetMyContextFromRoot(simulator.get_context())
-    names = [*_OF_ASSESSOR, "alarm", "levels", "judged_share", "alarm_cause"]
-    outputs = []
-    for k in range(len(rows)):
-        simulator.AdvanceTo((k + 0.25) * step_s)
-        outputs.append({name: np.copy(system.GetOutputPort(name).Eval(context)) for name in names})
-    return {name: np.array([one[name] for one in outputs]) for name in names}
+    parts = np.split(rows, np.cumsum(widths)[:-1], axis=1)
+    inputs = dict(zip(PORTS, parts, strict=True))
+    played = Played(MonitoredSafetyAssessor(assessment), assessment.detector_.step_s, **inputs)
+    return played.history(*_OF_ASSESSOR, "alarm", "levels", "judged_share", "alarm_cause")

@@ -5,11 +5,13 @@ import math
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import yaml
 
 from drake_safety.control.kinematics import RobotKinematics
 from drake_safety.models import load_robot
 from drake_safety.robots.robot_model import RobotModel, load_robot_file
+from drake_safety.systems.trajectory_planner import to_world
 
 
 def _link(name, mass, size, centre, collisions=()):
@@ -166,3 +168,13 @@ def robot_model(name: str) -> RobotModel:
 def robot_kinematics(name: str) -> RobotKinematics:
     """Its kinematics; they keep nothing between two calls, so tests may share them."""
     return RobotKinematics(robot_model(name))
+
+
+def standing_feet(kinematics, stance_pose=(0.0, 0.0, 0.0)):
+    feet = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
+    return to_world(np.array(stance_pose), feet)
+
+
+def base_over(kinematics, stance_pose=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0)):
+    base = np.append(kinematics.nominal_base_offset, kinematics.standing_height)
+    return to_world(np.array(stance_pose), base + shift)

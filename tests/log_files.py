@@ -14,6 +14,7 @@ from drake_safety.logs.robot_log import RobotLog, read_pieces
 from drake_safety.robots.robot import PlantVariation
 from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.rollouts import episode_rng
+from exported_robots import edited
 
 ORIGIN_NS = 1_700_000_000_123_000_000
 FORMATS = ("csv", "parquet", "mcap", "ros2", "ros1")
@@ -201,10 +202,7 @@ MESSAGE_MAP = MESSAGE_MAP.replace("FEET", str([f"position[{i}]" for i in range(1
 def map_beside(path, *changes):
     """Writes the map of a log of `write` or `save` beside it, with changes of its text."""
     text = TABLE_MAP if path.suffix in (".csv", ".parquet") else MESSAGE_MAP
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    (path.parent / "columns.yaml").write_text(text)
+    (path.parent / "columns.yaml").write_text(edited(text, dict(changes)))
     return path.parent / "columns.yaml"
 
 

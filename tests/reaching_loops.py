@@ -88,9 +88,9 @@ def easy_episode(variation="nominal", hand="left"):
     return run_episode(loop, 0, goal=EASY if loop.mirror is None else EASY * [1, -1, 1])
 
 
-def started(loop, seed=0, goal=None):
+def started(loop, seed=0, *goal):
     context = loop.CreateDefaultContext()
-    loop.reset(context, np.random.default_rng(seed), goal)
+    loop.reset(context, np.random.default_rng(seed), *goal)
     return context
 
 

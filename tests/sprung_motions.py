@@ -50,6 +50,11 @@ def recorded(rows, info=INFO, **changes):
     return Episodes(info, found)
 
 
+def same_detector(one, other):
+    pairs = zip(one.arrays().items(), other.arrays().items(), strict=True)
+    return all(a[0] == b[0] and np.array_equal(a[1], b[1]) for a, b in pairs)
+
+
 @functools.cache
 def learned():
     """A detector, of more motion than its limits need."""

@@ -5,6 +5,9 @@ from unittest import mock
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
 
 from cart_episodes import make_info
 from drake_safety.diagrams.walking.command_guard import CommandGuard
@@ -62,6 +65,41 @@ class Bench:
     def begin(self):
         self.simulator.Initialize()
         return self
+
+
+class Played:
+    """A system in a diagram that plays rows of its inputs, row k at step k."""
+
+    def __init__(self, system, step_s, **inputs):
+        builder = DiagramBuilder()
+        self.system, self.step_s = builder.AddSystem(system), step_s
+        for name, rows in inputs.items():
+            self.num_rows = len(rows)
+            times = step_s * (np.arange(len(rows) + 1) - 0.5)
+            # A polynomial of values that are not finite has none.
+            held = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([rows, rows[-1:]]).T)
+            source = builder.AddSystem(TrajectorySource(held))
+            builder.Connect(source.get_output_port(), system.GetInputPort(name))
+        self.simulator = Simulator(builder.Build())
+        self.context = system.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
+
+    def history(self, *names):
+        """Outputs after each row, by name."""
+        found = {name: [] for name in names}
+        for row in range(self.num_rows):
+            self.simulator.AdvanceTo((row + 0.25) * self.step_s)
+            for name, values in found.items():
+                values.append(np.copy(self.system.GetOutputPort(name).Eval(self.context)))
+        return {name: np.array(values) for name, values in found.items()}
+
+
+def begun(loop, reset, *arguments):
+    """A simulator of a loop at the start that it is set to, and its context."""
+    simulator = Simulator(loop)
+    context = simulator.get_mutable_context()
+    reset(context, *arguments)
+    simulator.Initialize()
+    return simulator, context
 
 
 def correction(size):

@@ -1,9 +1,10 @@
 import copy
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from cart_episodes import assert_identical
 from drake_safety.learning import adaptation
 from drake_safety.learning.adaptation import DiscrepancyFunction
 from drake_safety.learning.assessment import SafetyAssessment
@@ -174,9 +175,7 @@ def test_adapted_loaded_and_overridden_assessments_predict_the_same_bits(fitted,
     changes = {name: getattr(adapted, f"{name}_") for name in ("beliefs", "correction", "novelty")}
     expected = adapted.predict(*given)
     for other in (loaded.predict(*given), assessment.predict(*given, **changes)):
-        for field in fields(expected):
-            values = getattr(other, field.name), getattr(expected, field.name)
-            np.testing.assert_array_equal(*values, err_msg=field.name)
+        assert_identical([other], [expected])
     one = adapted.predict_one(*(part[7] for part in given))
     np.testing.assert_array_equal(one.belief, expected.belief[7])
     assert np.abs(assessment.predict(*given).belief - expected.belief).max() > 0.01

@@ -11,15 +11,9 @@ ALARM = Alarm(name="value", value=lambda motion: motion["value"])
 STEP_S = 0.1
 
 
-def motion(values, *, push_s=math.inf, leave_s=math.inf, fall_s=math.inf):
-    return Motion(
-        index=0,
-        push_time_s=push_s,
-        leave_time_s=leave_s,
-        fall_time_s=fall_s,
-        time_s=STEP_S * np.arange(len(values)),
-        ports={"value": np.array(values, dtype=float)},
-    )
+def motion(values, **times):
+    ports = {"value": np.array(values, dtype=float)}
+    return Motion(time_s=STEP_S * np.arange(len(values)), ports=ports, **times)
 
 
 def random_motions(rng, num=60):
@@ -28,8 +22,8 @@ def random_motions(rng, num=60):
     for i in range(num):
         values = rng.normal(size=9) - 0.5 * (i % 3 == 0)
         values[rng.random(9) < 0.03] = np.nan
-        ends = ({"leave_s": 0.5, "fall_s": 0.8}, {"leave_s": 0.5}, {})[i % 3]
-        found.append(motion(values, push_s=0.2, **ends))
+        ends = ({"leave_time_s": 0.5, "fall_time_s": 0.8}, {"leave_time_s": 0.5}, {})[i % 3]
+        found.append(motion(values, push_time_s=0.2, **ends))
     return found
 
 
@@ -45,12 +39,12 @@ def announced(one, share):
 
 
 def test_a_fall_is_announced_by_a_row_between_the_push_and_0_2_s_before_the_fall():
-    ends = {"push_s": 0.2, "leave_s": 0.6, "fall_s": 0.7}
+    ends = {"push_time_s": 0.2, "leave_time_s": 0.6, "fall_time_s": 0.7}
     in_time = motion([1, 1, 1, 1, 1, 0, 1, 1], **ends)
     late = motion([1, 1, 1, 1, 1, 1, 0, 0], **ends)
     too_early = motion([1, 0, 1, 1, 1, 1, 1, 1], **ends)
-    at_once = motion([0, 0], push_s=0.0, leave_s=0.1, fall_s=0.1)
-    survives = motion([1, 0.5, 1], push_s=0.1)
+    at_once = motion([0, 0], push_time_s=0.0, leave_time_s=0.1, fall_time_s=0.1)
+    survives = motion([1, 0.5, 1], push_time_s=0.1)
     found = watched([in_time, late, too_early, at_once, survives])
     np.testing.assert_array_equal(found.warning, [0, 1, 1, math.inf, math.inf])
     np.testing.assert_array_equal(found.lowest, [0, 0, 0, 0, 0.5])
@@ -74,7 +68,7 @@ def test_at_every_share_the_highest_allowed_threshold_is_applied():
 
 
 def test_a_false_alarm_is_a_row_below_the_threshold_after_one_that_is_not():
-    found = watched([motion([0.5] * 9, push_s=0.2, leave_s=0.5, fall_s=0.8)])
+    found = watched([motion([0.5] * 9, push_time_s=0.2, leave_time_s=0.5, fall_time_s=0.8)])
     assert found.undisturbed_s == pytest.approx(0.9) and len(found.undisturbed) == 2
     assert [found.num_false_alarms(one) for one in (0, 0.5, 1.5, 3)] == [0, 3, 2, 2]
     unknown = watched([], [motion([1, np.nan, 1])])

@@ -1,9 +1,6 @@
 """`ask` answers before anything moves, and `run --target` obeys, unless it is forced."""
 
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +16,6 @@ from drake_safety.simulation.motion import Motion
 from reaching_targets import CAUSE, FAR, NEAR, SCENARIO, learned_targets
 
 pytestmark = pytest.mark.train
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="session")
@@ -113,11 +108,8 @@ def test_an_answer_takes_none_of_the_packages_that_training_takes(folder):
         "try:\n    main()\n"
         "finally:\n    print(*{name.partition('.')[0] for name in sys.modules})\n"
     )
-    words = map(str, ["ask", SCENARIO, "--assessment", folder, "--target", *NEAR])
-    command = [sys.executable, "-c", code, *words]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    loaded = set(done.stdout.splitlines()[-1].split())
+    words = ("ask", SCENARIO, "--assessment", folder, "--target", *NEAR)
+    loaded = set(command_line.python("-c", code, *words).splitlines()[-1].split())
     assert "pydrake" in loaded
     heavy = {"torch", "dtaidistance", "openTSNE", "sklearn", "matplotlib", "numba"}
     heavy |= {"pandas", "pyarrow", "joblib", "tensorboard"}
@@ -140,13 +132,9 @@ def test_what_does_not_exist_is_answered_with_what_does(call, folder, arguments,
     assert not (folder / "run").exists()
 
 
-@pytest.fixture
-def nothing_near(monkeypatch):
-    """Spares the search for what would be accepted."""
+def test_a_run_obeys_a_refusal(call, folder, monkeypatch):
+    # Spares the search for what would be accepted.
     monkeypatch.setattr("drake_safety.cli.ask.nearest_accepted_goal", lambda *_, **options: None)
-
-
-def test_a_run_obeys_a_refusal(call, folder, nothing_near):
     calibrate(folder, 1.0 + 1e-6)
     code, printed = call("run", SCENARIO, "--assessment", folder, "--target", "red_can")
     assert code == 1

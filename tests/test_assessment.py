@@ -1,13 +1,12 @@
 import operator
-import subprocess
-import sys
-from dataclasses import fields
 
 import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 from threadpoolctl import threadpool_limits
 
+from cart_episodes import assert_identical
+from command_line import python
 from drake_safety.learning.assessment import AssessmentParameters, SafetyAssessment
 from drake_safety.learning.assessment_file import SCHEMA, SCHEMA_VERSION
 from drake_safety.learning.beliefs import EMPTY
@@ -15,6 +14,7 @@ from drake_safety.learning.prediction import is_unknown
 from drake_safety.learning.segments import split, training_segments
 from lip_assessments import QUICK, held_out_segments, inputs, quick_assessment, quick_episodes
 from lip_episodes import make_episodes
+from sprung_motions import same_detector
 
 pytestmark = pytest.mark.train
 
@@ -34,17 +34,6 @@ def path(assessment, tmp_path):
     """Where the assessment is saved."""
     assessment.save(tmp_path / "assessment.safetensors")
     return tmp_path / "assessment.safetensors"
-
-
-def assert_same(prediction, other):
-    for field in fields(prediction):
-        values = getattr(prediction, field.name), getattr(other, field.name)
-        np.testing.assert_array_equal(*values, err_msg=field.name)
-
-
-def assert_same_detector(assessment, other):
-    for name, array in assessment.detector_.arrays().items():
-        np.testing.assert_array_equal(array, other.detector_.arrays()[name], err_msg=name)
 
 
 def test_held_out_episodes_are_told_apart_by_consistent_masses(assessment, held_out):
@@ -84,9 +73,10 @@ def test_input_alone_has_the_same_bits_as_among_many(assessment, held_out):
     result = assessment.predict(*given)
     assert 0.05 < (result.belief[:, 2] == 1.0).mean() < 0.9
     rows = np.arange(0, len(held_out), 43)
-    assert_same(assessment.predict(*(part[rows] for part in given)), result.one(rows))
+    assert_identical([assessment.predict(*(part[rows] for part in given))], [result.one(rows)])
     for row in rows:
-        assert_same(assessment.predict_one(*(part[row] for part in given)), result.one(row))
+        one = assessment.predict_one(*(part[row] for part in given))
+        assert_identical([one], [result.one(row)])
 
 
 @pytest.mark.parametrize("bad", [np.nan, 1e200])
@@ -142,8 +132,7 @@ assessment.predict(*[part[None] for part in parts])
 heavy = {{"torch", "openTSNE", "dtaidistance", "sklearn", "pydrake", "scipy", "numba"}}
 sys.exit(", ".join(heavy & set(sys.modules)) or 0)
 """
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
+    python("-c", code)
 
 
 def test_features_enter_a_second_time_with_a_feature_unit(held_out):
@@ -212,7 +201,7 @@ def test_learning_gives_the_same_bits_for_any_number_of_threads():
     np.testing.assert_array_equal(one.training_.points, other.training_.points)
     np.testing.assert_array_equal(one.training_.heads, other.training_.heads)
     np.testing.assert_array_equal(one.novelty_.limits, other.novelty_.limits)
-    assert_same_detector(one, other)
+    assert same_detector(one.detector_, other.detector_)
     stages = ["monitor", "distances", "t-SNE", "training", "beliefs"]
     assert list(dict.fromkeys(stage for stage, *_ in reports)) == stages
     assert all(0 <= done <= total == 100 for _, done, total in reports)
@@ -222,10 +211,10 @@ def test_saved_assessment_is_loaded_to_the_bit(assessment, held_out, tmp_path, p
     loaded = SafetyAssessment.load(path)
     assert loaded.parameters == assessment.parameters
     assert loaded.info_ == assessment.info_
-    assert_same(*(a.predict(*inputs(held_out)) for a in (assessment, loaded)))
+    assert_identical(*([a.predict(*inputs(held_out))] for a in (assessment, loaded)))
     np.testing.assert_array_equal(loaded.training_.points, assessment.training_.points)
     assert loaded.embedding_.is_same(assessment.embedding_)
-    assert_same_detector(loaded, assessment)
+    assert same_detector(loaded.detector_, assessment.detector_)
     assert np.isfinite(loaded.embedding_.input_range).all() == assessment.uses_features
     assert list(tmp_path.iterdir()) == [path]
     # The same assessment gives the same bytes.

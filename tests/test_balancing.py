@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pydrake.geometry import Role
-from pydrake.systems.analysis import Simulator
 
 from balancing_loops import PACKAGED, packaged_loop, standing_loop, started
 from drake_safety import load_assessment, load_scenario, run_episode
@@ -13,6 +12,7 @@ from drake_safety.diagrams.balancing.sampling import throw_start
 from drake_safety.diagrams.balancing.throws import run_throw
 from drake_safety.plants.balls import Throw
 from legged_robots import robot_kinematics
+from system_doubles import begun
 
 ROBOTS = (PACKAGED, "hexapod")
 MASS_KG = 25.433
@@ -35,9 +35,8 @@ def test_noise_follows_from_the_generator_and_is_held_for_a_control_period():
     loop = standing_loop(variation="noisy")
 
     def noise(seed, time_s):
-        simulator = Simulator(loop)
-        context = simulator.get_mutable_context()
-        loop.reset_to(context, np.random.default_rng(seed), loop.standing_start())
+        start = np.random.default_rng(seed), loop.standing_start()
+        simulator, context = begun(loop, loop.reset_to, *start)
         simulator.AdvanceTo(time_s)
         measured, true = (loop.GetOutputPort(n).Eval(context) for n in ("state", "true_state"))
         return (measured - true)[:12]

@@ -6,11 +6,11 @@ from threading import Barrier
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from drake_safety import load_assessment, load_scenario
-from drake_safety.learning.blas_threads import ONE_BLAS_THREAD, one_blas_thread
+from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
+from system_doubles import begun
 
 
 def num_threads():
@@ -24,7 +24,7 @@ def two_threads():
 
 
 def test_nested_contexts_and_errors_restore_the_settings():
-    @one_blas_thread
+    @ONE_BLAS_THREAD
     def fail():
         with ONE_BLAS_THREAD:
             assert num_threads() == {1}
@@ -54,9 +54,7 @@ def test_ticks_of_several_threads_restore_the_settings_after_the_last_one():
 
 def test_simulation_with_gamma_uses_no_cpu_time_in_threads_of_blas():
     loop = load_scenario("atlas_reaching").make_loop(assessment=load_assessment("atlas_reaching"))
-    simulator = Simulator(loop)
-    loop.reset(simulator.get_mutable_context(), np.random.default_rng(0))
-    simulator.Initialize()
+    simulator, _ = begun(loop, loop.reset, np.random.default_rng(0))
     simulator.AdvanceTo(0.1)
     # A product that is threaded: its threads spin for a while after it.
     started = time.process_time() - time.thread_time()
@@ -74,9 +72,8 @@ def test_simulation_with_gamma_uses_no_cpu_time_in_threads_of_blas():
 
 
 def final_values(loop, seed):
-    context = loop.CreateDefaultContext()
-    loop.reset(context, np.random.default_rng(seed))
-    Simulator(loop, context).AdvanceTo(0.2)
+    simulator, context = begun(loop, loop.reset, np.random.default_rng(seed))
+    simulator.AdvanceTo(0.2)
     ports = ("state", "features", "margins", "belief")
     return np.concatenate([loop.GetOutputPort(name).Eval(context) for name in ports])
 

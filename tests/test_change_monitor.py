@@ -2,57 +2,34 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import TrajectorySource
-from pydrake.trajectories import PiecewisePolynomial
 
 from drake_safety import ChangeMonitor
 from sprung_motions import HORIZON, INFO, STEP_S, learned, motion
+from system_doubles import Played
 
 pytestmark = pytest.mark.train
 
 PUSHED = slice(100, 140)
 
 
-class Played:
-    """A diagram that plays rows of (state, desired preview, features), row k at step k."""
+class Monitored(Played):
+    """A monitor to which rows of (state, desired preview, features) are played."""
 
-    def __init__(self, rows, detector=None, hold=None):
-        builder = DiagramBuilder()
-        assessment = SimpleNamespace(info_=INFO, detector_=detector or learned())
-        self.monitor = builder.AddSystem(ChangeMonitor(assessment))
-        self.num_rows = len(rows)
-        times = STEP_S * (np.arange(len(rows) + 1) - 0.5)
+    def __init__(self, rows, **hold):
         parts = np.split(rows, [2, 2 + HORIZON], axis=1)
         inputs = dict(zip(("state", "desired_preview", "features"), parts, strict=True))
-        for name, part in (inputs if hold is None else inputs | {"hold": hold}).items():
-            held = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([part, part[-1:]]).T)
-            source = builder.AddSystem(TrajectorySource(held))
-            builder.Connect(source.get_output_port(), self.monitor.GetInputPort(name))
-        self.simulator = Simulator(builder.Build())
-        root = self.simulator.get_mutable_context()
-        self.context = self.monitor.GetMyMutableContextFromRoot(root)
-
-    def outputs(self):
-        """Levels, alarm and its cause."""
-        ports = [self.monitor.GetOutputPort(name) for name in ("levels", "alarm", "alarm_cause")]
-        levels, alarm, cause = (np.copy(port.Eval(self.context)) for port in ports)
-        return levels, alarm[0], str(cause)
+        assessment = SimpleNamespace(info_=INFO, detector_=learned())
+        super().__init__(ChangeMonitor(assessment), STEP_S, **inputs, **hold)
 
     def history(self):
-        """The same after each row."""
-        outputs = []
-        for row in range(self.num_rows):
-            self.simulator.AdvanceTo((row + 0.25) * STEP_S)
-            outputs.append(self.outputs())
-        levels, alarm, cause = zip(*outputs, strict=True)
-        return np.array(levels), np.array(alarm), cause
+        """Levels, alarm and its cause after each row."""
+        levels, alarm, cause = super().history("levels", "alarm", "alarm_cause").values()
+        return levels, alarm[:, 0], cause.tolist()
 
 
 def test_a_diagram_and_rows_have_the_same_levels_and_alarms():
     rows = np.concatenate([motion(30.0, 50, PUSHED), motion(2.0, 51, slice(0, None))])
-    levels, alarm, cause = Played(rows).history()
+    levels, alarm, cause = Monitored(rows).history()
     expected, alarms = learned().watch([rows], INFO.state_names)
     np.testing.assert_allclose(levels, expected, atol=1e-4)  # Single precision in one of them.
     assert not levels[:2].any() and len(alarms) >= 2
@@ -65,7 +42,7 @@ def test_a_diagram_and_rows_have_the_same_levels_and_alarms():
         assert {*cause[each.begin : each.end]} == {each.cause} != {""}
     np.testing.assert_array_equal(alarm, expected)
     frozen = np.tile(rows[0], (6, 1))
-    levels, _, _ = Played(frozen).history()
+    levels, _, _ = Monitored(frozen).history()
     np.testing.assert_allclose(levels, learned().watch([frozen])[0], atol=1e-5)
 
 
@@ -74,7 +51,7 @@ def test_it_waits_while_it_is_held():
     hold[PUSHED] = 1.0
     rows = motion(15.0, 50)
     rows[PUSHED] = rows[100]  # Frozen.
-    levels, alarm, _ = Played(rows, hold=hold).history()
+    levels, alarm, _ = Monitored(rows, hold=hold).history()
     assert not alarm.any()
     # And for half a second, ten rows, after it.
     np.testing.assert_array_equal(levels[100:151], np.tile(levels[99], (51, 1)))
@@ -90,9 +67,9 @@ def test_it_waits_while_it_is_held():
     ],
 )
 def test_it_waits_during_disturbances_that_are_announced(intervals, waits):
-    played = Played(motion(10.0, 50))
+    played = Monitored(motion(10.0, 50))
     for interval in intervals:
-        played.monitor.expect_disturbance(played.context, *interval)
+        played.system.expect_disturbance(played.context, *interval)
     levels, _, _ = played.history()
     is_same = (levels[1:] == levels[:-1]).all(axis=1)
     for begin, end in waits:
@@ -104,7 +81,7 @@ def test_it_waits_during_disturbances_that_are_announced(intervals, waits):
 def test_inputs_that_are_not_finite_are_left_out(value):
     rows = motion(4.0, 50)
     rows[40, 1] = value
-    levels, alarm, _ = Played(rows).history()
+    levels, alarm, _ = Monitored(rows).history()
     assert np.isfinite(levels).all() and not alarm.any()
     np.testing.assert_allclose(levels, learned().watch([rows])[0], atol=1e-4)
     share = 1.0 - learned().rates[-1]
@@ -118,10 +95,10 @@ def test_inputs_that_are_not_finite_are_left_out(value):
 def test_a_monitor_that_judges_too_few_inputs_raises_an_alarm(lost, share, is_blind):
     rows = motion(10.0, 50)
     rows[lost, 2 + HORIZON] = np.nan  # A feature.
-    played = Played(rows)
+    played = Monitored(rows)
     levels, alarm, cause = played.history()
     assert alarm[-1] == is_blind and cause[-1].startswith("blind: " * is_blind)
-    judged = played.monitor.GetOutputPort("judged_share").Eval(played.context)[0]
+    judged = played.system.GetOutputPort("judged_share").Eval(played.context)[0]
     assert judged == pytest.approx(share, abs=0.08)
     expected, alarms = learned().watch([rows], INFO.state_names)
     np.testing.assert_allclose(levels, expected, atol=1e-4)
@@ -131,15 +108,15 @@ def test_a_monitor_that_judges_too_few_inputs_raises_an_alarm(lost, share, is_bl
 def test_a_bias_is_seen_between_missing_inputs():
     rows = motion(20.0, 50, slice(0, None))
     rows[::8, 1] = np.nan
-    _, alarm, cause = Played(rows).history()
+    _, alarm, cause = Monitored(rows).history()
     assert alarm[-1] and "joint knee answers unlike in training" in cause[-1]
 
 
 def test_it_adopts_the_detector_of_an_adapted_assessment():
     known = [motion(60.0, seed, slice(0, None)) for seed in range(7)]
     adapted, rows = learned().with_motions(known), motion(3.0, 79, slice(0, None))
-    played = Played(rows)
-    played.monitor.adopt(played.context, SimpleNamespace(detector_=adapted))
+    played = Monitored(rows)
+    played.system.adopt(played.context, SimpleNamespace(detector_=adapted))
     levels, alarm, _ = played.history()
     np.testing.assert_allclose(levels, adapted.watch([rows])[0], atol=1e-4)
-    assert not alarm.any() and Played(rows).history()[1].any()
+    assert not alarm.any() and Monitored(rows).history()[1].any()

@@ -152,16 +152,12 @@ def test_a_task_without_goals_or_balls_runs_an_episode_and_takes_no_push(
     assert written == {"recording.html", "run.json", "run.mcap", "timeline.png", "timeline.svg"}
 
 
-@pytest.fixture
-def scenario():
+def test_pushes_are_the_scenarios_own_balls_or_described_in_degrees():
     demonstration = [Throw(time_s=0.6), Throw(time_s=1.7)]
-    return SimpleNamespace(parameters=SimpleNamespace(demonstration=demonstration))
-
-
-def test_pushes_are_the_scenarios_own_balls_or_described_in_degrees(scenario):
+    scenario = SimpleNamespace(parameters=SimpleNamespace(demonstration=demonstration))
     own = "time=1 mass=3 speed=9 direction=90"
     first, second, third = parse_pushes(scenario, ["ball", own])
-    assert [first, second] == scenario.parameters.demonstration
+    assert [first, second] == demonstration
     assert (third.time_s, third.mass_kg, third.speed_m_s) == (1.0, 3.0, 9.0)
     assert third.direction_rad == pytest.approx(math.pi / 2)
     assert parse_pushes(scenario, ["time=1"]) == [Throw(time_s=1.0)]

@@ -1,9 +1,6 @@
 """The composition guide: the example that it explains, its table and picture, and its parts."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +9,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.analysis import Simulator
 
 import compose
+from command_line import python
 from drake_safety.control.safe_sets import BalanceSafeSet
 from drake_safety.systems.assessor_inputs import AssessorInputs
 
@@ -34,11 +32,7 @@ def connections(diagram):
 def test_the_example_is_short_and_its_robot_that_is_pushed_steps_and_stands_again():
     file = Path(compose.__file__)
     assert len(file.read_text(encoding="utf-8").splitlines()) <= 80
-    command = [sys.executable, str(file)]
-    env = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8"}
-    done = subprocess.run(command, env=env, capture_output=True, text=True, encoding="utf-8")
-    assert done.returncode == 0, done.stderr
-    found = re.findall(r"(\S+) s  Γ (\S+)  nearest limit (\S+) cm", done.stdout)
+    found = re.findall(r"(\S+) s  Γ (\S+)  nearest limit (\S+) cm", python(file))
     gamma, limit = np.array(found, dtype=float).T[1:]
     assert gamma[0] < compose.RECOVERY.threshold
     assert limit.min() < 0.0  # On two legs.

@@ -14,13 +14,14 @@ from pydrake.multibody.parsing import ModelDirective, ModelDirectives, ProcessMo
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.controllers import LinearQuadraticRegulator
-from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.lcm import ApplyLcmBusConfig
 from pydrake.systems.primitives import AffineSystem
 from pydrake.visualization import ApplyVisualizationConfig, VisualizationConfig
 
 from drake_safety import AddSafetyAssessor, AssessmentParameters, SafetyAssessment, record_episodes
 from drake_safety.logs.mcap_recorder import McapRecorder
+from toy_tasks import declare_outputs
 
 HORIZON, STEP_S, UPRIGHT = 4, 0.05, np.array([0.0, np.pi, 0.0, 0.0])
 POLE_RAD, PUSH_RAD_S = 0.1, 3.0
@@ -86,16 +87,12 @@ class Balance(LeafSystem):
     def __init__(self):
         super().__init__()
         x = self.DeclareVectorInputPort("state", 4)
-        for name, size, calc in (
-            ("output", 1, lambda c: x.Eval(c)[:1]),
-            ("desired_preview", HORIZON, lambda c: np.zeros(HORIZON)),
-            ("margins", 1, lambda c: [POLE_RAD - abs(x.Eval(c)[1] - np.pi)]),
-        ):
-
-            def write(context, output, calc=calc):
-                output.SetFromVector(calc(context))
-
-            self.DeclareVectorOutputPort(name, BasicVector(size), write)
+        ports = {
+            "output": (1, lambda cart, *_: [cart]),
+            "desired_preview": (HORIZON, lambda *_: np.zeros(HORIZON)),
+            "margins": (1, lambda cart, pole, *_: [POLE_RAD - abs(pole - np.pi)]),
+        }
+        declare_outputs(self, ports, x.Eval)
 
 
 def balancing_gain():

@@ -64,9 +64,6 @@ def test_fresh_targets_are_judged_kept_and_not_simulated_again(monkeypatch, caps
     assert first["plans", "paper_at_06", "threshold"].value == 0.6
     assert first["plans", "outcomes", "safe"].n == 30
     assert first["plans", "sharpened", "threshold"].n == first.entries["calibration_episodes"] == 20
-    for place in ("calibration", "calibration.rows"):
-        error = first[place, "sharpened", "expected_calibration_error"]
-        assert error.low <= error.high and error.n == 30
     assert (folder / "reliability.png").is_file()
     # What takes throws or runs is no part of it.
     assert not {"throws", "segments"} & {key[0] for key in first}
@@ -114,7 +111,7 @@ def test_under_shifts_the_given_seed_is_used_whatever_it_is(monkeypatch, capsys,
     for method in ("gamma", "paper"):
         for metric in ("unknown", "confident_error"):
             assert (f"shifts.{shifted[0]}", method, metric) in results
-    for metric in ("delay_s", "leaves", "confident_error_10s", "silent_confident_error_10s"):
+    for metric in ("delay_s", "alarmed", "confident_error_10s"):
         assert (f"shifts.{shifted[0]}", "monitor", metric) in results
     assert results["shifts.nominal", "monitor", "false_alarms_per_hour"].value >= 0.0
 

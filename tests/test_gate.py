@@ -24,7 +24,9 @@ from drake_safety.policies.policy import network_file, read_policy_file
 from drake_safety.simulation.dataset import load_episodes
 from drake_safety.simulation.motion import End, simulate
 from drake_safety.simulation.rollouts import episode_rng
+from exported_robots import edited
 from studies import gate as study
+from toy_tasks import declare_outputs
 
 WEAK = {"parameters.effort_share": 0.2}
 GAMMA = SimpleNamespace(
@@ -130,18 +132,18 @@ def test_a_fall_and_a_diverged_simulation_are_failures():
 class Dip(LeafSystem):
     """Margins that are negative for a moment between two rows."""
 
-    def __init__(self, dips, safe):
+    def __init__(self, dips):
         super().__init__()
-        names = ("state", "true_state", "output", "desired_output", "desired_preview", "features")
-        for name in names:
-            self.DeclareVectorOutputPort(name, 1, lambda context, out: out.SetFromVector([0.0]))
 
-        def margins(context, output):
-            time_s = context.get_time()
-            output.SetFromVector([1.0 - 2.0 * (abs(time_s - dip) < 0.006) for dip in dips])
+        def margins(time_s):
+            return [1.0 - 2.0 * (abs(time_s - dip) < 0.006) for dip in dips]
 
-        self.DeclareVectorOutputPort("margins", 2, margins)
-        self.DeclareVectorOutputPort("safe", 1, lambda c, out: out.SetFromVector([safe(c)]))
+        def safe(time_s):
+            return [float(time_s < 0.125 if dips[0] == dips[1] else min(margins(time_s)) >= 0)]
+
+        ports = dict.fromkeys(RECORDED, (1, lambda time_s: [0.0]))
+        ports |= {"margins": (2, margins), "safe": (1, safe)}
+        declare_outputs(self, ports, lambda context: [context.get_time()])
 
 
 @pytest.mark.parametrize(
@@ -155,15 +157,8 @@ class Dip(LeafSystem):
 )
 def test_a_violation_between_two_rows_is_a_failure_at_its_instant(dips, metric, expected):
     second = "fall" if metric == "fall" else "height"
-    has_own = dips[0] == dips[1]
-    dip = Dip(
-        dips,
-        lambda c: float(
-            c.get_time() < 0.125 if has_own else min(dip.GetOutputPort("margins").Eval(c)) >= 0
-        ),
-    )
     builder = DiagramBuilder()
-    builder.AddSystem(dip)
+    dip = builder.AddSystem(Dip(dips))
     for i in range(dip.num_output_ports()):
         builder.ExportOutput(dip.get_output_port(i), dip.get_output_port(i).get_name())
     loop = builder.Build()
@@ -320,11 +315,7 @@ GO2, _ = policy_files(load_scenario("go2_walking"))
 
 def go2(tmp_path, **changes):
     """The walking scenario with other words in its policy's file."""
-    text = GO2.read_text()
-    for old, new in changes.items():
-        assert old in text
-        text = text.replace(old, new)
-    (tmp_path / "policy.yaml").write_text(text)
+    (tmp_path / "policy.yaml").write_text(edited(GO2.read_text(), changes))
     return load_scenario("go2_walking", {"parameters.policy": str(tmp_path / "policy.yaml")})
 
 

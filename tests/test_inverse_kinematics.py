@@ -5,16 +5,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_safety.control.inverse_kinematics import solve_inverse_kinematics
-from legged_robots import robot_kinematics
-
-
-def standing_contacts(kinematics):
-    return np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
-
-
-def base_pose(kinematics, rotation=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0)):
-    p = np.append(kinematics.nominal_base_offset, kinematics.standing_height)
-    return RigidTransform(RollPitchYaw(rotation), p + shift)
+from legged_robots import base_over, robot_kinematics, standing_feet
 
 
 @pytest.mark.parametrize("name", ["laikago", "biped"])
@@ -22,10 +13,11 @@ def base_pose(kinematics, rotation=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0)):
 def test_the_feet_are_where_they_were_asked_for_and_the_answer_is_a_fixed_point(name, seed):
     kinematics = robot_kinematics(name)
     rng = np.random.default_rng(seed)
-    X_WB = base_pose(kinematics, rng.uniform(-0.08, 0.08, 3), rng.uniform(-0.02, 0.02, 3))
+    R_WB = RollPitchYaw(rng.uniform(-0.08, 0.08, 3))
+    X_WB = RigidTransform(R_WB, base_over(kinematics, shift=rng.uniform(-0.02, 0.02, 3)))
     if name == "biped":  # A stretched knee would be the only other way.
         X_WB.set_translation(X_WB.translation() - [0.0, 0.0, 0.02])
-    p_WC = standing_contacts(kinematics)
+    p_WC = standing_feet(kinematics)
     joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
     reached = kinematics.contact_positions(kinematics.positions_at(X_WB, joints))
     np.testing.assert_allclose(reached, p_WC, atol=1e-4)
@@ -35,8 +27,8 @@ def test_the_feet_are_where_they_were_asked_for_and_the_answer_is_a_fixed_point(
 @pytest.mark.parametrize("height", [-0.5, 2.0])
 def test_joints_stay_within_their_limits_when_the_goal_is_out_of_reach(height):
     kinematics = robot_kinematics("biped")
-    X_WB = base_pose(kinematics, shift=(0.0, 0.0, height))
-    p_WC = standing_contacts(kinematics)
+    X_WB = RigidTransform(base_over(kinematics, shift=(0.0, 0.0, height)))
+    p_WC = standing_feet(kinematics)
     joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
     lowest, highest = kinematics.position_limits.T
     assert np.all((joints >= lowest) & (joints <= highest))

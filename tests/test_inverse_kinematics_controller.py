@@ -3,22 +3,11 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_safety.systems.inverse_kinematics_controller import InverseKinematicsController
-from drake_safety.systems.trajectory_planner import to_world
-from legged_robots import robot_kinematics
+from legged_robots import base_over, robot_kinematics, standing_feet
 from system_doubles import Bench
 
 PERIOD_S = 0.01
 STIFFNESS = 250.0
-
-
-def standing_feet(kinematics, stance_pose=(0.0, 0.0, 0.0)):
-    feet = np.column_stack([kinematics.nominal_contacts, kinematics.foot_radii])
-    return to_world(np.array(stance_pose), feet)
-
-
-def base_over(kinematics, stance_pose=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0)):
-    base = np.append(kinematics.nominal_base_offset, kinematics.standing_height)
-    return to_world(np.array(stance_pose), base + shift)
 
 
 class Commanded(Bench):

@@ -44,11 +44,7 @@ def meshcat():
     return Meshcat()
 
 
-def learned_quickly(scenario):
-    return learned(quick(scenario), 8)
-
-
-def session_of(name, threshold, learn=learned_quickly, changes=None, **options):
+def session_of(name, threshold, learn=lambda one: learned(quick(one), 8), changes=None, **options):
     @cache
     def loop(meshcat):
         scenario = load_scenario(name, changes)

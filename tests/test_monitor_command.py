@@ -28,11 +28,6 @@ COLUMNS = {
 MAP = SequenceMap(step_s=STEP_S, columns=COLUMNS, scale={"knee_rate": 20.0}, offset={"knee": 0.5})
 
 
-@pytest.fixture(scope="module")
-def detector():
-    return learned()
-
-
 def observed(rows):
     """What a policy observes of rows (K, n): scaled rates, and positions about another zero."""
     q, dq, now, later, load = rows[:, [0, 1, 2, 3, 2 + HORIZON]].T
@@ -44,53 +39,51 @@ def write(path, data, **arrays):
     return path
 
 
-def test_sequences_are_rows_of_the_detector(detector, tmp_path):
+def test_sequences_are_rows_of_the_detector(tmp_path):
     rows = [motion(4.0, seed) for seed in (60, 61)]
     data = np.stack([observed(motion_) for motion_ in rows])
     file = write(tmp_path / "many.npz", data)
     names = np.array(OBSERVED, dtype="S")
     one_file = write(tmp_path / "one.npz", data[1], observation_names=names)
-    sequences = read_sequences(file, MAP, detector, INFO)
+    sequences = read_sequences(file, MAP, learned(), INFO)
     for sequence, expected in zip(sequences, rows, strict=True):
         ((time_s, read),) = sequence
         np.testing.assert_allclose(time_s, STEP_S * np.arange(len(expected)))
-        used = detector.columns
+        used = learned().columns
         np.testing.assert_allclose(read[:, used], expected[:, used], atol=1e-12)
         assert not read[:, np.setdiff1d(np.arange(read.shape[1]), used)].any()
-    (alone,) = read_sequences(one_file, MAP, detector, INFO)
+    (alone,) = read_sequences(one_file, MAP, learned(), INFO)
     np.testing.assert_array_equal(alone[0][1], sequences[1][0][1])
 
 
-def test_a_sequence_is_cut_at_missing_values_and_thinned_to_the_step_of_the_detector(
-    detector, tmp_path
-):
+def test_a_sequence_is_cut_at_missing_values_and_thinned_to_the_step_of_the_detector(tmp_path):
     data = np.repeat(observed(motion(4.0, 60)), 2, axis=0)  # At twice the rate.
     data[20:24, 2] = data[140:, 4] = np.nan
     file = write(tmp_path / "fast.npz", data)
     read_by = dataclasses.replace(MAP, step_s=0.5 * STEP_S)
-    (sequence,) = read_sequences(file, read_by, detector, INFO)
+    (sequence,) = read_sequences(file, read_by, learned(), INFO)
     first, second = (time_s for time_s, _ in sequence)
     np.testing.assert_allclose(first, STEP_S * np.arange(10))
     np.testing.assert_allclose(second, STEP_S * np.arange(12, 70))
 
 
 @pytest.mark.parametrize("change", [{"columns": {}}, {"step_s": 0.04}])
-def test_a_map_that_does_not_fit_is_refused(detector, tmp_path, change):
+def test_a_map_that_does_not_fit_is_refused(tmp_path, change):
     file = write(tmp_path / "runs.npz", observed(motion(2.0, 60)))
     with pytest.raises(ValueError, match=r"expected|no observations"):
-        read_sequences(file, dataclasses.replace(MAP, **change), detector, INFO)
+        read_sequences(file, dataclasses.replace(MAP, **change), learned(), INFO)
 
 
-def test_a_file_of_objects_or_text_is_refused(detector, tmp_path):
+def test_a_file_of_objects_or_text_is_refused(tmp_path):
     text, objects = tmp_path / "text.npz", tmp_path / "objects.npz"
     text.write_text("time,q\n")
     for file in (text, write(objects, np.array([{}], dtype=object))):
         with pytest.raises(ValueError, match=rf"not an \.npz file: sequences '.*{file.name}'"):
-            read_sequences(file, MAP, detector, INFO)
+            read_sequences(file, MAP, learned(), INFO)
 
 
 @pytest.fixture
-def folder(detector, tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch):
     """An assessment with the detector of the mass on a spring, and a folder of runs."""
     folder = tmp_path / "spring"
     folder.mkdir()
@@ -98,7 +91,7 @@ def folder(detector, tmp_path, monkeypatch):
     names = ("state_names", "output_names", "feature_names", "horizon")
     changed = {name: getattr(INFO, name) for name in names}
     assessment.info_ = dataclasses.replace(assessment.info_, **changed)
-    assessment.detector_ = detector
+    assessment.detector_ = learned()
     runs = folder / "runs"
     runs.mkdir()
     usual, pushed = motion(30.0, 60), motion(30.0, 50, slice(100, 140))
@@ -121,14 +114,14 @@ def judge(monkeypatch, folder, *logs):
     return code, json.loads(file.read_text())["entries"]["logs"] if file.exists() else []
 
 
-def test_the_command_judges_every_sequence_of_a_folder(folder, monkeypatch, capsys, detector):
+def test_the_command_judges_every_sequence_of_a_folder(folder, monkeypatch, capsys):
     code, logs = judge(monkeypatch, folder, folder / "runs")
     assert not code
     printed = " ".join(capsys.readouterr().out.split())
     for text in ("runs/a.npz [0]", "runs/a.npz [1]", "runs/b.npz [0]", "no alarm; largest: knee"):
         assert text in printed
     assert [(log["sequence"], len(log["alarms"])) for log in logs] == [(0, 0), (1, 1), (0, 0)]
-    _, alarms = detector.watch([motion(30.0, 50, slice(100, 140))], INFO.state_names)
+    _, alarms = learned().watch([motion(30.0, 50, slice(100, 140))], INFO.state_names)
     ((begin, end, cause),) = alarms
     (alarm,) = logs[1]["alarms"]
     assert (alarm["begin_s"], alarm["end_s"]) == pytest.approx((begin * STEP_S, end * STEP_S))

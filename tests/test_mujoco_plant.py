@@ -76,12 +76,6 @@ def laikago():
     return loop_of("laikago_balancing", ball=False)
 
 
-def started(loop, seed=0):
-    context = loop.CreateDefaultContext()
-    loop.reset(context, np.random.default_rng(seed))
-    return context
-
-
 def read(loop, context, port="plant_state"):
     return loop.GetOutputPort(port).Eval(context).copy()
 
@@ -224,8 +218,8 @@ def test_a_step_from_nan_or_into_instability_is_an_error(monkeypatch, tmp_path):
 def test_two_contexts_of_one_diagram_do_not_disturb_each_other():
     loop = laikago()
     # The starts differ: so do contacts, torques and warm starts.
-    alone = [advanced(loop, started(loop, seed), 0.1) for seed in (0, 1)]
-    simulators = [Simulator(loop, started(loop, seed)) for seed in (0, 1)]
+    alone = [advanced(loop, reaching_loops.started(loop, seed), 0.1) for seed in (0, 1)]
+    simulators = [Simulator(loop, reaching_loops.started(loop, seed)) for seed in (0, 1)]
     for simulator in simulators:
         simulator.Initialize()
     for step in range(1, 41):

@@ -6,13 +6,12 @@ import shutil
 import numpy as np
 import pytest
 import yaml
-from pydrake.systems.analysis import Simulator
 
-from command_line import invoked
+from command_line import invoked, problems
 from drake_safety.importing.robot_template import write_robot
 from drake_safety.simulation.scenario import load_scenario
-from drake_safety.simulation.scenario_check import check_scenario
 from legged_robots import edited, write_hexapod, write_porter
+from system_doubles import begun
 from urdf_files import mesh, stl, with_shape
 
 
@@ -28,11 +27,6 @@ def spider(tmp_path_factory):
 def own(spider, tmp_path):
     """A copy of it that a test may spoil."""
     return shutil.copytree(spider.folder, tmp_path / "own")
-
-
-def problems(scenario, num_episodes=0):
-    findings = check_scenario(scenario, num_episodes=num_episodes)
-    return {f.item: f for f in findings if not f.is_ok}
 
 
 def test_what_new_writes_passes_its_check_as_it_is(spider):
@@ -66,10 +60,9 @@ def test_a_balancing_robot_has_a_plant_whose_arms_turn_while_it_stands(tmp_path)
     turned = {}
     for variation in ("actual", "arms"):
         loop = scenario.make_loop(variation, ball=False)
-        simulator = Simulator(loop)
-        loop.reset_calm(simulator.get_mutable_context(), np.random.default_rng(0))
+        simulator, context = begun(loop, loop.reset_calm, np.random.default_rng(0))
         simulator.AdvanceTo(1.0)
-        q = loop.GetOutputPort("state").Eval(simulator.get_context())
+        q = loop.GetOutputPort("state").Eval(context)
         turned[variation] = dict(zip(loop.state_names, q, strict=True))
     assert written.arms
     for arm in written.arms:

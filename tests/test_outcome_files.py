@@ -1,13 +1,11 @@
 """Verdicts on outcomes that another simulator wrote."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
-from command_line import call
+from command_line import call, python
 from drake_safety import compare_loops, load_scenario
 from drake_safety.evaluation.outcome_files import compare_outcomes, read_outcomes, write_outcomes
 from drake_safety.evaluation.paired_test import interim_estimate
@@ -194,8 +192,7 @@ def test_it_needs_none_of_the_extras():
     code = "import sys, drake_safety.cli.gate, drake_safety.evaluation.outcome_files as o; "
     code += "o.compare_outcomes({'a': 0.0}, {'a': 1.0}); "
     code += "print([n for n in ('torch', 'sklearn', 'pyarrow', 'pandas') if n in sys.modules])"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ended.stdout.strip() == "[]"
+    assert python("-c", code).strip() == "[]"
 
 
 def test_a_single_look_is_a_look_of_the_sequential_test():

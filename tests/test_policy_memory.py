@@ -5,8 +5,6 @@ from unittest import mock
 
 import numpy as np
 import pytest
-import yaml
-from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from cart_episodes import assert_identical
@@ -14,7 +12,9 @@ from drake_safety import load_scenario, run_episode, run_episodes
 from drake_safety.learning.segments import Episodes
 from drake_safety.policies.policy_network import load_network
 from drake_safety.simulation.feedback import AddFeedbackRecorder, pair_windows, window_start
-from policy_networks import TERMS, new, recurrent_module, save_onnx, save_script
+from legged_robots import edited
+from policy_networks import recurrent_module, save_onnx, save_script, walker
+from system_doubles import begun
 
 pytestmark = pytest.mark.train
 torch = pytest.importorskip("torch")
@@ -117,23 +117,10 @@ def test_a_memory_of_another_kind_is_refused(tmp_path, network, message):
 def walking(tmp_path_factory):
     """A hexapod that stands by a policy of random weights with a memory."""
     folder = tmp_path_factory.mktemp("walking")
-    policy = save_script(folder / "policy.pt", recurrent_module(42, 18))
-    out, result = new(folder, policy)
-    assert result.exit_code == 0, result.output
-    stated = {
-        "network": policy.name,
-        "joints": [f"{part}_{i}" for i in range(6) for part in ("swing", "lift", "knee")],
-        "default_positions": yaml.safe_load((out / "robot.yaml").read_text())["posture"],
-        "action_scale": {".*": 0.1},
-        "gains": {".*": {"stiffness": 200.0, "damping": 4.0}},
-        "observation": [{"name": name} for name in TERMS],
-    }
-    (out / "policy.yaml").write_text(yaml.safe_dump(stated))
-    scenario = yaml.safe_load((out / "walking.yaml").read_text())
-    scenario |= {"episode_duration_s": 0.4, "assessment": {"horizon": 3}}
-    scenario["parameters"]["start"] = {"walked_s": [0.0, 0.2]}
-    (out / "walking.yaml").write_text(yaml.safe_dump(scenario))
-    return load_scenario(out / "walking.yaml")
+    file = walker(folder, save_script(folder / "policy.pt", recurrent_module(42, 18)))
+    edited(file.with_name("policy.yaml"), action_scale={".*": 0.1})
+    changes = {"episode_duration_s": 0.4, "assessment": {"horizon": 3}}
+    return load_scenario(file, changes | {"parameters.start": {"walked_s": [0.0, 0.2]}})
 
 
 def test_episodes_are_the_same_for_any_number_of_workers_and_in_any_order(walking):
@@ -148,10 +135,8 @@ def windows(scenario):
     builder = DiagramBuilder()
     loop = builder.AddSystem(scenario.make_loop())
     recorder = AddFeedbackRecorder(builder, loop)
-    simulator = Simulator(builder.Build())
-    root = simulator.get_mutable_context()
-    loop.reset_standing(root, np.array([0.3, 0.0, 0.2]))
-    simulator.Initialize()
+    command = np.array([0.3, 0.0, 0.2])
+    simulator, root = begun(builder.Build(), loop.reset_standing, command)
     simulator.AdvanceTo(2.1 * scenario.episode_duration_s)
     return recorder, recorder.take_windows(recorder.GetMyMutableContextFromRoot(root))
 

@@ -98,19 +98,11 @@ def test_it_continues_and_has_the_same_bits_for_any_number_of_workers(
     assert (fresh.rate, fresh.failures) == (found.rate, found.failures)
 
 
-def make_diagram():
-    return Gliding(gliding(speed_m_s=0.9))
-
-
-def reset(diagram, context, rng):
-    return diagram.reset(context, rng)
-
-
 @pytest.mark.train
-def test_any_diagram_is_searched_with_its_reset_alone(glided):
+def test_any_diagram_is_searched_with_its_reset_alone():
     found = estimate_rare_failure(
-        make_diagram,
-        reset=reset,
+        lambda: Gliding(gliding(speed_m_s=0.9)),
+        reset=Gliding.reset,
         duration_s=0.8,
         step_s=0.04,
         constraint_names=["right", "left"],

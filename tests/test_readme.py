@@ -1,9 +1,7 @@
-import os
 import re
 import shlex
 import shutil
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -57,16 +55,8 @@ def test_the_python_of_the_readme_runs_as_one_script_and_prints_a_belief(tmp_pat
     first = first.replace("\nassessment = ", f"\n{few}\nassessment = ")
     script = tmp_path / "readme.py"
     script.write_text(first, encoding="utf-8")
-    paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
-    done = subprocess.run(
-        [sys.executable, script],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    belief = np.array(done.stdout.strip().strip("[]").split(), dtype=float)
+    printed = command_line.python(script, cwd=tmp_path)
+    belief = np.array(printed.strip().strip("[]").split(), dtype=float)
     assert belief.shape == (3,)
     assert np.all(belief >= 0)
     assert belief.sum() == pytest.approx(1.0, abs=1e-4)

@@ -1,7 +1,4 @@
 import logging
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +11,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 import quadrotor
 from cart_episodes import assert_identical
+from command_line import python
 from drake_safety import record_episodes
 from drake_safety.learning.segments import DIVERGED, EpisodeError
 from drake_safety.simulation.dataset import completed, load_episodes
@@ -173,6 +171,7 @@ def reset_outside(diagram, context, rng):
     return reset_glider(diagram, context, rng)
 
 
+@pytest.mark.train
 def test_an_episode_that_ends_at_its_start_vouches_for_no_diagram(tmp_path):
     options = {"reset": reset_outside, "path": tmp_path, "name": "glider"}
     assert record(3, **options)[0].num_steps == 0
@@ -253,8 +252,7 @@ def test_what_a_script_or_notebook_defines_reaches_the_workers(tmp_path):
         "for one, other in zip(*sets, strict=True):\n"
         "    np.testing.assert_array_equal(one.state, other.state)\n"
     )
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    subprocess.run([sys.executable, str(script)], env=environment, check=True)
+    python(script)
 
 
 @pytest.mark.parametrize("begin_s", [0.07, 1.76e9])

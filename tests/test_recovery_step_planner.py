@@ -5,8 +5,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from drake_safety.control.kinematics import fit_stance
 from drake_safety.control.recovery_step import RecoveryStepParameters, capture_point, gait_groups
 from drake_safety.systems.recovery_step_planner import RecoveryStepPlanner
-from drake_safety.systems.trajectory_planner import to_world
-from legged_robots import robot_kinematics
+from legged_robots import base_over, robot_kinematics, standing_feet
 from system_doubles import Bench
 
 PERIOD_S = 0.01
@@ -23,8 +22,8 @@ class Stepping(Bench):
         options = {"period_s": PERIOD_S, "horizon": 4, "num_outlook": 3}
         super().__init__(RecoveryStepPlanner(k, self.parameters, **options))
         self.stance_pose, self.speed = np.array(stance_pose), np.array([*speed, 0.0])
-        self.feet = to_world(self.stance_pose, np.c_[k.nominal_contacts, k.foot_radii])
-        self.base = to_world(self.stance_pose, np.r_[k.nominal_base_offset, k.standing_height])
+        self.feet = standing_feet(k, stance_pose)
+        self.base = base_over(k, stance_pose)
         self.see(self.base)
         self.fix(recovery_active=active, nominal_desired_output=self.base)
         self.begin()

@@ -27,20 +27,19 @@ def test_probabilities_that_come_true_lie_on_the_diagonal_and_overconfident_ones
     p = rng.random(20000)
     label = rng.random(20000) < p
     true = once(p, label)
-    assert true.error.value < 0.02
+    assert true.error < 0.02
     for expected, observed in zip(true.expected, true.observed, strict=True):
         assert observed.low <= expected <= observed.high
     # As far from one half again as it should be, where that is possible: off by |p - 1/2|.
     bold = once(np.clip(2.0 * p - 0.5, 0.0, 1.0), label)
-    assert bold.error.value == pytest.approx(0.125, abs=0.02)
-    assert bold.error.low < bold.error.value < bold.error.high
+    assert bold.error == pytest.approx(0.125, abs=0.02)
 
 
 def test_equal_probabilities_share_a_bin():
     one = once(np.array([0.2, 0.2, 0.2, 1.0]), np.array([True, False, False, True]))
     np.testing.assert_allclose(one.expected, [0.2, 1.0])
     assert one.observed == [proportion(1, 3), proportion(1, 1)]
-    assert one.error.value == pytest.approx(3 / 4 * (1 / 3 - 0.2))
+    assert one.error == pytest.approx(3 / 4 * (1 / 3 - 0.2))
 
 
 def test_repeating_the_rows_of_an_episode_adds_no_certainty():
@@ -53,4 +52,4 @@ def test_repeating_the_rows_of_an_episode_adds_no_certainty():
         assert many.n == few.n == alone.n / 20
         assert many.high - many.low > 3.0 * (alone.high - alone.low)
         assert many.high - many.low == pytest.approx(few.high - few.low, rel=0.3)
-    assert often.error.value == pytest.approx(single.error.value)
+    assert often.error == pytest.approx(single.error)

@@ -1,5 +1,3 @@
-import os
-import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -7,9 +5,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-import drake_safety
 import toy_tasks
-from command_line import invoked
+from command_line import invoked, python
 from drake_safety import load_scenario
 from drake_safety.simulation.rollouts import episodes_info
 from drake_safety.simulation.scenario import parse_scenario, read_scenario, scenario_names
@@ -93,8 +90,7 @@ def test_a_task_beside_its_scenario_runs_in_worker_processes(beside):
         "assert all((a.state == b.state).all() for a, b in zip(episodes, same, strict=True))"
     )
     # The folder is neither that of the process nor on its path.
-    environment = os.environ | {"PYTHONPATH": str(Path(drake_safety.__file__).parents[1])}
-    subprocess.run([sys.executable, "-c", code], cwd="/", env=environment, check=True)
+    python("-c", code)
 
 
 def test_a_task_of_a_name_that_is_taken_is_refused_with_both_files(beside, tmp_path):

@@ -5,12 +5,12 @@ import math
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
 
 from drake_safety import load_scenario
 from drake_safety.models import load_robot
 from drake_safety.robots.shift import Fault, JointShift, Shift
 from drake_safety.simulation.rollouts import run_episode
+from system_doubles import begun
 
 SCENARIO = "laikago_balancing"
 KNEE = "FR_calf_joint"
@@ -26,12 +26,9 @@ def loop_with(shift, engine="drake"):
 def standing(shift, seconds, height_m=0.0):
     """The diagram and its Context after standing, or falling from a height, for a while."""
     loop = loop_with(shift)
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
     start = loop.standing_start()
     start.q[6] += height_m
-    loop.reset_to(context, None, start)
-    simulator.Initialize()
+    simulator, context = begun(loop, loop.reset_to, None, start)
     simulator.AdvanceTo(seconds)
     return loop, context
 

@@ -101,16 +101,12 @@ def test_a_minute_goes_on_with_the_next_motions_and_an_alarm_is_dont_know():
     ]
     found = monitored(motions, Gamma())
     assert [one.alarm_s for one in found] == [12.0, 2.0, 16.0, 6.0, 22.0]
-    assert [one.leave_s for one in found] == [10.0, 20.0, 10.0, 10.0, 10.0]
     # The first is wrong for 5 s, the fourth for 5 s with and 3 s without the alarm.
-    assert [one.silent_error_s[0] for one in found] == [5.0, 0.0, 0.0, 5.0, 0.0]
     assert [one.error_s[0] for one in found] == [5.0, 0.0, 0.0, 3.0, 0.0]
-    assert [one.silent_error_s[1] for one in found] == [10.0] * 5
     assert [one.error_s[1] for one in found] == [8.0] * 5
     late = [motion(i, 100, is_safe=i != 1) for i in range(2)] + [motion(2, 100, alarm=[50])]
     found = monitored(late, Gamma())
     assert [one.alarm_s for one in found] == [math.inf, math.inf, 25.0]
-    assert [one.leave_s for one in found] == [math.inf, 50.0, math.inf]
 
 
 def test_false_alarms_are_those_of_undisturbed_motion():

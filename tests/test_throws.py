@@ -25,17 +25,8 @@ TIME_S = np.arange(0.0, 1.02, 0.02)
 CALM = Scorer(name="calm", probability=lambda state, *_: state[:, 0])
 
 
-@pytest.fixture(scope="module")
-def balancing():
-    return packaged_loop("actual", ball=True)
-
-
-@pytest.fixture(scope="module")
-def recovering():
-    return packaged_loop("actual", ball=True, recovery=True)
-
-
-def test_a_hard_throw_makes_balancing_fall_and_the_log_ends_there(balancing):
+def test_a_hard_throw_makes_balancing_fall_and_the_log_ends_there():
+    balancing = packaged_loop("actual", ball=True)
     log = run_throw(balancing, 0, seed=5, throws=[HARD], duration_s=2.5)
     assert log.has_left and log.has_fallen
     assert HARD.time_s < log.leave_time_s < log.fall_time_s == pytest.approx(log.time_s[-1])
@@ -43,7 +34,9 @@ def test_a_hard_throw_makes_balancing_fall_and_the_log_ends_there(balancing):
     assert log["margins"][-1, fall] < 0 <= log["margins"][-2, fall]
 
 
-def test_before_the_trigger_recovery_changes_no_bit(balancing, recovering):
+def test_before_the_trigger_recovery_changes_no_bit():
+    balancing = packaged_loop("actual", ball=True)
+    recovering = packaged_loop("actual", ball=True, recovery=True)
     options = {"seed": 5, "throws": [HARD], "duration_s": 0.6}
     alone = run_throw(balancing, 3, **options)
     saved = run_throw(recovering, 3, trigger_time_s=0.34, **options)
@@ -54,7 +47,8 @@ def test_before_the_trigger_recovery_changes_no_bit(balancing, recovering):
 
 
 @pytest.mark.parametrize("direction", [math.pi / 2, -math.pi / 4])
-def test_recovery_steps_save_the_robot_without_violations(recovering, direction):
+def test_recovery_steps_save_the_robot_without_violations(direction):
+    recovering = packaged_loop("actual", ball=True, recovery=True)
     throw = replace(HARD, direction_rad=direction)
     log = run_throw(recovering, 1, seed=5, throws=[throw], duration_s=3.5, trigger_time_s=0.32)
     assert not log.has_fallen

@@ -1,6 +1,5 @@
 import re
 
-import numpy as np
 import pytest
 
 from command_line import call
@@ -8,12 +7,8 @@ from drake_safety.cli.training_folder import MODES, load_assessment
 from drake_safety.learning.change_detector import usual_rows
 from drake_safety.learning.seeds import FALLS, MOTION
 from drake_safety.simulation.dataset import load_episodes
+from sprung_motions import same_detector
 from toy_tasks import SHUTTLING
-
-
-def same_detector(one, other):
-    pairs = zip(one.arrays().items(), other.arrays().items(), strict=True)
-    return all(a[0] == b[0] and np.array_equal(a[1], b[1]) for a, b in pairs)
 
 
 @pytest.mark.slow

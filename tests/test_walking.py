@@ -14,7 +14,7 @@ from drake_safety.diagrams.walking.parameters import WalkingRecovery
 from drake_safety.learning.beliefs import empty
 from drake_safety.simulation.contract import check_contract
 from drake_safety.simulation.rollouts import episode_rng
-from system_doubles import HORIZON, OUTLOOK, Bench, SlowIsSafe, guard
+from system_doubles import HORIZON, OUTLOOK, Bench, SlowIsSafe, begun, guard
 
 
 @pytest.fixture(scope="module")
@@ -23,11 +23,9 @@ def loop():
 
 
 def walk(loop, command, duration_s):
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
     plan = PiecewisePolynomial(np.array(command)[:, None])
-    loop.reset_to(context, None, replace(loop.standing_start(), plan=plan))
-    simulator.Initialize()
+    start = replace(loop.standing_start(), plan=plan)
+    simulator, context = begun(loop, loop.reset_to, None, start)
     velocities, margins = [], []
     for tick in range(1, round(duration_s / 0.1) + 1):
         simulator.AdvanceTo(0.1 * tick)
@@ -98,21 +96,16 @@ def test_state_and_output_do_not_depend_on_place_and_heading(loop):
 
 
 def test_a_start_has_the_controllers_memory_so_that_the_motion_continues(loop):
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset_standing(context, np.array([0.4, 0.0, 0.3]))
-    simulator.Initialize()
+    simulator, context = begun(loop, loop.reset_standing, np.array([0.4, 0.0, 0.3]))
     simulator.AdvanceTo(0.6)
     start = loop.start_of(context)
     simulator.AdvanceTo(1.0)
     expected = loop.GetOutputPort("plant_state").Eval(context).copy()
 
     def continued(start):
-        again = Simulator(loop)
-        loop.reset_to(again.get_mutable_context(), None, start)
-        again.Initialize()
+        again, context = begun(loop, loop.reset_to, None, start)
         again.AdvanceTo(0.4)
-        return loop.GetOutputPort("plant_state").Eval(again.get_context())
+        return loop.GetOutputPort("plant_state").Eval(context)
 
     np.testing.assert_allclose(continued(start), expected, atol=1e-3)
     forgotten = continued(replace(start, controller_state=None))
@@ -157,11 +150,23 @@ def test_the_guard_passes_an_accepted_command_unchanged():
     np.testing.assert_array_equal(out["desired_outlook"], np.tile(command, OUTLOOK))
 
 
-def test_the_guard_replaces_a_refused_command_by_the_nearest_accepted_one():
-    out = passed_on(SlowIsSafe(fastest=1.5), [2.5, 0.4, 0.0])
-    # Shares of 2.5 are .5 apart, and the other entries stay.
-    np.testing.assert_allclose(out["desired_output"], [1.5, 0.4, 0.0])
-    assert (out["is_changed"][0], out["safety_probability"][0]) == (1.0, 0.0)
+@pytest.mark.parametrize(
+    ("novelty", "state", "is_acting", "expected"),
+    [
+        (0.0, 0.0, True, [1.5, 0.4, -3.0]),  # Shares of 2.5 are .5 apart, and the others stay.
+        # Without an accepted command it keeps to the ranges.
+        (2.0, 0.0, True, [1.0, 0.4, -1.0]),
+        (0.0, np.nan, True, [1.0, 0.4, -1.0]),
+        (0.0, 0.0, False, [2.5, 0.4, -3.0]),
+        (0.0, np.nan, False, [2.5, 0.4, -3.0]),
+    ],
+)
+def test_the_guard_replaces_a_refused_command_by_the_nearest_accepted_one_if_it_acts(
+    novelty, state, is_acting, expected
+):
+    out = passed_on(SlowIsSafe(novelty=novelty), [2.5, 0.4, -3.0], state, is_acting)
+    np.testing.assert_array_equal(out["desired_output"], expected)
+    assert (out["is_changed"][0], out["safety_probability"][0]) == (float(is_acting), 0.0)
 
 
 def test_the_guard_tries_the_nearest_commands_first_as_measured_in_the_policys_ranges():
@@ -172,29 +177,11 @@ def test_the_guard_tries_the_nearest_commands_first_as_measured_in_the_policys_r
     assert (np.diff(distance) >= 0.0).all()
 
 
-@pytest.mark.parametrize(
-    ("assessment", "state"), [(SlowIsSafe(novelty=2.0), 0.0), (SlowIsSafe(), np.nan)]
-)
-def test_without_an_accepted_command_the_guard_keeps_to_the_ranges(assessment, state):
-    out = passed_on(assessment, [2.5, 0.4, -3.0], state)
-    np.testing.assert_array_equal(out["desired_output"], [1.0, 0.4, -1.0])
-    assert out["safety_probability"][0] == 0.0
-
-
-@pytest.mark.parametrize("state", [0.0, np.nan])
-def test_a_guard_that_does_not_act_passes_on_everything(state):
-    out = passed_on(SlowIsSafe(fastest=1.5), [2.5, 0.4, 0.0], state, is_acting=False)
-    np.testing.assert_array_equal(out["desired_output"], [2.5, 0.4, 0.0])
-    assert out["safety_probability"][0] == 0.0
-
-
 @pytest.mark.parametrize("what", ["beliefs", "an alarm"])
 def test_the_guard_judges_by_adopted_beliefs_and_by_none_during_an_alarm(what):
     assessment = load_assessment("go2_walking")
     loop = load_scenario("go2_walking").make_loop(assessment=assessment, guard=True)
-    simulator = Simulator(loop)
-    context = simulator.get_mutable_context()
-    loop.reset_standing(context, np.array([0.3, 0.0, 0.0]))
+    simulator, context = begun(loop, loop.reset_standing, np.array([0.3, 0.0, 0.0]))
     guard_system = loop.GetSubsystemByName("command_guard")
     assessor = loop.GetSubsystemByName("safety_assessor")
 

@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 
@@ -9,27 +7,21 @@ from studies.walking import guard_estimates, push_estimates, recovery_estimates,
 from studies.walking_motions import run_motions, run_push
 
 
-def motion(values, *, push_s=math.inf, leave_s=math.inf, fall_s=math.inf, changed=0.0, impact=0.0):
+def motion(values, *, changed=0.0, impact=0.0, **times):
     n = len(values)
-    return Motion(
-        index=0,
-        push_time_s=push_s,
-        leave_time_s=leave_s,
-        fall_time_s=fall_s,
-        time_s=0.1 * np.arange(n),
-        ports={
-            "features": np.array(values, dtype=float)[:, None],
-            "output": np.tile([0.5, 0.0, 0.1], (n, 1)),
-            "guard_active": np.full((n, 1), changed),
-            "downward_m_s": np.full((n, 1), impact),
-        },
-    )
+    ports = {
+        "features": np.array(values, dtype=float)[:, None],
+        "output": np.tile([0.5, 0.0, 0.1], (n, 1)),
+        "guard_active": np.full((n, 1), changed),
+        "downward_m_s": np.full((n, 1), impact),
+    }
+    return Motion(time_s=0.1 * np.arange(n), ports=ports, **times)
 
 
 def test_falls_and_their_times_are_those_of_motions_that_leave_after_the_push():
-    falls = motion([1] * 8, push_s=0.2, leave_s=0.6, fall_s=0.7)
-    before_push = motion([1, 1], push_s=0.5, leave_s=0.1, fall_s=0.1)
-    pushed = [falls, falls, motion([1] * 6, push_s=0.1), before_push]
+    falls = motion([1] * 8, push_time_s=0.2, leave_time_s=0.6, fall_time_s=0.7)
+    before_push = motion([1, 1], push_time_s=0.5, leave_time_s=0.1, fall_time_s=0.1)
+    pushed = [falls, falls, motion([1] * 6, push_time_s=0.1), before_push]
     found = push_estimates(pushed, push_s=0.2)
     assert found["pushes", "", "fallen"].value == pytest.approx(2 / 3)
     assert found["pushes", "", "push_to_fall_s"].value == pytest.approx(0.5)
@@ -38,8 +30,8 @@ def test_falls_and_their_times_are_those_of_motions_that_leave_after_the_push():
 
 
 def test_guard_recovery_and_speeds_compare_the_same_motions():
-    falls, stays = motion([1, 1], leave_s=0.1, fall_s=0.1, impact=3.0), motion([1, 1])
-    softer = motion([1, 1], leave_s=0.1, fall_s=0.1, impact=2.0)
+    falls, stays = motion([1, 1], leave_time_s=0.1, fall_time_s=0.1, impact=3.0), motion([1, 1])
+    softer = motion([1, 1], leave_time_s=0.1, fall_time_s=0.1, impact=2.0)
     guard = guard_estimates([falls, falls, stays], [stays, falls, stays], [motion([1], changed=1)])
     assert (guard["guard", "", "falls_without"].value, guard["guard", "", "falls_with"].value) == (
         2 / 3,

@@ -1,5 +1,7 @@
 """The whole-body controller: the program's torques, and held commands."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -70,20 +72,24 @@ def test_a_reference_holds_for_the_context_it_was_set_in():
     np.testing.assert_array_equal(other.begin().get("actuation"), standing)
 
 
-@pytest.mark.parametrize("entry", ["state", "orientation", "velocity", "desired_output"])
-def test_an_input_that_is_not_finite_keeps_the_last_good_command(entry):
+NUMBERS = (np.nan, np.inf, 1e9, 1e100)
+
+
+@pytest.mark.parametrize(
+    ("what", "entry", "value"),
+    [("q", 9, np.nan), ("q", ..., 0.0), *itertools.product(["q", "v", "goal"], [1], NUMBERS)],
+)
+def test_an_input_that_is_not_finite_keeps_the_last_good_command(what, entry, value):
     bench = Alone()
     bench.begin()
-    good = bench.get("actuation")
+    good, goal = bench.get("actuation"), bench.at_rest["desired_output"].copy()
     q, v = bench.q.copy(), np.zeros(bench.kinematics.num_velocities)
-    if entry == "state":
-        q[9] = np.nan
-    elif entry == "orientation":
-        q[:] = 0.0
-    elif entry == "velocity":
-        v[:] = 1e100
-    else:
-        bench.fix(desired_output=[0.0, np.inf, 1.0])
+    reference = bench.system.model.reference(q)
+    {"q": q, "v": v, "goal": goal}[what][entry] = value
+    reference.reaching.position = goal
+    with pytest.raises(ValueError, match="state and set points must be finite"):
+        build_qp(bench.system.model, q, v, reference)
+    bench.fix(desired_output=goal)
     bench.set_state(q, v)
     status, num_failures = bench.ticks(3)
     assert status == NOT_FINITE and num_failures >= 3

@@ -144,16 +144,6 @@ def _contacts(kinematics: RobotKinematics, rng: np.random.Generator, offset_m: f
     return np.column_stack([kinematics.nominal_contacts + xy, kinematics.foot_radii])
 
 
-def resting_feet(
-    kinematics: RobotKinematics, X_WB: RigidTransform, joints: np.ndarray, V_WB: np.ndarray
-) -> np.ndarray:
-    """Velocities (n_v,) with a moving base and the feet at rest: 0 = J_b V_WB + J_j dq."""
-    J = kinematics.contact_jacobian(kinematics.positions_at(X_WB, joints))
-    J_base, J_joints = np.split(J, [NUM_BASE_VELOCITIES], axis=1)
-    rates, *_ = np.linalg.lstsq(J_joints, -J_base @ V_WB, rcond=1e-6)
-    return np.concatenate([V_WB, rates])
-
-
 def _start(
     kinematics: RobotKinematics,
     X_WB: RigidTransform,
@@ -163,7 +153,11 @@ def _start(
     joint_offsets: np.ndarray | float = 0.0,
 ) -> EpisodeStart:
     joints = solve_inverse_kinematics(kinematics, X_WB, p_WC, kinematics.posture)
-    v = resting_feet(kinematics, X_WB, joints, V_WB)
+    # The base moves over feet at rest: 0 = J_b V_WB + J_j dq.
+    J = kinematics.contact_jacobian(kinematics.positions_at(X_WB, joints))
+    J_base, J_joints = np.split(J, [NUM_BASE_VELOCITIES], axis=1)
+    rates, *_ = np.linalg.lstsq(J_joints, -J_base @ V_WB, rcond=1e-6)
     joints = np.clip(joints + joint_offsets, *kinematics.position_limits.T)
     q = kinematics.positions_at(X_WB, joints)
+    v = np.concatenate([V_WB, rates])
     return EpisodeStart(q=q, v=v, plan=plan, foot_positions=p_WC)

@@ -12,7 +12,7 @@ from drake_safety.control.kinematics import (
 )
 from drake_safety.control.whole_body_model import Hand, PointReference, WholeBodyModel
 from drake_safety.control.whole_body_qp import task_errors
-from drake_safety.learning.blas_threads import one_blas_thread
+from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
 
 _FOOT_WEIGHT = 1e4  # Task weights are at most some hundreds, so feet move by micrometres.
 _MAX_ITERATIONS = 4
@@ -32,7 +32,7 @@ class KinematicPreview:
         self.model = model
         self.hand = model.hand
 
-    @one_blas_thread
+    @ONE_BLAS_THREAD
     def follow(self, q: np.ndarray, path: np.ndarray) -> np.ndarray:
         """Positions (M, n_q) along a path (M, 3) [m] of the hand in the world, from ``q``."""
         model, kinematics = self.model, self.model.kinematics

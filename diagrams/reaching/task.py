@@ -10,8 +10,9 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
+from pydrake.trajectories import PiecewisePolynomial
 
-from drake_safety.control.kinematics import fit_stance, planar_pose
+from drake_safety.control.kinematics import planar_pose
 from drake_safety.control.mirror import Mirror
 from drake_safety.diagrams.reaching.parameters import ReachingParameters
 from drake_safety.diagrams.reaching.safe_set import ReachingSafeSet
@@ -178,16 +179,13 @@ class Reaching(LeggedLoop):
         piece_s = self.scenario.parameters.plan_duration_s
         q = self.scenario.parameters.start.sample(self.safe_set, rng, self.mirror)
         self._set(context, q, self._output_of(q))
-        plan, X_SW = self._plan_of(context), self._stance_in_world(q).inverse()
-        home, pieces = plan.value(0.0).ravel(), []
+        X_SW, plan = self._stance_in_world(q).inverse(), PiecewisePolynomial()
+        home = self.start_of(context).plan.value(0.0).ravel()
         for i in range(math.ceil(duration_s / (2.0 * piece_s))):
             target = X_SW @ rng.uniform(*self.target_box)
             goal = home + rng.uniform(*_USUAL_SHARES) * (target - home)
-            pieces.append(interpolate(home, goal, piece_s, 2 * i * piece_s))
-            pieces.append(interpolate(goal, home, piece_s, (2 * i + 1) * piece_s))
-        plan = pieces[0]
-        for piece in pieces[1:]:
-            plan.ConcatenateInTime(piece)
+            plan.ConcatenateInTime(interpolate(home, goal, piece_s, 2 * i * piece_s))
+            plan.ConcatenateInTime(interpolate(goal, home, piece_s, (2 * i + 1) * piece_s))
         self.set_plan(context, plan)
         self._observers.reseed(context, rng)
 
@@ -221,8 +219,7 @@ class Reaching(LeggedLoop):
         self._enter(context, EpisodeStart(q=q, v=v, plan=plan))
 
     def _stance_in_world(self, q: np.ndarray) -> RigidTransform:
-        contacts = self.kinematics.contact_positions(q)
-        return planar_pose(fit_stance(contacts, self.kinematics.nominal_contacts))
+        return planar_pose(self.kinematics.stance_pose(q))
 
     def _set_state(self, context: Context, start: EpisodeStart) -> None:
         super()._set_state(context, start)

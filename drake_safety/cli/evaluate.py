@@ -204,15 +204,12 @@ def add_verdicts(
 def add_reliability(evaluation: Evaluation, test: Episodes) -> None:
     """Evaluates the reliability of either mode, and its stored calibrations."""
     segments = split(test, stride=1, discount=1.0, shortest=1)
-    estimates, curves = {}, {}
+    estimates, curves = dict[Key, Estimate](), {}
     for scorer in evaluation.scorers:
         mode, score = scorer.name, scorer.unsafe_score(segments)
         of_first, label = episode_scores(segments, score, PLAN)
-        first = curves[f"{mode}, first row"] = reliability(of_first, label, np.arange(len(label)))
-        rows = reliability(score, segments.is_unsafe, segments.episode)
-        curves[f"{mode}, every row"] = rows
-        estimates["calibration", mode, "expected_calibration_error"] = first.error
-        estimates["calibration.rows", mode, "expected_calibration_error"] = rows.error
+        curves[f"{mode}, first row"] = reliability(of_first, label, np.arange(len(label)))
+        curves[f"{mode}, every row"] = reliability(score, segments.is_unsafe, segments.episode)
         estimates |= _promises(evaluation.assessments[mode], mode, segments, score, family=False)
     evaluation.add(estimates, reliability=reliability_figure(curves))
 

@@ -208,6 +208,7 @@ def record_motions(motions: Mapping[str, Callable[[Meshcat], str]], file: Path) 
     panels = [_PANELS]
     for name, move in motions.items():
         viewer = console.open_viewer()
+        viewer.StartRecording()
         end = move(viewer)
         viewer.StopRecording()
         viewer.PublishRecording()
@@ -226,7 +227,6 @@ def _record_episode(
 ) -> str:
     """Records one episode of a pair's second loop, also as MCAP; returns how it ends."""
     loop = make_paired(pair, int(pair[0] is not pair[1]), meshcat=viewer)
-    viewer.StartRecording()
     with console.recorded(loop, file, follow(loop, viewer)) as monitor:
         episode = run_episode(loop, index, seed=seed, after_leaving_s=math.inf, monitor=monitor)
     end = f"leaves the safe set: {spoken(episode.cause)}"

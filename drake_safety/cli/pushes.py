@@ -134,7 +134,6 @@ def _move(
     """Records the weakest push; returns how it ends."""
     rig = PushRig(plant.scenario, plant.variation, plan, meshcat=viewer, **options)
     cell = weakest.weakest
-    viewer.StartRecording()
     impulse = cell.critical_n_s if math.isfinite(cell.critical_n_s) else cell.survived_n_s
     motion = rig.pushed(impulse, cell.direction, cell.phase, monitor=follow(rig.loop, viewer))
     end = f"leaves the safe set: {motion.cause}" if motion.has_left else "stays in the safe set"

@@ -23,7 +23,6 @@ from drake_safety.cli.gate import (
 from drake_safety.evaluation.failure_rate import estimate_failure_rate
 from drake_safety.evaluation.figure_style import save, spoken
 from drake_safety.evaluation.loop_comparison import ComparedPlant
-from drake_safety.evaluation.metrics import Estimate
 from drake_safety.evaluation.outcomes import UNSAFE
 from drake_safety.evaluation.rare_failures import RareFailures, Sample, estimate_rare_failure
 from drake_safety.evaluation.rare_figure import rare_figure, telling_facts
@@ -120,7 +119,8 @@ def _report_rare(
 ) -> None:
     """Prints a rate and the kinds of failures that make it, and writes them with a picture."""
     plain = "" if math.isnan(rare.plain_rollouts) else str(round(rare.plain_rollouts))
-    row = (_exponent(rare.rate), f"{rare.search_rate:.1e}", rare.simulations, plain)
+    text = f"{rare.rate.value:.1e} ({rare.rate.low:.1e} to {rare.rate.high:.1e})"
+    row = (text, f"{rare.search_rate:.1e}", rare.simulations, plain)
     columns = ("failure rate", "by the search", "episodes", "random episodes of the same variance")
     title = f"{loaded.name}, {variation}: {metric}"
     show_rows(title, columns, [row])
@@ -143,16 +143,11 @@ def _report_rare(
         console.say("to see one:", console.command_line("drake-safety", "--replay=1"))
 
 
-def _exponent(rate: Estimate) -> str:
-    return f"{rate.value:.1e} ({rate.low:.1e} to {rate.high:.1e})"
-
-
 def _record(scenario: Scenario, variation: str, sample: Sample, viewer: Meshcat) -> str:
     """Records a failure; returns its cause."""
     options = scenario.options_for("pairs", variation)
     loop = scenario.make_loop(variation, meshcat=viewer, **options)
     point = NormalPoint(np.random.default_rng(sample.seed), np.array(sample.z))
-    viewer.StartRecording()
     episode = run_episode(
         loop,
         draws=NormalGenerator(point),

@@ -79,6 +79,8 @@ class RobotKinematics:
         limits = [[j.position_lower_limit(), j.position_upper_limit()] for j in joints]
         self.position_limits = np.array(limits).reshape(-1, 2)
         self.velocity_limits = np.array([j.velocity_upper_limit() for j in joints])
+        motors = map(self.plant.get_joint_actuator, self.plant.GetJointActuatorIndices())
+        self.effort_limits = {motor.joint().name(): motor.effort_limit() for motor in motors}
         self.base = base
         self.world_frame = self.plant.world_frame()
         self.foot_names = list(robot.feet)

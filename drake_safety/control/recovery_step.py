@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from drake_safety.control.safe_sets import signed_distance_to_polygon
 from drake_safety.files.schema import Count, NotNegative, Positive, schema
 from drake_safety.robots.robot_size import GRAVITY_M_S2
 
@@ -60,15 +61,9 @@ def minimum_jerk(s: float) -> float:
 
 def first_group(groups: list[list[int]], feet: np.ndarray, point: np.ndarray) -> int:
     """The group whose swing leaves the other's stance line nearest the capture point (2,) [m]."""
-
-    def distance_to_line(foot: int, other: int) -> float:
-        a, edge = feet[foot], feet[other] - feet[foot]
-        length_squared = edge @ edge
-        s = 0.0 if length_squared == 0 else np.clip((point - a) @ edge / length_squared, 0.0, 1.0)
-        return float(np.linalg.norm(point - a - s * edge))
-
-    # While one group swings, the other stands.
-    return int(np.argmin([distance_to_line(group[0], group[-1]) for group in groups[::-1]]))
+    # While one group swings, the other stands. No point is inside a line.
+    lines = [feet[[group[0], group[-1]]].tolist() for group in groups[::-1]]
+    return int(np.argmax([signed_distance_to_polygon(point, line) for line in lines]))
 
 
 def foothold(

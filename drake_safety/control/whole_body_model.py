@@ -105,12 +105,9 @@ class WholeBodyModel:
         self.H = np.diag(diagonal)
         """Part of the cost's matrix from regularisation and posture, (n_v, n_v)."""
         self.base_turns = np.eye(3, self.num_velocities)
-        self.torque_limits = np.zeros(self.num_joints)
+        motors, names = kinematics.effort_limits, kinematics.joint_names
+        self.torque_limits = np.array([motors.get(name, 0.0) for name in names])
         """Largest torque of every joint (n_j,) [N·m]; zero for a joint without an actuator."""
-        for index in plant.GetJointActuatorIndices():
-            actuator = plant.get_joint_actuator(index)
-            joint = kinematics.joint_names.index(actuator.joint().name())
-            self.torque_limits[joint] = actuator.effort_limit()
         # Rows of constraints: equations of motion (n_v), contact constraints, friction pyramids.
         # Columns: v̇ (n_v), forces of the feet's points (3 each).
         n_v, num_points = self.num_velocities, kinematics.num_contacts

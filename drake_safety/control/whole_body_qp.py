@@ -11,7 +11,7 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 from drake_safety.control.kinematics import NUM_BASE_POSITIONS, NUM_BASE_VELOCITIES
 from drake_safety.control.observation import rotation_vector
 from drake_safety.control.whole_body_model import WholeBodyModel, WholeBodyReference
-from drake_safety.learning.blas_threads import one_blas_thread
+from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
 
 SOLVED = 0  # Status of a solved program; other values are daqp's negative exit flags.
 ITERATION_LIMIT = -4  # Status of a program that was given up, as of a fallen robot.
@@ -199,7 +199,7 @@ def _set_body_biases(model: WholeBodyModel, Jdot_v: np.ndarray) -> None:
     Jdot_v[_LAST] = plant.CalcBiasTranslationalAcceleration(context, *of_hand)[:, 0]
 
 
-@one_blas_thread
+@ONE_BLAS_THREAD
 def solve_qp(qp: WholeBodyQP) -> WholeBodySolution:
     """Solves the program by daqp's dual active-set method, deterministically without warm start.
 

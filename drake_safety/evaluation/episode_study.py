@@ -39,7 +39,6 @@ def evaluate_episodes(
             estimates |= {(kind, scorer.name, metric): one for metric, one in judged.items()}
     num_judged = test.num_unsafe + test.num_safe
     estimates["episodes", "", "share_unsafe"] = proportion(test.num_unsafe, num_judged)
-    estimates["episodes", "", "share_diverged"] = proportion(test.num_diverged, len(test))
     return estimates
 
 

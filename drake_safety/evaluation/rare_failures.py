@@ -24,7 +24,7 @@ from drake_safety.learning.seeds import RATE
 from drake_safety.learning.segments import DIVERGED, Episode
 from drake_safety.simulation.normal_space import NormalGenerator, NormalPoint, moved
 from drake_safety.simulation.recording import prepare_recording
-from drake_safety.simulation.rollouts import run_episode, worker_loop
+from drake_safety.simulation.rollouts import episodes_info, run_episode, worker_loop
 from drake_safety.simulation.scenario import Scenario
 from drake_safety.simulation.worker_processes import CloudPickled, MadeOnce, Progress, map_items
 
@@ -149,13 +149,11 @@ def estimate_rare_failure(
     is_task = isinstance(loop, Scenario)
     if isinstance(loop, Scenario):
         make = worker_loop(loop, variation, **loop.options_for("pairs", variation))
-        task, who = make(), loop.simulation_hash(variation)
-        names, of_state, of_output = task.constraint_names, task.state_names, task.output_names
-        run = run_episode
+        info, run = episodes_info(make(), seed), run_episode
     else:
         info, make, recorded_run = prepare_recording(loop, **recorded)
-        names, of_state, of_output = info.constraint_names, info.state_names, info.output_names
-        run, who = CloudPickled(recorded_run), info.scenario_hash
+        run = CloudPickled(recorded_run)
+    names = info.constraint_names
     name = getattr(make(), "fall_name", "") if metric == "fall" else metric
     if name not in (UNSAFE, *names):
         known = [UNSAFE, "fall", *names]
@@ -164,9 +162,12 @@ def estimate_rare_failure(
         run = partial(run_episode, **OutcomeReader(make(), metric).simulated)
     require_extra("train", "a search for rare failures")
     column = None if name == UNSAFE else names.index(name)
-    facts = [f"initial {one}" for one in of_state], [f"desired {one}" for one in of_output]
+    initial = [f"initial {one}" for one in info.state_names]
+    facts = initial, [f"desired {one}" for one in info.output_names]
     call = partial(_simulated, run, is_task, column, facts)
-    key = hashlib.sha256(repr((who, metric, samples, seed)).encode()).hexdigest()[:12]
+    key = hashlib.sha256(repr((info.scenario_hash, metric, samples, seed)).encode()).hexdigest()[
+        :12
+    ]
     file = None if path is None else Path(path) / f"samples-{key}.json"
     simulate = _Simulator(call, make, file, num_workers=num_workers, progress=progress)
     return search_and_sample(simulate, samples, np.random.default_rng(seed))
@@ -268,16 +269,20 @@ def _search(simulate: Simulate, number: int, rng: np.random.Generator) -> _Searc
         lowest = float((np.array(sample.margins) / spread).min())
         return min(lowest, 0.0) if sample.has_failed else max(lowest, 0.0)
 
-    def walk(chains: list[Sample], below: float) -> tuple[list[Sample], float]:
-        """Moves chains that stay below a level; returns them, and the share that moved."""
+    tried, rate, step = [(one, level(one)) for one in random], 1.0, _FIRST_STEP
+
+    def walk(chains: list[Sample], below: float) -> list[Sample]:
+        """Moves chains that stay below a level, and adapts the step to the share that moved."""
+        nonlocal step
         points = [moved(np.array(x.z), np.array(x.is_discrete), step, rng) for x in chains]
         proposed = simulate(points, rng)
         tried.extend((one, level(one)) for one in proposed)
         is_kept = [level(one) < below for one in proposed]
+        step *= math.exp(float(np.mean(is_kept)) - _ACCEPTED)
+        step = float(np.clip(step, _SMALLEST_STEP, 1.0))
         pairs = zip(proposed, chains, is_kept, strict=True)
-        return [new if kept else old for new, old, kept in pairs], float(np.mean(is_kept))
+        return [new if kept else old for new, old, kept in pairs]
 
-    tried, rate, step = [(one, level(one)) for one in random], 1.0, _FIRST_STEP
     num_chains = max(2, round(_SHARE * number))
     for _ in range(_MOST_LEVELS):
         if sum(one.has_failed for one in samples) >= num_chains:
@@ -292,9 +297,8 @@ def _search(simulate: Simulate, number: int, rng: np.random.Generator) -> _Searc
         rate *= len(chains) / number
         samples = []
         while len(samples) < number:
-            chains, accepted = walk(chains, threshold)
+            chains = walk(chains, threshold)
             samples += chains
-            step = float(np.clip(step * math.exp(accepted - _ACCEPTED), _SMALLEST_STEP, 1.0))
         samples = samples[:number]
     failures = [one for one in samples if one.has_failed]
     rate *= len(failures) / number
@@ -302,9 +306,8 @@ def _search(simulate: Simulate, number: int, rng: np.random.Generator) -> _Searc
         chains = [failures[i] for i in rng.choice(len(failures), num_chains)]
         failures = []
         for _ in range(2 * _MIXED):
-            chains, accepted = walk(chains, math.nextafter(0.0, 1.0))
+            chains = walk(chains, math.nextafter(0.0, 1.0))
             failures += chains
-            step = float(np.clip(step * math.exp(accepted - _ACCEPTED), _SMALLEST_STEP, 1.0))
         failures = failures[len(failures) // 2 :]
     return _Search(random, tried, failures, rate)
 

@@ -37,34 +37,23 @@ class Reliability(NamedTuple):
 
     expected: np.ndarray
     observed: list[Estimate]
-    error: Estimate  # Mean distance between the two over all rows.
+    error: float  # Mean distance between the two over all rows.
 
 
 def reliability(
     unsafe_probability: np.ndarray, is_unsafe: np.ndarray, episode: np.ndarray, num_bins: int = 10
 ) -> Reliability:
     """Compares 1 - probability of rows, (N,), with outcomes of their episodes."""
-    p = unsafe_probability
-
-    def error(weight: np.ndarray) -> float:
-        drawn = np.repeat(np.arange(len(p)), weight.astype(int))
-        bins = _bins(p[drawn], num_bins)
-        distances = [abs(p[drawn[b]].mean() - is_unsafe[drawn[b]].mean()) for b in bins]
-        return float([len(b) for b in bins] @ np.array(distances) / len(drawn))
-
-    bins = _bins(p, num_bins)
-    return Reliability(
-        expected=np.array([p[b].mean() for b in bins]),
-        observed=[share(is_unsafe[b], episode[b], bootstrap=_BOOTSTRAP) for b in bins],
-        error=_BOOTSTRAP.over_episodes(error, episode),
-    )
-
-
-def _bins(p: np.ndarray, num_bins: int) -> list[np.ndarray]:
     # Edges are occurring values, so that equal probabilities share a bin.
-    edges = np.unique(np.quantile(p, np.linspace(0, 1, num_bins + 1)[1:-1], method="nearest"))
-    members = np.searchsorted(edges, p, side="right")
-    return [np.flatnonzero(members == i) for i in np.unique(members)]
+    shares = np.linspace(0, 1, num_bins + 1)[1:-1]
+    edges = np.unique(np.quantile(unsafe_probability, shares, method="nearest"))
+    members = np.searchsorted(edges, unsafe_probability, side="right")
+    bins = [np.flatnonzero(members == i) for i in np.unique(members)]
+    expected = np.array([unsafe_probability[b].mean() for b in bins])
+    observed = [share(is_unsafe[b], episode[b], bootstrap=_BOOTSTRAP) for b in bins]
+    distance = np.abs(expected - [one.value for one in observed])
+    error = np.average(distance, weights=[len(b) for b in bins])
+    return Reliability(expected, observed, float(error))
 
 
 def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
@@ -86,7 +75,7 @@ def reliability_figure(curves: Mapping[str, Reliability]) -> Figure:
                 if own == mode:
                     value, low, high = np.array([(s.value, s.low, s.high) for s in one.observed]).T
                     interval = np.clip([value - low, high - value], 0.0, None)
-                    label = f"{rows}: error {one.error.value:.3f}"
+                    label = f"{rows}: error {one.error:.3f}"
                     axes.errorbar(one.expected, value, yerr=interval, label=label, **look)
             axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal", title=mode)
             axes.set_xlabel("predicted probability of an unsafe end")

@@ -1,6 +1,5 @@
 """Γ and its monitor under shifts: "don't know", rows sure and wrong (confident errors), alarms."""
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -119,19 +118,21 @@ class Minute(NamedTuple):
     """Times in a minute that begins with a motion and continues with the next; infinite: never."""
 
     alarm_s: float
-    leave_s: float
     error_s: list[float]  # Confident errors in the first 10 s and 60 s, outside alarms.
-    silent_error_s: list[float]  # The same without a monitor.
 
 
 def monitored(motions: Sequence[Episode], assessment: SafetyAssessment) -> list[Minute]:
     """Judges the minute that begins with each motion, by the monitor and Γ."""
     detector = assessment.detector_
     rows = [rows_of(one) for one in motions]
-    every = max(1, round(assessment.info_.step_s / detector.step_s))
+    info = assessment.info_
+    every = max(1, round(info.step_s / detector.step_s))
+    horizon = round(info.num_steps * info.step_s / detector.step_s)
     wrong_rows = []
     for one in motions:
-        last = last_rows(one, assessment, every)
+        # Of a motion that leaves the safe set, the rows within an episode's duration before it.
+        last = np.arange(0, len(one.time_s), every)
+        last = last[(len(one.time_s) - 1 - last <= horizon) & (not one.is_safe)]
         wrong_rows.append(last[safety_probability(assessment, one, last) >= CONFIDENT])
     most = round(max(SPANS_S) / detector.step_s)
     minutes = []
@@ -144,47 +145,25 @@ def monitored(motions: Sequence[Episode], assessment: SafetyAssessment) -> list[
         for alarm in alarms:
             is_alarm[alarm.begin : alarm.end] = True
         wrong = np.concatenate([begin[k] + wrong_rows[i] for k, i in enumerate(order)])
-        leaves = [begin[k + 1] for k, i in enumerate(order) if not motions[i].is_safe]
-        firsts = (min(at, default=most) for at in ([one.begin for one in alarms], leaves))
-        alarm_s, leave_s = (row * detector.step_s if row < most else np.inf for row in firsts)
-        error_s, silent_error_s = (
-            [every * detector.step_s * (detector.step_s * one < span).sum() for span in SPANS_S]
-            for one in (wrong[~is_alarm[wrong]], wrong)
-        )
-        minutes.append(Minute(alarm_s, leave_s, error_s, silent_error_s))
+        wrong_s = detector.step_s * wrong[~is_alarm[wrong]]
+        error_s = [every * detector.step_s * (wrong_s < span).sum() for span in SPANS_S]
+        first = min((one.begin for one in alarms), default=most)
+        minutes.append(Minute(first * detector.step_s if first < most else np.inf, error_s))
     return minutes
 
 
-def last_rows(motion: Episode, assessment: SafetyAssessment, every: int) -> np.ndarray:
-    """Every n-th row within an episode's duration of leaving the safe set; none if it stays."""
-    rows = np.arange(0, len(motion.time_s), every)
-    info = assessment.info_
-    horizon = round(info.num_steps * info.step_s / assessment.detector_.step_s)
-    is_last = len(motion.time_s) - 1 - rows <= horizon
-    return rows[is_last & (not motion.is_safe)]
-
-
 def monitor_estimates(minutes: Sequence[Minute]) -> dict[str, Estimate]:
-    """Alarms, their delay, and Γ's confident errors outside alarms, and without a monitor."""
+    """Alarms, their delay, and shares of Γ's confident errors outside alarms since a change."""
     delay_s = np.array([one.alarm_s for one in minutes])
-    num_leaving = sum(math.isfinite(one.leave_s) for one in minutes)
-    silent = error_estimates([one.silent_error_s for one in minutes])
-    return {
-        "leaves": proportion(num_leaving, len(minutes)),
-        **{f"silent_{metric}": one for metric, one in silent.items()},
+    estimates = {
         "alarmed": proportion(int(np.isfinite(delay_s).sum()), len(delay_s)),
         "delay_s": quantile(delay_s, 0.5, bootstrap=BOOTSTRAP),
         "delay_95_s": quantile(delay_s, 0.95, bootstrap=BOOTSTRAP),
-        **error_estimates([one.error_s for one in minutes]),
     }
-
-
-def error_estimates(error_s: Sequence[Sequence[float]]) -> dict[str, Estimate]:
-    """Shares of confident errors since a change, from their durations in each minute [s]."""
-    minute, estimates = np.arange(len(error_s)), {}
-    for span_s, errors in zip(SPANS_S, zip(*error_s, strict=True), strict=True):
-        share = mean(np.array(errors) / span_s, minute, bootstrap=BOOTSTRAP)
-        estimates[f"confident_error_{span_s:g}s"] = share
+    shares = np.array([one.error_s for one in minutes]) / SPANS_S
+    for span_s, share in zip(SPANS_S, shares.T, strict=True):
+        error = mean(share, np.arange(len(minutes)), bootstrap=BOOTSTRAP)
+        estimates[f"confident_error_{span_s:g}s"] = error
     return estimates
 
 

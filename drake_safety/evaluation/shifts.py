@@ -42,7 +42,7 @@ def plant_shifts(scenario: Scenario, loop: ClosedLoop) -> dict[str, PlantShift]:
     is_stance = np.ones(kinematics.num_contacts, dtype=bool)
     torques = np.abs(kinematics.gravity_torques(kinematics.standing_positions(), is_stance))
     motors = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
-    limits = {one.joint().name(): one.effort_limit() for one in motors if one.effort_limit() > 0.0}
+    limits = {name: limit for name, limit in kinematics.effort_limits.items() if limit > 0.0}
     loads = dict(zip(kinematics.joint_names, torques.tolist(), strict=True))
     joint = max((name for name in loads if name in limits), key=loads.__getitem__)
     key, period_s = as_pattern(joint), scenario.control_period_s

@@ -61,14 +61,23 @@ class DiscrepancyFunction:
     """
 
     def __init__(self, points: np.ndarray, difference: np.ndarray):
+        from sklearn.exceptions import ConvergenceWarning
         from sklearn.gaussian_process import GaussianProcessRegressor
-        from sklearn.gaussian_process.kernels import RBF
+        from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
         is_finite = np.isfinite(points).all(axis=1)
         points, difference = points[is_finite].astype(float), difference[is_finite].astype(float)
         if not len(points):
             raise ValueError("DiscrepancyFunction: none of the feedback's points is finite")
-        kernel = _fitted_kernel(points, difference)
+        kernel = ConstantKernel(1.0, "fixed") * RBF(10.0, (3.0, 40.0))
+        kernel += WhiteKernel(0.03, (1e-3, 0.08))
+        rows = np.arange(len(points))
+        if len(points) > _MOST_FITTED:
+            rows = np.random.default_rng(0).choice(len(points), _MOST_FITTED, replace=False)
+        with warnings.catch_warnings():
+            # Hyperparameters may end at their bounds.
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            kernel = GaussianProcessRegressor(kernel).fit(points[rows], difference[rows]).kernel_
         scale, noise = float(kernel.k1.k2.length_scale), float(kernel.k2.noise_level)
         # As `alpha`, the noise of the observations does not enter sigma.
         process = GaussianProcessRegressor(RBF(scale), alpha=noise, optimizer=None)
@@ -84,21 +93,6 @@ class DiscrepancyFunction:
                 points[chunk].astype(float), return_std=True
             )
         return np.clip(mean, 0.0, 1.0), deviation
-
-
-def _fitted_kernel(points: np.ndarray, difference: np.ndarray) -> Any:
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-
-    kernel = ConstantKernel(1.0, "fixed") * RBF(10.0, (3.0, 40.0)) + WhiteKernel(0.03, (1e-3, 0.08))
-    if len(points) > _MOST_FITTED:
-        rows = np.random.default_rng(0).choice(len(points), _MOST_FITTED, replace=False)
-        points, difference = points[rows], difference[rows]
-    with warnings.catch_warnings():
-        # Hyperparameters may end at their bounds.
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        return GaussianProcessRegressor(kernel=kernel).fit(points, difference).kernel_
 
 
 def feedback_beliefs(

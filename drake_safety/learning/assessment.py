@@ -20,7 +20,7 @@ from drake_safety.learning import assessment_file
 from drake_safety.learning.adaptation import Adaptation, paper_beliefs
 from drake_safety.learning.assessment_parameters import AdaptationParameters, AssessmentParameters
 from drake_safety.learning.beliefs import empty
-from drake_safety.learning.blas_threads import one_blas_thread
+from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
 from drake_safety.learning.calibration import Calibration, fitted_temperature
 from drake_safety.learning.change_detector import ChangeDetector, usual_rows
 from drake_safety.learning.fall_logit import FallLogit
@@ -36,7 +36,7 @@ from drake_safety.learning.maps import learned_maps
 from drake_safety.learning.mode_settings import ModeSettings, mode_settings
 from drake_safety.learning.novelty import Novelty
 from drake_safety.learning.points import embedded_points
-from drake_safety.learning.prediction import BaseLogit, Correction, Model, Prediction
+from drake_safety.learning.prediction import LEARNED, BaseLogit, Correction, Model, Prediction
 from drake_safety.learning.recalibration import recalibrated
 from drake_safety.learning.seeds import UsedEpisodes, check_unused
 from drake_safety.learning.segments import (
@@ -55,11 +55,6 @@ from drake_safety.learning.trees import Trees
 __all__ = ["AdaptationParameters", "AssessmentParameters", "Prediction", "SafetyAssessment"]
 
 _LOGGER = logging.getLogger("drake_safety")
-_OF_MODEL = (
-    *("embedding", "grid", "beliefs", "correction", "novelty"),
-    *("base_logit", "trees", "fall_logit"),
-)
-"""Attributes of `Model`, each of which is a learned attribute."""
 
 
 class SafetyAssessment:
@@ -119,7 +114,7 @@ class SafetyAssessment:
     def model(self) -> Model:
         """All that a prediction is made from, as one object of the present learned attributes."""
         self._check_fitted()
-        learned = {name: getattr(self, f"{name}_") for name in _OF_MODEL}
+        learned = {name: getattr(self, f"{name}_") for name in LEARNED}
         return Model(**learned, initial_uncertainty=self.parameters.initial_uncertainty)
 
     def fit(
@@ -198,7 +193,7 @@ class SafetyAssessment:
         training = training.thinned(grid, parameters.seed)
         model = replace(model, beliefs=prior_beliefs(training, grid, parameters, num_causes))
         stage_of(progress, "beliefs")(1.0)
-        return {f"{name}_": getattr(model, name) for name in _OF_MODEL} | {
+        return {f"{name}_": getattr(model, name) for name in LEARNED} | {
             "info_": info,
             "columns_": columns,
             "training_": training,
@@ -380,7 +375,7 @@ class SafetyAssessment:
         """Assesses recorded rows of a plant; see `InputColumns.of_rows`."""
         return self._predict(self.columns_.of_rows(rows, variation))
 
-    @one_blas_thread
+    @ONE_BLAS_THREAD
     def _predict(self, x: np.ndarray, **learned: Any) -> Prediction:
         own = self.model
         model = replace(own, **learned) if learned else own

@@ -21,7 +21,7 @@ from drake_safety.learning.fall_logit import FallLogit
 from drake_safety.learning.grid import Grid
 from drake_safety.learning.inputs import InputColumns
 from drake_safety.learning.novelty import Moments, Novelty
-from drake_safety.learning.prediction import BaseLogit, Correction, Model
+from drake_safety.learning.prediction import LEARNED, BaseLogit, Correction, Model
 from drake_safety.learning.seeds import UsedEpisodes
 from drake_safety.learning.segments import EpisodesInfo
 from drake_safety.learning.trained_maps import Embedding
@@ -247,15 +247,11 @@ def _learned(
     correction = Correction(**group("correction."))
     correction.guard = correction.guard.astype(float)
     counts, limits = numbers["novelty_counts"], np.array(numbers["novelty_limits"], dtype=float)
-    if not (min(counts) >= 0 < counts[0] and (limits > 0.0).all() and len(limits) in (3, 4)):
+    if not (min(counts) >= 0 < counts[0] and (limits > 0.0).all() and len(limits) == 4):
         raise ValueError(f"its novelty has the counts {counts} and limits {limits.tolist()}")
     feedback = Moments(count=counts[1], **group("feedback_novelty.")) if counts[1] else None
     training = {k: v.astype(_TRAINING[k][1]) for k, v in group("training_").items()}
-    known = group("novelty.")
-    if len(limits) == 3:  # Without a range, which then has no limit.
-        known |= {"least": known["mean"], "largest": known["mean"]}
-        limits = np.append(limits, np.inf)
-    nominal = Moments(count=counts[0], **known)
+    nominal = Moments(count=counts[0], **group("novelty."))
     learned: dict[str, Any] = {
         "info_": info,
         "grid_": Grid.of(parameters),
@@ -276,11 +272,8 @@ def _learned(
         learned[f"{name}_"] = objects if isinstance(value, list) else next(iter(objects), None)
     learned["calibrations_"] = {c.key: c for c in learned["calibrations_"]}
     # Layers that do not fit together raise an error.
-    names = "embedding grid beliefs correction base_logit novelty trees fall_logit"
-    model = Model(
-        **{name: learned[f"{name}_"] for name in names.split()},
-        initial_uncertainty=parameters.initial_uncertainty,
-    )
+    of_model = {name: learned[f"{name}_"] for name in LEARNED}
+    model = Model(**of_model, initial_uncertainty=parameters.initial_uncertainty)
     with np.errstate(all="ignore"):
         model.predict(model.novelty.training.mean[None])
         learned["detector_"].predictor.errors(*(np.zeros((3, sizes[size])) for size in "uw"))

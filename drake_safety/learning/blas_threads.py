@@ -5,19 +5,17 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable
+from contextlib import ContextDecorator
 from threading import Lock
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
-_P = ParamSpec("_P")
-_R = TypeVar("_R")
 
-
-class OneBlasThread:
+class OneBlasThread(ContextDecorator):
     """A context in which BLAS runs in the calling thread; the settings are restored after it.
 
-    Contexts may be nested, and entered by several threads at once.
+    Contexts may be nested, and entered by several threads at once. It also decorates functions.
     """
 
     def __init__(self) -> None:
@@ -48,17 +46,6 @@ class OneBlasThread:
 
 ONE_BLAS_THREAD = OneBlasThread()
 """Process-wide instance."""
-
-
-def one_blas_thread(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorates a function that runs with one BLAS thread."""
-
-    @functools.wraps(function)
-    def limited(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        with ONE_BLAS_THREAD:
-            return function(*args, **kwargs)
-
-    return limited
 
 
 @functools.cache

@@ -37,6 +37,10 @@ class Graph:
         return Value(self, name)
 
 
+def _arithmetic(operator: str) -> Callable[[Value, Any], Value]:
+    return lambda value, other: value.graph.node(operator, value, other)
+
+
 class Value:
     """A value of a graph: its operators and methods add the node that has it as first input."""
 
@@ -48,23 +52,14 @@ class Value:
     def __getattr__(self, operator: str) -> Callable[..., Value]:
         return lambda *others, **options: self.graph.node(operator, self, *others, **options)
 
-    def __add__(self, other: Any) -> Value:
-        return self.Add(other)
-
-    def __sub__(self, other: Any) -> Value:
-        return self.Sub(other)
+    __add__ = _arithmetic("Add")
+    __sub__ = _arithmetic("Sub")
+    __mul__ = _arithmetic("Mul")
+    __truediv__ = _arithmetic("Div")
+    __matmul__ = _arithmetic("MatMul")
 
     def __rsub__(self, other: Any) -> Value:
         return self.graph.node("Sub", other, self)
-
-    def __mul__(self, other: Any) -> Value:
-        return self.Mul(other)
-
-    def __truediv__(self, other: Any) -> Value:
-        return self.Div(other)
-
-    def __matmul__(self, other: Any) -> Value:
-        return self.MatMul(other)
 
     def part(self, start: int, stop: int, *, axis: int, output: str | None = None) -> Value:
         """Entries along an axis."""

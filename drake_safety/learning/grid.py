@@ -48,10 +48,6 @@ class Grid:
         """Largest coordinate of the grid."""
         return 0.5 * self.resolution * self.cell_length
 
-    @cached_property
-    def _rows(self) -> np.ndarray:
-        return np.arange(self.resolution, dtype=float)
-
     @property
     def centres(self) -> np.ndarray:
         """Centre of every cell, (R*R, 2)."""
@@ -97,7 +93,7 @@ class Grid:
         # These choose the number of a number and NaN.
         np.fmin(np.fmax(position, 0.0, out=position), last, out=position)
         # The weight of a row or column of cells falls linearly with the distance from its centre.
-        weight = position[..., None] - self._rows
+        weight = position[..., None] - np.arange(self.resolution)
         np.subtract(1.0, np.abs(weight, out=weight), out=weight)
         np.maximum(weight, 0.0, out=weight)
         weight *= is_inside[..., None, None]

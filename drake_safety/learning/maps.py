@@ -246,11 +246,12 @@ def _network(num_inputs: int, num_margins: int, settings: ModeSettings) -> Any:
         if settings.dropout > 0.0:
             trunk.append(nn.Dropout(settings.dropout))
         width = size
-    if settings.is_paper:
-        return nn.ModuleDict({"trunk": nn.Sequential(*trunk), "output": nn.Linear(width, 2)})
-    output = nn.Linear(width, 2 + num_margins)
-    safety = nn.Sequential(nn.Linear(2, _SAFETY_HIDDEN), nn.ReLU(), nn.Linear(_SAFETY_HIDDEN, 1))
-    return nn.ModuleDict({"trunk": nn.Sequential(*trunk), "output": output, "safety": safety})
+    num_outputs = 2 if settings.is_paper else 2 + num_margins
+    net = nn.ModuleDict({"trunk": nn.Sequential(*trunk), "output": nn.Linear(width, num_outputs)})
+    if not settings.is_paper:
+        head = nn.Linear(2, _SAFETY_HIDDEN), nn.ReLU(), nn.Linear(_SAFETY_HIDDEN, 1)
+        net["safety"] = nn.Sequential(*head)
+    return net
 
 
 def _folded_weights(

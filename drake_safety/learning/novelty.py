@@ -110,11 +110,6 @@ class Distances:
         np.multiply(entries, entries, out=entries)
         return (entries @ terms)[:, 0]
 
-    def precision(self) -> np.ndarray:
-        """The matrix of the sum of the three as a quadratic form of the offset, (n_x, n_x)."""
-        of_entries, of_axes = np.split(self.terms.sum(axis=1), [len(self.mean)])
-        return np.diag(of_entries) + (self.axes * of_axes) @ self.axes.T
-
 
 def _above(variance: np.ndarray, axes: np.ndarray, least: float) -> np.ndarray:
     is_above = variance > least
@@ -227,5 +222,8 @@ class Novelty:
 
     def contradictions(self, x: np.ndarray) -> np.ndarray:
         """Errors of each column's linear regression on the others [standard deviation], (n_x,)."""
-        precision = self.quadratic.precision()
-        return precision @ (x - self.quadratic.mean) / np.sqrt(np.diag(precision))
+        known, axes = self.quadratic, self.quadratic.axes
+        # The matrix of the sum of the three distances as a quadratic form of the offset.
+        of_entries, of_axes = np.split(known.terms.sum(axis=1), [len(known.mean)])
+        precision = np.diag(of_entries) + (axes * of_axes) @ axes.T
+        return precision @ (x - known.mean) / np.sqrt(np.diag(precision))

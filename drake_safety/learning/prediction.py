@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -247,6 +247,10 @@ class Model:
             novelty=distance,
             fall_probability=fall_probability,
         )
+
+
+LEARNED = [one.name for one in fields(Model) if one.name != "initial_uncertainty"]
+"""Attributes of `Model`, each of which is a learned attribute of `SafetyAssessment`."""
 
 
 def _weighted(heads: np.ndarray, slopes: Sequence[float], offset: float = 0.0) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -45,6 +46,7 @@ class StatePredictor:
     ) -> StatePredictor:
         """Learns from inputs (K, n_u) and states (K, n_w) of motions of at least three rows."""
         import torch
+        from torch.nn import functional
 
         every = np.concatenate(inputs)
         mean, scale = every.mean(axis=0), np.maximum(every.std(axis=0), _SMALLEST_SPREAD)
@@ -68,7 +70,11 @@ class StatePredictor:
                 if (batch := step % per_epoch) == 0:
                     order = torch.randperm(len(x))
                 rows = order[batch * _BATCH : (batch + 1) * _BATCH]
-                loss = torch.nn.functional.smooth_l1_loss(network(x[rows]), y[rows])
+                hidden = x[rows]
+                for layer in network["hidden"]:
+                    hidden = functional.silu(layer(hidden))
+                predicted = network["output"](hidden) + network["linear"](x[rows])
+                loss = functional.smooth_l1_loss(predicted, y[rows])
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
@@ -146,23 +152,11 @@ class StatePredictor:
         return cls(**own, weights=weights)
 
 
-def _network(num_inputs: int, num_outputs: int):  # type: ignore[no-untyped-def]
-    import torch
+def _network(num_inputs: int, num_outputs: int) -> Any:
+    from torch import nn
 
-    class Network(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            widths = (num_inputs, *HIDDEN_SIZES)
-            self.linear = torch.nn.Linear(num_inputs, num_outputs)
-            self.hidden = torch.nn.ModuleList(
-                torch.nn.Linear(*pair) for pair in itertools.pairwise(widths)
-            )
-            self.output = torch.nn.Linear(widths[-1], num_outputs, bias=False)
-
-        def forward(self, x: torch.Tensor) -> torch.Tensor:
-            hidden = x
-            for layer in self.hidden:
-                hidden = torch.nn.functional.silu(layer(hidden))
-            return self.output(hidden) + self.linear(x)
-
-    return Network()
+    widths = (num_inputs, *HIDDEN_SIZES)
+    linear = nn.Linear(num_inputs, num_outputs)
+    hidden = nn.ModuleList(nn.Linear(*pair) for pair in itertools.pairwise(widths))
+    output = nn.Linear(widths[-1], num_outputs, bias=False)
+    return nn.ModuleDict({"linear": linear, "hidden": hidden, "output": output})

@@ -154,23 +154,21 @@ class Embedding:
         """
         x = np.asarray(x, dtype=float)
         clipped = np.clip(x, *self.input_range)
-        logit, gradient = np.zeros(len(x)), np.zeros(np.shape(x))
-        for k in range(self.num_members):
-            w = {name: array[k] for name, array in self.weights.items()}
-            z, is_active = clipped, []
-            for i in range(self.num_layers):
-                z = z @ w[f"trunk.{i}.weight"] + w[f"trunk.{i}.bias"]
-                is_active.append(z > 0.0)
-                z = np.maximum(z, 0.0)
-            y = z @ w["output.weight"][:, :2] + w["output.bias"][:2]
-            hidden = y @ w["safety.0.weight"] + w["safety.0.bias"]
-            logit += (np.maximum(hidden, 0.0) @ w["safety.1.weight"] + w["safety.1.bias"])[:, 0]
-            back = (hidden > 0.0) * w["safety.1.weight"][:, 0]
-            back = back @ w["safety.0.weight"].T @ w["output.weight"][:, :2].T
-            for i in reversed(range(self.num_layers)):
-                back = (back * is_active[i]) @ w[f"trunk.{i}.weight"].T
-            gradient += back * (clipped == x)
-        return logit / self.num_members, gradient / self.num_members
+        *trunk, (weight, bias) = self._layers
+        z, is_active = clipped, []
+        for of_layer, of_bias in trunk:
+            z = z @ of_layer + of_bias
+            is_active.append(z > 0.0)
+            z = np.maximum(z, 0.0)
+        (head, head_bias), (last, last_bias) = self._layer("safety.0"), self._layer("safety.1")
+        hidden = (z @ weight[..., :2] + bias[..., :2]) @ head + head_bias
+        logit = (np.maximum(hidden, 0.0) @ last + last_bias)[..., 0]
+        back = (hidden > 0.0) * last.swapaxes(1, 2)
+        back = back @ head.swapaxes(1, 2) @ weight[..., :2].swapaxes(1, 2)
+        for (of_layer, _), active in zip(reversed(trunk), reversed(is_active), strict=True):
+            back = (back * active) @ of_layer.swapaxes(1, 2)
+        gradient = (back * (clipped == x)).sum(axis=0, dtype=float)
+        return logit.sum(axis=0) / self.num_members, gradient / self.num_members
 
     def _clipped(self, x: np.ndarray) -> np.ndarray:
         """Inputs clipped to the range, from its centre, in single precision."""

@@ -184,18 +184,16 @@ def _check_desired_output(source: Source, kinematics: RobotKinematics) -> None:
     desired, base = (source.at(n, source.at_s[:1])[0] for n in ("desired_output", "base_position"))
     low = _LOW_HAND if kinematics.robot.reaching_frames else _LOW_BASE
     height, unit = kinematics.standing_height, si_units(source.log_map.desired_output)
+    reach = _REACH_SHARE * height
 
     def is_near(z: np.ndarray) -> bool:
-        is_far = np.linalg.norm(z - base) > _REACH_SHARE * height
-        return bool(low < z[2] / height < 1 / low and not is_far)
+        return bool(low < z[2] / height < 1 / low and np.linalg.norm(z - base) <= reach)
 
     if is_near(desired):
         return
     units = [one for one, size in LENGTH_UNITS.items() if is_near(size / unit * desired)]
     got = f"{np.linalg.norm(desired - base):.3g} m from the robot's base, at z = {desired[2]:.3g} m"
-    near = (
-        f"within {_REACH_SHARE * height:.3g} m, at z = {low * height:.3g} to {height / low:.3g} m"
-    )
+    near = f"within {reach:.3g} m, at z = {low * height:.3g} to {height / low:.3g} m"
     what = f"the desired output is {got}; expected a position, no velocity, {near}"
     hint = f"it fits if 'desired_output.unit' is {units[0]}" if units else "check columns and unit"
     raise ValueError(f"{source.where}: {what}: {hint}")

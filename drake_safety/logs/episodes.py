@@ -52,18 +52,16 @@ def cut_log(
     scenario, assessment = loop.scenario, loop.scenario.assessment
     shortest = assessment.preview_stride * mode_settings(assessment).shortest
     cutter = _Cutter(loop, scenario.step_s, scenario.episode_duration_s, shortest)
-    episodes: list[Episode] = []
-    starts: list[EpisodeStart] = []
+    kept: list[tuple[Episode, EpisodeStart]] = []
     for parts in cutter.parts(log):
         pairs = [pair for _, several in parts for pair in several]
         if not pairs:
             longest = max((piece for piece, _ in parts), key=lambda piece: piece.duration_s)
             what = f"too short for a segment of {shortest} steps of {scenario.step_s} s"
             raise ValueError(f"log '{longest.path}' lasts {longest.duration_s:g} s: {what}")
-        episodes += [episode for episode, _ in pairs]
-        starts += [start for _, start in pairs]
-    episodes = [replace(episode, index=i) for i, episode in enumerate(episodes)]
-    return Episodes(episodes_info(loop, seed=NOT_DRAWN), episodes), starts
+        kept += pairs
+    episodes = [replace(episode, index=i) for i, (episode, _) in enumerate(kept)]
+    return Episodes(episodes_info(loop, seed=NOT_DRAWN), episodes), [start for _, start in kept]
 
 
 def motions_from_log(

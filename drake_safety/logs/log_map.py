@@ -83,10 +83,9 @@ class Orientation(_Columns):
 
 
 @schema(kw_only=True)
-class LinearVelocity(_Columns):
+class LinearVelocity(Position):
     """Velocity of the base's origin relative to the world: x, y, z per second."""
 
-    unit: LengthUnit = "m"
     frame: Frame = "world"  # Frame of x, y, z; ``body``: the base's own (as in ROS odometry).
 
 

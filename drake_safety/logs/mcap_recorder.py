@@ -63,7 +63,7 @@ class McapRecorder:
                 numbered = ["value"] if size == 1 else [f"entry_{i}" for i in range(size)]
                 self._add_numbers(name, names.get(name, numbered), port.Eval)
             elif isinstance(port.Allocate().get_value(), str):
-                self._add(name, "std_msgs/String", lambda context, port=port: [port.Eval(context)])
+                self._add(name, "std_msgs/msg/String", lambda c, port=port: [port.Eval(c)])
         if isinstance(diagram, LeggedLoop):
             self._add_robot(diagram)
             data = json.dumps(_log_map(diagram, names), indent=2).encode()
@@ -77,37 +77,32 @@ class McapRecorder:
 
     def __call__(self, context: Context) -> object:
         """Writes a row of a root Context if one is due; returns what the monitor returns."""
-        self._write_due(context)
-        return None if self._monitor is None else self._monitor(context)
-
-    def _write_due(self, context: Context) -> None:
         now_s, before_s = context.get_time(), self._now_s
         if now_s < before_s:
             self._shift_ns += round(1e9 * (before_s - now_s)) + _BREAK_NS
             self._due_s = -math.inf
         self._now_s = now_s
-        if now_s < self._due_s - _ROUNDING_S:
-            return
-        is_late = now_s - self._due_s >= self._period_s  # The simulator's steps are longer.
-        self._due_s = self._period_s + (now_s if is_late else self._due_s)
-        self._stamp_ns = round(1e9 * now_s) + self._shift_ns
-        row = [(channel, make(context)) for channel, make in self._topics.values()]
-        for channel, data in row:  # The row is complete, wherever Ctrl-C stops it.
-            self._writer.add_message(channel, self._stamp_ns, data, self._stamp_ns)
+        if now_s >= self._due_s - _ROUNDING_S:
+            is_late = now_s - self._due_s >= self._period_s  # The simulator's steps are longer.
+            self._due_s = self._period_s + (now_s if is_late else self._due_s)
+            self._stamp_ns = round(1e9 * now_s) + self._shift_ns
+            row = [(channel, make(context)) for channel, make in self._topics.values()]
+            for channel, data in row:  # The row is complete, wherever Ctrl-C stops it.
+                self._writer.add_message(channel, self._stamp_ns, data, self._stamp_ns)
+        return None if self._monitor is None else self._monitor(context)
 
     def _of(self, kind: str, *values: Any) -> Any:
-        """A message of a type such as ``std_msgs/String``."""
-        return self._store.types[kind.replace("/", "/msg/")](*values)
+        """A message of a type such as ``std_msgs/msg/String``."""
+        return self._store.types[kind](*values)
 
     def _add(self, topic: str, kind: str, fields: Callable[..., Iterable[Any]]) -> None:
         """Adds a topic, whose messages have the given fields of a root Context."""
-        name = kind.replace("/", "/msg/")
-        text, _ = self._store.generate_msgdef(name, ros_version=2)
-        schema = self._writer.register_schema(name, "ros2msg", text.encode())
+        text, _ = self._store.generate_msgdef(kind, ros_version=2)
+        schema = self._writer.register_schema(kind, "ros2msg", text.encode())
         channel = self._writer.register_channel(f"/{topic}", "cdr", schema)
 
         def make(context: Context) -> bytes:
-            return bytes(self._store.serialize_cdr(self._of(kind, *fields(context)), name))
+            return bytes(self._store.serialize_cdr(self._of(kind, *fields(context)), kind))
 
         self._topics[topic] = channel, make
 
@@ -116,9 +111,9 @@ class McapRecorder:
     ) -> None:
         from rosbags.typesys import get_types_from_msg
 
-        kind = f"drake_safety/{topic.title().replace('_', '')}"
+        kind = f"drake_safety/msg/{topic.title().replace('_', '')}"
         if text := "".join(f"float64 {field}\n" for field in field_names(names)):
-            self._store.register(get_types_from_msg(text, kind.replace("/", "/msg/")))
+            self._store.register(get_types_from_msg(text, kind))
             self._add(topic, kind, values)
 
     def _add_robot(self, loop: LeggedLoop) -> None:
@@ -135,20 +130,20 @@ class McapRecorder:
 
         def transforms(context: Context) -> list[Any]:
             at, made = plant_context(context), []
-            time = self._of("builtin_interfaces/Time", *divmod(self._stamp_ns, 1_000_000_000))
-            header = self._of("std_msgs/Header", time, "world")
+            time = self._of("builtin_interfaces/msg/Time", *divmod(self._stamp_ns, 1_000_000_000))
+            header = self._of("std_msgs/msg/Header", time, "world")
             for body in bodies:
                 is_own = body.model_instance() == instance
                 name = body.name() if is_own else body.scoped_name().get_full()
                 X_WB = plant.EvalBodyPoseInWorld(at, body)
                 w, *xyz = X_WB.rotation().ToQuaternion().wxyz()
-                place = self._of("geometry_msgs/Vector3", *X_WB.translation())
-                turn = self._of("geometry_msgs/Quaternion", *xyz, w)
-                pose = self._of("geometry_msgs/Transform", place, turn)
-                made.append(self._of("geometry_msgs/TransformStamped", header, name, pose))
+                place = self._of("geometry_msgs/msg/Vector3", *X_WB.translation())
+                turn = self._of("geometry_msgs/msg/Quaternion", *xyz, w)
+                pose = self._of("geometry_msgs/msg/Transform", place, turn)
+                made.append(self._of("geometry_msgs/msg/TransformStamped", header, name, pose))
             return [made]
 
-        self._add("tf", "tf2_msgs/TFMessage", transforms)
+        self._add("tf", "tf2_msgs/msg/TFMessage", transforms)
         if not is_drake:
             return
         motors = map(plant.get_joint_actuator, plant.GetJointActuatorIndices(instance))

@@ -58,7 +58,9 @@ def read_sequences(
     for name, column in columns.items():
         values = data[:, ::stride, names.index(column)] * scale.get(name, 1.0)
         rows[:, :, inputs[name]] = values + offset.get(name, 0.0)
-    return [_motions(sequence, step_s) for sequence in rows]
+    time_s = step_s * np.arange(rows.shape[1])
+    known = [np.isfinite(one).all(axis=1) for one in rows]
+    return [_motions(time_s[k], one[k], step_s) for k, one in zip(known, rows, strict=True)]
 
 
 def read_recording(
@@ -77,19 +79,16 @@ def read_recording(
     wanted = dict(zip((inputs, margins), map(field_names, names), strict=True))
     channels = read_messages(path, wanted, LogTime())
     leave_s, cause = math.inf, ""
-    own = channels[margins]
-    for time_s, row in zip(own.time_s, own.frame.to_numpy(), strict=True):
-        if is_outside(row):
-            leave_s, cause = time_s, info.constraint_names[violated(row)]
-            break
+    own = channels[margins].frame.to_numpy()
+    if (outside := np.flatnonzero(is_outside(own))).size:
+        leave_s = channels[margins].time_s[outside[0]]
+        cause = info.constraint_names[violated(own[outside[0]])]
     # A row shows what the monitor took in the step before; while it waits there is none.
     time_s = (channels[inputs].time_s - detector.step_s).round(6)
     time_s = time_s[time_s <= leave_s]
     rows = np.zeros((len(time_s), _num_entries(info)))
     rows[:, detector.columns] = channels[inputs].frame.to_numpy()[: len(time_s)]
-    begins = np.flatnonzero(np.diff(time_s) > 1.5 * detector.step_s) + 1
-    parts = np.split(np.arange(len(time_s)), begins)
-    return [(time_s[part], rows[part]) for part in parts if len(part) > 2], cause
+    return _motions(time_s, rows, detector.step_s), cause
 
 
 def _num_entries(info: EpisodesInfo) -> int:
@@ -112,8 +111,7 @@ def _arrays(path: Path, sequence_map: SequenceMap) -> tuple[np.ndarray, list[str
     return data.reshape(-1, *data.shape[-2:]), names
 
 
-def _motions(rows: np.ndarray, step_s: float) -> list[Motion]:
-    """The motions of a sequence (K, n) between missing values, of three rows or more."""
-    kept = np.flatnonzero(np.isfinite(rows).all(axis=1))
-    parts = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
-    return [(step_s * part, rows[part]) for part in parts if len(part) > 2]
+def _motions(time_s: np.ndarray, rows: np.ndarray, step_s: float) -> list[Motion]:
+    """The motions of rows (K, n) that are a step apart, of three rows or more."""
+    parts = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(time_s) > 1.5 * step_s) + 1)
+    return [(time_s[part], rows[part]) for part in parts if len(part) > 2]

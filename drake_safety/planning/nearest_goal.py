@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.blas_threads import one_blas_thread
+from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
 from drake_safety.planning.goal_verdict import GoalVerdict, assess_goals, checked_goal, goal_inputs
 from drake_safety.simulation.capabilities import HasGoals, require
 from drake_safety.simulation.closed_loop import ClosedLoop
@@ -24,7 +24,7 @@ _SPREAD = 0.25  # Radius of the candidates about the best goal, by its distance 
 _NUM_ROUNDS, _ROUNDS_FROM_KNOWN = 6, 4  # Rounds of candidates about the best goal.
 
 
-@one_blas_thread
+@ONE_BLAS_THREAD
 def nearest_accepted_goal(
     loop: ClosedLoop,
     assessment: SafetyAssessment,

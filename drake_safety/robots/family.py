@@ -1,6 +1,7 @@
 """Plant families: random plants around the nominal one, on which Γ learns beside it."""
 
 from dataclasses import asdict, field
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -36,31 +37,21 @@ class PlantFamily:
 
     def extreme(self, nominal: PlantVariation, number: int) -> PlantVariation:
         """The plant with every entry, at one end of each range, the odd numbers at the highest."""
-        return _plant(nominal, _drawn(self.ranges, _Extreme(number), "ranges"))
+        # Stands for a generator, and draws the ends of ranges and the items of lists in turn.
+        ends = SimpleNamespace(
+            random=lambda: 0.0,
+            uniform=lambda *bounds: bounds[number % 2],
+            integers=lambda count: number % count,
+        )
+        return self._drawn_by(ends, nominal)
 
     def plant(self, nominal: PlantVariation, seed: int, number: int) -> PlantVariation:
         """Draws the plant of a number, the same for a seed."""
-        return _plant(nominal, _drawn(self.ranges, plant_rng(seed, number), "ranges"))
+        return self._drawn_by(plant_rng(seed, number), nominal)
 
-
-class _Extreme:
-    """Stands for a generator, and draws the ends of ranges and the items of lists in turn."""
-
-    def __init__(self, number: int):
-        self._number = number
-
-    def random(self) -> float:
-        return 0.0
-
-    def uniform(self, *bounds: float) -> float:
-        return bounds[self._number % 2]
-
-    def integers(self, number: int) -> int:
-        return self._number % number
-
-
-def _plant(nominal: PlantVariation, drawn: dict[str, Any]) -> PlantVariation:
-    return load_typed(PlantVariation, asdict(nominal) | drawn, "family")
+    def _drawn_by(self, rng: Any, nominal: PlantVariation) -> PlantVariation:
+        drawn = _drawn(self.ranges, rng, "ranges")
+        return load_typed(PlantVariation, asdict(nominal) | drawn, "family")
 
 
 def plant_rng(seed: int, number: int) -> np.random.Generator:

@@ -40,15 +40,7 @@ class EpisodeStart:
         return fit_stance(self.feet(kinematics), kinematics.nominal_contacts)
 
     def check(self, who: str, num_positions: int, num_velocities: int) -> None:
-        """Checks the state.
-
-        Args:
-            who: Name that begins the error.
-            num_positions, num_velocities: Sizes of q and v.
-
-        Raises:
-            ValueError: q or v has another size or an entry that is not finite.
-        """
+        """Raises a ValueError that names ``who`` if q or v has another size or is not finite."""
         for name, size in {"q": num_positions, "v": num_velocities}.items():
             value = getattr(self, name)
             if np.shape(value) != (size,) or not np.isfinite(value).all():

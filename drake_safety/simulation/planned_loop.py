@@ -89,9 +89,6 @@ class PlannedLoop(ClosedLoop):
         """Sets the plan over simulation time, in the stance frame, (n_z, 1) [m]."""
         self._planner.set_plan(self._planner.GetMyMutableContextFromRoot(context), plan)
 
-    def _plan_of(self, context: Context) -> PiecewisePolynomial:
-        return self._planner.get_plan(self._planner.GetMyContextFromRoot(context))
-
     def _enter(self, context: Context, start: EpisodeStart) -> None:
         # Only the state is reset: parameters such as an assessor's beliefs outlive an episode.
         context.SetTime(0.0)

@@ -22,12 +22,7 @@ from drake_safety.learning.segments import (
 from drake_safety.robots.family import FAMILY, plant_rng
 from drake_safety.simulation.closed_loop import REQUIRED_PORTS, port_sizes
 from drake_safety.simulation.motion import End, simulate
-from drake_safety.simulation.rollouts import (
-    collect_episodes,
-    loops_by_plant,
-    run_on_plant,
-    seed_random_sources,
-)
+from drake_safety.simulation.rollouts import collect_episodes, loops_by_plant, seed_random_sources
 from drake_safety.simulation.worker_processes import CloudPickled, MadeOnce, Progress
 from drake_safety.systems.monitored_assessor import warn_of_sampled_ports
 
@@ -110,8 +105,7 @@ def record_episodes(
         monitor_period_s=monitor_period_s,
         seed=seed,
     )
-    call = run if draw_plant is None else partial(run_on_plant, run, info)
-    episodes = collect_episodes(info, range(num_episodes), make, call, is_repeated=True, **options)
+    episodes = collect_episodes(info, range(num_episodes), make, run, is_repeated=True, **options)
     episodes.warn()
     if stride := _better_stride(episodes):
         _LOGGER.warning(

@@ -85,27 +85,17 @@ def run_on_plant(
 
 
 def _loops(
-    scenario: Scenario, variation: str, seed: int, options: dict[str, Any]
-) -> tuple[MadeOnce[Any], ClosedLoop]:
-    """Makes a process's loops, of a variation or of a family's plants; also returns one loop."""
+    scenario: Scenario, variation: str, plants: int | None, seed: int, options: dict[str, Any]
+) -> tuple[MadeOnce[Any], ClosedLoop, int]:
+    """Makes a process's loops, of a variation or of a family's plants; one loop; their number."""
     make: MadeOnce[Any] = worker_loop(scenario, variation, **options)
-    if variation != FAMILY:
-        return make, make()
+    if variation != FAMILY or scenario.family is None:
+        return make, make(), 0
     make = loops_by_plant(
         (make.key, seed),
         lambda number: scenario.with_plant(seed, number).make_loop(FAMILY, **options),
     )
-    return make, make()(1)
-
-
-def _with_plants(
-    info: EpisodesInfo, scenario: Scenario, plants: int | None, run: Callable[..., Episode]
-) -> Callable[..., Episode]:
-    """Runs each episode of a family on its plant."""
-    if info.variation != FAMILY or scenario.family is None:
-        return run
-    info.plants = scenario.family.plants if plants is None else plants
-    return partial(run_on_plant, run, info)
+    return make, make()(1), plants or scenario.family.plants
 
 
 def episode_rng(seed: int, index: int) -> np.random.Generator:
@@ -290,13 +280,13 @@ def run_motions(
     Example: ``motions = run_motions(scenario, 10.0, num_workers=1)``
     """
     check_times("run_motions", duration_s=duration_s)
-    make, loop = _loops(scenario, variation, seed, loop_options)
+    make, loop, num_plants = _loops(scenario, variation, plants, seed, loop_options)
     step_s, piece_s = scenario.monitor_step_s, motion_piece_s(loop, are_episodes)
     options = {**loop_options, "episodes_s" if are_episodes else "undisturbed_s": piece_s}
-    info = episodes_info(loop, seed, options)
-    info = replace(info, step_s=step_s, num_steps=round(piece_s / step_s))
-    run: Callable[..., Episode] = partial(run_motion, seed=seed, is_episode=are_episodes)
-    run, number = _with_plants(info, scenario, plants, run), math.ceil(duration_s / piece_s - 1e-6)
+    info = replace(episodes_info(loop, seed, options), step_s=step_s, plants=num_plants)
+    info.num_steps = round(piece_s / step_s)
+    run = partial(run_motion, seed=seed, is_episode=are_episodes)
+    number = math.ceil(duration_s / piece_s - 1e-6)
     kept = dict[str, Any](num_workers=num_workers, path=path, progress=progress, extra=extra)
     size = 1 if piece_s > scenario.episode_duration_s else BATCH_SIZE
     return collect_episodes(info, range(number), make, run, batch_size=size, **kept)
@@ -375,12 +365,12 @@ def run_episodes(
 
     Example: ``more = run_episodes(scenario, 8, variation="actual", seed=1, num_workers=1)``
     """
-    make, loop = _loops(scenario, variation, seed, loop_options)
+    make, loop, num_plants = _loops(scenario, variation, plants, seed, loop_options)
     info = episodes_info(loop, seed, loop_options | ({"until_fall": True} if until_fall else {}))
-    run: Callable[..., Episode] = partial(run_episode, seed=seed, until_fall=until_fall)
+    info.plants = num_plants
     if until_fall:
         info.until = require(loop, CanFall).fall_name
-    run, is_many = _with_plants(info, scenario, plants, run), num_episodes >= _MANY
+    run, is_many = partial(run_episode, seed=seed, until_fall=until_fall), num_episodes >= _MANY
     kept = dict[str, Any](num_workers=num_workers, path=path, progress=progress, extra=extra)
     return collect_episodes(info, range(num_episodes), make, run, is_repeated=is_many, **kept)
 
@@ -400,9 +390,12 @@ def collect_episodes(
 ) -> Episodes:
     """Simulates the episodes of a set that a folder does not hold yet, in worker processes.
 
-    ``run`` returns the episode of a diagram and an index. If ``is_repeated``, the first
-    episode with several rows, simulated again after the next by a new diagram, must be the same.
+    ``run`` returns the episode of a diagram, of a family the plant's, and an index. If
+    ``is_repeated``, the first episode with several rows, simulated again after the next by a new
+    diagram, must be the same.
     """
+    if info.plants:
+        run = partial(run_on_plant, run, info)
     with nullcontext() if path is None else EpisodeWriter(path, info, extra) as writer:
         there = [] if writer is None else load_episodes(writer.path)
         wanted = set(indices)
@@ -426,13 +419,11 @@ def collect_episodes(
         judged = set(pending[:1] if is_repeated else ())
         with closing(results):
             for episode in results:
-                if is_judged := episode.index in judged:
-                    judged = (
-                        set() if episode.num_steps else set(pending)
-                    )  # A single row says little.
-                if is_judged and not judged and not is_repeatable(episode, make.make(), run):
-                    who = f"episode {episode.index} of '{info.scenario}'"
-                    raise ValueError(f"{who}, simulated again after the next, {HIDDEN_STATE}")
+                if episode.index in judged:
+                    judged = set() if episode.num_steps else set(pending)  # A row says little.
+                    if not judged and not is_repeatable(episode, make.make(), run):
+                        who = f"episode {episode.index} of '{info.scenario}'"
+                        raise ValueError(f"{who}, simulated again after the next, {HIDDEN_STATE}")
                 episodes.append(episode)
                 if writer is not None:
                     writer.append(episode)

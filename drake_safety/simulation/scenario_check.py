@@ -191,9 +191,7 @@ def _diagram(scenario: Scenario) -> Generator[Finding, None, ClosedLoop]:
 
 
 def _motors(kinematics: RobotKinematics) -> _Check:
-    plant, robot = kinematics.plant, kinematics.robot
-    actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
-    limits = {actuator.joint().name(): actuator.effort_limit() for actuator in actuators}
+    plant, robot, limits = kinematics.plant, kinematics.robot, kinematics.effort_limits
     without = [name for name in kinematics.joint_names if name not in limits]
     each, none = f"one on each of {len(limits)} joints", f"joints {without} have none"
     yield _judged("motors", not without, each, none, _EFFORT_REMEDY)

@@ -7,7 +7,7 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_safety.learning.assessment import SafetyAssessment
-from drake_safety.learning.blas_threads import one_blas_thread
+from drake_safety.learning.blas_threads import ONE_BLAS_THREAD
 from drake_safety.learning.change_detector import SETTLING_S, TIME_CONSTANTS_S, ChangeDetector
 
 
@@ -106,7 +106,7 @@ class ChangeMonitor(LeafSystem):
         value: np.ndarray = context.get_discrete_state(self._groups[name]).get_value()
         return value
 
-    @one_blas_thread
+    @ONE_BLAS_THREAD
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         part = {name: self._value(context, name).copy() for name in self._groups}
         now_s, (begin_s, end_s) = context.get_time(), part["expected_s"]
