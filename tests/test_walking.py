@@ -150,23 +150,11 @@ def test_the_guard_passes_an_accepted_command_unchanged():
     np.testing.assert_array_equal(out["desired_outlook"], np.tile(command, OUTLOOK))
 
 
-@pytest.mark.parametrize(
-    ("novelty", "state", "is_acting", "expected"),
-    [
-        (0.0, 0.0, True, [1.5, 0.4, -3.0]),  # Shares of 2.5 are .5 apart, and the others stay.
-        # Without an accepted command it keeps to the ranges.
-        (2.0, 0.0, True, [1.0, 0.4, -1.0]),
-        (0.0, np.nan, True, [1.0, 0.4, -1.0]),
-        (0.0, 0.0, False, [2.5, 0.4, -3.0]),
-        (0.0, np.nan, False, [2.5, 0.4, -3.0]),
-    ],
-)
-def test_the_guard_replaces_a_refused_command_by_the_nearest_accepted_one_if_it_acts(
-    novelty, state, is_acting, expected
-):
-    out = passed_on(SlowIsSafe(novelty=novelty), [2.5, 0.4, -3.0], state, is_acting)
-    np.testing.assert_array_equal(out["desired_output"], expected)
-    assert (out["is_changed"][0], out["safety_probability"][0]) == (float(is_acting), 0.0)
+def test_the_guard_replaces_a_refused_command_by_the_nearest_accepted_one():
+    out = passed_on(SlowIsSafe(fastest=1.5), [2.5, 0.4, 0.0])
+    # Shares of 2.5 are .5 apart, and the other entries stay.
+    np.testing.assert_allclose(out["desired_output"], [1.5, 0.4, 0.0])
+    assert (out["is_changed"][0], out["safety_probability"][0]) == (1.0, 0.0)
 
 
 def test_the_guard_tries_the_nearest_commands_first_as_measured_in_the_policys_ranges():
@@ -175,6 +163,22 @@ def test_the_guard_tries_the_nearest_commands_first_as_measured_in_the_policys_r
     distance = np.linalg.norm((commands - asked) / [2.0, 1.0, 2.0], axis=1)
     np.testing.assert_array_equal(commands[[0, -1]], [asked, np.zeros(3)])
     assert (np.diff(distance) >= 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("assessment", "state"), [(SlowIsSafe(novelty=2.0), 0.0), (SlowIsSafe(), np.nan)]
+)
+def test_without_an_accepted_command_the_guard_keeps_to_the_ranges(assessment, state):
+    out = passed_on(assessment, [2.5, 0.4, -3.0], state)
+    np.testing.assert_array_equal(out["desired_output"], [1.0, 0.4, -1.0])
+    assert out["safety_probability"][0] == 0.0
+
+
+@pytest.mark.parametrize("state", [0.0, np.nan])
+def test_a_guard_that_does_not_act_passes_on_everything(state):
+    out = passed_on(SlowIsSafe(fastest=1.5), [2.5, 0.4, 0.0], state, is_acting=False)
+    np.testing.assert_array_equal(out["desired_output"], [2.5, 0.4, 0.0])
+    assert out["safety_probability"][0] == 0.0
 
 
 @pytest.mark.parametrize("what", ["beliefs", "an alarm"])
