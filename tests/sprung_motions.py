@@ -51,8 +51,10 @@ def recorded(rows, info=INFO, **changes):
 
 
 def same_detector(one, other):
-    pairs = zip(one.arrays().items(), other.arrays().items(), strict=True)
-    return all(a[0] == b[0] and np.array_equal(a[1], b[1]) for a, b in pairs)
+    known, found = one.arrays(), other.arrays()
+    if known.keys() != found.keys():
+        return False
+    return all(np.array_equal(known[name], found[name], equal_nan=True) for name in known)
 
 
 @functools.cache
