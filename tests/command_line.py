@@ -26,7 +26,7 @@ def invoked(*arguments):
 
 
 def python(*arguments, cwd="/"):
-    """What a Python of its own prints, which finds the package here."""
+    """Runs Python in a process of its own, which finds this package; returns its output."""
     paths = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
     environment["PYTHONIOENCODING"] = "utf-8"
@@ -37,7 +37,7 @@ def python(*arguments, cwd="/"):
 
 
 def problems(scenario, num_episodes=0):
-    """What `check` refuses, by item."""
+    """Returns the findings of `check` that are problems, by item."""
     findings = check_scenario(scenario, num_episodes=num_episodes)
     return {finding.item: finding for finding in findings if not finding.is_ok}
 

@@ -42,7 +42,7 @@ def quick_assessment(mode):
 
 
 def map_data(x, target, **changes):
-    """What a map learns of inputs that are all safe and have no margins."""
+    """Training data of a map: inputs that are all safe and have no margins."""
     n = len(x)
     values = dict(x=x, target=target, has_target=np.ones(n, dtype=bool))
     values |= dict(is_unsafe=np.zeros(n, dtype=bool), margins=np.zeros((n, 0)))

@@ -68,7 +68,7 @@ class Bench:
 
 
 class Played:
-    """A system in a diagram that plays rows of its inputs, row k at step k."""
+    """A system in a diagram that plays rows of the system's inputs, row k at step k."""
 
     def __init__(self, system, step_s, **inputs):
         builder = DiagramBuilder()
@@ -84,7 +84,7 @@ class Played:
         self.context = system.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
 
     def history(self, *names):
-        """Outputs after each row, by name."""
+        """Returns the outputs after each row, by name."""
         found = {name: [] for name in names}
         for row in range(self.num_rows):
             self.simulator.AdvanceTo((row + 0.25) * self.step_s)
@@ -94,7 +94,7 @@ class Played:
 
 
 def begun(loop, reset, *arguments):
-    """A simulator of a loop at the start that it is set to, and its context."""
+    """Resets a loop; returns its initialised simulator and the root Context."""
     simulator = Simulator(loop)
     context = simulator.get_mutable_context()
     reset(context, *arguments)

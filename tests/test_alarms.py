@@ -10,7 +10,7 @@ PUSH_S, LEAVE_S, FALL_S, END_S = 1.0, 1.4, 1.8, 3.6
 
 
 def motion_of(index, values, *, leaves=False, falls=False, push_time_s=PUSH_S):
-    """What is seen of it is one number: `values` by the time from which it holds."""
+    """A motion of one number: `values` by the time from which each holds."""
     end_s = FALL_S if falls else END_S
     time_s = np.round(np.arange(0.0, end_s + 0.05, 0.1), 9)
     state = np.ones((len(time_s), 1))

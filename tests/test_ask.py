@@ -133,7 +133,7 @@ def test_what_does_not_exist_is_answered_with_what_does(call, folder, arguments,
 
 
 def test_a_run_obeys_a_refusal(call, folder, monkeypatch):
-    # Spares the search for what would be accepted.
+    # The search for an accepted target takes long.
     monkeypatch.setattr("drake_safety.cli.ask.nearest_accepted_goal", lambda *_, **options: None)
     calibrate(folder, 1.0 + 1e-6)
     code, printed = call("run", SCENARIO, "--assessment", folder, "--target", "red_can")

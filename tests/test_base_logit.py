@@ -23,7 +23,7 @@ def segments():
 
 
 def outputs(logit, margins=None):
-    """What maps say, of which only the safety logits (K, N) and margins (K, N, n_c) matter."""
+    """Outputs of maps, of which only the safety logits (K, N) and margins (K, N, n_c) matter."""
     margins = np.zeros((*logit.shape, 1)) if margins is None else margins
     return EmbeddingOutput(np.zeros((*logit.shape, 2)), logit, margins)
 

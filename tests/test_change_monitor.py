@@ -22,7 +22,7 @@ class Monitored(Played):
         super().__init__(ChangeMonitor(assessment), STEP_S, **inputs, **hold)
 
     def history(self):
-        """Levels, alarm and its cause after each row."""
+        """Returns the levels, the alarm and its cause after each row."""
         levels, alarm, cause = super().history("levels", "alarm", "alarm_cause").values()
         return levels, alarm[:, 0], cause.tolist()
 

@@ -82,7 +82,7 @@ def make_station(text):
 
 
 class Balance(LeafSystem):
-    """What Γ needs of the station: z, its preview, and how far the pole is from falling."""
+    """Γ's inputs from the station: z, its preview, and the pole's distance from falling."""
 
     def __init__(self):
         super().__init__()

@@ -20,7 +20,7 @@ def balancing():
 
 
 def start_at(loop, index, **goal):
-    """What an episode of the loop begins with."""
+    """Returns the start of an episode of the loop."""
     context = loop.CreateDefaultContext()
     loop.reset(context, episode_rng(0, index), **goal)
     return loop.start_of(context)

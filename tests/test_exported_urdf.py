@@ -31,7 +31,7 @@ def robot_of(text, folder, task="balancing", **options):
 
 
 def findings_of(written, *, is_imported=True):
-    """What a check warns of or refuses."""
+    """Returns the warnings and problems of a check."""
     options = {"is_imported": is_imported, "check_robot": check_urdf}
     findings = check_scenario(written.files[-1], num_episodes=0, **options)
     return {f.item: f for f in findings if f.remedy}

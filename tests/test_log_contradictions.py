@@ -120,7 +120,7 @@ def test_a_contradiction_names_the_columns_the_reading_that_fits_and_by_how_much
 
 
 def noisy(frame, rng):
-    """What encoders, an inertial measurement unit and a state estimator make of a motion."""
+    """Measures a motion by encoders, an inertial measurement unit and a state estimator."""
 
     def add(columns, size):
         values = frame[columns].to_numpy()

@@ -227,7 +227,7 @@ EXCLUDE = '<contact><exclude body1="FL_calf" body2="FR_calf"/></contact>'
 
 @pytest.fixture(scope="module")
 def dog(tmp_path_factory):
-    """What `new` writes for the quadruped's scene, which includes its file."""
+    """The robot that `new` writes for the quadruped's scene, which includes its file."""
     folder = tmp_path_factory.mktemp("mjcf")
     write_dog(folder)
     (folder / "scene.xml").write_text(f'<mujoco><include file="dog.xml"/>{EXCLUDE}</mujoco>')

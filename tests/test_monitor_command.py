@@ -29,7 +29,7 @@ MAP = SequenceMap(step_s=STEP_S, columns=COLUMNS, scale={"knee_rate": 20.0}, off
 
 
 def observed(rows):
-    """What a policy observes of rows (K, n): scaled rates, and positions about another zero."""
+    """Observations of a policy, from rows (K, n): scaled rates, positions about another zero."""
     q, dq, now, later, load = rows[:, [0, 1, 2, 3, 2 + HORIZON]].T
     return np.stack([load, np.full(len(rows), np.nan), q - 0.5, dq / 20.0, now, later], axis=1)
 

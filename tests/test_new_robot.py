@@ -17,7 +17,7 @@ from urdf_files import mesh, stl, with_shape
 
 @pytest.fixture(scope="module")
 def spider(tmp_path_factory):
-    """What `new` writes for a URDF of six legs."""
+    """The robot that `new` writes for a URDF of six legs."""
     folder = tmp_path_factory.mktemp("urdf")
     write_hexapod(folder)
     return write_robot("spider", folder / "hexapod.urdf", "balancing", folder / "spider")

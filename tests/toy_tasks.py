@@ -36,7 +36,7 @@ def evaluated(system, context, name):
 
 @dataclass(kw_only=True)
 class GlidingParameters:
-    """What a gliding scenario may say."""
+    """Parameters of a gliding scenario."""
 
     speed_m_s: float = 2.0  # Largest at the start.
     failure: str = ""  # Beyond x = 0.5: "raise", "nan", "inf", "1e13", "bug" or none.
@@ -138,7 +138,7 @@ def gliding(task="Gliding", **parameters):
 
 @dataclass(kw_only=True)
 class ShuttleParameters:
-    """What a shuttle scenario may say: nothing."""
+    """Parameters of a shuttle scenario: none."""
 
 
 class Shuttle(LeafSystem):

@@ -130,7 +130,7 @@ def monitored(motions: Sequence[Episode], assessment: SafetyAssessment) -> list[
     horizon = round(info.num_steps * info.step_s / detector.step_s)
     wrong_rows = []
     for one in motions:
-        # Of a motion that leaves the safe set, the rows within an episode's duration before it.
+        # Rows within an episode's duration of leaving the safe set; none of a motion that stays.
         last = np.arange(0, len(one.time_s), every)
         last = last[(len(one.time_s) - 1 - last <= horizon) & (not one.is_safe)]
         wrong_rows.append(last[safety_probability(assessment, one, last) >= CONFIDENT])

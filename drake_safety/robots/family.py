@@ -37,7 +37,7 @@ class PlantFamily:
 
     def extreme(self, nominal: PlantVariation, number: int) -> PlantVariation:
         """The plant with every entry, at one end of each range, the odd numbers at the highest."""
-        # Stands for a generator, and draws the ends of ranges and the items of lists in turn.
+        # In place of a random generator: draws the ends of ranges, and the items of lists in turn.
         ends = SimpleNamespace(
             random=lambda: 0.0,
             uniform=lambda *bounds: bounds[number % 2],

@@ -87,7 +87,7 @@ def run_on_plant(
 def _loops(
     scenario: Scenario, variation: str, plants: int | None, seed: int, options: dict[str, Any]
 ) -> tuple[MadeOnce[Any], ClosedLoop, int]:
-    """Makes a process's loops, of a variation or of a family's plants; one loop; their number."""
+    """Returns a maker of a process's loops, one loop, and the number of a family's plants."""
     make: MadeOnce[Any] = worker_loop(scenario, variation, **options)
     if variation != FAMILY or scenario.family is None:
         return make, make(), 0
@@ -420,7 +420,8 @@ def collect_episodes(
         with closing(results):
             for episode in results:
                 if episode.index in judged:
-                    judged = set() if episode.num_steps else set(pending)  # A row says little.
+                    # A single row vouches for nothing.
+                    judged = set() if episode.num_steps else set(pending)
                     if not judged and not is_repeatable(episode, make.make(), run):
                         who = f"episode {episode.index} of '{info.scenario}'"
                         raise ValueError(f"{who}, simulated again after the next, {HIDDEN_STATE}")
