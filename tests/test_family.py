@@ -83,6 +83,7 @@ def test_a_plant_depends_on_seed_and_number_alone_and_not_on_the_shares_of_other
         ({"mass_scale": {"uniform": [0, 1], "one_of": [1]}}, "must have one of ['uniform'"),
         ({"payload": {"share": 2.0}}, "ranges.payload.share must be in (0, 1]; got 2.0"),
         ({"mass_scal": {"uniform": [0.5, 1]}}, "unknown key 'mass_scal' (did you mean"),
+        ({"mass_scale": {"uniform": [-1.0, -0.5]}}, "'mass_scale'"),
         ({"shift": {"joints": {"one_of": 3}}}, "one_of must be a list; got 3"),
         ({}, "ranges must have an entry of a plant variation; got {}"),
         ({"share": 0.5, "mass_scale": 1.1}, "ranges cannot have a share"),
